@@ -1,0 +1,292 @@
+"""Files that are either whole or absent: atomic writers, digests, provenance, view caches."""
+
+import errno
+import fcntl
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilsplat.base.errors import ArtifactError, DiskSpaceError
+
+INDEX = "index.json"
+"""Written last into a folder artifact: its presence means that the folder is complete."""
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """Yield a temporary name beside `path` that replaces it when the block ends without error.
+
+    Raises:
+        DiskSpaceError: the disk is full.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o644)
+        os.replace(temporary, path)
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise DiskSpaceError(
+                f"no space left while writing {path}",
+                fix=f"free space on the disk of {path.parent}, then run again; finished work is kept",
+            ) from error
+        raise
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """Yield a temporary folder beside `path` that replaces it when the block ends without error."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
+    try:
+        yield temporary
+        temporary.chmod(0o755)
+        if path.exists():
+            shutil.rmtree(path)
+        os.replace(temporary, path)
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise DiskSpaceError(
+                f"no space left while writing {path}",
+                fix=f"free space on the disk of {path.parent}, then run again; finished work is kept",
+            ) from error
+        raise
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def require_free_space(folder: Path, needed_mib: float) -> None:
+    """Refuse to begin where the disk cannot hold what is about to be written.
+
+    Raises:
+        DiskSpaceError: less than `needed_mib` MiB is free on the folder's disk.
+    """
+    folder = Path(folder)
+    while not folder.exists():
+        folder = folder.parent
+    free_mib = shutil.disk_usage(folder).free / 2**20
+    if free_mib < needed_mib:
+        raise DiskSpaceError(
+            f"too little space on the disk of {folder}",
+            expected=f"at least {needed_mib:.0f} MiB free",
+            found=f"{free_mib:.0f} MiB free",
+            fix="free space, or point the results folder at another disk",
+        )
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file atomically (UTF-8)."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON atomically, indented, keys in the given order, with a closing newline."""
+    write_text(path, json.dumps(value, indent=1, ensure_ascii=False) + "\n")
+
+
+def read_json(path: Path) -> Any:
+    """Read JSON.
+
+    Raises:
+        ArtifactError: the file is missing or is no JSON.
+    """
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ArtifactError(f"{path} is missing", fix="run the stage that writes it") from error
+    except ValueError as error:
+        raise ArtifactError(
+            f"{path} is not valid JSON: {error}", fix="delete it and run its stage again"
+        ) from error
+
+
+def write_npz(path: Path, **arrays: np.ndarray) -> None:
+    """Write a compressed .npz atomically, with fixed time stamps: same arrays, same bytes."""
+    import io
+    import zipfile
+
+    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        for name, array in arrays.items():
+            buffer = io.BytesIO()
+            np.lib.format.write_array(buffer, np.ascontiguousarray(array), allow_pickle=False)
+            info = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
+            info.compress_type = zipfile.ZIP_DEFLATED
+            archive.writestr(info, buffer.getvalue(), compresslevel=1)
+
+
+def read_npz(path: Path) -> dict[str, np.ndarray]:
+    """Read an .npz into a dict; nothing is unpickled.
+
+    Raises:
+        ArtifactError: the file is missing, damaged or holds objects.
+    """
+    import zipfile
+
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except FileNotFoundError as error:
+        raise ArtifactError(f"{path} is missing", fix="run the stage that writes it") from error
+    except (ValueError, zipfile.BadZipFile, EOFError, OSError) as error:
+        raise ArtifactError(
+            f"{path} cannot be read: {error}", fix="delete it and run its stage again"
+        ) from error
+
+
+def write_npy(path: Path, array: np.ndarray) -> None:
+    """Write one array as .npy atomically."""
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
+        np.save(stream, array, allow_pickle=False)
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """Read one .npy array; nothing is unpickled.
+
+    Raises:
+        ArtifactError: the file is missing or damaged.
+    """
+    try:
+        return np.load(path, allow_pickle=False)
+    except FileNotFoundError as error:
+        raise ArtifactError(f"{path} is missing", fix="run the stage that writes it") from error
+    except (ValueError, EOFError, OSError) as error:
+        raise ArtifactError(
+            f"{path} cannot be read: {error}", fix="delete it and run its stage again"
+        ) from error
+
+
+def sha256_of_bytes(*parts: bytes) -> str:
+    """SHA-256 of the parts, each preceded by its length so that borders count."""
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(len(part).to_bytes(8, "little"))
+        digest.update(part)
+    return digest.hexdigest()
+
+
+def sha256_of_json(value: Any) -> str:
+    """SHA-256 of a JSON value, independent of the order of keys."""
+    return sha256_of_bytes(json.dumps(value, sort_keys=True).encode())
+
+
+def sha256_of_file(path: Path) -> str:
+    """SHA-256 of a file's bytes."""
+    with Path(path).open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def sha256_of_path(path: Path) -> str:
+    """SHA-256 of a file, or of a folder's files (names and bytes, provenance left out)."""
+    path = Path(path)
+    if path.is_file():
+        return sha256_of_file(path)
+    files = sorted(
+        file for file in path.rglob("*") if file.is_file() and not file.name.startswith((".", PROVENANCE))
+    )
+    if not files:
+        raise ArtifactError(f"{path} is missing or empty", fix="run the stage that writes it")
+    return sha256_of_json([(file.relative_to(path).as_posix(), sha256_of_file(file)) for file in files])
+
+
+PROVENANCE = "provenance"
+
+
+def provenance_path(artifact: Path) -> Path:
+    """Where the provenance of an artifact stands: inside a folder, beside a file."""
+    artifact = Path(artifact)
+    if artifact.is_dir():
+        return artifact / f"{PROVENANCE}.json"
+    return artifact.with_name(f"{artifact.name}.{PROVENANCE}.json")
+
+
+def write_index(folder: Path, views: Mapping[str, Any], **more: Any) -> None:
+    """Close a folder artifact: write `index.json` with one entry per view, keyed by view name."""
+    write_json(Path(folder) / INDEX, {**more, "views": dict(views)})
+
+
+def read_index(folder: Path) -> dict[str, Any]:
+    """Read a folder artifact's index.
+
+    Raises:
+        ArtifactError: there is none, so the folder is missing or incomplete.
+    """
+    path = Path(folder) / INDEX
+    if not path.is_file():
+        raise ArtifactError(
+            f"{folder} is missing or incomplete: it has no {INDEX}", fix="run its stage again"
+        )
+    return read_json(path)
+
+
+class ViewCache:
+    """Finished views of a long stage, kept outside its declared output and keyed by content.
+
+    A stage that was killed finds them again, and one added photo costs one photo. An entry is one
+    .npz file under a key that must cover everything the result depends on: the digests of image,
+    model and code, and the settings.
+
+    Args:
+        folder: where entries live, such as `results/.cache/masks`.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = Path(folder)
+        self.hits = 0
+        self.misses = 0
+
+    def path(self, key: str) -> Path:
+        """File of a key, whether it exists or not."""
+        return self.folder / key[:2] / f"{key}.npz"
+
+    def get(self, key: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+        """Return the entry, computing and storing it where it is missing or damaged."""
+        path = self.path(key)
+        if path.is_file():
+            try:
+                arrays = read_npz(path)
+                os.utime(path)  # last use, for pruning
+                self.hits += 1
+                return arrays
+            except ArtifactError:
+                path.unlink(missing_ok=True)
+        arrays = compute()
+        write_npz(path, **arrays)
+        self.misses += 1
+        return arrays
+
+
+@contextmanager
+def output_lock(output: Path) -> Iterator[None]:
+    """Hold an output for writing; a second writer of the same output is refused.
+
+    Raises:
+        ArtifactError: another process is writing it.
+    """
+    output = Path(output)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    lock = output.parent / f".{output.name}.lock"
+    with lock.open("w") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ArtifactError(
+                f"another process is writing {output}",
+                fix="wait for it, or end it (a killed Snakemake leaves its jobs running), then run again",
+            ) from error
+        yield

@@ -1,0 +1,71 @@
+"""Reading and writing images: upright, RGB, channel-last."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageOps, UnidentifiedImageError
+
+from hilsplat.base.artifacts import atomic_path
+from hilsplat.base.errors import ImageError
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
+
+
+def list_images(folder: Path) -> list[Path]:
+    """Image files of a folder, by name; other files and hidden ones are passed over."""
+    return sorted(
+        path
+        for path in Path(folder).iterdir()
+        if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+    )
+
+
+def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
+    """Read an image as upright RGB (the EXIF orientation is applied, alpha is dropped).
+
+    Raises:
+        ImageError: the file is missing, empty, truncated or no image.
+    """
+    path = Path(path)
+    try:
+        with Image.open(path) as image:
+            image.load()
+            return np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
+    except FileNotFoundError as error:
+        raise ImageError(f"image {path} is missing") from error
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+        size = path.stat().st_size if path.exists() else 0
+        raise ImageError(
+            f"image {path} cannot be read: {error}",
+            found=f"a file of {size} bytes",
+            fix="remove it from the folder or replace it by a whole copy",
+        ) from error
+
+
+def write_png(path: Path, pixels: np.ndarray) -> None:
+    """Write an 8-bit RGB or grey, or a 16-bit grey image, as PNG, atomically."""
+    with atomic_path(path) as temporary:
+        Image.fromarray(np.ascontiguousarray(pixels)).save(temporary, format="PNG")
+
+
+def to_float(pixels: UInt8[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """uint8 at rest to float32 in [0, 1] in flight."""
+    return pixels.astype(np.float32) / np.float32(255)
+
+
+def to_uint8(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+    """float in [0, 1] to uint8, rounded, clipped."""
+    return (np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def resize_to_fit(pixels: UInt8[np.ndarray, "H W 3"], max_side_px: int) -> UInt8[np.ndarray, "h w 3"]:
+    """Shrink so that the longer side is at most `max_side_px` (area filter); never enlarges."""
+    import cv2
+
+    height, width = pixels.shape[:2]
+    scale = max_side_px / max(height, width)
+    if scale >= 1:
+        return pixels
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)

@@ -1,0 +1,62 @@
+"""Progress of long work: a bar on a terminal, sparse lines in a log."""
+
+import logging
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import TypeVar
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+Item = TypeVar("Item")
+logger = logging.getLogger(__name__)
+
+LOG_EVERY_S = 15.0
+"""Seconds between progress lines where there is no terminal to draw a bar on."""
+
+
+def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterator[Item]:
+    """Yield the items, showing how many are done.
+
+    Args:
+        items: what is worked through.
+        what: a few words, such as "masks of views".
+        total: number of items, where `len(items)` is not available.
+    """
+    if total is None:
+        total = len(items) if hasattr(items, "__len__") else None  # type: ignore[arg-type]
+    if sys.stderr.isatty():
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+        )
+        with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+            task = progress.add_task(what, total=total)
+            for item in items:
+                yield item
+                progress.advance(task)
+        return
+    last = time.monotonic()
+    for done, item in enumerate(items, start=1):
+        yield item
+        if time.monotonic() - last >= LOG_EVERY_S and done != total:
+            logger.info("%s: %d of %s", what, done, total if total is not None else "?")
+            last = time.monotonic()
+
+
+@contextmanager
+def stage_log(stage: str, scene: str) -> Iterator[dict[str, object]]:
+    """Log one line when a stage starts and one when it ends, with the counts that matter.
+
+    Yields a dict; what the stage puts in it is printed in the closing line.
+    """
+    counts: dict[str, object] = {}
+    logger.info("%s %s: start", stage, scene)
+    start = time.monotonic()
+    yield counts
+    text = ", ".join(f"{name} {value}" for name, value in counts.items())
+    logger.info("%s %s: done in %.1f s%s", stage, scene, time.monotonic() - start, f" ({text})" if text else "")

@@ -1,0 +1,150 @@
+"""Hierarchical annotations: who is what, at which level, inside whom, and where in each view.
+
+The format of our own for Hi-LERF-like benchmarks (theirs is unpublished). A folder holds
+
+    annotations.json          nodes (the tree) and, per view, the nodes that are annotated there
+    labels/<view>.<level>.png 16-bit label images: node id + 1, 0 where there is none
+
+Only `evaluate` reads it; no stage before may.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Int32
+from PIL import Image
+
+from hilsplat.base.artifacts import read_json, write_json
+from hilsplat.base.errors import ArtifactError
+from hilsplat.base.images import write_png
+from hilsplat.base.levels import LEVELS, NONE, Level
+
+FORMAT = "hilsplat-hierarchy-1"
+
+
+@dataclass(frozen=True)
+class AnnotatedNode:
+    """One true object, part or subpart of a scene.
+
+    Attributes:
+        id: row in the list of nodes.
+        level: 1 whole, 2 part, 3 subpart.
+        parent: id of the node one level up, -1 for a whole.
+        text: the query it answers. Several nodes may share a text; their masks are then united.
+        synonyms: other texts that name it.
+    """
+
+    id: int
+    level: int
+    parent: int
+    text: str
+    synonyms: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class HierarchyAnnotations:
+    """The annotations of one scene.
+
+    Attributes:
+        folder: where label images lie.
+        nodes: all nodes, by id.
+        views: annotated node ids per view name (large enough to be scored there).
+    """
+
+    folder: Path
+    nodes: tuple[AnnotatedNode, ...]
+    views: Mapping[str, tuple[int, ...]]
+
+    def label_image(self, view: str, level: Level) -> Int32[np.ndarray, "H W"]:
+        """Node id per pixel, -1 where the level has none.
+
+        Raises:
+            ArtifactError: the label image is missing.
+        """
+        path = label_path(self.folder, view, level)
+        if not path.is_file():
+            raise ArtifactError(f"label image {path} is missing", fix="write the annotations again")
+        return np.asarray(Image.open(path)).astype(np.int32) - 1
+
+    def texts(self, view: str, level: Level) -> dict[str, tuple[int, ...]]:
+        """Texts that are annotated in a view at a level, with the ids of their nodes."""
+        texts: dict[str, list[int]] = {}
+        for node_id in self.views.get(view, ()):
+            node = self.nodes[node_id]
+            if node.level == int(level):
+                texts.setdefault(node.text, []).append(node_id)
+        return {text: tuple(ids) for text, ids in texts.items()}
+
+    def mask(self, view: str, ids: Iterable[int]) -> Bool[np.ndarray, "H W"]:
+        """Union of the regions of some nodes of one level in a view."""
+        ids = tuple(ids)
+        level = Level(self.nodes[ids[0]].level)
+        return np.isin(self.label_image(view, level), ids)
+
+    def path_of(self, node_id: int) -> tuple[str, ...]:
+        """Texts from the whole down to the node: ("bear", "head", "nose")."""
+        texts: list[str] = []
+        while node_id != NONE:
+            node = self.nodes[node_id]
+            texts.append(node.text)
+            node_id = node.parent
+        return tuple(reversed(texts))
+
+    @staticmethod
+    def load(folder: Path) -> "HierarchyAnnotations":
+        """Read the folder.
+
+        Raises:
+            ArtifactError: annotations.json is missing or of another format.
+        """
+        folder = Path(folder)
+        record = read_json(folder / "annotations.json")
+        if record.get("format") != FORMAT:
+            raise ArtifactError(
+                f"{folder}/annotations.json has another format",
+                expected=FORMAT,
+                found=record.get("format"),
+            )
+        nodes = tuple(
+            AnnotatedNode(
+                node["id"], node["level"], node["parent"], node["text"], tuple(node.get("synonyms", ()))
+            )
+            for node in record["nodes"]
+        )
+        return HierarchyAnnotations(
+            folder, nodes, {view: tuple(ids) for view, ids in record["views"].items()}
+        )
+
+
+def label_path(folder: Path, view: str, level: Level) -> Path:
+    """File of a view's label image at a level."""
+    return Path(folder) / "labels" / f"{view}.{level.label}.png"
+
+
+def write_hierarchy(
+    folder: Path,
+    nodes: Iterable[AnnotatedNode],
+    labels: Mapping[str, Mapping[Level, Int32[np.ndarray, "H W"]]],
+    views: Mapping[str, Iterable[int]],
+) -> None:
+    """Write annotations: label images first, `annotations.json` last.
+
+    Args:
+        folder: created where missing.
+        nodes: ids must be 0, 1, 2, ... in order.
+        labels: per view and level, node id per pixel, -1 for none.
+        views: annotated node ids per view.
+    """
+    for view, levels in labels.items():
+        for level in LEVELS:
+            write_png(label_path(folder, view, level), (levels[level] + 1).astype(np.uint16))
+    write_json(
+        Path(folder) / "annotations.json",
+        {
+            "format": FORMAT,
+            "nodes": [asdict(node) for node in nodes],
+            "views": {view: list(ids) for view, ids in views.items()},
+        },
+    )

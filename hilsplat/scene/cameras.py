@@ -1,0 +1,88 @@
+"""Posed pinhole cameras of a scene, keyed by view name."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int32
+
+from hilsplat.base.artifacts import read_npz, write_npz
+from hilsplat.base.errors import SceneError
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One undistorted pinhole camera (OpenCV axes: x right, y down, z forward).
+
+    Attributes:
+        name: view name, the image's file name.
+        cam_from_world: `x_cam = cam_from_world @ x_world`, scene units.
+        K: intrinsics, px; the centre of the top-left pixel is (0.5, 0.5).
+        size_hw: image height and width, px.
+    """
+
+    name: str
+    cam_from_world: Float[np.ndarray, "4 4"]
+    K: Float[np.ndarray, "3 3"]
+    size_hw: tuple[int, int]
+
+    @property
+    def centre(self) -> Float[np.ndarray, " 3"]:
+        """Camera centre in the world, scene units."""
+        rotation, translation = self.cam_from_world[:3, :3], self.cam_from_world[:3, 3]
+        return -rotation.T @ translation
+
+    def scaled(self, size_hw: tuple[int, int]) -> "Camera":
+        """The same camera for a resized image: K scales with each side."""
+        scale = np.array([size_hw[1] / self.size_hw[1], size_hw[0] / self.size_hw[0], 1.0])
+        return Camera(self.name, self.cam_from_world, scale[:, None] * self.K, tuple(size_hw))
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """V posed cameras.
+
+    Attributes:
+        names: view names (file names of the images), in the order of all rows.
+        cam_from_world: V world-to-camera transforms, scene units.
+        K: V intrinsics, px.
+        size_hw: V image sizes (height, width), px.
+    """
+
+    names: tuple[str, ...]
+    cam_from_world: Float[np.ndarray, "V 4 4"]
+    K: Float[np.ndarray, "V 3 3"]
+    size_hw: Int32[np.ndarray, "V 2"]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, name: str) -> Camera:
+        try:
+            row = self.names.index(name)
+        except ValueError as error:
+            raise SceneError(
+                f"view {name!r} has no camera", expected=f"one of {len(self.names)} views: {', '.join(self.names[:5])}, ..."
+            ) from error
+        return Camera(name, self.cam_from_world[row], self.K[row], tuple(int(n) for n in self.size_hw[row]))
+
+    def save(self, path: Path) -> None:
+        """Write `cameras.npz` atomically."""
+        write_npz(
+            path,
+            names=np.array(self.names, dtype=np.str_),
+            cam_from_world=self.cam_from_world.astype(np.float64),
+            K=self.K.astype(np.float64),
+            size_hw=self.size_hw.astype(np.int32),
+        )
+
+    @staticmethod
+    def load(path: Path) -> "Cameras":
+        """Read `cameras.npz`."""
+        arrays = read_npz(path)
+        return Cameras(
+            tuple(str(name) for name in arrays["names"]),
+            arrays["cam_from_world"],
+            arrays["K"],
+            arrays["size_hw"],
+        )

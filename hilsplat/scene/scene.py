@@ -1,0 +1,93 @@
+"""A posed scene: cameras, undistorted images, sparse points, split."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from hilsplat.base.artifacts import read_index, read_npz, write_index, write_npz
+from hilsplat.base.errors import SceneError
+from hilsplat.base.images import read_image
+from hilsplat.scene.cameras import Cameras
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What every stage after `poses` reads, from the folder `scene/`.
+
+    Attributes:
+        folder: the scene artifact; images are `folder/images/<view name>`.
+        name: `<dataset>/<scene>`.
+        unit: what one length unit is: "metre" or "arbitrary".
+        cameras: V undistorted pinhole cameras.
+        split: "train" or "test" per view name. Test views are held out of every stage between
+            poses and evaluate.
+        points_xyz: sparse points, scene units.
+        points_rgb: their colours.
+        scene_from_source: similarity that maps source coordinates to the scene's.
+    """
+
+    folder: Path
+    name: str
+    unit: str
+    cameras: Cameras
+    split: dict[str, str]
+    points_xyz: Float32[np.ndarray, "P 3"]
+    points_rgb: UInt8[np.ndarray, "P 3"]
+    scene_from_source: Float[np.ndarray, "4 4"]
+
+    def views(self, split: str | None = None) -> list[str]:
+        """View names of a split ("train", "test"), or all, in camera order."""
+        return [name for name in self.cameras.names if split is None or self.split[name] == split]
+
+    def image_path(self, view: str) -> Path:
+        """File of a view's undistorted image."""
+        return self.folder / "images" / view
+
+    def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
+        """A view's undistorted image, checked against its camera's size."""
+        pixels = read_image(self.image_path(view))
+        expected = self.cameras[view].size_hw
+        if pixels.shape[:2] != expected:
+            raise SceneError(
+                f"image of view {view} of {self.name} does not fit its camera",
+                expected=f"{expected[0]} x {expected[1]} (height x width)",
+                found=f"{pixels.shape[0]} x {pixels.shape[1]}",
+                fix="run the poses stage again",
+            )
+        return pixels
+
+    def save(self) -> None:
+        """Write cameras, points and, last, the index into `folder` (images are already there)."""
+        self.cameras.save(self.folder / "cameras.npz")
+        write_npz(
+            self.folder / "points.npz",
+            xyz=self.points_xyz.astype(np.float32),
+            rgb=self.points_rgb.astype(np.uint8),
+            scene_from_source=self.scene_from_source.astype(np.float64),
+        )
+        write_index(
+            self.folder,
+            {name: {"split": self.split[name]} for name in self.cameras.names},
+            name=self.name,
+            unit=self.unit,
+        )
+
+    @staticmethod
+    def load(folder: Path) -> "Scene":
+        """Read a scene folder that the poses stage finished."""
+        folder = Path(folder)
+        index = read_index(folder)
+        points = read_npz(folder / "points.npz")
+        return Scene(
+            folder=folder,
+            name=index["name"],
+            unit=index["unit"],
+            cameras=Cameras.load(folder / "cameras.npz"),
+            split={name: entry["split"] for name, entry in index["views"].items()},
+            points_xyz=points["xyz"],
+            points_rgb=points["rgb"],
+            scene_from_source=points["scene_from_source"],
+        )
+

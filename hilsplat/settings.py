@@ -1,0 +1,258 @@
+"""Every knob: its one default, unit, range and origin.
+
+The configuration files hold choices; this module holds what may be chosen. A section is what one
+stage (or family of stages) depends on, so a changed knob reruns exactly the stages whose sections
+hold it. `workflow/schemas/` is generated from here.
+"""
+
+import json
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from hilsplat.base.errors import SettingsError
+
+
+def knob(default: Any, what: str, *, unit: str = "", origin: str = "ours", **limits: Any) -> Any:
+    """A field with description, unit, range (ge, gt, le, lt) and where the default comes from."""
+    return Field(default, description=what, json_schema_extra={"unit": unit, "origin": origin}, **limits)
+
+
+class Section(BaseModel):
+    """Settings of one stage; frozen, and unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class WorldSettings(Section):
+    """How a synthetic scene is rendered. What is in it follows from kind and seed (scene sheet)."""
+
+    views: int = knob(40, "number of views", unit="views", ge=3, le=1000)
+    image_px: int = knob(256, "height and width of a view", unit="px", ge=32, le=4096)
+    arc_deg: float = knob(360.0, "azimuth covered by the cameras; a ring is 360", unit="degree", gt=0, le=360)
+    objects: int = knob(6, "objects asked for; placement reports how many fitted", unit="objects", ge=1, le=30)
+    samples: int = knob(3, "sub-samples per pixel side", ge=1, le=8)
+
+
+class PosesSettings(Section):
+    """Camera poses by structure from motion, or imported."""
+
+    max_side_px: int = knob(1600, "images are shrunk to this longer side", unit="px", ge=64, origin="3DGS: 1600")
+    camera_model: Literal["auto", "simple_pinhole", "simple_radial", "opencv"] = knob(
+        "auto", "lens model; auto takes simple_radial for photographs and simple_pinhole for renders"
+    )
+    single_camera: Literal["auto", "yes", "no"] = knob(
+        "auto", "all photographs share one camera; auto: where all sizes are equal"
+    )
+    matcher: Literal["auto", "exhaustive", "sequential"] = knob(
+        "auto", "pairs to match; auto: exhaustive up to 200 views, else sequential"
+    )
+    mapper: Literal["incremental", "global"] = knob("incremental", "structure-from-motion algorithm", origin="COLMAP")
+    max_features: int = knob(4096, "SIFT features per image", ge=100, le=32768, origin="COLMAP: 8192")
+    first_octave: Literal[-1, 0] = knob(-1, "-1 doubles the image first: more features, four times the time")
+    min_registered_share: float = knob(
+        0.7, "the stage fails where the largest model holds fewer of the views", unit="share", gt=0, le=1
+    )
+    several_models: Literal["largest", "stop"] = knob(
+        "largest", "what to do where the photographs fall into several models"
+    )
+    test_every: int = knob(8, "every n-th view is held out for testing; 0: none", unit="views", ge=0, origin="3DGS")
+
+
+class GaussiansSettings(Section):
+    """Base 3D Gaussian Splatting fit."""
+
+    iterations: int = knob(3000, "optimisation steps, one view each", ge=1, origin="3DGS: 30000")
+    max_gaussians: int = knob(60_000, "the fit never holds more", ge=100)
+    image_scale: float = knob(1.0, "images are shrunk by this factor for the fit", gt=0, le=1)
+    sh_degree: int = knob(2, "degree of the colour's spherical harmonics", ge=0, le=3, origin="3DGS: 3")
+    ssim_weight: float = knob(0.2, "weight of D-SSIM against L1", ge=0, le=1, origin="3DGS")
+    densify_from: float = knob(0.06, "densify from this share of the iterations", ge=0, le=1, origin="3DGS: 500 / 30000")
+    densify_until: float = knob(0.6, "densify until this share of the iterations", ge=0, le=1, origin="3DGS: 0.5")
+    densify_every: int = knob(100, "steps between densifications", ge=1, origin="3DGS")
+    densify_gradient: float = knob(
+        2e-4, "screen-space gradient above which a Gaussian is cloned or split", gt=0, origin="3DGS"
+    )
+    opacity_reset_every: int = knob(3000, "steps between opacity resets", ge=1, origin="3DGS")
+    min_opacity: float = knob(0.005, "Gaussians below are pruned", gt=0, lt=1, origin="3DGS")
+    background: Literal["black", "white", "random"] = knob("black", "colour behind the Gaussians", origin="3DGS")
+    checkpoint_every: int = knob(1000, "steps between checkpoints", ge=1)
+
+
+class MasksSettings(Section):
+    """Masks of each view at three levels."""
+
+    segmenter: Literal["sam", "graph"] = knob(
+        "sam", "sam: a SAM model folder; graph: OpenCV graph segmentation, no weights, for photographs"
+    )
+    model: str = knob("models/sam-tiny", "folder of a SAM in the Hugging Face ONNX export layout")
+    points_per_side: int = knob(32, "prompts per image side", ge=1, le=128, origin="LangSplat: 32")
+    points_per_batch: int = knob(64, "prompts per decoder call", ge=1, le=4096, origin="LangSplat: 64")
+    crop_layers: int = knob(0, "layers of overlapping crops", ge=0, le=2, origin="LangSplat: 1")
+    predicted_iou_min: float = knob(0.35, "masks below are dropped", ge=0, le=1, origin="SAM: 0.88, LangSplat: 0.7")
+    stability_min: float = knob(0.5, "masks below are dropped", ge=0, le=1, origin="SAM: 0.95, LangSplat: 0.85")
+    stability_offset: float = knob(1.0, "logit offset of the stability test", gt=0, origin="SAM")
+    box_nms_iou: float = knob(0.7, "box IoU above which the worse mask is dropped", gt=0, le=1, origin="SAM")
+    min_area_px: int = knob(16, "smaller masks, islands and holes are dropped", unit="px", ge=1, origin="LangSplat: 100")
+    nms_iou: float = knob(0.8, "mask IoU above which the worse mask is dropped", gt=0, le=1, origin="LangSplat")
+    nms_score: float = knob(
+        0.0, "masks whose predicted IoU x stability is below are dropped", ge=0, le=1, origin="LangSplat: 0.7"
+    )
+    nms_inner: float = knob(0.5, "inner-mask suppression threshold", ge=0, le=1, origin="LangSplat")
+    graph_scales: tuple[float, float, float] = knob(
+        (0.12, 0.04, 0.015), "least segment size at whole, part, subpart as a share of the image side; graph only"
+    )
+
+
+class TreeSettings(Section):
+    """Coverage tree of each view."""
+
+    theta: float = knob(0.9, "coverage threshold", unit="share", gt=0.5, lt=1, origin="paper: 0.9")
+    parents: Literal["coarser", "any"] = knob("coarser", "levels a parent may come from")
+
+
+class ClipSettings(Section):
+    """One CLIP vector per mask."""
+
+    model: str = knob("models/clip-tiny", "folder of a CLIP in the Hugging Face ONNX export layout")
+    background: Literal["black", "mean", "keep", "dim"] = knob(
+        "black", "pixels of the crop outside the mask", origin="LangSplat: black"
+    )
+    context: float = knob(0.0, "margin around the box, as a share of its side", ge=0, le=1)
+    batch: int = knob(64, "crops per network call", ge=1, le=4096)
+
+
+class ContributionsSettings(Section):
+    """The frozen-geometry matrices."""
+
+    min_weight: float = knob(1 / 255, "weights of a Gaussian at a pixel below are dropped", ge=0, lt=1)
+
+
+class SemanticTreeSettings(Section):
+    """3D semantic tree: masks linked across views by the Gaussians they share."""
+
+    link_threshold: float = knob(0.12, "pooled average IoU above which clusters of masks are joined", gt=0, lt=1)
+    min_views: int = knob(3, "a node is seen in at least this many views", ge=1)
+    min_member_share: float = knob(
+        0.15, "a Gaussian joins its best node where more than this share of its weight lies in it", ge=0, lt=1
+    )
+    parent_coverage: float = knob(0.5, "share of a node inside a coarser one that makes it a child", gt=0, lt=1)
+
+
+class AutoencoderSettings(Section):
+    """Scene autoencoder of CLIP vectors."""
+
+    latent: int = knob(8, "latent numbers d", ge=1, le=64, origin="paper, LangSplat: 3")
+    targets: Literal["node", "mask"] = knob(
+        "node", "node: the view-averaged vector of the mask's node, where it fits one; mask: its own", origin="paper: mask"
+    )
+    epochs: int = knob(100, "passes over all vectors", ge=1, origin="LangSplat: 100")
+    batch: int = knob(64, "vectors per step", ge=2, origin="LangSplat: 64")
+    learning_rate: float = knob(7e-4, "Adam step", gt=0, origin="LangSplat: 7e-4")
+    cosine_weight: float = knob(1e-3, "weight of 1 - cosine beside the squared error", ge=0, origin="LangSplat: 1e-3")
+
+
+class LanguageSettings(Section):
+    """Language field: per Gaussian one latent for each level."""
+
+    weight_language: float = knob(1.0, "weight of the regression to the latents", ge=0, origin="paper: not stated")
+    weight_clustering: float = knob(0.3, "weight of L_h (Eq. 2)", ge=0, origin="paper: 1")
+    weight_instance: float = knob(0.03, "weight of L_ins (Eq. 3), lambda_1", ge=0, origin="paper: e-6")
+    weight_part: float = knob(0.0, "weight of L_part (Eq. 5), lambda_2", ge=0, origin="paper: e-5")
+    instance_mode: Literal["literal", "tree", "logratio"] = knob("tree", "reading of L_ins", origin="paper: literal")
+    part_mode: Literal["literal", "disentangle"] = knob("disentangle", "reading of L_part", origin="paper: literal")
+    omega: float = knob(10.0, "similarity degree Omega", gt=1, origin="paper: 10")
+    tau: float = knob(0.1, "temperature of L_part", gt=0, origin="paper: not given; VCH: 0.1")
+    ridge: float = knob(0.1, "pull towards the lifted average, in units of the visible mass", ge=0)
+    cg_steps: int = knob(10, "conjugate-gradient steps of the quadratic part", ge=0)
+    lbfgs_steps: int = knob(30, "L-BFGS steps where L_ins or L_part are on", ge=0)
+    min_mask_px: int = knob(50, "smaller masks stay out of L_ins and L_part", unit="px", ge=1)
+    max_masks_per_level: int = knob(96, "masks of one view and level in L_ins and L_part, largest first", ge=2)
+
+
+class EvaluateSettings(Section):
+    """Queries and protocols."""
+
+    canonical: tuple[str, ...] = knob(
+        ("object", "things", "stuff", "texture"), "canonical phrases of the relevancy", origin="LERF, LangSplat"
+    )
+    relevancy_scale: float = knob(10.0, "scale of the cosine in the relevancy", gt=0, origin="LangSplat")
+    filter_px: int = knob(0, "side of the mean filter; 0: 30 px at a height of 730", unit="px", ge=0, origin="LangSplat: 30")
+    node_select: float = knob(0.85, "nodes above this share of the best (min-max) are selected", ge=0, le=1)
+    min_region_px: int = knob(60, "smaller true regions are not scored", unit="px", ge=1)
+    methods: tuple[Literal["tree", "tree-path", "field"], ...] = knob(
+        ("tree", "tree-path", "field"), "what answers; each becomes a row"
+    )
+
+
+class FiguresSettings(Section):
+    """Panels per scene."""
+
+    queries_per_level: int = knob(2, "queries shown per level", ge=1, le=10)
+    views: int = knob(1, "views shown per scene", ge=1, le=10)
+
+
+class StageSettings(Section):
+    """All sections, one per stage."""
+
+    world: WorldSettings = WorldSettings()
+    poses: PosesSettings = PosesSettings()
+    gaussians: GaussiansSettings = GaussiansSettings()
+    masks: MasksSettings = MasksSettings()
+    tree: TreeSettings = TreeSettings()
+    clip: ClipSettings = ClipSettings()
+    contributions: ContributionsSettings = ContributionsSettings()
+    semantic_tree: SemanticTreeSettings = SemanticTreeSettings()
+    autoencoder: AutoencoderSettings = AutoencoderSettings()
+    language: LanguageSettings = LanguageSettings()
+    evaluate: EvaluateSettings = EvaluateSettings()
+    figures: FiguresSettings = FiguresSettings()
+
+
+SECTIONS: dict[str, type[Section]] = {
+    name: field.annotation  # type: ignore[misc]
+    for name, field in StageSettings.model_fields.items()
+}
+
+
+def parse_section(name: str, text: str) -> Any:
+    """Read one section from JSON, as a rule hands it to a stage.
+
+    Raises:
+        SettingsError: a key is unknown, or a value is of the wrong type or out of range.
+    """
+    try:
+        return SECTIONS[name].model_validate_json(text or "{}")
+    except ValidationError as error:
+        raise settings_error(error, name) from error
+
+
+def settings_error(error: ValidationError, where: str) -> SettingsError:
+    """Turn pydantic's report into one line per key: place, problem, what is allowed."""
+    import difflib
+
+    lines = []
+    for problem in error.errors():
+        path = [str(part) for part in problem["loc"]]
+        place = ".".join([where, *path] if where else path)
+        if problem["type"] == "extra_forbidden":
+            known = _known_keys(error.title, path[:-1])
+            near = difflib.get_close_matches(path[-1], known, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"
+            lines.append(f"{place}: unknown key; {hint}")
+        else:
+            found = json.dumps(problem.get("input"), default=str)
+            lines.append(f"{place}: {problem['msg']}; found {found}")
+    return SettingsError("settings cannot be used:\n  " + "\n  ".join(lines))
+
+
+def _known_keys(title: str, path: list[str]) -> list[str]:
+    """Keys allowed where an unknown one was found."""
+    models: dict[str, type[BaseModel]] = {cls.__name__: cls for cls in Section.__subclasses__()}
+    model: Any = models.get(title)
+    for part in path:
+        if model is None or part not in getattr(model, "model_fields", {}):
+            continue
+        annotation = model.model_fields[part].annotation
+        model = annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else model
+    return sorted(model.model_fields) if model is not None else []
