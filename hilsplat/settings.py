@@ -5,6 +5,7 @@ stage (or family of stages) depends on, so a changed knob reruns exactly the sta
 hold it. `workflow/schemas/` is generated from here.
 """
 
+import difflib
 import json
 from typing import Any, Literal
 
@@ -177,7 +178,18 @@ class EvaluateSettings(Section):
         ("object", "things", "stuff", "texture"), "canonical phrases of the relevancy", origin="LERF, LangSplat"
     )
     relevancy_scale: float = knob(10.0, "scale of the cosine in the relevancy", gt=0, origin="LangSplat")
-    filter_px: int = knob(0, "side of the mean filter; 0: 30 px at a height of 730", unit="px", ge=0, origin="LangSplat: 30")
+    filter_px: int = knob(
+        0, "side of the mean filter; 0: 30 px at a height of 730, scaled", unit="px", ge=0, origin="LangSplat: 30, paper: 20"
+    )
+    mix: bool = knob(True, "average the filtered relevancy with the relevancy itself", origin="LangSplat")
+    relevancy_threshold: float = knob(0.4, "a map's mask is what exceeds it", ge=0, lt=1, origin="LangSplat, paper")
+    threshold_on: Literal["normalised_pm1", "normalised_01", "raw"] = knob(
+        "normalised_pm1", "scale of the threshold; normalised_pm1: 0.4 means min-max above 0.7", origin="LangSplat's code"
+    )
+    majority: bool = knob(True, "smooth a map's mask by the majority of 7 x 7 px", origin="LangSplat's code")
+    level_rule: Literal["max", "mean_in_mask"] = knob(
+        "max", "level of a map where none is given: highest value, or highest mean in its mask", origin="LangSplat: max"
+    )
     node_select: float = knob(0.85, "nodes above this share of the best (min-max) are selected", ge=0, le=1)
     min_region_px: int = knob(60, "smaller true regions are not scored", unit="px", ge=1)
     methods: tuple[Literal["tree", "tree-path", "field"], ...] = knob(
@@ -224,19 +236,17 @@ def parse_section(name: str, text: str) -> Any:
     try:
         return SECTIONS[name].model_validate_json(text or "{}")
     except ValidationError as error:
-        raise settings_error(error, name) from error
+        raise settings_error(error, name, SECTIONS[name]) from error
 
 
-def settings_error(error: ValidationError, where: str) -> SettingsError:
+def settings_error(error: ValidationError, where: str, model: type[BaseModel]) -> SettingsError:
     """Turn pydantic's report into one line per key: place, problem, what is allowed."""
-    import difflib
-
     lines = []
     for problem in error.errors():
         path = [str(part) for part in problem["loc"]]
         place = ".".join([where, *path] if where else path)
         if problem["type"] == "extra_forbidden":
-            known = _known_keys(error.title, path[:-1])
+            known = _known_keys(model, path[:-1])
             near = difflib.get_close_matches(path[-1], known, n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"
             lines.append(f"{place}: unknown key; {hint}")
@@ -246,13 +256,142 @@ def settings_error(error: ValidationError, where: str) -> SettingsError:
     return SettingsError("settings cannot be used:\n  " + "\n  ".join(lines))
 
 
-def _known_keys(title: str, path: list[str]) -> list[str]:
-    """Keys allowed where an unknown one was found."""
-    models: dict[str, type[BaseModel]] = {cls.__name__: cls for cls in Section.__subclasses__()}
-    model: Any = models.get(title)
+def _known_keys(model: Any, path: list[str]) -> list[str]:
+    """Keys allowed at a place of the configuration."""
     for part in path:
-        if model is None or part not in getattr(model, "model_fields", {}):
-            continue
-        annotation = model.model_fields[part].annotation
-        model = annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else model
-    return sorted(model.model_fields) if model is not None else []
+        model = model.model_fields[part].annotation
+    return sorted(model.model_fields)
+
+
+VARIANT_SECTIONS = (
+    "masks",
+    "tree",
+    "clip",
+    "contributions",
+    "semantic_tree",
+    "autoencoder",
+    "language",
+    "evaluate",
+)
+"""Sections a variant may override; the stages before them are shared by all variants."""
+
+UPSTREAM: dict[str, tuple[str, ...]] = {
+    "masks": ("masks",),
+    "tree": ("masks", "tree"),
+    "clip": ("masks", "clip"),
+    "contributions": ("masks", "contributions"),
+    "semantic_tree": ("masks", "clip", "contributions", "semantic_tree"),
+    "autoencoder": ("masks", "clip", "contributions", "semantic_tree", "autoencoder"),
+    "language": VARIANT_SECTIONS[:-1],
+    "evaluate": VARIANT_SECTIONS,
+}
+"""Sections that each variant stage depends on, through its inputs too."""
+
+
+class RunSettings(StageSettings):
+    """The whole configuration: what is run, with which settings."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    seed: int = knob(0, "seed of everything random", ge=0)
+    scenes: str = knob("config/scenes.tsv", "scene sheet, relative to the project")
+    groups: tuple[str, ...] = knob(("benchmark",), "groups of the scene sheet that are run")
+    only: tuple[str, ...] = knob((), "names of scenes, to run fewer than the groups hold")
+    data_root: str = knob("", "folder of the real data sets; empty: they are skipped")
+    main_variants: tuple[str, ...] = knob(("default",), "variants in the main tables")
+    ablation_variants: tuple[str, ...] = knob((), "variants in the ablation table")
+    variants: dict[str, dict[str, dict[str, Any]]] = knob(
+        {}, "named overrides: variant -> section -> knob -> value; 'default' always exists"
+    )
+    labels: dict[str, str] = knob({}, "how tables name a variant")
+    overrides: dict[str, dict[str, dict[str, Any]]] = knob(
+        {}, "settings of a whole group or of one scene: group or dataset/scene -> section -> knob -> value"
+    )
+    queries: dict[str, tuple[str, ...]] = knob({}, "texts shown in the panel of a scene without labels")
+
+    def variant_names(self) -> list[str]:
+        """Variants that a run needs, "default" first."""
+        names = ["default", *self.main_variants, *self.ablation_variants]
+        return list(dict.fromkeys(names))
+
+    def stages(self, variant: str = "default", scopes: tuple[str, ...] = ()) -> StageSettings:
+        """Settings of a variant for a scene.
+
+        Args:
+            variant: name of a variant.
+            scopes: keys of `overrides` that apply, general first (group, then dataset/scene).
+
+        Raises:
+            SettingsError: the variant is unknown or an override cannot be used.
+        """
+        merged = {name: getattr(self, name).model_dump() for name in SECTIONS}
+        layers = [(f"overrides.{scope}", self.overrides.get(scope, {})) for scope in scopes]
+        if variant != "default" or variant in self.variants:
+            if variant not in self.variants:
+                raise SettingsError(
+                    f"variant {variant!r} is not defined", expected=f"one of default, {', '.join(self.variants)}"
+                )
+            layers.append((f"variants.{variant}", self.variants[variant]))
+        for where, layer in layers:
+            for section, values in layer.items():
+                if section not in SECTIONS:
+                    raise SettingsError(
+                        f"{where}.{section}: unknown section", expected=f"one of {', '.join(SECTIONS)}"
+                    )
+                if where.startswith("variants.") and section not in VARIANT_SECTIONS:
+                    raise SettingsError(
+                        f"{where}.{section}: a variant cannot change this section, all variants share it",
+                        expected=f"one of {', '.join(VARIANT_SECTIONS)}",
+                        fix="use overrides: for a group or a scene, or a configuration file of its own",
+                    )
+                merged[section].update(values)
+                try:
+                    SECTIONS[section].model_validate(merged[section])
+                except ValidationError as error:
+                    raise settings_error(error, f"{where}.{section}", SECTIONS[section]) from error
+        return StageSettings.model_validate(merged)
+
+
+def parse_run(config: dict[str, Any]) -> RunSettings:
+    """Validate a whole configuration, variants and overrides included.
+
+    Raises:
+        SettingsError: naming each key that cannot be used.
+    """
+    try:
+        run = RunSettings.model_validate(config)
+    except ValidationError as error:
+        raise settings_error(error, "", RunSettings) from error
+    for variant in dict.fromkeys([*run.variant_names(), *run.variants]):
+        run.stages(variant)
+    for scope in run.overrides:
+        run.stages(scopes=(scope,))
+    return run
+
+
+def config_schema() -> dict[str, Any]:
+    """JSON schema of the configuration, for editors and for `snakemake`'s users."""
+    schema = RunSettings.model_json_schema()
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+
+
+def knob_table() -> str:
+    """Every knob as text: name, default, range, unit, origin, meaning."""
+    lines = []
+    models = {"": RunSettings, **SECTIONS}
+    for section, model in models.items():
+        for name, field in model.model_fields.items():
+            if not section and name in SECTIONS:
+                continue
+            extra = field.json_schema_extra or {}
+            limits = ", ".join(
+                f"{symbol} {getattr(limit, attribute)}"
+                for limit in field.metadata
+                for attribute, symbol in (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
+                if hasattr(limit, attribute)
+            )
+            facts = [limits, extra.get("unit", ""), f"origin: {extra.get('origin', 'ours')}"]
+            place = f"{section}.{name}" if section else name
+            lines.append(f"{place} = {field.default!r}  ({'; '.join(fact for fact in facts if fact)})")
+            lines.append(f"    {field.description}")
+    return "\n".join(lines)

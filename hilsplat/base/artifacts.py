@@ -3,10 +3,12 @@
 import errno
 import fcntl
 import hashlib
+import io
 import json
 import os
 import shutil
 import tempfile
+import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -118,9 +120,6 @@ def read_json(path: Path) -> Any:
 
 def write_npz(path: Path, **arrays: np.ndarray) -> None:
     """Write a compressed .npz atomically, with fixed time stamps: same arrays, same bytes."""
-    import io
-    import zipfile
-
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name, array in arrays.items():
             buffer = io.BytesIO()
@@ -136,8 +135,6 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
     Raises:
         ArtifactError: the file is missing, damaged or holds objects.
     """
-    import zipfile
-
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
@@ -192,27 +189,16 @@ def sha256_of_file(path: Path) -> str:
 
 
 def sha256_of_path(path: Path) -> str:
-    """SHA-256 of a file, or of a folder's files (names and bytes, provenance left out)."""
+    """SHA-256 of a file, or of a folder's files (names and bytes; hidden files left out)."""
     path = Path(path)
     if path.is_file():
         return sha256_of_file(path)
     files = sorted(
-        file for file in path.rglob("*") if file.is_file() and not file.name.startswith((".", PROVENANCE))
+        file for file in path.rglob("*") if file.is_file() and not file.name.startswith(".")
     )
     if not files:
         raise ArtifactError(f"{path} is missing or empty", fix="run the stage that writes it")
     return sha256_of_json([(file.relative_to(path).as_posix(), sha256_of_file(file)) for file in files])
-
-
-PROVENANCE = "provenance"
-
-
-def provenance_path(artifact: Path) -> Path:
-    """Where the provenance of an artifact stands: inside a folder, beside a file."""
-    artifact = Path(artifact)
-    if artifact.is_dir():
-        return artifact / f"{PROVENANCE}.json"
-    return artifact.with_name(f"{artifact.name}.{PROVENANCE}.json")
 
 
 def write_index(folder: Path, views: Mapping[str, Any], **more: Any) -> None:

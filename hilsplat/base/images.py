@@ -8,17 +8,17 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.errors import ImageError
+from hilsplat.base.files import IMAGE_SUFFIXES, list_images
 
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
-
-
-def list_images(folder: Path) -> list[Path]:
-    """Image files of a folder, by name; other files and hidden ones are passed over."""
-    return sorted(
-        path
-        for path in Path(folder).iterdir()
-        if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
-    )
+__all__ = [
+    "IMAGE_SUFFIXES",
+    "list_images",
+    "read_image",
+    "resize_to_fit",
+    "to_float",
+    "to_uint8",
+    "write_png",
+]
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:

@@ -10,6 +10,9 @@ from hilsplat.base.artifacts import read_npz, write_npz
 from hilsplat.base.errors import EmptyMaskError
 from hilsplat.base.levels import NONE, Level
 
+BAND_ELEMENTS = 2**25
+"""Elements of masks that are unpacked at once for overlaps: 128 MiB as float32."""
+
 
 def encode_runs(
     masks: Bool[np.ndarray, "M H W"],
@@ -98,13 +101,87 @@ class HierarchicalMasks:
         """Unpack all masks, or the given rows, to booleans."""
         rows = np.arange(len(self)) if rows is None else np.asarray(rows)
         height, width = self.size_hw
-        masks = np.zeros((len(rows), height * width), dtype=bool)
+        masks = np.empty((len(rows), height * width), dtype=bool)
         for out, row in enumerate(rows):
-            lengths = self.runs[self.offsets[row] : self.offsets[row + 1]].astype(np.int64)
-            ends = np.cumsum(lengths)
-            for start, end in zip(ends[0::2], ends[1::2], strict=False):
-                masks[out, start:end] = True
+            lengths = self.runs[self.offsets[row] : self.offsets[row + 1]]
+            masks[out] = np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
         return masks.reshape(len(rows), height, width)
+
+    def band(self, start_px: int, stop_px: int) -> Bool[np.ndarray, "M n"]:
+        """Unpack all masks between two positions of the flattened image."""
+        masks = np.empty((len(self), stop_px - start_px), dtype=bool)
+        for row in range(len(self)):
+            ends = np.cumsum(self.runs[self.offsets[row] : self.offsets[row + 1]], dtype=np.int64)
+            clipped = np.clip(ends, start_px, stop_px)
+            masks[row] = np.repeat(np.arange(len(ends)) % 2 == 1, np.diff(clipped, prepend=start_px))
+        return masks
+
+    def overlaps_px(self) -> Int64[np.ndarray, "M M"]:
+        """Pixels that each pair of masks shares, as a product of flattened masks.
+
+        float32 counts exactly up to 2**24 px, which no band reaches, so the result does not depend
+        on the order of summation or on the number of threads.
+        """
+        shared = np.zeros((len(self), len(self)), dtype=np.int64)
+        size_px = self.size_hw[0] * self.size_hw[1]
+        step = max(1, min(2**23, BAND_ELEMENTS // max(1, len(self))))
+        for start in range(0, size_px, step):
+            band = self.band(start, min(size_px, start + step)).astype(np.float32)
+            shared += (band @ band.T).astype(np.int64)
+        return shared
+
+    def take(self, rows: Int64[np.ndarray, " m"]) -> "HierarchicalMasks":
+        """The given rows, in the given order."""
+        pieces = [self.runs[self.offsets[row] : self.offsets[row + 1]] for row in rows]
+        offsets = np.zeros(len(rows) + 1, dtype=np.int64)
+        offsets[1:] = np.cumsum([len(piece) for piece in pieces])
+        return HierarchicalMasks(
+            np.concatenate(pieces) if pieces else np.zeros(0, np.uint32),
+            offsets,
+            self.level[rows],
+            self.predicted_iou[rows],
+            self.stability[rows],
+            self.area_px[rows],
+            self.box_xyxy[rows],
+            self.size_hw,
+        )
+
+    @staticmethod
+    def concatenate(parts: "list[HierarchicalMasks]", size_hw: tuple[int, int]) -> "HierarchicalMasks":
+        """Rows of all parts, one after the other; `size_hw` is the view's where there is no part."""
+        empty = HierarchicalMasks.from_dense(
+            np.zeros((0, *size_hw), bool),
+            np.zeros(0, np.uint8),
+            np.zeros(0, np.float32),
+            np.zeros(0, np.float32),
+        )
+        parts = [empty, *parts]
+        starts = np.cumsum([0, *(len(part.runs) for part in parts)])
+        offsets = [part.offsets[1:] + start for part, start in zip(parts, starts[:-1], strict=True)]
+        joined = {
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in ("runs", "level", "predicted_iou", "stability", "area_px", "box_xyxy")
+        }
+        return HierarchicalMasks(offsets=np.concatenate([np.zeros(1, np.int64), *offsets]), size_hw=size_hw, **joined)
+
+    def content_order(self) -> Int64[np.ndarray, " M"]:
+        """Rows sorted by what they hold: level, large to small, box, predicted IoU, runs.
+
+        The order depends on no row numbers, so a segmenter that ends with it gives the same file
+        whatever order its prompts came in.
+        """
+        keys = [
+            (
+                int(self.level[row]),
+                -int(self.area_px[row]),
+                tuple(self.box_xyxy[row].tolist()),
+                -float(self.predicted_iou[row]),
+                -float(self.stability[row]),
+                self.runs[self.offsets[row] : self.offsets[row + 1]].tobytes(),
+            )
+            for row in range(len(self))
+        ]
+        return np.array(sorted(range(len(self)), key=keys.__getitem__), dtype=np.int64)
 
     def rows_of(self, level: Level) -> Int64[np.ndarray, " m"]:
         """Rows of a level, in order."""

@@ -1,0 +1,35 @@
+# make run    set up and run the default configuration (synthetic scenes, to tables and figures)
+# make test   set up and run lint and all tests
+PYTHON ?= python3
+CORES ?= 2
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+export PATH := $(CURDIR)/$(BIN):$(PATH)
+
+.PHONY: run test lint report models bench clean-cache setup
+
+run: $(STAMP)
+	snakemake --cores $(CORES) --workflow-profile workflow/profiles/default
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $(STAMP)
+
+lint: $(STAMP)
+	ruff check hilsplat tests
+	ruff format --check hilsplat tests
+	lint-imports
+	snakefmt --check Snakefile rules
+	snakemake --lint --configfile config/ci.yaml
+
+test: lint
+	python -m pytest
+
+report: $(STAMP)
+	snakemake --cores $(CORES) --workflow-profile workflow/profiles/default
+	snakemake --report results/report.html

@@ -1,0 +1,38 @@
+# hilsplat: photographs to 3D scenes that answer text queries at three levels, and the paper's tables.
+#
+#   snakemake --cores 2                                   everything the configuration names
+#   snakemake --cores 2 results/synthetic/desk/gaussians.ply     one file and what it needs
+#   snakemake --cores 2 tables                            the tables
+#   snakemake --cores 2 report                            results/report.html
+
+
+configfile: "config/config.yaml"
+
+
+include: "rules/common.smk"
+
+
+wildcard_constraints:
+    dataset=any_of(row.dataset for row in ALL_SCENES),
+    scene=any_of(row.scene for row in ALL_SCENES),
+    variant=any_of(RUN.variant_names()),
+
+
+rule all:
+    input:
+        targets_of_tables(),
+        targets_of_figures(),
+    default_target: True
+
+
+include: "rules/world.smk"
+include: "rules/scene.smk"
+include: "rules/splat.smk"
+include: "rules/segment.smk"
+include: "rules/language.smk"
+include: "rules/evaluate.smk"
+include: "rules/report.smk"
+
+
+onsuccess:
+    print_where_time_went()

@@ -1,0 +1,63 @@
+"""Square crops of masked regions: what CLIP sees, in training and at run time alike."""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from hilsplat.base.errors import EmptyMaskError
+
+BACKGROUNDS = ("black", "mean", "keep", "dim")
+DIM = 0.35
+"""Brightness that `dim` leaves to pixels outside the mask."""
+
+
+def square_crop(
+    image: UInt8[np.ndarray, "H W 3"],
+    mask: Bool[np.ndarray, "H W"],
+    background: str,
+    context: float,
+    size: int,
+) -> UInt8[np.ndarray, "size size 3"]:
+    """Cut a mask's box out, centre it in a square and resize that (LangSplat's preprocessing).
+
+    The square's side is the longer side of the box (with its margin); what the box does not fill is
+    black, or the image's mean colour with `mean`. Shrinking averages areas, enlarging is bilinear.
+
+    Args:
+        image: the view.
+        mask: region of the view, not empty.
+        background: pixels of the box outside the mask: `black`, `mean` colour of the image, `keep`
+            them as they are, or `dim` them to 0.35 of their brightness.
+        context: margin on each side of the box, as a share of the box's longer side; it ends at the
+            image's border.
+        size: side of the result, px.
+
+    Raises:
+        EmptyMaskError: the mask has no pixel.
+    """
+    if background not in BACKGROUNDS:
+        raise ValueError(f"background {background!r} is none of {', '.join(BACKGROUNDS)}")
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        raise EmptyMaskError("a mask without pixels cannot be cropped", fix="drop empty masks first")
+    y0, y1, x0, x1 = int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+    margin = round(context * max(y1 - y0, x1 - x0))
+    y0, x0 = max(0, y0 - margin), max(0, x0 - margin)
+    y1, x1 = min(mask.shape[0], y1 + margin), min(mask.shape[1], x1 + margin)
+    box = image[y0:y1, x0:x1]
+    inside = mask[y0:y1, x0:x1, None]
+    fill = np.zeros(3, np.uint8)
+    if background == "mean":
+        fill = (image.reshape(-1, 3).mean(axis=0) + 0.5).astype(np.uint8)
+    if background == "dim":
+        box = np.where(inside, box, (box * DIM + 0.5).astype(np.uint8))
+    elif background != "keep":
+        box = np.where(inside, box, fill)
+    height, width = box.shape[:2]
+    side = max(height, width)
+    square = np.empty((side, side, 3), np.uint8)
+    square[:] = fill
+    top, left = (side - height) // 2, (side - width) // 2
+    square[top : top + height, left : left + width] = box
+    method = cv2.INTER_AREA if side > size else cv2.INTER_LINEAR
+    return cv2.resize(square, (size, size), interpolation=method)

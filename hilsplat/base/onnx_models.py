@@ -1,0 +1,365 @@
+"""Model folders in the layout of the Hugging Face ONNX exports: finding, checking, running.
+
+A folder holds `config.json`, `preprocessor_config.json`, for CLIP `tokenizer.json`, and the networks
+as `<name>.onnx`, either beside them or under `onnx/`. Everything that turns a photograph into a
+network's input is read from the folder, so folder and digest together are the model's identity.
+"""
+
+import logging
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+
+from hilsplat.base.artifacts import read_json, sha256_of_file, sha256_of_json
+from hilsplat.base.errors import ArtifactError, ModelError
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class NetworkSpec:
+    """What one network of a model takes and gives.
+
+    Attributes:
+        inputs: names and number of axes of the inputs that must be there.
+        outputs: names and number of axes of the outputs that must be there; others are ignored.
+        optional: names of inputs that are fed where the network has them.
+    """
+
+    inputs: Mapping[str, int]
+    outputs: Mapping[str, int]
+    optional: tuple[str, ...] = ()
+
+
+KINDS: dict[str, dict[str, NetworkSpec]] = {
+    "sam": {
+        "vision_encoder": NetworkSpec(
+            {"pixel_values": 4}, {"image_embeddings": 4, "image_positional_embeddings": 4}
+        ),
+        "prompt_encoder_mask_decoder": NetworkSpec(
+            {
+                "input_points": 4,
+                "input_labels": 3,
+                "image_embeddings": 4,
+                "image_positional_embeddings": 4,
+            },
+            {"iou_scores": 3, "pred_masks": 5},
+        ),
+    },
+    "clip": {
+        "vision_model": NetworkSpec({"pixel_values": 4}, {"image_embeds": 2}),
+        "text_model": NetworkSpec({"input_ids": 2}, {"text_embeds": 2}, optional=("attention_mask",)),
+    },
+}
+"""Networks of each kind of model, by `model_type` of its config.json."""
+
+DESCRIPTIONS = {
+    "sam": ("config.json", "preprocessor_config.json"),
+    "clip": ("config.json", "preprocessor_config.json", "tokenizer.json"),
+}
+"""Files beside the networks, by kind."""
+
+DTYPES = {
+    "tensor(float)": np.float32,
+    "tensor(float16)": np.float16,
+    "tensor(double)": np.float64,
+    "tensor(int64)": np.int64,
+    "tensor(int32)": np.int32,
+}
+
+
+@dataclass(frozen=True)
+class ModelFolder:
+    """A model folder whose files are all there.
+
+    Attributes:
+        folder: as the settings name it.
+        kind: "sam" or "clip".
+        config: content of `config.json`.
+        preprocessing: content of `preprocessor_config.json`.
+        networks: file of each network by name.
+        files: all files that take part, for the digest.
+    """
+
+    folder: Path
+    kind: str
+    config: dict[str, Any]
+    preprocessing: dict[str, Any]
+    networks: dict[str, Path]
+    files: tuple[Path, ...]
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over names and bytes of the files used; independent of where the folder stands."""
+        return sha256_of_json([(path.relative_to(self.folder).as_posix(), sha256_of_file(path)) for path in self.files])
+
+    def network(self, name: str, threads: int = 1) -> "Network":
+        """Open one of the model's networks and check its inputs and outputs.
+
+        Raises:
+            ModelError: it cannot be read, or its names or numbers of axes are not the expected ones.
+        """
+        return Network(self.networks[name], KINDS[self.kind][name], threads)
+
+
+def open_model_folder(folder: Path, kind: str | None = None, *, fix: str = "") -> ModelFolder:
+    """Find a model's files.
+
+    Args:
+        folder: the model folder.
+        kind: "sam" or "clip"; None accepts either.
+        fix: an additional way out, for the message where the folder is missing.
+
+    Raises:
+        ModelError: the folder or some of its files are missing, or it holds another kind of model.
+    """
+    folder = Path(folder)
+    way_out = "name a folder in the layout of the Hugging Face ONNX exports" + (f", or {fix}" if fix else "")
+    if not folder.is_dir():
+        raise ModelError(f"model folder {folder} is missing", fix=way_out)
+    try:
+        config = read_json(folder / "config.json")
+    except ArtifactError as error:
+        raise ModelError(
+            f"model folder {folder} has no readable config.json",
+            expected="config.json with model_type sam or clip",
+            found=", ".join(sorted(path.name for path in folder.iterdir())[:12]) or "an empty folder",
+            fix=way_out,
+        ) from error
+    found_kind = config.get("model_type")
+    if found_kind not in KINDS or (kind is not None and found_kind != kind):
+        raise ModelError(
+            f"model folder {folder} holds another kind of model",
+            expected=f"model_type {kind or ' or '.join(KINDS)} in config.json",
+            found=f"model_type {found_kind!r}",
+            fix=way_out,
+        )
+    networks = {}
+    missing = []
+    for name in KINDS[found_kind]:
+        places = [folder / f"{name}.onnx", folder / "onnx" / f"{name}.onnx"]
+        present = [place for place in places if place.is_file()]
+        if present:
+            networks[name] = present[0]
+        else:
+            missing.append(f"onnx/{name}.onnx")
+    described = [folder / name for name in DESCRIPTIONS[found_kind]]
+    missing += [path.name for path in described if not path.is_file()]
+    if missing:
+        found = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+        raise ModelError(
+            f"model folder {folder} lacks {', '.join(missing)}",
+            expected=", ".join([*DESCRIPTIONS[found_kind], *(f"onnx/{name}.onnx" for name in KINDS[found_kind])]),
+            found=", ".join(found[:20]),
+            fix=f"complete the folder (variants such as {next(iter(KINDS[found_kind]))}_quantized.onnx must be "
+            "copied to the plain name)" + (f", or {fix}" if fix else ""),
+        )
+    optional = [folder / name for name in ("tokenizer_config.json", "special_tokens_map.json")]
+    beside = [path for path in optional if found_kind == "clip" and path.is_file()]
+    # Large exports keep their weights in files named after the network.
+    weights = [
+        path
+        for network in networks.values()
+        for path in sorted(network.parent.glob(f"{network.name}?data*"))
+        if path.is_file()
+    ]
+    return ModelFolder(
+        folder,
+        found_kind,
+        config,
+        read_json(folder / "preprocessor_config.json"),
+        networks,
+        tuple(sorted({*described, *beside, *networks.values(), *weights})),
+    )
+
+
+def model_digest(folder: Path) -> str:
+    """SHA-256 over the files of a model folder that take part in its results.
+
+    Raises:
+        ModelError: the folder is incomplete.
+    """
+    return open_model_folder(folder).digest
+
+
+def execution_providers() -> list[str]:
+    """onnxruntime's execution providers in the order we ask for them: CUDA where there is one, CPU."""
+    available = onnxruntime.get_available_providers()
+    return [name for name in ("CUDAExecutionProvider", "CPUExecutionProvider") if name in available]
+
+
+class Network:
+    """One ONNX network: checked names, inputs cast to what it takes, outputs as float32.
+
+    A call runs in one thread by default: stages go faster by working on several views at once, and
+    the sums inside a call then never depend on the number of threads. Calls from several threads
+    are allowed.
+    """
+
+    def __init__(self, path: Path, spec: NetworkSpec, threads: int = 1) -> None:
+        self.path = path
+        self.spec = spec
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.inter_op_num_threads = 1
+        options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+        options.log_severity_level = 3
+        try:
+            self.session = onnxruntime.InferenceSession(str(path), options, providers=execution_providers())
+        except Exception as error:  # onnxruntime's errors share no public base class
+            raise ModelError(
+                f"network {path} cannot be opened: {error}", fix="export it again, or fetch a whole copy"
+            ) from error
+        self.inputs = {item.name: item for item in self.session.get_inputs()}
+        self.outputs = {item.name: item for item in self.session.get_outputs()}
+        self._check("inputs", spec.inputs, self.inputs, spec.optional)
+        self._check("outputs", spec.outputs, self.outputs, tuple(self.outputs))
+        self.providers = self.session.get_providers()
+        logger.info("network %s runs on %s", path.name, self.providers[0])
+
+    def _check(self, what: str, expected: Mapping[str, int], found: dict[str, Any], optional: tuple[str, ...]) -> None:
+        """Compare names and numbers of axes."""
+        wrong = [name for name in expected if name not in found]
+        wrong += [name for name in found if name not in expected and name not in optional]
+        wrong += [
+            name
+            for name, axes in expected.items()
+            if name in found and found[name].shape and len(found[name].shape) != axes
+        ]
+        if wrong:
+            raise ModelError(
+                f"network {self.path} has other {what} than expected: {', '.join(dict.fromkeys(wrong))}",
+                expected=", ".join(f"{name} with {axes} axes" for name, axes in expected.items()),
+                found=", ".join(f"{name} {list(item.shape)}" for name, item in found.items()),
+                fix="export the model in the layout of the Hugging Face ONNX exports",
+            )
+
+    def fixed_axis(self, name: str, axis: int) -> int | None:
+        """Length of an input's axis where the network fixes it."""
+        shape = self.inputs[name].shape
+        return shape[axis] if shape and isinstance(shape[axis], int) else None
+
+    def __call__(self, **feeds: np.ndarray) -> list[np.ndarray]:
+        """Run once; outputs come in the order of the spec.
+
+        Raises:
+            ModelError: the network refuses the inputs.
+        """
+        wanted = {name: value for name, value in feeds.items() if name in self.inputs}
+        cast = {name: np.asarray(value, DTYPES[self.inputs[name].type]) for name, value in wanted.items()}
+        try:
+            outputs = self.session.run(list(self.spec.outputs), cast)
+        except Exception as error:  # as above
+            shapes = ", ".join(f"{name} {value.shape}" for name, value in cast.items())
+            raise ModelError(
+                f"network {self.path} failed: {error}",
+                found=shapes,
+                fix="check that preprocessor_config.json belongs to this network",
+            ) from error
+        for (name, axes), output in zip(self.spec.outputs.items(), outputs, strict=True):
+            if output.ndim != axes:
+                raise ModelError(
+                    f"network {self.path} gave {name} with {output.ndim} axes",
+                    expected=f"{axes} axes",
+                    found=f"shape {output.shape}",
+                    fix="export the model in the layout of the Hugging Face ONNX exports",
+                )
+        return [output.astype(np.float32) for output in outputs]
+
+
+def side_px(size: Any, default: int) -> int:
+    """Side of a square input from a preprocessor's size: a number, or a dict of any of its forms."""
+    if isinstance(size, dict):
+        for key in ("longest_edge", "shortest_edge", "height"):
+            if key in size:
+                return int(size[key])
+        return default
+    return int(size) if size else default
+
+
+def input_side_px(model: ModelFolder) -> int:
+    """Side of the square that the image network takes, px."""
+    keys = ("pad_size", "size") if model.kind == "sam" else ("crop_size", "size")
+    default = 1024 if model.kind == "sam" else 224
+    for key in keys:
+        if model.preprocessing.get(key):
+            return side_px(model.preprocessing[key], default)
+    return default
+
+
+def check_model(folder: Path) -> str:
+    """Describe a model folder after running each of its networks once on an empty input.
+
+    Returns:
+        kind, image size, shapes, digest, execution provider and time, one per line.
+
+    Raises:
+        ModelError: as for `open_model_folder` and `Network`.
+    """
+    model = open_model_folder(folder)
+    side = input_side_px(model)
+    pixels = np.zeros((1, 3, side, side), dtype=np.float32)
+    lines = [f"folder     {model.folder}", f"kind       {model.kind}", f"image      {side} x {side} px"]
+    if model.kind == "sam":
+        encoder, decoder = (model.network(name) for name in KINDS["sam"])
+        start = time.perf_counter()
+        embeddings, positional = encoder(pixel_values=pixels)
+        encode_s = time.perf_counter() - start
+        prompts = decoder.fixed_axis("input_points", 1) or 1
+        start = time.perf_counter()
+        scores, masks = decoder(
+            input_points=np.full((1, prompts, 1, 2), side / 2),
+            input_labels=np.ones((1, prompts, 1)),
+            image_embeddings=embeddings,
+            image_positional_embeddings=positional,
+        )
+        decode_s = time.perf_counter() - start
+        require_three_heads(decoder.path, scores, masks)
+        lines += [
+            f"embedding  {' x '.join(map(str, embeddings.shape[1:]))}",
+            f"masks      3 heads (subpart, part, whole) of {masks.shape[-2]} x {masks.shape[-1]} px",
+            f"time       {encode_s:.3f} s for one image, {decode_s / prompts:.4f} s for one prompt",
+        ]
+        providers = encoder.providers
+    else:
+        vision, text = (model.network(name) for name in KINDS["clip"])
+        start = time.perf_counter()
+        (image_embeds,) = vision(pixel_values=pixels)
+        encode_s = time.perf_counter() - start
+        length = int(model.config.get("text_config", {}).get("max_position_embeddings", 77))
+        ids = np.zeros((1, length), dtype=np.int64)
+        (text_embeds,) = text(input_ids=ids, attention_mask=np.ones_like(ids))
+        if image_embeds.shape[1] != text_embeds.shape[1]:
+            raise ModelError(
+                f"the two networks of {folder} do not belong together",
+                expected=f"text vectors of {image_embeds.shape[1]} numbers, as the image vectors",
+                found=f"{text_embeds.shape[1]} numbers",
+                fix="export both networks, with their projections, from one model",
+            )
+        lines += [
+            f"vectors    {image_embeds.shape[1]} numbers, texts of up to {length} tokens",
+            f"time       {encode_s:.3f} s for one image",
+        ]
+        providers = vision.providers
+    lines += [f"runs on    {', '.join(providers)}", f"digest     {model.digest}"]
+    return "\n".join(lines)
+
+
+def require_three_heads(path: Path, iou_scores: np.ndarray, pred_masks: np.ndarray) -> None:
+    """Refuse a decoder that does not give three masks per prompt.
+
+    Raises:
+        ModelError: the third axis is not 3 long.
+    """
+    if iou_scores.shape[2] != 3 or pred_masks.shape[2] != 3:
+        raise ModelError(
+            f"decoder {path} does not give three masks per prompt",
+            expected="iou_scores (images, prompts, 3) and pred_masks (images, prompts, 3, h, w)",
+            found=f"{iou_scores.shape} and {pred_masks.shape}",
+            fix="export it with multimask output",
+        )

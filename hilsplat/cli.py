@@ -1,0 +1,564 @@
+"""The `hilsplat` command: one subcommand per stage, plus new, query, world show, models.
+
+A stage here is thin: it reads its settings, takes the lock of its output, calls one function of the
+package and writes the provenance. Heavy libraries are imported by the functions, not by this file.
+"""
+
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+# Linear algebra libraries sum in another order for another number of threads. Stages that use
+# several cores do so through numba or pools of our own, whose results do not depend on it.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[_name] = "1"
+
+import typer  # noqa: E402
+
+from hilsplat.base.artifacts import output_lock, require_free_space  # noqa: E402
+from hilsplat.base.errors import HilsplatError  # noqa: E402
+
+app = typer.Typer(
+    help="Photographs in, a 3D Gaussian scene out that answers text queries at three semantic levels.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+world_app = typer.Typer(help="The synthetic world.", no_args_is_help=True)
+models_app = typer.Typer(help="Model folders (SAM, CLIP).", no_args_is_help=True)
+app.add_typer(world_app, name="world")
+app.add_typer(models_app, name="models")
+
+PathIn = Annotated[Path, typer.Option(help="input", show_default=False)]
+PathOut = Annotated[Path, typer.Option(help="output; written atomically", show_default=False)]
+Settings = Annotated[str, typer.Option(help="the stage's settings as JSON; missing keys take their defaults")]
+Threads = Annotated[int, typer.Option(min=1, help="threads; results do not depend on it")]
+Seed = Annotated[int, typer.Option(min=0, help="seed of everything random")]
+Log = Annotated[Path | None, typer.Option(help="also write the log to this file")]
+Cache = Annotated[Path, typer.Option(help="folder of finished views, for resuming")]
+
+DEFAULT_CACHE = Path("results/.cache")
+MIN_FREE_MIB = 200
+"""A stage does not begin with less free space than this."""
+
+STAGE_MODULES: dict[str, str] = {
+    "world": "hilsplat.world.stage",
+    "poses": "hilsplat.scene.poses",
+    "gaussians": "hilsplat.splat.fit",
+    "masks": "hilsplat.segment.stage",
+    "tree": "hilsplat.segment.tree_stage",
+    "clip": "hilsplat.language.clip_stage",
+    "contributions": "hilsplat.language.contributions",
+    "semantic_tree": "hilsplat.language.semantic_tree",
+    "autoencoder": "hilsplat.language.autoencoder",
+    "language": "hilsplat.language.field",
+    "evaluate": "hilsplat.evaluate.stage",
+    "tables": "hilsplat.evaluate.tables",
+    "efficiency": "hilsplat.evaluate.efficiency",
+    "figures": "hilsplat.evaluate.figures",
+}
+"""Module of each stage, whose import closure is the stage's code (see `base.code_hash`)."""
+
+
+def main() -> None:
+    """Run the command; a mistake a user can fix is told in a sentence, without a traceback."""
+    try:
+        app()
+    except HilsplatError as error:
+        logging.getLogger("hilsplat").error("%s", error)
+        sys.exit(1)
+
+
+def start_logging(log: Path | None) -> None:
+    """Send log records to the terminal (short) and, where given, to a file (with times)."""
+    root = logging.getLogger()
+    root.setLevel(logging.INFO)
+    root.handlers.clear()
+    terminal = logging.StreamHandler(sys.stderr)
+    terminal.setFormatter(logging.Formatter("%(message)s"))
+    root.addHandler(terminal)
+    if log is not None:
+        log.parent.mkdir(parents=True, exist_ok=True)
+        file = logging.FileHandler(log, mode="w", encoding="utf-8")
+        file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        root.addHandler(file)
+    for noisy in ("matplotlib", "numba", "PIL", "fontTools"):
+        logging.getLogger(noisy).setLevel(logging.WARNING)
+
+
+@contextmanager
+def stage(
+    name: str,
+    out: Path,
+    log: Path | None,
+    *,
+    settings: Any = None,
+    seed: int | None = None,
+    threads: int = 1,
+    inputs: dict[str, Path] | None = None,
+) -> Iterator[None]:
+    """Everything around a stage's one function call: log, lock, disk space, provenance."""
+    from hilsplat.base.code_hash import code_hash
+    from hilsplat.base.provenance import write_provenance
+
+    start_logging(log)
+    os.environ["NUMBA_NUM_THREADS"] = str(max(threads, int(os.environ.get("NUMBA_NUM_THREADS", "1"))))
+    try:
+        for what, path in (inputs or {}).items():
+            if not path.exists():
+                raise HilsplatError(f"{name}: input {what} is missing: {path}", fix="run the stage that writes it")
+        require_free_space(out.parent, MIN_FREE_MIB)
+        with output_lock(out):
+            yield
+            write_provenance(
+                out,
+                stage=name,
+                code=code_hash(STAGE_MODULES[name]),
+                command=["hilsplat", *sys.argv[1:]],
+                settings=settings.model_dump(mode="json") if settings is not None else {},
+                seed=seed,
+                inputs=inputs or {},
+            )
+    except HilsplatError:
+        raise
+    except BaseException as error:
+        if not isinstance(error, KeyboardInterrupt | SystemExit | typer.Exit):
+            logging.getLogger("hilsplat").exception("%s failed on %s", name, out)
+            sys.exit(1)
+        raise
+
+
+def _section(name: str, text: str) -> Any:
+    from hilsplat.settings import parse_section
+
+    return parse_section(name, text)
+
+
+@app.callback(invoke_without_command=True)
+def version(
+    show: Annotated[bool, typer.Option("--version", help="print the version and exit")] = False,
+) -> None:
+    """Print the version, where asked."""
+    if show:
+        from hilsplat.base.provenance import library_versions
+
+        typer.echo(f"hilsplat {library_versions()['hilsplat']}")
+        raise typer.Exit
+
+
+@world_app.command("make")
+def world_make(
+    source: Annotated[str, typer.Option(help="what to make, as world:KIND:SEED")],
+    out: PathOut,
+    settings: Settings = "{}",
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Make a synthetic scene: images, and the truth that only evaluate reads."""
+    section = _section("world", settings)
+    with stage("world", out, log, settings=section, threads=threads):
+        from hilsplat.world.stage import run_world
+
+        run_world(source, section, out, threads)
+
+
+@app.command()
+def poses(
+    images: PathIn,
+    out: PathOut,
+    name: Annotated[str, typer.Option(help="dataset/scene, for messages")] = "scene",
+    unit: Annotated[str, typer.Option(help="what one length unit is: metre or arbitrary")] = "arbitrary",
+    render: Annotated[bool, typer.Option(help="the images are renders: an ideal pinhole lens")] = False,
+    settings: Settings = "{}",
+    seed: Seed = 0,
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Find the cameras of photographs (or import a COLMAP model or transforms.json)."""
+    section = _section("poses", settings)
+    with stage("poses", out, log, settings=section, seed=seed, threads=threads, inputs={"images": images}):
+        from hilsplat.scene.poses import run_poses
+
+        run_poses(images, out, name, unit, render, section, seed, threads)
+
+
+@app.command()
+def gaussians(
+    scene: PathIn,
+    out: PathOut,
+    report: Annotated[Path, typer.Option(help="folder of the fit's report")],
+    settings: Settings = "{}",
+    cache: Cache = DEFAULT_CACHE,
+    seed: Seed = 0,
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Fit 3D Gaussians to the training views."""
+    section = _section("gaussians", settings)
+    with stage("gaussians", out, log, settings=section, seed=seed, threads=threads, inputs={"scene": scene}):
+        from hilsplat.splat.fit import run_gaussians
+
+        run_gaussians(scene, out, report, cache, section, seed, threads)
+
+
+@app.command()
+def masks(
+    scene: PathIn,
+    out: PathOut,
+    settings: Settings = "{}",
+    cache: Cache = DEFAULT_CACHE,
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Segment each training view at three levels."""
+    section = _section("masks", settings)
+    with stage("masks", out, log, settings=section, threads=threads, inputs={"scene": scene}):
+        from hilsplat.segment.stage import run_masks
+
+        run_masks(scene, out, cache, section, threads)
+
+
+@app.command()
+def tree(masks: PathIn, out: PathOut, settings: Settings = "{}", log: Log = None) -> None:
+    """Find the parent of each mask (coverage tree of each view)."""
+    section = _section("tree", settings)
+    with stage("tree", out, log, settings=section, inputs={"masks": masks}):
+        from hilsplat.segment.tree_stage import run_tree
+
+        run_tree(masks, out, section)
+
+
+@app.command()
+def clip(
+    scene: PathIn,
+    masks: PathIn,
+    out: PathOut,
+    settings: Settings = "{}",
+    cache: Cache = DEFAULT_CACHE,
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Embed each mask with CLIP."""
+    section = _section("clip", settings)
+    inputs = {"scene": scene, "masks": masks}
+    with stage("clip", out, log, settings=section, threads=threads, inputs=inputs):
+        from hilsplat.language.clip_stage import run_clip
+
+        run_clip(scene, masks, out, cache, section, threads)
+
+
+@app.command()
+def contributions(
+    scene: PathIn,
+    gaussians: PathIn,
+    masks: PathIn,
+    out: PathOut,
+    settings: Settings = "{}",
+    cache: Cache = DEFAULT_CACHE,
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Weights of each Gaussian in each mask, from one pass over the views."""
+    section = _section("contributions", settings)
+    inputs = {"scene": scene, "gaussians": gaussians, "masks": masks}
+    with stage("contributions", out, log, settings=section, threads=threads, inputs=inputs):
+        from hilsplat.language.contributions import run_contributions
+
+        run_contributions(scene, gaussians, masks, out, cache, section, threads)
+
+
+@app.command("semantic-tree")
+def semantic_tree(
+    contributions: PathIn,
+    masks: PathIn,
+    clip: PathIn,
+    out: PathOut,
+    settings: Settings = "{}",
+    log: Log = None,
+) -> None:
+    """Link the masks of all views into nodes at three levels."""
+    section = _section("semantic_tree", settings)
+    inputs = {"contributions": contributions, "masks": masks, "clip": clip}
+    with stage("semantic_tree", out, log, settings=section, inputs=inputs):
+        from hilsplat.language.semantic_tree import run_semantic_tree
+
+        run_semantic_tree(contributions, masks, clip, out, section)
+
+
+@app.command()
+def autoencoder(
+    clip: PathIn,
+    semantic_tree: PathIn,
+    contributions: PathIn,
+    out: PathOut,
+    settings: Settings = "{}",
+    seed: Seed = 0,
+    log: Log = None,
+) -> None:
+    """Train the scene's autoencoder of CLIP vectors and encode the masks."""
+    section = _section("autoencoder", settings)
+    inputs = {"clip": clip, "semantic_tree": semantic_tree, "contributions": contributions}
+    with stage("autoencoder", out, log, settings=section, seed=seed, inputs=inputs):
+        from hilsplat.language.autoencoder import run_autoencoder
+
+        run_autoencoder(clip, semantic_tree, contributions, out, section, seed)
+
+
+@app.command()
+def language(
+    contributions: PathIn,
+    tree: PathIn,
+    autoencoder: PathIn,
+    out: PathOut,
+    settings: Settings = "{}",
+    seed: Seed = 0,
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Train the language field: regression, L_h, L_ins and L_part over three levels."""
+    section = _section("language", settings)
+    inputs = {"contributions": contributions, "tree": tree, "autoencoder": autoencoder}
+    with stage("language", out, log, settings=section, seed=seed, threads=threads, inputs=inputs):
+        from hilsplat.language.field import run_language
+
+        run_language(contributions, tree, autoencoder, out, section, seed, threads)
+
+
+@app.command()
+def evaluate(
+    scene: PathIn,
+    truth: PathIn,
+    gaussians: PathIn,
+    semantic_tree: PathIn,
+    language: PathIn,
+    autoencoder: PathIn,
+    clip: PathIn,
+    masks: PathIn,
+    out: PathOut,
+    dataset: Annotated[str, typer.Option(help="data set, for the rows")],
+    name: Annotated[str, typer.Option(help="scene, for the rows")],
+    variant: Annotated[str, typer.Option(help="variant, for the rows")] = "default",
+    settings: Settings = "{}",
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Ask every annotated text in every test view and score the answers."""
+    section = _section("evaluate", settings)
+    inputs = {
+        "scene": scene,
+        "truth": truth,
+        "gaussians": gaussians,
+        "semantic_tree": semantic_tree,
+        "language": language,
+        "autoencoder": autoencoder,
+        "clip": clip,
+        "masks": masks,
+    }
+    with stage("evaluate", out, log, settings=section, threads=threads, inputs=inputs):
+        from hilsplat.evaluate.stage import run_evaluate
+
+        run_evaluate(
+            scene_folder=scene,
+            truth=truth,
+            gaussians=gaussians,
+            semantic_tree=semantic_tree,
+            language=language,
+            autoencoder=autoencoder,
+            clip_folder=clip,
+            masks_folder=masks,
+            out=out,
+            settings=section,
+            dataset=dataset,
+            scene=name,
+            variant=variant,
+            threads=threads,
+        )
+
+
+@app.command()
+def table(
+    name: Annotated[str, typer.Argument(help="table: hierarchy, lerf or ablation")],
+    scores: Annotated[list[Path], typer.Argument(help="scores.csv files of the scenes and variants")],
+    published: PathIn,
+    out: Annotated[Path, typer.Option(help="the CSV; .md, .tex and .html are written beside it")],
+    labels: Annotated[str, typer.Option(help="JSON: how the table names a variant")] = "{}",
+    log: Log = None,
+) -> None:
+    """Build one table of the paper: reported rows, measured rows, stand-in rows."""
+    import json
+
+    inputs = {"published": published, **{f"scores {number}": path for number, path in enumerate(scores)}}
+    with stage("tables", out, log, inputs=inputs):
+        from hilsplat.evaluate.tables import run_table
+
+        run_table(name, scores, published, json.loads(labels), out)
+
+
+@app.command()
+def figures(
+    scene: PathIn,
+    gaussians: PathIn,
+    fit: Annotated[Path, typer.Option(help="report folder of the fit")],
+    masks: PathIn,
+    clip: PathIn,
+    semantic_tree: PathIn,
+    language: PathIn,
+    autoencoder: PathIn,
+    out: Annotated[Path, typer.Option(help="panel PNG; registration.png and fit.png go beside it")],
+    truth: Annotated[Path | None, typer.Option(help="truth folder, where the scene has one")] = None,
+    queries: Annotated[str, typer.Option(help="JSON list of texts, where the scene has no labels")] = "[]",
+    settings: Settings = "{}",
+    evaluate: Settings = "{}",
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Draw a scene's panel: photograph, masks, field, relevancy, answers, truth."""
+    import json
+    import shutil
+
+    from hilsplat.base.artifacts import atomic_path
+
+    section, protocol = _section("figures", settings), _section("evaluate", evaluate)
+    inputs = {"scene": scene, "gaussians": gaussians, "masks": masks, "language": language}
+    with stage("figures", out, log, settings=section, threads=threads, inputs=inputs):
+        from hilsplat.evaluate.figures import run_figures
+
+        for source, name in ((scene / "registration.png", "registration.png"), (fit / "test_views.png", "fit.png")):
+            with atomic_path(out.with_name(name)) as temporary:
+                shutil.copyfile(source, temporary)
+        run_figures(
+            scene_folder=scene,
+            truth=truth,
+            masks_folder=masks,
+            gaussians=gaussians,
+            semantic_tree=semantic_tree,
+            language=language,
+            autoencoder=autoencoder,
+            clip_folder=clip,
+            out=out,
+            settings=section,
+            evaluate=protocol,
+            queries=json.loads(queries),
+            threads=threads,
+        )
+
+
+@app.command()
+def efficiency(
+    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    out: Annotated[Path, typer.Option(help="the CSV; .md beside it")] = Path("results/efficiency.csv"),
+) -> None:
+    """Print where the time went, from the benchmark files of a run."""
+    start_logging(None)
+    from hilsplat.evaluate.efficiency import run_efficiency
+
+    typer.echo(run_efficiency(results, out))
+
+
+@app.command()
+def new(
+    name: Annotated[str, typer.Argument(help="name of the scene: letters, digits, . _ -")],
+    photos: Annotated[Path, typer.Argument(help="folder of photographs")],
+    sheet: Annotated[Path, typer.Option(help="scene sheet")] = Path("config/scenes.tsv"),
+) -> None:
+    """Add a folder of photographs to the scene sheet and tell what was found."""
+    start_logging(None)
+    from hilsplat.scene.sheet import add_scene
+
+    report = add_scene(sheet, name, photos)
+    typer.echo(str(report))
+    typer.echo(
+        f"\nadded photos/{name} to {sheet}. Next:\n"
+        f"  snakemake --cores 2 --config 'groups=[photos]' 'only=[{name}]'\n"
+        f"  hilsplat query photos/{name} 'bear nose'"
+    )
+
+
+@app.command()
+def query(
+    scene: Annotated[str, typer.Argument(help="dataset/scene, such as photos/bear")],
+    text: Annotated[str, typer.Argument(help="what to look for; 'bear > nose' searches a nose inside a bear")],
+    level: Annotated[str, typer.Option(help="auto, whole, part or subpart")] = "auto",
+    variant: Annotated[str, typer.Option(help="variant whose files answer")] = "default",
+    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    views: Annotated[int, typer.Option(min=1, max=8, help="views in the panel")] = 3,
+    out: Annotated[Path | None, typer.Option(help="folder of panel.png; default: beside the scene")] = None,
+    threads: Threads = 2,
+) -> None:
+    """Ask a finished scene for a text: score, level, position, box, views, and a panel PNG."""
+    start_logging(None)
+    from hilsplat.evaluate.query_panel import answer
+
+    typer.echo(answer(results / scene, text, level=level, variant=variant, views=views, out=out, threads=threads))
+
+
+@app.command()
+def settings(
+    schema: Annotated[bool, typer.Option(help="print the JSON schema of the configuration instead")] = False,
+) -> None:
+    """Print every knob: default, unit, range, origin."""
+    import json
+
+    from hilsplat.settings import config_schema, knob_table
+
+    typer.echo(json.dumps(config_schema(), indent=1) if schema else knob_table())
+
+
+@world_app.command("show")
+def world_show(
+    scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that was made")],
+    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    out: Annotated[Path | None, typer.Option(help="PNG to write; default: beside the scene")] = None,
+) -> None:
+    """Write a contact sheet: views, labels by level, the tree with its texts."""
+    start_logging(None)
+    from hilsplat.world.stage import show_world
+
+    target = out or results / scene / "world.png"
+    show_world(results / scene / "world", target)
+    typer.echo(f"wrote {target}")
+
+
+@models_app.command("check")
+def models_check(folder: Annotated[Path, typer.Argument(help="model folder")]) -> None:
+    """Say what a model folder holds, and time one image."""
+    start_logging(None)
+    from hilsplat.language.model_check import check_model
+
+    typer.echo(check_model(folder))
+
+
+@models_app.command("train")
+def models_train(
+    out: Annotated[Path, typer.Option(help="folder that holds sam-tiny and clip-tiny")] = Path("models"),
+    cache: Cache = Path("results/.cache/train"),
+    seed: Seed = 0,
+    threads: Threads = 2,
+) -> None:
+    """Train the small SAM and CLIP on training scenes of the synthetic world (about 20 minutes)."""
+    start_logging(None)
+    from hilsplat.world.tiny_train import train_models
+
+    train_models(out, cache, seed=seed, threads=threads)
+
+
+@app.command("cache")
+def cache_command(
+    folder: Annotated[Path, typer.Argument(help="cache folder")] = DEFAULT_CACHE,
+    prune_days: Annotated[float, typer.Option(help="delete entries not used for so many days")] = -1.0,
+) -> None:
+    """Show the size of the cache of finished views, and prune it."""
+    import time
+
+    files = [path for path in folder.rglob("*") if path.is_file()] if folder.is_dir() else []
+    old = [path for path in files if prune_days >= 0 and time.time() - path.stat().st_mtime > prune_days * 86400]
+    typer.echo(f"{folder}: {len(files)} files, {sum(path.stat().st_size for path in files) / 2**20:.1f} MiB")
+    if old:
+        freed = sum(path.stat().st_size for path in old)
+        for path in old:
+            path.unlink()
+        typer.echo(f"deleted {len(old)} files, {freed / 2**20:.1f} MiB")

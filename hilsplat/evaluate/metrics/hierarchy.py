@@ -1,0 +1,63 @@
+"""Hierarchical consistency (HC): do predicted parts lie in predicted wholes?"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool
+
+Reading = Literal["containment", "literal", "anchored"]
+READINGS: tuple[Reading, ...] = ("containment", "literal", "anchored")
+
+
+@dataclass(frozen=True)
+class Family:
+    """Predicted masks of one annotated parent and of its annotated children, in one view.
+
+    Attributes:
+        parent: prediction for the parent's text.
+        children: predictions for the children's texts, at least one.
+        true_parent: the annotated region of the parent; `anchored` needs it.
+    """
+
+    parent: Bool[np.ndarray, "H W"]
+    children: tuple[Bool[np.ndarray, "H W"], ...]
+    true_parent: Bool[np.ndarray, "H W"]
+
+
+def family_consistency(family: Family, reading: Reading) -> float:
+    """Mean over the children of one parent.
+
+    `containment`: area(p and c) / area(c), the paper's wording; 1 for perfect nesting.
+    `literal`: area(p and c) / area(p), the printed symbols with l = 1 the whole.
+    `anchored`: area(c and true p) / area(c); predicting the whole image does not fool it.
+    An empty denominator (nothing was predicted) gives 0.
+    """
+    anchor = family.true_parent if reading == "anchored" else family.parent
+    terms = []
+    for child in family.children:
+        area = np.count_nonzero(family.parent if reading == "literal" else child)
+        terms.append(np.count_nonzero(anchor & child) / area if area else 0.0)
+    return float(np.mean(terms))
+
+
+def hierarchical_consistency(
+    transitions: Sequence[Sequence[Family]], reading: Reading = "containment", pooled: bool = False
+) -> float:
+    """HC of one view (paper, Sec. IV-A).
+
+    Departs: the printed normaliser uses N_l outside the sum over l, where it is not defined; here
+    it is the mean over the parents of each level, then over the L - 1 transitions. A transition
+    without parents contributes 0, as max(N_l, 1) has it.
+
+    Args:
+        transitions: families per level of the parent: wholes first, then parts.
+        reading: see `family_consistency`.
+        pooled: mean over all parents of all levels instead.
+    """
+    scores = [[family_consistency(family, reading) for family in families] for families in transitions]
+    if pooled:
+        every = [score for level in scores for score in level]
+        return float(np.mean(every)) if every else 0.0
+    return float(np.mean([np.mean(level) if level else 0.0 for level in scores]))

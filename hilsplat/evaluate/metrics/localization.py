@@ -1,0 +1,41 @@
+"""Localization: does the most relevant point lie on the object that was asked for?"""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from hilsplat.base.levels import LEVELS, Level
+
+
+def peak_points(
+    filtered: Float[np.ndarray, "3 H W"], level: Level | None
+) -> tuple[Int[np.ndarray, "P 2"], Level]:
+    """All pixels (x, y) that hold the maximum of a filtered map.
+
+    Without a level, the one with the largest maximum; of equal ones the coarsest.
+    """
+    if level is None:
+        level = LEVELS[int(filtered.max(axis=(1, 2)).argmax())]
+    chosen = filtered[level.index]
+    rows, columns = np.nonzero(chosen == chosen.max())
+    return np.stack([columns, rows], axis=1), level
+
+
+def hits_a_box(points_xy: Int[np.ndarray, "P 2"], boxes_xyxy: Int[np.ndarray, "B 4"]) -> bool:
+    """True where any point lies in any box, borders included (x1 <= x <= x2): LERF's test."""
+    x, y = points_xy[:, None, 0], points_xy[:, None, 1]
+    x1, y1, x2, y2 = (boxes_xyxy[None, :, side] for side in range(4))
+    return bool(((x1 <= x) & (x <= x2) & (y1 <= y) & (y <= y2)).any())
+
+
+def hits_the_mask(points_xy: Int[np.ndarray, "P 2"], truth: Bool[np.ndarray, "H W"]) -> bool:
+    """True where any point lies in the true region: stricter than the box."""
+    return bool(truth[points_xy[:, 1], points_xy[:, 0]].any())
+
+
+def box_of(mask: Bool[np.ndarray, "H W"]) -> Int[np.ndarray, " 4"]:
+    """Box of a region with its borders included: first and last column and row.
+
+    Unlike boxes elsewhere in this package, whose ends are exclusive: LERF's test includes borders.
+    """
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return np.array([columns[0], rows[0], columns[-1], rows[-1]])

@@ -1,0 +1,98 @@
+"""Rows of `scores.csv`: one number each, in long form."""
+
+import csv
+import io
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hilsplat.base.artifacts import write_text
+from hilsplat.base.errors import ArtifactError
+from hilsplat.evaluate.metrics.registry import METRICS
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Score:
+    """One number.
+
+    Attributes:
+        dataset: data set of the scene.
+        scene: scene name.
+        variant: named set of settings.
+        masks: what made the masks, such as `sam-tiny`.
+        method: what answered: `tree`, `tree-path`, `field`, or `truth` for the annotations' own HC.
+        view: view name.
+        query: text; empty for a number of a whole view.
+        level: level label of the annotation; empty where the protocol knows none.
+        metric: a key of `METRICS`.
+        protocol: how the answer was made and compared.
+        value: in the metric's bounds.
+        n: how many things the value is a mean of.
+    """
+
+    dataset: str
+    scene: str
+    variant: str
+    masks: str
+    method: str
+    view: str
+    query: str
+    level: str
+    metric: str
+    protocol: str
+    value: float
+    n: int
+
+
+COLUMNS: tuple[str, ...] = tuple(field.name for field in fields(Score))
+
+
+def write_scores(path: Path, scores: Iterable[Score]) -> None:
+    """Write rows, sorted, values with six decimals: the same rows give the same bytes."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    rows = []
+    for score in scores:
+        assert score.metric in METRICS, score.metric
+        row = asdict(score)
+        row["value"] = f"{score.value:.6f}"
+        rows.append([str(row[name]) for name in COLUMNS])
+    writer.writerows(sorted(rows))
+    write_text(path, stream.getvalue())
+
+
+def read_scores(paths: Iterable[Path]) -> "pd.DataFrame":
+    """Read score files into one frame.
+
+    Raises:
+        ArtifactError: a file is missing or has other columns.
+    """
+    import pandas as pd
+
+    frames = []
+    for path in paths:
+        try:
+            frame = pd.read_csv(path, dtype=str, keep_default_na=False)
+        except FileNotFoundError as error:
+            raise ArtifactError(f"{path} is missing", fix="run the evaluate stage") from error
+        except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
+            raise ArtifactError(
+                f"{path} cannot be read: {error}", fix="delete it and run evaluate again"
+            ) from error
+        if tuple(frame.columns) != COLUMNS:
+            raise ArtifactError(
+                f"{path} does not have the columns of a score file",
+                expected=", ".join(COLUMNS),
+                found=", ".join(map(str, frame.columns)),
+                fix="delete it and run evaluate again",
+            )
+        frames.append(frame)
+    if not frames:
+        frames.append(pd.DataFrame(columns=list(COLUMNS), dtype=str))
+    scores = pd.concat(frames, ignore_index=True)
+    return scores.assign(value=scores["value"].astype(float), n=scores["n"].astype(int))

@@ -1,0 +1,68 @@
+"""What the instance and part losses share: softened distances, ancestors, cosines."""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int32, Int64
+from torch import Tensor
+
+from hilsplat.base.levels import NONE
+
+SOFTENING = 1e-3
+"""Added in quadrature to every distance, so that its logarithm has a finite slope at zero."""
+
+
+def soft_distances(means: Float[Tensor, "M D"]) -> Float[Tensor, "M M"]:
+    """Pairwise sqrt(|m_i - m_j|^2 + SOFTENING^2)."""
+    difference = means[:, None] - means[None]
+    return (difference.square().sum(-1) + SOFTENING**2).sqrt()
+
+
+def off_diagonal_mean(values: Float[Tensor, "M M"]) -> Float[Tensor, ""]:
+    """Mean over ordered pairs i != j; 0 for fewer than two rows."""
+    rows = len(values)
+    if rows < 2:
+        return values.sum() * 0
+    return (values.sum() - values.diagonal().sum()) / (rows * (rows - 1))
+
+
+def common_ancestor_depth(parent: Int32[np.ndarray, " M"]) -> Int64[np.ndarray, "M M"]:
+    """Depth of the deepest common ancestor of every two masks of one view's coverage tree.
+
+    A mask counts as its own ancestor, roots have depth 1, and 0 means that two masks are unrelated:
+    a mask and its child share the depth of the mask, two children of a root share depth 1.
+
+    Example:
+        >>> common_ancestor_depth(np.array([-1, 0, 0, 1], dtype=np.int32))[3]
+        array([1, 2, 1, 3])
+    """
+    rows = len(parent)
+    is_ancestor = np.eye(rows, dtype=np.int64)  # [mask, ancestor]
+    current = np.arange(rows)
+    for _ in range(rows):
+        current = np.where(current == NONE, NONE, parent[current])
+        has = np.flatnonzero(current != NONE)
+        if not len(has):
+            break
+        is_ancestor[has, current[has]] = 1
+    # Common ancestors of two masks form a chain from the root down: their number is the depth.
+    # float32 counts exactly and multiplies fast.
+    chains = is_ancestor.astype(np.float32)
+    return (chains @ chains.T).astype(np.int64)
+
+
+def unit(values: Float[Tensor, "*rows D"]) -> Float[Tensor, "*rows D"]:
+    """Divide by the softened length, so that a zero vector stays zero and has a finite gradient."""
+    return values / (values.square().sum(-1, keepdim=True) + 1e-12).sqrt()
+
+
+def similarity_without_parent(
+    anchors: Float[Tensor, "A D"], others: Float[Tensor, "B D"], parent: Float[Tensor, "A D"]
+) -> Float[Tensor, "A B"]:
+    """s_p of Eq. 4: cosine of two mask means after the anchor's parent mean is subtracted from both.
+
+    Departs: Eq. 4 prints index j twice in the denominator; we take i and j, so that s_p is a cosine.
+    Its one un-indexed parent mean is read as the anchor's, for positives and negatives alike. The
+    parent is detached: parts move against their whole, not the whole against its parts.
+    """
+    parent = parent.detach()
+    return torch.einsum("ad,abd->ab", unit(anchors - parent), unit(others[None] - parent[:, None]))

@@ -1,0 +1,265 @@
+"""The quadratic form of frozen geometry: G_l = sum over views of W' diag(valid_l) W.
+
+W holds the compositing weights of all pixels that have a mask at some level. G is stored once for
+all levels, as an upper triangle with three values per pair of Gaussians; where W has fewer
+non-zeros, W is kept and streamed instead. Both give the same products.
+"""
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numba
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Bool, Float32, Float64
+
+from hilsplat.base.artifacts import read_npz, write_npz
+from hilsplat.base.errors import ArtifactError
+from hilsplat.base.levels import LEVELS
+
+BLOCKS = 16
+"""Blocks of Gaussians that threads share when G is built; the result does not depend on it."""
+
+
+def compiled(function: Callable, **options: bool) -> Callable:
+    """Compile a loop with numba (unwrapped: the tests' type checker wraps every function)."""
+    return numba.njit(cache=True, nogil=True, **options)(inspect.unwrap(function))
+
+
+@dataclass(frozen=True)
+class Gram:
+    """Upper triangle of G for all levels, with one pattern.
+
+    Attributes:
+        pairs: CSR pattern (N, N), columns from the diagonal on; its data are not used.
+        values: G of each level at each pair of the pattern, float32.
+    """
+
+    indptr: np.ndarray
+    indices: np.ndarray
+    values: Float32[np.ndarray, "E 3"]
+
+    @property
+    def nonzeros(self) -> int:
+        """Stored pairs of Gaussians."""
+        return len(self.indices)
+
+    @property
+    def num_gaussians(self) -> int:
+        """N."""
+        return len(self.indptr) - 1
+
+    def product(self, features: Float32[np.ndarray, "N 3 D"]) -> Float32[np.ndarray, "N 3 D"]:
+        """G_l F_l for every level; one thread, always summed in the same order."""
+        out = np.zeros_like(features)
+        _gram_product(self.indptr, self.indices, self.values, np.ascontiguousarray(features), out)
+        return out
+
+    def save(self, path: Path) -> None:
+        """Write `G.npz`."""
+        write_npz(path, indptr=self.indptr, indices=self.indices, values=self.values)
+
+
+@dataclass(frozen=True)
+class StackedWeights:
+    """W of all labelled pixels of all views, and at which levels each pixel has a mask.
+
+    Attributes:
+        weights: CSR (P, N); rows sum to 1.
+        valid: whether a pixel has a mask at each level.
+    """
+
+    weights: sp.csr_matrix
+    valid: Bool[np.ndarray, "P 3"]
+
+    @property
+    def nonzeros(self) -> int:
+        """Stored weights."""
+        return self.weights.nnz
+
+    @property
+    def num_gaussians(self) -> int:
+        """N."""
+        return self.weights.shape[1]
+
+    def product(self, features: Float32[np.ndarray, "N 3 D"]) -> Float32[np.ndarray, "N 3 D"]:
+        """W' diag(valid_l) W F_l for every level; one thread, always summed in the same order."""
+        out = np.zeros_like(features)
+        _weights_product(
+            self.weights.indptr,
+            self.weights.indices,
+            self.weights.data,
+            self.valid,
+            np.ascontiguousarray(features),
+            out,
+        )
+        return out
+
+    def save(self, path: Path) -> None:
+        """Write `W.npz`."""
+        write_npz(
+            path,
+            indptr=self.weights.indptr,
+            indices=self.weights.indices,
+            data=self.weights.data,
+            columns=np.array(self.weights.shape[1]),
+            valid=self.valid,
+        )
+
+
+Quadratic = Gram | StackedWeights
+
+
+def level_mass(quadratic: Quadratic) -> Float32[np.ndarray, "N 3"]:
+    """Visible mass of each Gaussian in the labelled pixels of each level: G_l 1, as rows of W sum to 1."""
+    ones = np.ones((quadratic.num_gaussians, len(LEVELS), 1), np.float32)
+    return quadratic.product(ones)[:, :, 0]
+
+
+def build_gram(stacked: StackedWeights, limit: int | None, threads: int) -> Gram | None:
+    """Build G from W, exactly (float64 sums, no entry dropped).
+
+    Args:
+        stacked: W of all views, columns sorted within rows.
+        limit: give up, and return None, where G has more non-zeros than this.
+        threads: rows of G are shared among them; the bytes do not depend on it.
+    """
+    weights = stacked.weights
+    num_gaussians = weights.shape[1]
+    # The transposed matrix holds positions in W: from there on lie the columns of the upper triangle.
+    positions = sp.csr_matrix(
+        (np.arange(weights.nnz, dtype=np.int64), weights.indices, weights.indptr), shape=weights.shape
+    ).tocsc()
+    args = (weights.indptr, weights.indices, weights.data, positions.indptr, positions.indices, positions.data)
+    numba.set_num_threads(max(1, min(threads, numba.config.NUMBA_NUM_THREADS)))
+    counts = np.zeros(num_gaussians, np.int64)
+    _count_pairs(*args[:2], *args[3:], BLOCKS, counts)
+    indptr = np.concatenate(([0], np.cumsum(counts)))
+    if limit is not None and indptr[-1] > limit:
+        return None
+    indices = np.zeros(indptr[-1], np.int32)
+    values = np.zeros((indptr[-1], len(LEVELS)), np.float32)
+    _fill_pairs(*args, stacked.valid, BLOCKS, indptr, indices, values)
+    return Gram(indptr, indices, values)
+
+
+def choose_quadratic(stacked: StackedWeights, keep: str, threads: int) -> Quadratic:
+    """Keep whichever has fewer non-zeros: one product touches each of them equally often.
+
+    Args:
+        stacked: W of all views.
+        keep: "auto", or "gram" or "weights" to insist on one.
+        threads: for building G.
+    """
+    if keep == "weights":
+        return stacked
+    gram = build_gram(stacked, stacked.nonzeros if keep == "auto" else None, threads)
+    return stacked if gram is None else gram
+
+
+def load_quadratic(folder: Path) -> Quadratic:
+    """Read `G.npz` or `W.npz`, whichever the contributions stage kept.
+
+    Raises:
+        ArtifactError: neither is there.
+    """
+    if (folder / "G.npz").is_file():
+        return Gram(**read_npz(folder / "G.npz"))
+    if (folder / "W.npz").is_file():
+        arrays = read_npz(folder / "W.npz")
+        shape = (len(arrays["indptr"]) - 1, int(arrays["columns"]))
+        matrix = sp.csr_matrix((arrays["data"], arrays["indices"], arrays["indptr"]), shape=shape)
+        return StackedWeights(matrix, arrays["valid"])
+    raise ArtifactError(f"{folder} holds neither G.npz nor W.npz", fix="run the contributions stage again")
+
+
+def dense_gram(quadratic: Quadratic) -> Float64[np.ndarray, "3 N N"]:
+    """G of every level as dense matrices, for tests and small scenes."""
+    identity = np.eye(quadratic.num_gaussians, dtype=np.float32)
+    columns = np.repeat(identity[:, None], len(LEVELS), axis=1)
+    return quadratic.product(columns).transpose(1, 0, 2).astype(np.float64)
+
+
+@compiled
+def _gram_product(indptr, indices, values, features, out):
+    levels, channels = features.shape[1], features.shape[2]
+    for i in range(len(indptr) - 1):
+        for k in range(indptr[i], indptr[i + 1]):
+            j = indices[k]
+            for level in range(levels):
+                value = values[k, level]
+                for c in range(channels):
+                    out[i, level, c] += value * features[j, level, c]
+                if j != i:
+                    for c in range(channels):
+                        out[j, level, c] += value * features[i, level, c]
+
+
+@compiled
+def _weights_product(indptr, indices, data, valid, features, out):
+    levels, channels = features.shape[1], features.shape[2]
+    rendered = np.zeros((levels, channels), np.float32)
+    for p in range(len(indptr) - 1):
+        rendered[:] = 0
+        for k in range(indptr[p], indptr[p + 1]):
+            j, weight = indices[k], data[k]
+            for level in range(levels):
+                if valid[p, level]:
+                    for c in range(channels):
+                        rendered[level, c] += weight * features[j, level, c]
+        for k in range(indptr[p], indptr[p + 1]):
+            j, weight = indices[k], data[k]
+            for level in range(levels):
+                if valid[p, level]:
+                    for c in range(channels):
+                        out[j, level, c] += weight * rendered[level, c]
+
+
+def _count_pairs_loop(indptr, indices, col_indptr, col_rows, col_positions, blocks, counts):
+    num = len(col_indptr) - 1
+    for block in numba.prange(blocks):
+        seen = np.full(num, -1, np.int64)
+        for i in range(block * num // blocks, (block + 1) * num // blocks):
+            count = 0
+            for t in range(col_indptr[i], col_indptr[i + 1]):
+                for k in range(col_positions[t], indptr[col_rows[t] + 1]):
+                    j = indices[k]
+                    if seen[j] != i:
+                        seen[j] = i
+                        count += 1
+            counts[i] = count
+
+
+def _fill_pairs_loop(
+    indptr, indices, data, col_indptr, col_rows, col_positions, valid, blocks, out_indptr, out_indices, out_values
+):
+    num, levels = len(col_indptr) - 1, valid.shape[1]
+    for block in numba.prange(blocks):
+        seen = np.full(num, -1, np.int64)
+        sums = np.zeros((num, levels), np.float64)
+        for i in range(block * num // blocks, (block + 1) * num // blocks):
+            end = out_indptr[i]
+            for t in range(col_indptr[i], col_indptr[i + 1]):
+                p = col_rows[t]
+                weight = np.float64(data[col_positions[t]])
+                for k in range(col_positions[t], indptr[p + 1]):
+                    j = indices[k]
+                    if seen[j] != i:
+                        seen[j] = i
+                        sums[j] = 0
+                        out_indices[end] = j
+                        end += 1
+                    for level in range(levels):
+                        if valid[p, level]:
+                            sums[j, level] += weight * data[k]
+            row = np.sort(out_indices[out_indptr[i] : end])
+            out_indices[out_indptr[i] : end] = row
+            for place in range(len(row)):
+                for level in range(levels):
+                    out_values[out_indptr[i] + place, level] = sums[row[place], level]
+
+
+_count_pairs = compiled(_count_pairs_loop, parallel=True)
+_fill_pairs = compiled(_fill_pairs_loop, parallel=True)

@@ -1,0 +1,247 @@
+"""From photographs to verified matches: upright work images, cameras to estimate, SIFT, pairs."""
+
+import logging
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from PIL import Image, UnidentifiedImageError
+
+from hilsplat.base.errors import ImageError, SceneError
+from hilsplat.base.images import read_image, resize_to_fit, write_png
+from hilsplat.base.progress import track
+from hilsplat.settings import PosesSettings
+
+logger = logging.getLogger(__name__)
+
+EXHAUSTIVE_UP_TO = 200
+"""matcher = "auto" tries every pair up to this many views; beyond, neighbours by name."""
+
+SEQUENTIAL_OVERLAP = 10
+"""Neighbours by name that sequential matching tries (and as many at distances 2, 4, 8, ...)."""
+
+MIN_INLIERS = 12
+"""Verified matches a pair needs (reference block for renders and photographs alike; COLMAP: 15)."""
+
+PEAK_THRESHOLD = 0.02 / 3 / 2
+"""SIFT contrast threshold, half of COLMAP's: renders and indoor photographs are low in contrast."""
+
+EXIF_35MM_FOCAL = 0xA405
+EXIF_SUB_FOLDER = 0x8769
+EXIF_ORIENTATION = 0x0112
+DIAGONAL_35MM = 43.2666
+"""Diagonal of a 35 mm frame in mm, to which the EXIF equivalent focal length refers."""
+
+
+@dataclass(frozen=True)
+class WorkImage:
+    """One input photograph as structure from motion sees it: upright, shrunk, PNG.
+
+    Attributes:
+        view: view name, which is the file name of the work image.
+        source: the photograph it was made from.
+        size_hw: height and width of the work image, px.
+        focal_px: focal length by EXIF, in px of the work image; None where EXIF has none.
+    """
+
+    view: str
+    source: Path
+    size_hw: tuple[int, int]
+    focal_px: float | None
+
+
+def view_names(sources: Sequence[Path]) -> list[str]:
+    """View names of image files: the file name with the suffix .png ("DSC_1.jpg" -> "DSC_1.png").
+
+    Files of one name in different folders ("train/r_0.png", "test/r_0.png") are told apart by
+    their folder: "train_r_0.png".
+
+    Raises:
+        SceneError: two files would get the same view name.
+    """
+    stems = Counter(source.stem for source in sources)
+    by_folder = {stem for stem, count in stems.items() if count > 1}
+    same_folder = Counter((source.parent, source.stem) for source in sources)
+    names = []
+    owners: dict[str, list[Path]] = defaultdict(list)
+    for source in sources:
+        apart = source.stem in by_folder and same_folder[source.parent, source.stem] == 1
+        name = f"{source.parent.name}_{source.stem}.png" if apart else f"{source.stem}.png"
+        owners[name].append(source)
+        names.append(name)
+    for name, files in owners.items():
+        if len(files) > 1:
+            raise SceneError(
+                f"{len(files)} images would become the same view {name}",
+                found=", ".join(str(file) for file in files),
+                fix="rename or remove all but one: views are named after the file without its suffix",
+            )
+    return names
+
+
+def exif_focal_px(path: Path, size_hw: tuple[int, int]) -> float | None:
+    """Focal length by EXIF (35 mm equivalent), in px of an image of the given size."""
+    try:
+        with Image.open(path) as image:
+            focal_mm = image.getexif().get_ifd(EXIF_SUB_FOLDER).get(EXIF_35MM_FOCAL)
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
+        return None  # damaged EXIF only: whether the pixels can be read is checked elsewhere
+    try:
+        focal = float(focal_mm or 0)
+    except (TypeError, ValueError):
+        return None
+    return focal / DIAGONAL_35MM * float(np.hypot(*size_hw)) if focal > 0 else None
+
+
+def prepare_images(sources: Sequence[Path], folder: Path, max_side_px: int) -> list[WorkImage]:
+    """Write every photograph upright, at most `max_side_px` long, as PNG into a work folder.
+
+    Raises:
+        ImageError: files cannot be read; all of them are named.
+        SceneError: two files would become the same view.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    images = []
+    damaged: list[tuple[Path, str]] = []
+    for source, view in track(
+        list(zip(sources, view_names(sources), strict=True)), "photographs read", total=len(sources)
+    ):
+        try:
+            pixels = resize_to_fit(read_image(source), max_side_px)
+        except ImageError as error:
+            damaged.append((source, str(error)))
+            continue
+        size_hw = (pixels.shape[0], pixels.shape[1])
+        write_png(folder / view, pixels)
+        images.append(WorkImage(view, source, size_hw, exif_focal_px(source, size_hw)))
+    if len(damaged) == 1:
+        raise ImageError(damaged[0][1])
+    if damaged:
+        raise ImageError(
+            f"{len(damaged)} of {len(sources)} images in {damaged[0][0].parent} cannot be read",
+            found=", ".join(f"{path.name} ({path.stat().st_size} bytes)" for path, _ in damaged),
+            fix="remove them from the folder or replace them by whole copies",
+        )
+    return images
+
+
+def camera_groups(images: Sequence[WorkImage], single_camera: str) -> list[list[WorkImage]]:
+    """Group the views that share one set of intrinsics, in order of their first view.
+
+    "auto" joins views of equal size and EXIF focal length, "yes" all, "no" none.
+
+    Raises:
+        SceneError: "yes" with images of different sizes.
+    """
+    if single_camera == "no":
+        return [[image] for image in images]
+    groups: dict[object, list[WorkImage]] = {}
+    for image in images:
+        key = image.size_hw if single_camera == "yes" else (image.size_hw, image.focal_px)
+        groups.setdefault(key, []).append(image)
+    if single_camera == "yes" and len(groups) > 1:
+        sizes = sorted({f"{width} x {height}" for (height, width) in (image.size_hw for image in images)})
+        raise SceneError(
+            "poses.single_camera is yes, but the images have several sizes",
+            expected="one size (width x height) for all images",
+            found=", ".join(sizes),
+            fix="set poses.single_camera to auto, or leave images of other sizes out",
+        )
+    return list(groups.values())
+
+
+def register_images(
+    database: Path, folder: Path, images: Sequence[WorkImage], camera_model: str, single_camera: str
+) -> None:
+    """Enter cameras and images into a new database, before any thread works on it.
+
+    Extraction would enter them as its threads finish; the ids, and with them the result, would
+    depend on timing.
+    """
+    for group in camera_groups(images, single_camera):
+        options = pycolmap.ImageReaderOptions()
+        options.camera_model = camera_model.upper()
+        height, width = group[0].size_hw
+        focal = group[0].focal_px
+        if focal is not None:
+            camera = pycolmap.Camera.create_from_model_name(1, camera_model.upper(), focal, width, height)
+            options.camera_params = ", ".join(repr(float(value)) for value in camera.params)
+        pycolmap.import_images(
+            database, folder, pycolmap.CameraMode.SINGLE, [image.view for image in group], options
+        )
+
+
+def extract_features(
+    database: Path, folder: Path, views: Sequence[str], settings: PosesSettings, threads: int
+) -> None:
+    """SIFT features of registered images (CPU; the result does not depend on `threads`)."""
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = threads
+    options.use_gpu = False
+    options.max_image_size = settings.max_side_px
+    options.sift.max_num_features = settings.max_features
+    options.sift.first_octave = settings.first_octave
+    options.sift.peak_threshold = PEAK_THRESHOLD
+    pycolmap.extract_features(
+        database, folder, list(views), extraction_options=options, device=pycolmap.Device.cpu
+    )
+
+
+def match_features(database: Path, num_views: int, settings: PosesSettings, seed: int, threads: int) -> str:
+    """Match pairs and verify them geometrically; returns the kind of matching."""
+    matcher = settings.matcher
+    if matcher == "auto":
+        matcher = "exhaustive" if num_views <= EXHAUSTIVE_UP_TO else "sequential"
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads = threads
+    matching.use_gpu = False
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.min_num_inliers = MIN_INLIERS
+    verification.ransac.random_seed = seed
+    verification.ransac.num_threads = 1
+    verification.compute_relative_pose = settings.mapper == "global"
+    if matcher == "exhaustive":
+        pycolmap.match_exhaustive(
+            database, matching, verification_options=verification, device=pycolmap.Device.cpu
+        )
+    else:
+        pairing = pycolmap.SequentialPairingOptions()
+        pairing.overlap = SEQUENTIAL_OVERLAP
+        pairing.num_threads = threads
+        pycolmap.match_sequential(database, matching, pairing, verification, device=pycolmap.Device.cpu)
+    return matcher
+
+
+@dataclass(frozen=True)
+class MatchCounts:
+    """What matching found for one view.
+
+    Attributes:
+        features: SIFT features.
+        pairs: other views with at least `MIN_INLIERS` verified matches.
+        best_pair: verified matches with the best of them.
+    """
+
+    features: int
+    pairs: int
+    best_pair: int
+
+
+def count_matches(database: Path) -> dict[str, MatchCounts]:
+    """Features and verified pairs of every view in the database, by view name."""
+    with pycolmap.Database.open(database) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        features = {image_id: opened.num_keypoints_for_image(image_id) for image_id in names}
+        pair_ids, inliers = opened.read_two_view_geometry_num_inliers()
+    of_view: dict[int, list[int]] = defaultdict(list)
+    for pair_id, count in zip(pair_ids, inliers, strict=True):
+        if count >= MIN_INLIERS:
+            for image_id in pycolmap.pair_id_to_image_pair(pair_id):
+                of_view[image_id].append(count)
+    return {
+        name: MatchCounts(features[image_id], len(of_view[image_id]), max(of_view[image_id], default=0))
+        for image_id, name in sorted(names.items(), key=lambda entry: entry[1])
+    }

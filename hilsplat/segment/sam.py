@@ -1,0 +1,183 @@
+"""Segment Anything by onnxruntime: one image in, three masks per point prompt out.
+
+Preparation and restoring of sizes follow the SamProcessor of the transformers library, because its
+ONNX exports are what we read. The rounding of logits (`quantise`) is ours.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int8, UInt8
+from PIL import Image
+
+from hilsplat.base.levels import Level
+from hilsplat.base.onnx_models import ModelFolder, open_model_folder, require_three_heads, side_px
+
+HEADS: tuple[Level, Level, Level] = (Level.SUBPART, Level.PART, Level.WHOLE)
+"""What the decoder's three outputs mean, in its order: fine to coarse."""
+
+LOGIT_STEP = 1 / 8
+"""Logits are rounded to this step and clipped to +-127 steps, so that a view's survivors fit in a few MB
+of cache. A border moves by less than a hundredth of a low-resolution pixel where the logit changes by 5 per
+pixel, as it does at SAM's borders."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """How an image sits in the network's square input.
+
+    Attributes:
+        original_hw: the image, px.
+        resized_hw: its size in the input, at the top left, px.
+        padded_hw: the whole input, px.
+    """
+
+    original_hw: tuple[int, int]
+    resized_hw: tuple[int, int]
+    padded_hw: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """One image after the vision encoder."""
+
+    embeddings: Float32[np.ndarray, "1 C h w"]
+    positional: Float32[np.ndarray, "1 C h w"]
+    frame: Frame
+
+
+def resized_size(original_hw: tuple[int, int], longest_edge: int) -> tuple[int, int]:
+    """Height and width whose longer side is `longest_edge`; halves are rounded up, as in SamProcessor."""
+    scale = longest_edge / max(original_hw)
+    return int(original_hw[0] * scale + 0.5), int(original_hw[1] * scale + 0.5)
+
+
+def point_grid(points_per_side: int) -> Float[np.ndarray, "P 2"]:
+    """Centres of a grid of squares over the unit square, as (x, y), row by row."""
+    centres = (np.arange(points_per_side) + 0.5) / points_per_side
+    x, y = np.meshgrid(centres, centres)
+    return np.stack([x.reshape(-1), y.reshape(-1)], axis=1)
+
+
+def quantise(logits: Float32[np.ndarray, "*shape"]) -> Int8[np.ndarray, "*shape"]:
+    """Round logits to multiples of `LOGIT_STEP`, clipped to +-127 of them (15.9)."""
+    return np.clip(np.rint(logits / LOGIT_STEP), -127, 127).astype(np.int8)
+
+
+class SamModel:
+    """A SAM folder, ready to run."""
+
+    def __init__(self, model: ModelFolder) -> None:
+        self.model = model
+        self.digest = model.digest
+        self.encoder = model.network("vision_encoder")
+        self.decoder = model.network("prompt_encoder_mask_decoder")
+        preprocessing = model.preprocessing
+        self.longest_edge = side_px(preprocessing.get("size"), 1024)
+        padded = preprocessing.get("pad_size")
+        if isinstance(padded, dict) and {"height", "width"} <= padded.keys():
+            self.padded_hw = (int(padded["height"]), int(padded["width"]))
+        else:
+            self.padded_hw = (side_px(padded, self.longest_edge),) * 2
+        self.resample = Image.Resampling(preprocessing.get("resample", Image.Resampling.BILINEAR))
+        # transformers' defaults where a key is missing: ImageNet statistics, values in 0..1
+        self.mean = np.array(preprocessing.get("image_mean", (0.485, 0.456, 0.406)), dtype=np.float32)
+        self.std = np.array(preprocessing.get("image_std", (0.229, 0.224, 0.225)), dtype=np.float32)
+        self.rescale = np.float32(preprocessing.get("rescale_factor", 1 / 255))
+
+    @staticmethod
+    def load(folder: Path) -> "SamModel":
+        """Open a model folder.
+
+        Raises:
+            ModelError: it is missing, incomplete or no SAM.
+        """
+        return SamModel(open_model_folder(folder, "sam", fix="set masks.segmenter: graph, which needs no model"))
+
+    def prepare(
+        self, image: UInt8[np.ndarray, "H W 3"]
+    ) -> tuple[Float32[np.ndarray, "1 3 h w"], Frame]:
+        """Resize to the longest edge, normalise, pad with zeros at the right and bottom."""
+        original = (image.shape[0], image.shape[1])
+        resized = resized_size(original, self.longest_edge)
+        if resized != original:
+            shrunk = Image.fromarray(image).resize((resized[1], resized[0]), self.resample)
+            image = np.asarray(shrunk)
+        values = (image.astype(np.float32) * self.rescale - self.mean) / self.std
+        padded = np.zeros((1, 3, *self.padded_hw), dtype=np.float32)
+        padded[0, :, : resized[0], : resized[1]] = values.transpose(2, 0, 1)
+        return padded, Frame(original, resized, self.padded_hw)
+
+    def encode(self, image: UInt8[np.ndarray, "H W 3"]) -> Encoded:
+        """Run the vision encoder."""
+        pixels, frame = self.prepare(image)
+        embeddings, positional = self.encoder(pixel_values=pixels)
+        return Encoded(embeddings, positional, frame)
+
+    def prompts_per_call(self, wanted: int) -> int:
+        """Prompts of one decoder call: the network's number where it fixes one."""
+        return self.decoder.fixed_axis("input_points", 1) or wanted
+
+    def decode(
+        self, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]
+    ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"]]:
+        """Three masks for each foreground point of the original image (px).
+
+        Returns:
+            predicted IoUs and low-resolution logits; heads as in `HEADS`.
+        """
+        frame = encoded.frame
+        scale = np.array(
+            [
+                frame.resized_hw[1] / frame.original_hw[1],
+                frame.resized_hw[0] / frame.original_hw[0],
+            ]
+        )
+        scores, logits = self.decoder(
+            input_points=(points_xy * scale)[None, :, None, :],
+            input_labels=np.ones((1, len(points_xy), 1)),
+            image_embeddings=encoded.embeddings,
+            image_positional_embeddings=encoded.positional,
+        )
+        require_three_heads(self.decoder.path, scores, logits)
+        return scores[0], logits[0]
+
+
+def valid_low_resolution(low_hw: tuple[int, int], frame: Frame) -> tuple[int, int]:
+    """Rows and columns of the low-resolution masks that touch the image; the rest is padding."""
+    return (
+        -(-frame.resized_hw[0] * low_hw[0] // frame.padded_hw[0]),
+        -(-frame.resized_hw[1] * low_hw[1] // frame.padded_hw[1]),
+    )
+
+
+def stability_of(logits: Int8[np.ndarray, "K h w"], offset: float, frame: Frame) -> Float32[np.ndarray, " K"]:
+    """IoU of the masks at logit thresholds +offset and -offset; 0 where the larger one is empty.
+
+    Departs: SAM counts pixels of the full-size mask; we count low-resolution ones, which saves the
+    upscaling of masks that are dropped.
+    """
+    height, width = valid_low_resolution((logits.shape[1], logits.shape[2]), frame)
+    inside = logits[:, :height, :width]
+    steps = offset / LOGIT_STEP
+    small = (inside > steps).sum(axis=(1, 2), dtype=np.int64)
+    large = (inside > -steps).sum(axis=(1, 2), dtype=np.int64)
+    return (small / np.maximum(large, 1)).astype(np.float32)
+
+
+def restore(logits: Int8[np.ndarray, "h w"], frame: Frame) -> Bool[np.ndarray, "H W"]:
+    """Upscale one low-resolution mask to the original image and cut it at logit 0.
+
+    Bilinear to the padded input, cropped to the resized image, bilinear to the original size.
+    """
+    padded = cv2.resize(
+        logits.astype(np.float32), (frame.padded_hw[1], frame.padded_hw[0]), interpolation=cv2.INTER_LINEAR
+    )
+    cropped = padded[: frame.resized_hw[0], : frame.resized_hw[1]]
+    if frame.resized_hw != frame.original_hw:
+        cropped = cv2.resize(
+            cropped, (frame.original_hw[1], frame.original_hw[0]), interpolation=cv2.INTER_LINEAR
+        )
+    return cropped > 0

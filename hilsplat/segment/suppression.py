@@ -1,0 +1,102 @@
+"""Dropping masks that say the same as a better one: by boxes, then by pixels."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Int64
+
+from hilsplat.base.levels import LEVELS
+from hilsplat.segment.masks import HierarchicalMasks
+
+INNER_COVERED = 0.85
+"""Share of a mask inside another one above which it counts as contained (LangSplat)."""
+
+INNER_COVERS = 0.5
+"""Share of the container that the contained mask must stay below (LangSplat)."""
+
+
+def box_iou(
+    boxes_a: Int[np.ndarray, "A 4"], boxes_b: Int[np.ndarray, "B 4"]
+) -> Float[np.ndarray, "A B"]:
+    """IoU of boxes (xyxy, px, end exclusive); 0 where both are empty."""
+    low = np.maximum(boxes_a[:, None, :2], boxes_b[None, :, :2])
+    high = np.minimum(boxes_a[:, None, 2:], boxes_b[None, :, 2:])
+    shared = np.prod(np.clip(high - low, 0, None).astype(np.float64), axis=2)
+    area_a = np.prod((boxes_a[:, 2:] - boxes_a[:, :2]).astype(np.float64), axis=1)
+    area_b = np.prod((boxes_b[:, 2:] - boxes_b[:, :2]).astype(np.float64), axis=1)
+    union = area_a[:, None] + area_b[None, :] - shared
+    return np.where(union > 0, shared / np.where(union > 0, union, 1), 0.0)
+
+
+def suppress_boxes(
+    boxes_xyxy: Int[np.ndarray, "M 4"], score: Float[np.ndarray, " M"], iou_max: float
+) -> Int64[np.ndarray, " k"]:
+    """Greedy suppression, as SAM's automatic generator does it.
+
+    The best box stays and drops every other whose IoU with it exceeds `iou_max`; then the best of
+    the rest, and so on. Equal scores go by larger area, then by the box's numbers, then by row.
+
+    Returns:
+        rows kept, ascending.
+    """
+    width_height = (boxes_xyxy[:, 2:] - boxes_xyxy[:, :2]).astype(np.int64)
+    area = width_height[:, 0] * width_height[:, 1]
+    order = np.lexsort((*boxes_xyxy.T[::-1], -area, -score))
+    boxes = boxes_xyxy[order]
+    alive = np.ones(len(boxes), dtype=bool)
+    for place in range(len(boxes)):
+        if alive[place]:
+            rest = np.flatnonzero(alive[place + 1 :]) + place + 1
+            alive[rest] = box_iou(boxes[place : place + 1], boxes[rest])[0] <= iou_max
+    return np.sort(order[alive])
+
+
+def keep_best_masks(
+    overlap_px: Int64[np.ndarray, "M M"],
+    score: Float[np.ndarray, " M"],
+    *,
+    iou_max: float,
+    score_min: float,
+    inner: float,
+) -> Bool[np.ndarray, " M"]:
+    """LangSplat's mask suppression inside one level, for rows that are already in a fixed order.
+
+    With I shared pixels and areas a, row j is dropped where any of these holds:
+    - its score is below `score_min`;
+    - a row of better score (of equal score: a lower row) has an IoU with it above `iou_max`;
+    - it sits inside a row i: `I / a_j >= 0.85`, `I / a_i < 0.5` and
+      `1 - (I / a_i) (I / a_j) > 1 - inner`. The left side exceeds 0.5, so `inner = 0.5` drops every
+      contained mask whichever score is higher, and `inner = 0` none: nesting then stands between
+      levels, or inside them too.
+    As in LangSplat, a row that is dropped itself still drops others. The result follows from three
+    comparisons of matrices, so it does not depend on the order in which rows are visited.
+    """
+    area_px = np.diagonal(overlap_px)
+    union_px = area_px[:, None] + area_px[None, :] - overlap_px
+    iou = overlap_px / union_px
+    rank = np.empty(len(score), dtype=np.int64)
+    rank[np.argsort(-score, kind="stable")] = np.arange(len(score))
+    better = rank[:, None] < rank[None, :]
+    repeated = (better & (iou > iou_max)).any(axis=0)
+    share = overlap_px / area_px[:, None]  # [i, j]: share of i inside j
+    inside = (share.T >= INNER_COVERED) & (share < INNER_COVERS)  # [i, j]: j sits in i
+    contained = (inside & (share * share.T < inner)).any(axis=0)
+    return (score >= score_min) & ~repeated & ~contained
+
+
+def suppress_masks(
+    masks: HierarchicalMasks, *, iou_max: float, score_min: float, inner: float
+) -> HierarchicalMasks:
+    """Suppress masks inside each level (`keep_best_masks`, score = predicted IoU x stability).
+
+    Rows come back in `content_order`, so shuffled input gives the same result. A level may end empty.
+    """
+    masks = masks.take(masks.content_order())
+    kept = []
+    for level in LEVELS:
+        rows = masks.rows_of(level)
+        of_level = masks.take(rows)
+        score = of_level.predicted_iou.astype(np.float64) * of_level.stability
+        keep = keep_best_masks(
+            of_level.overlaps_px(), score, iou_max=iou_max, score_min=score_min, inner=inner
+        )
+        kept.append(rows[keep])
+    return masks.take(np.concatenate(kept))

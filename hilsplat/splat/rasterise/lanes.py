@@ -1,0 +1,216 @@
+"""Sixteen float32 lanes as one numba value, so that a 4x4-pixel block is a single vector.
+
+numba turns a loop over 16 pixels into vector code only where it can prove that arrays do not
+overlap, and it spills every temporary to memory. A value of type `Lanes` is an LLVM `<16 x float>`:
+arithmetic on it is vector arithmetic and accumulators stay in registers. LLVM splits it into what
+the machine has (one register with AVX-512, two with AVX2, four with NEON).
+
+Operations, for use inside `numba.njit` functions: `+ - *` between lanes, `lanes(x)` (all lanes equal
+x), `load(array, i)`, `store(array, i, v)`, `exp2_negative(v)`, `smaller(a, b)`, `keep_ge(a, b, v)`,
+`keep_gt(a, b, v)`, `any_ge(a, b)`, `lane_sum(v)`, `reciprocal(v)`. Sums run in a fixed order.
+"""
+
+import operator
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, models, register_model
+
+WIDTH = 16
+_FLOAT = ir.FloatType()
+_INT = ir.IntType(32)
+_VECTOR = ir.VectorType(_FLOAT, WIDTH)
+_INTS = ir.VectorType(_INT, WIDTH)
+# Products and sums may fuse into one rounding; nothing may be reordered.
+_FLAGS = ("contract",)
+
+
+class LanesType(types.Type):
+    """numba type of 16 float32 values."""
+
+    def __init__(self) -> None:
+        super().__init__(name="Lanes16")
+
+
+LANES = LanesType()
+
+
+@register_model(LanesType)
+class _LanesModel(models.PrimitiveModel):
+    def __init__(self, dmm: Any, fe_type: Any) -> None:
+        super().__init__(dmm, fe_type, _VECTOR)
+
+
+def _binary(python_operator: Any, emit: Any) -> None:
+    """Teach numba one operator between two lane values."""
+
+    class Template(AbstractTemplate):
+        def generic(self, args: Any, kws: Any) -> Any:
+            return signature(LANES, LANES, LANES) if args == (LANES, LANES) else None
+
+    infer_global(python_operator)(Template)
+    lower_builtin(python_operator, LANES, LANES)(
+        lambda context, builder, sig, args: emit(builder)(*args, flags=_FLAGS)
+    )
+
+
+_binary(operator.add, lambda builder: builder.fadd)
+_binary(operator.sub, lambda builder: builder.fsub)
+_binary(operator.mul, lambda builder: builder.fmul)
+
+
+def _constant(value: float) -> ir.Constant:
+    return ir.Constant(_VECTOR, [ir.Constant(_FLOAT, value)] * WIDTH)
+
+
+def _splat(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
+    one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), scalar, ir.Constant(_INT, 0))
+    return builder.shuffle_vector(
+        one, ir.Constant(_VECTOR, ir.Undefined), ir.Constant(ir.VectorType(_INT, WIDTH), [0] * WIDTH)
+    )
+
+
+def _pointer(context: Any, builder: ir.IRBuilder, array_type: Any, array: ir.Value, index: ir.Value) -> ir.Value:
+    data = context.make_array(array_type)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index]), _VECTOR.as_pointer())
+
+
+@intrinsic
+def lanes(typingctx, scalar):
+    """All lanes equal one number."""
+
+    def codegen(context, builder, sig, args):
+        return _splat(builder, args[0])
+
+    return LANES(types.float32), codegen
+
+
+@intrinsic
+def load(typingctx, array, index):
+    """Sixteen consecutive numbers of a flat float32 array."""
+    if not (isinstance(array, types.Array) and array.dtype == types.float32 and array.ndim == 1):
+        return None
+
+    def codegen(context, builder, sig, args):
+        return builder.load(_pointer(context, builder, sig.args[0], args[0], args[1]), align=4)
+
+    return LANES(array, types.intp), codegen
+
+
+@intrinsic
+def store(typingctx, array, index, value):
+    """Write sixteen consecutive numbers of a flat float32 array."""
+    if not (isinstance(array, types.Array) and array.dtype == types.float32 and array.ndim == 1):
+        return None
+
+    def codegen(context, builder, sig, args):
+        builder.store(args[2], _pointer(context, builder, sig.args[0], args[0], args[1]), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, LANES), codegen
+
+
+@intrinsic
+def exp2_negative(typingctx, value):
+    """2**x for x in [-126, 0], relative error below 3e-7.
+
+    Truncation gives x = k + f with f in (-1, 0]; a degree-6 polynomial is 2**f and k goes into the
+    exponent bits. Lanes outside the range hold something finite or infinite, never a trap.
+    """
+
+    def codegen(context, builder, sig, args):
+        whole = builder.fptosi(args[0], _INTS)
+        rest = builder.fsub(args[0], builder.sitofp(whole, _VECTOR))
+        # Chebyshev fit of 2**f over [-1, 0], degree 6
+        result = _constant(_EXP2[-1])
+        for coefficient in reversed(_EXP2[:-1]):
+            result = builder.fadd(
+                builder.fmul(result, rest, flags=_FLAGS), _constant(coefficient), flags=_FLAGS
+            )
+        bits = builder.shl(
+            builder.add(whole, ir.Constant(_INTS, [ir.Constant(_INT, 127)] * WIDTH)),
+            ir.Constant(_INTS, [ir.Constant(_INT, 23)] * WIDTH),
+        )
+        return builder.fmul(result, builder.bitcast(bits, _VECTOR))
+
+    return LANES(LANES), codegen
+
+
+def _fit_exp2() -> tuple[float, ...]:
+    """Coefficients, constant first, of the polynomial for 2**f on [-1, 0]."""
+    import numpy as np
+
+    fit = np.polynomial.chebyshev.Chebyshev.interpolate(np.exp2, 6, domain=[-1, 0])
+    return tuple(float(np.float32(c)) for c in fit.convert(kind=np.polynomial.Polynomial).coef)
+
+
+_EXP2 = _fit_exp2()
+
+
+def _select(condition: str, doc: str) -> Any:
+    def keep(typingctx, left, right, value):
+        def codegen(context, builder, sig, args):
+            return builder.select(
+                builder.fcmp_ordered(condition, args[0], args[1]), args[2], ir.Constant(_VECTOR, None)
+            )
+
+        return LANES(LANES, LANES, LANES), codegen
+
+    keep.__doc__ = doc
+    return intrinsic(keep)
+
+
+keep_ge = _select(">=", "Lanes of `value` where left >= right, 0 elsewhere.")
+keep_gt = _select(">", "Lanes of `value` where left > right, 0 elsewhere.")
+keep_lt = _select("<", "Lanes of `value` where left < right, 0 elsewhere.")
+
+
+@intrinsic
+def smaller(typingctx, left, right):
+    """Lane-wise minimum."""
+
+    def codegen(context, builder, sig, args):
+        return builder.select(builder.fcmp_ordered("<", args[0], args[1]), args[0], args[1])
+
+    return LANES(LANES, LANES), codegen
+
+
+@intrinsic
+def any_ge(typingctx, left, right):
+    """Whether left >= right in any lane."""
+
+    def codegen(context, builder, sig, args):
+        mask = builder.bitcast(builder.fcmp_ordered(">=", args[0], args[1]), ir.IntType(WIDTH))
+        return builder.icmp_unsigned("!=", mask, ir.Constant(ir.IntType(WIDTH), 0))
+
+    return types.boolean(LANES, LANES), codegen
+
+
+@intrinsic
+def lane_sum(typingctx, value):
+    """Sum of the lanes: halves are added to halves, so the order is fixed."""
+
+    def codegen(context, builder, sig, args):
+        vector, width = args[0], WIDTH
+        while width > 1:
+            width //= 2
+            undefined = ir.Constant(vector.type, ir.Undefined)
+            half = ir.VectorType(_INT, width)
+            low = builder.shuffle_vector(vector, undefined, ir.Constant(half, list(range(width))))
+            high = builder.shuffle_vector(vector, undefined, ir.Constant(half, list(range(width, 2 * width))))
+            vector = builder.fadd(low, high)
+        return builder.extract_element(vector, ir.Constant(_INT, 0))
+
+    return types.float32(LANES), codegen
+
+
+@intrinsic
+def reciprocal(typingctx, value):
+    """1 / x in every lane."""
+
+    def codegen(context, builder, sig, args):
+        return builder.fdiv(_constant(1.0), args[0])
+
+    return LANES(LANES), codegen

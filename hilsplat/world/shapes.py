@@ -1,0 +1,267 @@
+"""Triangle meshes from a few primitives: boxes, lathed profiles, swept tubes, extruded outlines."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float
+
+SMOOTH_BELOW_DEG = 40.0
+"""Lathed profiles are shaded smoothly over corners that turn by less, sharply over others."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """F triangles with a shading normal per corner; z is up.
+
+    Attributes:
+        triangles: corner positions.
+        normals: unit normals at the corners, pointing outwards.
+    """
+
+    triangles: Float[np.ndarray, "F 3 3"]
+    normals: Float[np.ndarray, "F 3 3"]
+
+    def __len__(self) -> int:
+        return len(self.triangles)
+
+    def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Mesh":
+        """Shift the mesh."""
+        return Mesh(self.triangles + np.array([x, y, z]), self.normals)
+
+    def scaled(self, x: float, y: float | None = None, z: float | None = None) -> "Mesh":
+        """Scale about the origin; one factor scales all axes. Factors are positive."""
+        factors = np.array([x, x if y is None else y, x if z is None else z])
+        return Mesh(self.triangles * factors, _unit(self.normals / factors))
+
+    def turned(self, axis: str, degrees: float) -> "Mesh":
+        """Rotate about a coordinate axis, right-handed."""
+        rotation = rotation_about(axis, degrees)
+        return Mesh(self.triangles @ rotation.T, self.normals @ rotation.T)
+
+
+def rotation_about(axis: str, degrees: float) -> Float[np.ndarray, "3 3"]:
+    """Right-handed rotation matrix about "x", "y" or "z"."""
+    angle = np.radians(degrees)
+    c, s = np.cos(angle), np.sin(angle)
+    first, second = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    rotation = np.eye(3)
+    rotation[first, first] = rotation[second, second] = c
+    rotation[first, second], rotation[second, first] = -s, s
+    return rotation
+
+
+def joined(*meshes: Mesh) -> Mesh:
+    """Several meshes as one."""
+    return Mesh(
+        np.concatenate([mesh.triangles for mesh in meshes]), np.concatenate([mesh.normals for mesh in meshes])
+    )
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
+
+def _flat(triangles: np.ndarray) -> Mesh:
+    """Flat-shaded mesh: each corner takes the normal of its triangle; degenerate triangles go."""
+    triangles = np.asarray(triangles, dtype=np.float64)
+    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    keep = np.linalg.norm(normal, axis=1) > 1e-12
+    return Mesh(triangles[keep], np.repeat(_unit(normal[keep])[:, None], 3, axis=1))
+
+
+def _fan(polygon: np.ndarray) -> list[np.ndarray]:
+    return [np.stack([polygon[0], polygon[i], polygon[i + 1]]) for i in range(1, len(polygon) - 1)]
+
+
+def box(
+    size: tuple[float, float, float], centre: tuple[float, float, float] = (0.0, 0.0, 0.0), bevel: float = 0.0
+) -> Mesh:
+    """Axis-aligned box with its edges cut off by `bevel`.
+
+    Args:
+        size: lengths along x, y, z.
+        centre: middle of the box.
+        bevel: length cut off each edge; 0 gives 12 triangles, else 44.
+    """
+    half = np.asarray(size, dtype=np.float64) / 2
+    bevel = float(min(bevel, 0.45 * 2 * half.min()))
+    triangles: list[np.ndarray] = []
+
+    def corner(signs: Sequence[float], inset_axis: int) -> np.ndarray:
+        """Corner of the face whose normal is `inset_axis`: full there, inset by the bevel elsewhere."""
+        inset = np.full(3, bevel)
+        inset[inset_axis] = 0.0
+        return np.asarray(signs) * (half - inset)
+
+    def add(polygon: list[np.ndarray]) -> None:
+        points = np.stack(polygon)
+        normal = np.cross(points[1] - points[0], points[2] - points[0])
+        if normal @ points.mean(axis=0) < 0:
+            points = points[::-1]
+        triangles.extend(_fan(points))
+
+    for axis in range(3):
+        b, c = (axis + 1) % 3, (axis + 2) % 3
+        for sign in (-1.0, 1.0):
+            quad = []
+            for sb, sc in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+                signs = np.empty(3)
+                signs[axis], signs[b], signs[c] = sign, sb, sc
+                quad.append(corner(signs, axis))
+            add(quad)
+    if bevel > 0:
+        for axis in range(3):
+            b, c = (axis + 1) % 3, (axis + 2) % 3
+            for sb in (-1.0, 1.0):
+                for sc in (-1.0, 1.0):
+                    ends = []
+                    for sa in (-1.0, 1.0):
+                        signs = np.empty(3)
+                        signs[axis], signs[b], signs[c] = sa, sb, sc
+                        ends.append(signs)
+                    add([corner(ends[0], b), corner(ends[1], b), corner(ends[1], c), corner(ends[0], c)])
+        for sx in (-1.0, 1.0):
+            for sy in (-1.0, 1.0):
+                for sz in (-1.0, 1.0):
+                    signs = np.array([sx, sy, sz])
+                    add([corner(signs, 0), corner(signs, 1), corner(signs, 2)])
+    return _flat(np.stack(triangles)).moved(*centre)
+
+
+def lathe(profile: Sequence[tuple[float, float]], segments: int = 28) -> Mesh:
+    """Surface of revolution about z.
+
+    Args:
+        profile: (radius, z) from bottom to top along the outside, so that normals point outwards.
+        segments: facets around the axis.
+    """
+    points = np.asarray(profile, dtype=np.float64)
+    steps = np.diff(points, axis=0)
+    keep = np.concatenate([[True], np.linalg.norm(steps, axis=1) > 1e-9])
+    points = points[keep]
+    steps = np.diff(points, axis=0)
+    normals = _unit(np.stack([steps[:, 1], -steps[:, 0]], axis=1))  # (radial, z) of each piece
+    smooth = np.cos(np.radians(SMOOTH_BELOW_DEG))
+    angle = np.linspace(0, 2 * np.pi, segments + 1)
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    ring[-1] = ring[0]
+    triangles, shading = [], []
+    for i, (low, high) in enumerate(pairwise(points)):
+        own = normals[i]
+        below = normals[i - 1] if i > 0 and normals[i - 1] @ own > smooth else own
+        above = normals[i + 1] if i + 1 < len(normals) and normals[i + 1] @ own > smooth else own
+        normal_low, normal_high = _unit(own + below), _unit(own + above)
+
+        def around(value: np.ndarray) -> np.ndarray:
+            return np.concatenate(
+                [ring * value[0], np.full((len(ring), 1), value[1])], axis=1
+            )  # (segments + 1, 3)
+
+        p0, p1, n0, n1 = around(low), around(high), around(normal_low), around(normal_high)
+        if low[0] > 1e-9:
+            triangles.append(np.stack([p0[:-1], p0[1:], p1[1:]], axis=1))
+            shading.append(np.stack([n0[:-1], n0[1:], n1[1:]], axis=1))
+        if high[0] > 1e-9:
+            triangles.append(np.stack([p0[:-1], p1[1:], p1[:-1]], axis=1))
+            shading.append(np.stack([n0[:-1], n1[1:], n1[:-1]], axis=1))
+    return Mesh(np.concatenate(triangles), _unit(np.concatenate(shading)))
+
+
+def cylinder(radius: float, bottom: float, top: float, segments: int = 28, bevel: float = 0.0) -> Mesh:
+    """Closed upright cylinder about z."""
+    if bevel <= 0:
+        return lathe([(0, bottom), (radius, bottom), (radius, top), (0, top)], segments)
+    return lathe(
+        [
+            (0, bottom),
+            (radius - bevel, bottom),
+            (radius, bottom + bevel),
+            (radius, top - bevel),
+            (radius - bevel, top),
+            (0, top),
+        ],
+        segments,
+    )
+
+
+def ellipsoid(
+    radii: tuple[float, float, float],
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    segments: int = 24,
+    rings: int = 12,
+) -> Mesh:
+    """Ellipsoid with the given half axes."""
+    angle = np.linspace(-np.pi / 2, np.pi / 2, rings + 1)
+    profile = [(max(0.0, float(np.cos(a))), float(np.sin(a))) for a in angle]
+    profile[0], profile[-1] = (0.0, -1.0), (0.0, 1.0)
+    return lathe(profile, segments).scaled(*radii).moved(*centre)
+
+
+def sphere(radius: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0), segments: int = 24) -> Mesh:
+    """Sphere."""
+    return ellipsoid((radius, radius, radius), centre, segments)
+
+
+def sweep(path: Sequence[Sequence[float]], radius: float | Sequence[float], segments: int = 12) -> Mesh:
+    """Round tube along a polyline, closed at both ends.
+
+    Args:
+        path: points of the centre line.
+        radius: of the tube, one for all points or one each.
+        segments: facets around the tube.
+    """
+    points = np.asarray(path, dtype=np.float64)
+    radii = np.broadcast_to(np.asarray(radius, dtype=np.float64), (len(points),))
+    tangents = _unit(np.gradient(points, axis=0))
+    reference = np.eye(3)[np.argmin(np.abs(tangents[0]))]
+    side = _unit(np.cross(tangents[0], reference))
+    angle = np.linspace(0, 2 * np.pi, segments + 1)
+    rings, normals = [], []
+    for point, tangent, r in zip(points, tangents, radii, strict=True):
+        side = _unit(side - (side @ tangent) * tangent)  # carried along: the tube does not twist
+        other = np.cross(tangent, side)
+        direction = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * other
+        direction[-1] = direction[0]
+        rings.append(point + r * direction)
+        normals.append(direction)
+    triangles, shading = [], []
+    for (p0, p1), (n0, n1) in zip(pairwise(rings), pairwise(normals), strict=True):
+        triangles += [np.stack([p0[:-1], p0[1:], p1[1:]], axis=1), np.stack([p0[:-1], p1[1:], p1[:-1]], axis=1)]
+        shading += [np.stack([n0[:-1], n0[1:], n1[1:]], axis=1), np.stack([n0[:-1], n1[1:], n1[:-1]], axis=1)]
+    first = np.broadcast_to(points[0], (segments, 3))
+    last = np.broadcast_to(points[-1], (segments, 3))
+    caps = _flat(
+        np.concatenate(
+            [
+                np.stack([first, rings[0][1:], rings[0][:-1]], axis=1),
+                np.stack([last, rings[-1][:-1], rings[-1][1:]], axis=1),
+            ]
+        )
+    )
+    return joined(Mesh(np.concatenate(triangles), _unit(np.concatenate(shading))), caps)
+
+
+def arc(
+    radii: tuple[float, float], start_deg: float, stop_deg: float, steps: int = 14
+) -> list[tuple[float, float, float]]:
+    """Points of an elliptic arc in the x-z plane, as a path for `sweep`; 0 degrees is +x, 90 is +z."""
+    angle = np.radians(np.linspace(start_deg, stop_deg, steps + 1))
+    return [(float(radii[0] * np.cos(a)), 0.0, float(radii[1] * np.sin(a))) for a in angle]
+
+
+def extrude(outline: Sequence[tuple[float, float]], depth: float) -> Mesh:
+    """Prism over a convex outline in the x-z plane, from y = -depth/2 to y = +depth/2."""
+    points = np.asarray(outline, dtype=np.float64)
+    shifted = np.roll(points, -1, axis=0)
+    area = (points[:, 0] * shifted[:, 1] - shifted[:, 0] * points[:, 1]).sum()
+    if area < 0:  # counter-clockwise as seen from -y, so that normals point outwards
+        points = points[::-1]
+    front = np.insert(points, 1, -depth / 2, axis=1)
+    back = np.insert(points, 1, depth / 2, axis=1)
+    triangles = [*_fan(front), *_fan(back[::-1])]
+    for i in range(len(points)):
+        j = (i + 1) % len(points)
+        triangles += [np.stack([front[i], back[j], front[j]]), np.stack([front[i], back[i], back[j]])]
+    return _flat(np.stack(triangles))

@@ -1,0 +1,101 @@
+"""A small CLIP: crops of masked regions and short phrases, in one space of 128 dimensions."""
+
+from collections.abc import Iterable
+
+import torch
+from jaxtyping import Float, Int64
+from tokenizers import Tokenizer, models, normalizers, pre_tokenizers
+from torch import Tensor, nn
+from torch.nn import functional
+
+from hilsplat.world.tiny_sam import Residual, convolution
+
+CROP_PX = 64
+"""Side of the crops that the model takes."""
+DIMENSIONS = 128
+PAD, UNKNOWN = "[PAD]", "[UNK]"
+MAX_WORDS = 16
+
+CANONICAL = ("object", "things", "stuff", "texture")
+"""The phrases that mean nothing in particular; relevancy compares queries with them (LERF)."""
+
+
+def word_tokenizer(phrases: Iterable[str]) -> Tokenizer:
+    """One token per lower-case word of the phrases; id 0 pads, id 1 stands for any other word."""
+    splitter = pre_tokenizers.Whitespace()
+    words = sorted({word for phrase in phrases for word, _ in splitter.pre_tokenize_str(phrase.lower())})
+    vocabulary = {word: row for row, word in enumerate([PAD, UNKNOWN, *words])}
+    tokenizer = Tokenizer(models.WordLevel(vocabulary, unk_token=UNKNOWN))
+    tokenizer.normalizer = normalizers.Lowercase()
+    tokenizer.pre_tokenizer = splitter
+    tokenizer.enable_padding(pad_id=0, pad_token=PAD)
+    tokenizer.enable_truncation(MAX_WORDS)
+    return tokenizer
+
+
+class ClipVision(nn.Module):
+    """Crop (B, 3, 64, 64) to a unit vector (B, 128)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            convolution(3, 32, stride=2),
+            convolution(32, 64, stride=2),
+            Residual(64),
+            convolution(64, 128, stride=2),
+            Residual(128),
+            convolution(128, 160, stride=2),
+            Residual(160),
+        )
+        self.project = nn.Linear(160, DIMENSIONS)
+
+    def forward(self, pixels: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B D"]:
+        """Unit vectors."""
+        return functional.normalize(self.project(self.layers(pixels).mean(dim=(2, 3))), dim=-1)
+
+
+class ClipText(nn.Module):
+    """Words (B, W) to a unit vector (B, 128): one attention layer and the mean over words."""
+
+    def __init__(self, num_words: int, width: int = 96) -> None:
+        super().__init__()
+        self.words = nn.Embedding(num_words, width)
+        self.attend = nn.Linear(width, 3 * width)
+        self.hidden = nn.Sequential(nn.Linear(width, 2 * width), nn.ReLU(), nn.Linear(2 * width, width))
+        self.project = nn.Linear(width, DIMENSIONS)
+        self.width = width
+
+    def forward(self, words: Int64[Tensor, "B W"], mask: Int64[Tensor, "B W"]) -> Float[Tensor, "B D"]:
+        """Unit vectors; `mask` is 1 where there is a word."""
+        present = mask.to(self.words.weight.dtype)
+        x = self.words(words)
+        query, key, value = self.attend(x).split(self.width, dim=-1)
+        affinity = torch.matmul(query, key.transpose(1, 2)) / self.width**0.5
+        affinity = affinity + (present[:, None, :] - 1) * 1e4
+        x = x + torch.matmul(torch.softmax(affinity, dim=-1), value)
+        x = x + self.hidden(x)
+        pooled = (x * present[..., None]).sum(dim=1) / present.sum(dim=1, keepdim=True).clamp(min=1.0)
+        return functional.normalize(self.project(pooled), dim=-1)
+
+
+def contrastive_loss(
+    image: Float[Tensor, "B D"],
+    text: Float[Tensor, "B D"],
+    valid: Float[Tensor, "B B"],
+    scale: Float[Tensor, ""],
+) -> Float[Tensor, ""]:
+    """Symmetric contrastive loss in which one crop may have several right captions in the batch.
+
+    Args:
+        image: unit vectors of crops.
+        text: unit vectors of captions; caption i was drawn for crop i.
+        valid: 1 where caption j is true of crop i; the diagonal is all ones.
+        scale: factor on the cosines (inverse temperature).
+
+    Returns:
+        mean of both directions' cross-entropy against uniform targets on the valid pairs.
+    """
+    logits = scale * image @ text.T
+    by_image = -(valid * torch.log_softmax(logits, dim=1)).sum(dim=1) / valid.sum(dim=1)
+    by_text = -(valid * torch.log_softmax(logits, dim=0)).sum(dim=0) / valid.sum(dim=0)
+    return (by_image.mean() + by_text.mean()) / 2

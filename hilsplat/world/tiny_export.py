@@ -1,0 +1,206 @@
+"""Write the small models in the layout of the Hugging Face ONNX exports of SAM and CLIP."""
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from onnx import numpy_helper
+from tokenizers import Tokenizer
+from torch import Tensor, nn
+
+from hilsplat.base.artifacts import atomic_path, write_json
+from hilsplat.world.tiny_clip import CROP_PX, DIMENSIONS, ClipText, ClipVision
+from hilsplat.world.tiny_sam import FRAME_PX, MASK_STRIDE, STRIDE, SamDecoder, SamEncoder, positional_embeddings
+
+MEAN = (0.485, 0.456, 0.406)
+STD = (0.229, 0.224, 0.225)
+OPSET = 18
+HALF_FROM = 64
+"""Initialisers with at least this many numbers are stored as float16."""
+
+
+class _VisionEncoder(nn.Module):
+    """The encoder together with the positional embeddings of a whole frame."""
+
+    def __init__(self, encoder: SamEncoder) -> None:
+        super().__init__()
+        self.encoder = encoder
+        whole = torch.tensor([[0.0, 0.0, 1.0]])
+        self.register_buffer("positional", positional_embeddings(whole, FRAME_PX // STRIDE))
+
+    def forward(self, pixel_values: Tensor) -> tuple[Tensor, Tensor]:
+        embeddings = self.encoder(pixel_values)
+        return embeddings, self.positional.expand(pixel_values.shape[0], -1, -1, -1)
+
+
+def store_as_half(model: onnx.ModelProto) -> onnx.ModelProto:
+    """Store large float32 initialisers as float16, each behind a Cast: half the size, float32 arithmetic."""
+    graph = model.graph
+    casts = []
+    for initializer in list(graph.initializer):
+        values = numpy_helper.to_array(initializer)
+        if values.dtype != np.float32 or values.size < HALF_FROM:
+            continue
+        name = initializer.name
+        half = numpy_helper.from_array(values.astype(np.float16), f"{name}_half")
+        graph.initializer.remove(initializer)
+        graph.initializer.append(half)
+        casts.append(onnx.helper.make_node("Cast", [half.name], [name], to=onnx.TensorProto.FLOAT))
+    for cast in reversed(casts):
+        graph.node.insert(0, cast)
+    onnx.checker.check_model(model)
+    return model
+
+
+def export_onnx(
+    module: nn.Module,
+    inputs: dict[str, Tensor],
+    outputs: dict[str, dict[int, str]],
+    dynamic: dict[str, dict[int, str]],
+    path: Path,
+) -> None:
+    """Trace a module and write it with half-size weights.
+
+    Args:
+        module: put into evaluation mode.
+        inputs: example inputs by name, in the order of the module's arguments.
+        outputs: names of the outputs and their dynamic axes.
+        dynamic: dynamic axes of the inputs.
+        path: the .onnx file.
+    """
+    module.eval()
+    with atomic_path(path) as temporary:
+        with warnings.catch_warnings():
+            # The tracing exporter is deprecated but needs no further package and names axes as we want.
+            warnings.simplefilter("ignore")
+            torch.onnx.export(
+                module,
+                tuple(inputs.values()),
+                str(temporary),
+                input_names=list(inputs),
+                output_names=list(outputs),
+                dynamic_axes={**dynamic, **outputs},
+                opset_version=OPSET,
+                dynamo=False,
+            )
+        model = store_as_half(onnx.load(str(temporary)))
+        temporary.write_bytes(model.SerializeToString(deterministic=True))
+
+
+def export_sam(encoder: SamEncoder, decoder: SamDecoder, folder: Path) -> None:
+    """Write `config.json`, `preprocessor_config.json` and the two networks of SAM's layout."""
+    folder = Path(folder)
+    vision = _VisionEncoder(encoder).eval()
+    pixels = torch.zeros(1, 3, FRAME_PX, FRAME_PX)
+    export_onnx(
+        vision,
+        {"pixel_values": pixels},
+        {"image_embeddings": {0: "batch"}, "image_positional_embeddings": {0: "batch"}},
+        {"pixel_values": {0: "batch"}},
+        folder / "onnx" / "vision_encoder.onnx",
+    )
+    with torch.no_grad():
+        embeddings, positional = vision(pixels)
+    export_onnx(
+        decoder,
+        {
+            # Two points of a prompt and three prompts: axes of length one would be traced as constants.
+            "input_points": torch.full((2, 3, 2, 2), FRAME_PX / 2.0),
+            "input_labels": torch.ones((2, 3, 2), dtype=torch.int64),
+            "image_embeddings": embeddings.repeat(2, 1, 1, 1),
+            "image_positional_embeddings": positional.repeat(2, 1, 1, 1),
+        },
+        {
+            "iou_scores": {0: "batch", 1: "prompts"},
+            "pred_masks": {0: "batch", 1: "prompts"},
+        },
+        {
+            "input_points": {0: "batch", 1: "prompts", 2: "points"},
+            "input_labels": {0: "batch", 1: "prompts", 2: "points"},
+            "image_embeddings": {0: "batch"},
+            "image_positional_embeddings": {0: "batch"},
+        },
+        folder / "onnx" / "prompt_encoder_mask_decoder.onnx",
+    )
+    write_json(
+        folder / "config.json",
+        {
+            "model_type": "sam",
+            "architectures": ["TinySam"],
+            "image_size": FRAME_PX,
+            "mask_size": FRAME_PX // MASK_STRIDE,
+            "num_multimask_outputs": 3,
+            "world_only": True,
+        },
+    )
+    write_json(
+        folder / "preprocessor_config.json",
+        {
+            "image_processor_type": "SamImageProcessor",
+            "do_convert_rgb": True,
+            "do_resize": True,
+            "size": {"longest_edge": FRAME_PX},
+            "resample": 2,
+            "do_rescale": True,
+            "rescale_factor": 1 / 255,
+            "do_normalize": True,
+            "image_mean": list(MEAN),
+            "image_std": list(STD),
+            "do_pad": True,
+            "pad_size": {"height": FRAME_PX, "width": FRAME_PX},
+        },
+    )
+
+
+def export_clip(vision: ClipVision, text: ClipText, tokenizer: Tokenizer, folder: Path) -> None:
+    """Write `config.json`, `preprocessor_config.json`, `tokenizer.json` and the two networks of CLIP's layout."""
+    folder = Path(folder)
+    export_onnx(
+        vision,
+        {"pixel_values": torch.zeros(2, 3, CROP_PX, CROP_PX)},
+        {"image_embeds": {0: "batch"}},
+        {"pixel_values": {0: "batch"}},
+        folder / "onnx" / "vision_model.onnx",
+    )
+    export_onnx(
+        text,
+        {
+            "input_ids": torch.ones(2, 3, dtype=torch.int64),
+            "attention_mask": torch.ones(2, 3, dtype=torch.int64),
+        },
+        {"text_embeds": {0: "batch"}},
+        {"input_ids": {0: "batch", 1: "words"}, "attention_mask": {0: "batch", 1: "words"}},
+        folder / "onnx" / "text_model.onnx",
+    )
+    with atomic_path(folder / "tokenizer.json") as temporary:
+        temporary.write_text(tokenizer.to_str(pretty=False) + "\n", encoding="utf-8")
+    write_json(
+        folder / "config.json",
+        {
+            "model_type": "clip",
+            "architectures": ["TinyClip"],
+            "projection_dim": DIMENSIONS,
+            "world_only": True,
+        },
+    )
+    size: dict[str, Any] = {"height": CROP_PX, "width": CROP_PX}
+    write_json(
+        folder / "preprocessor_config.json",
+        {
+            "image_processor_type": "CLIPImageProcessor",
+            "do_convert_rgb": True,
+            "do_resize": True,
+            "size": {"shortest_edge": CROP_PX},
+            "resample": 2,
+            "do_center_crop": True,
+            "crop_size": size,
+            "do_rescale": True,
+            "rescale_factor": 1 / 255,
+            "do_normalize": True,
+            "image_mean": list(MEAN),
+            "image_std": list(STD),
+        },
+    )

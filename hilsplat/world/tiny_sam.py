@@ -1,0 +1,250 @@
+"""A small promptable segmenter with SAM's interface: point prompts in, three nested masks out.
+
+Three choices make it trainable in minutes on a CPU, in a world whose objects it will meet again:
+a dense U-shaped encoder whose embedding also says, for every pixel, where the centre of the region
+it belongs to lies at each level; a decoder that is one tiny pixel network whose weights are written by
+the prompt (dynamic convolution, CondInst); and full-resolution pixel features that end with
+resize and a 3x3 convolution, so that masks show no checkerboard.
+"""
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor, nn
+from torch.nn import functional
+
+FRAME_PX = 256
+"""Side of the square frame that the exported model takes."""
+STRIDE = 4
+"""Image pixels per pixel of the embedding."""
+MASK_STRIDE = 2
+"""Image pixels per pixel of a predicted mask."""
+UNIT_PX = 32.0
+"""Relative coordinates and offsets to centres are measured in this many pixels."""
+HEADS = ("subpart", "part", "whole")
+"""Order of the three output masks, as in SAM: fine to coarse."""
+
+FINE = 4
+SEMANTIC = 64
+OFFSETS = 2 * len(HEADS)
+EMBEDDING = FINE * 4 + OFFSETS + SEMANTIC
+FREQUENCIES = 3
+POSITIONAL = 2 + 4 * FREQUENCIES
+PIXEL = 16
+HIDDEN = 16
+TOKEN = 160
+
+
+def convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+    """3x3 convolution, batch normalisation, ReLU."""
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1, bias=False),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(),
+    )
+
+
+class Residual(nn.Module):
+    """Two 3x3 convolutions around which the input passes unchanged."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = convolution(channels, channels)
+        self.second = nn.Sequential(
+            nn.Conv2d(channels, channels, 3, padding=1, bias=False), nn.BatchNorm2d(channels)
+        )
+
+    def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H W"]:
+        """Same shape as the input."""
+        return functional.relu(x + self.second(self.first(x)))
+
+
+class SamEncoder(nn.Module):
+    """Image to embedding: (B, 3, S, S) to (B, 86, S/4, S/4); S is a multiple of 32.
+
+    Channels of the embedding: 16 that hold 4 features at stride 2 (pixel-unshuffled, nothing lost),
+    6 offsets from a pixel to the centre of its region per head (x, y; in units of 32 px), and 64 that
+    say what the pixel shows.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stem = convolution(3, 24, stride=2)
+        widths = (64, 96, 144, 192)
+        depths = (2, 2, 2, 1)
+        downs, previous = [], 24
+        for width, depth in zip(widths, depths, strict=True):
+            downs.append(
+                nn.Sequential(convolution(previous, width, stride=2), *(Residual(width) for _ in range(depth)))
+            )
+            previous = width
+        self.downs = nn.ModuleList(downs)
+        self.laterals = nn.ModuleList(
+            nn.Conv2d(coarse, fine, 1) for fine, coarse in zip(widths, widths[1:], strict=False)
+        )
+        self.merges = nn.ModuleList(convolution(width, width) for width in widths[:-1])
+        self.fine = nn.Conv2d(24, FINE, 3, padding=1)
+        self.semantic = nn.Conv2d(widths[0], SEMANTIC, 3, padding=1)
+        self.offsets = nn.Sequential(convolution(widths[0], 48), nn.Conv2d(48, OFFSETS, 1))
+
+    def forward(self, pixels: Float[Tensor, "B 3 S S"]) -> Float[Tensor, "B C s s"]:
+        """Embedding at stride 4."""
+        stem = self.stem(pixels)
+        pyramid, x = [], stem
+        for down in self.downs:
+            x = down(x)
+            pyramid.append(x)
+        for scale in (2, 1, 0):
+            up = functional.interpolate(self.laterals[scale](x), scale_factor=2.0, mode="nearest")
+            x = self.merges[scale](pyramid[scale] + up)
+        fine = functional.pixel_unshuffle(self.fine(stem), STRIDE // MASK_STRIDE)
+        return torch.cat([fine, self.offsets(x), self.semantic(x)], dim=1)
+
+
+def positional_embeddings(
+    windows: Float[Tensor, "B 3"], cells: int
+) -> Float[Tensor, "B C cells cells"]:
+    """Where each cell of the embedding lies.
+
+    Args:
+        windows: x0, y0 and side of the image's window that each row of the batch shows, as shares of
+            the whole image; (0, 0, 1) is the whole image.
+        cells: side of the embedding.
+
+    Returns:
+        two channels with x and y in the network's own frame (units of 32 px), then sines and cosines
+        of the position in the whole image.
+    """
+    steps = (torch.arange(cells, dtype=torch.float32) + 0.5) / cells
+    local = steps * (cells * STRIDE / UNIT_PX)
+    channels = [
+        local[None, None, :].expand(len(windows), cells, cells),
+        local[None, :, None].expand(len(windows), cells, cells),
+    ]
+    x = (windows[:, 0, None] + steps * windows[:, 2, None])[:, None, :].expand(-1, cells, -1)
+    y = (windows[:, 1, None] + steps * windows[:, 2, None])[:, :, None].expand(-1, -1, cells)
+    for power in range(FREQUENCIES):
+        for axis in (x, y):
+            angle = axis * (torch.pi * 2**power)
+            channels += [torch.sin(angle), torch.cos(angle)]
+    return torch.stack(channels, dim=1)
+
+
+class SamDecoder(nn.Module):
+    """Prompts to masks: the prompt writes the weights of a three-layer network run at every pixel.
+
+    The pixel network sees 16 shared features, the pixel's position relative to the prompt, and, for
+    each head, how far the centre that the pixel votes for lies from the one the prompted pixel votes
+    for (difference and squared distance). All of these are affine in features shared by all prompts,
+    so its first layer is one matrix product per image.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.label = nn.Embedding(3, TOKEN)
+        self.point = nn.Linear(EMBEDDING + POSITIONAL - 2, TOKEN)
+        self.token = nn.Sequential(nn.ReLU(), nn.Linear(TOKEN, TOKEN), nn.ReLU())
+        self.mix = nn.Conv2d(OFFSETS + SEMANTIC, 24, 1)
+        self.sharpen = nn.Sequential(nn.Conv2d(24 + FINE, 24, 3, padding=1), nn.ReLU())
+        self.pixel = nn.Conv2d(24, PIXEL, 1)
+        self.inputs = PIXEL + 2 + OFFSETS + len(HEADS)
+        self.sizes = (HIDDEN * self.inputs, HIDDEN, HIDDEN * HIDDEN, HIDDEN, len(HEADS) * HIDDEN, len(HEADS))
+        self.weights = nn.Linear(TOKEN, sum(self.sizes))
+        self.quality = nn.Sequential(
+            nn.Linear(TOKEN + 3 * len(HEADS), 64), nn.ReLU(), nn.Linear(64, len(HEADS))
+        )
+        with torch.no_grad():
+            self.weights.weight.mul_(0.3)
+            # Most pixels lie outside a mask: begin there.
+            self.weights.bias[-len(HEADS) :] = -2.0
+
+    def forward(
+        self,
+        points: Float[Tensor, "B P N 2"],
+        labels: Int64[Tensor, "B P N"],
+        embeddings: Float[Tensor, "B C s s"],
+        positional: Float[Tensor, "B D s s"],
+    ) -> tuple[Float[Tensor, "B P 3"], Float[Tensor, "B P 3 h w"]]:
+        """Predicted IoU and mask logits at stride 2, heads in the order subpart, part, whole.
+
+        Args:
+            points: x, y in pixels of the encoder's frame.
+            labels: 1 inside the region, 0 outside, negative: no point (padding).
+            embeddings: from the encoder.
+            positional: from `positional_embeddings`.
+        """
+        cells = int(embeddings.shape[-1])  # constant in the exported graph
+        side = cells * (STRIDE // MASK_STRIDE)
+        grid = points / (cells * STRIDE) * 2 - 1
+        sampled = functional.grid_sample(
+            torch.cat([embeddings, positional], dim=1), grid, padding_mode="border", align_corners=False
+        ).permute(0, 2, 3, 1)  # (B, P, N, C + D)
+        valid = (labels >= 0).to(sampled.dtype)[..., None]
+        inside = (labels == 1).to(sampled.dtype)[..., None]
+        features = torch.cat([sampled[..., :EMBEDDING], sampled[..., EMBEDDING + 2 :]], dim=-1)
+        token = self.token[0](self.point(features) + self.label(labels.clamp(-1, 1) + 1)) * valid
+        token = self.token[1:](token.sum(dim=2) / valid.sum(dim=2).clamp(min=1.0))  # (B, P, T)
+
+        # What the prompt compares each pixel with: its place, and the centres it votes for.
+        here = sampled[..., EMBEDDING : EMBEDDING + 2]
+        centres = sampled[..., FINE * 4 : FINE * 4 + OFFSETS] + here.repeat(1, 1, 1, len(HEADS))
+        anchor = torch.cat([here, centres], dim=-1) * inside
+        anchor = anchor.sum(dim=2) / inside.sum(dim=2).clamp(min=1.0)  # (B, P, 2 + 6)
+
+        shared = self.shared_features(embeddings, positional, side)  # (B, K, h * w)
+        parts = self.weights(token).split(self.sizes, dim=-1)
+        first = parts[0].unflatten(-1, (HIDDEN, self.inputs))
+        first, bias = _around_anchor(first, parts[1], anchor)
+        hidden = torch.matmul(first.flatten(1, 2), shared).unflatten(1, (-1, HIDDEN))  # (B, P, H, n)
+        hidden = functional.relu(hidden + bias[..., None])
+        second = parts[2].unflatten(-1, (HIDDEN, HIDDEN))
+        hidden = functional.relu(torch.matmul(second, hidden) + parts[3][..., None])
+        third = parts[4].unflatten(-1, (len(HEADS), HIDDEN))
+        logits = torch.matmul(third, hidden) + parts[5][..., None]  # (B, P, 3, n)
+        return self.predicted_iou(token, logits), logits.unflatten(-1, (side, side))
+
+    def shared_features(
+        self, embeddings: Float[Tensor, "B C s s"], positional: Float[Tensor, "B D s s"], side: int
+    ) -> Float[Tensor, "B K n"]:
+        """Features of every pixel at stride 2, the same for all prompts of an image."""
+        fine = functional.pixel_shuffle(embeddings[:, : FINE * 4], STRIDE // MASK_STRIDE)
+        coarse = self.mix(embeddings[:, FINE * 4 :])
+        here = positional[:, :2]
+        centres = embeddings[:, FINE * 4 : FINE * 4 + OFFSETS] + here.repeat(1, len(HEADS), 1, 1)
+        resized = functional.interpolate(
+            torch.cat([coarse, here, centres], dim=1), size=(side, side), mode="bilinear", align_corners=False
+        )
+        pixel = self.pixel(self.sharpen(torch.cat([fine, resized[:, :24]], dim=1)))
+        place = resized[:, 24:]
+        squared = place[:, 2:].square()
+        squared = squared[:, 0::2] + squared[:, 1::2]
+        return torch.cat([pixel, place, squared], dim=1).flatten(2)
+
+    def predicted_iou(
+        self, token: Float[Tensor, "B P T"], logits: Float[Tensor, "B P 3 n"]
+    ) -> Float[Tensor, "B P 3"]:
+        """Estimate each mask's IoU from its area, its confidence and the prompt; no gradient to the mask."""
+        share = torch.sigmoid(logits.detach())
+        inside = (share > 0.5).to(share.dtype)
+        area = share.mean(dim=-1)
+        confidence = (share * inside).sum(dim=-1) / inside.sum(dim=-1).clamp(min=1.0)
+        blur = (share * (1 - share)).mean(dim=-1) / (area + 1e-3)
+        evidence = torch.cat([token.detach(), area.sqrt(), confidence, blur], dim=-1)
+        return torch.sigmoid(self.quality(evidence))
+
+
+def _around_anchor(
+    weights: Float[Tensor, "B P H K"], bias: Float[Tensor, "B P H"], anchor: Float[Tensor, "B P 8"]
+) -> tuple[Float[Tensor, "B P H K"], Float[Tensor, "B P H"]]:
+    """Turn a layer on prompt-relative inputs into the same layer on shared inputs.
+
+    With a the anchor and c a pixel's place, w.(c - a) = w.c - w.a, and
+    q |c - a|^2 = q |c|^2 - 2 q a.c + q |a|^2: the squared term only shifts the linear weights.
+    """
+    linear = weights[..., PIXEL : PIXEL + 2 + OFFSETS]  # (B, P, H, 8)
+    square = weights[..., PIXEL + 2 + OFFSETS :]  # (B, P, H, 3)
+    near = anchor[:, :, None, :]
+    centre = anchor[:, :, None, 2:]
+    doubled = square.repeat_interleave(2, dim=-1)  # one per x and y of each head's centre
+    shifted = torch.cat([linear[..., :2], linear[..., 2:] - 2 * doubled * centre], dim=-1)
+    constant = (doubled * centre.square()).sum(dim=-1) - (linear * near).sum(dim=-1)
+    return torch.cat([weights[..., :PIXEL], shifted, square], dim=-1), bias + constant

@@ -1,0 +1,156 @@
+# What every rule uses: the validated configuration, the scenes, settings and code digests as
+# parameters, and the rule that shares stages between variants.
+import json
+import os
+import re
+from pathlib import Path
+
+from snakemake.exceptions import WorkflowError
+
+from hilsplat.base.artifacts import sha256_of_path
+from hilsplat.base.code_hash import code_hash as code_of
+from hilsplat.base.errors import HilsplatError
+from hilsplat.cli import STAGE_MODULES
+from hilsplat.scene.sheet import read_sheet
+from hilsplat.settings import UPSTREAM, parse_run
+
+
+def or_stop(function, *arguments):
+    """Call, and turn an error that a user can fix into Snakemake's own, without a traceback."""
+    try:
+        return function(*arguments)
+    except HilsplatError as error:
+        raise WorkflowError(str(error)) from None
+
+
+RUN = or_stop(parse_run, config)
+ALL_SCENES = or_stop(read_sheet, Path(RUN.scenes))
+SCENES = [
+    row
+    for row in ALL_SCENES
+    if row.group in RUN.groups and (not RUN.only or row.scene in RUN.only)
+]
+if not SCENES:
+    raise WorkflowError(
+        f"no scene to run: groups {list(RUN.groups)}, only {list(RUN.only)}; "
+        f"{RUN.scenes} holds {[f'{row.scene} ({row.group})' for row in ALL_SCENES]}"
+    )
+
+RESULTS = "results"
+SCENE = RESULTS + "/{dataset}/{scene}"
+VARIANT = SCENE + "/{variant}"
+CACHE = RESULTS + "/.cache"
+
+# With at least as many scenes as cores, one thread a job keeps all cores busy.
+THREADS = max(1, (workflow.cores or 1) // min(len(SCENES), workflow.cores or 1))
+
+
+def any_of(names):
+    """Regular expression that matches exactly these names."""
+    return "|".join(sorted({re.escape(name) for name in names}))
+
+
+def row_of(wildcards):
+    """Row of the scene sheet that the wildcards name."""
+    for row in ALL_SCENES:
+        if (row.dataset, row.scene) == (wildcards.dataset, wildcards.scene):
+            return row
+    raise WorkflowError(f"{wildcards.dataset}/{wildcards.scene} is not in {RUN.scenes}")
+
+
+def scopes_of(row):
+    return (row.group, f"{row.dataset}/{row.scene}")
+
+
+def stages_of(wildcards):
+    """All settings of a scene and, where the wildcards hold one, a variant."""
+    variant = getattr(wildcards, "variant", "default")
+    return or_stop(RUN.stages, variant, scopes_of(row_of(wildcards)))
+
+
+def settings_of(section):
+    """Parameter: a section's settings for this scene and variant, as JSON."""
+    return lambda wildcards: getattr(stages_of(wildcards), section).model_dump_json()
+
+
+def code(stage):
+    """Parameter: digest of the code that a stage runs."""
+    return or_stop(code_of, STAGE_MODULES[stage])
+
+
+def shared_variant(stage, wildcards):
+    """First variant whose settings, up to this stage, equal those of the wildcards' variant.
+
+    A sweep over Omega thus retrains fields and shares masks, trees and embeddings with `default`.
+    """
+    scopes = scopes_of(row_of(wildcards))
+    wanted = or_stop(RUN.stages, wildcards.variant, scopes)
+    for name in RUN.variant_names():
+        other = or_stop(RUN.stages, name, scopes)
+        if all(getattr(other, section) == getattr(wanted, section) for section in UPSTREAM[stage]):
+            return name
+    return wildcards.variant
+
+
+def shared(stage, path):
+    """Input function: a stage's output under the variant that it is shared with."""
+    return lambda wildcards: f"{RESULTS}/{wildcards.dataset}/{wildcards.scene}/{shared_variant(stage, wildcards)}/{path}"
+
+
+def variant_path(row, stage, variant, path):
+    """The same outside a rule: the file of a stage for a scene and variant."""
+
+    class Names:
+        dataset, scene = row.dataset, row.scene
+
+    Names.variant = variant
+    return shared(stage, path)(Names)
+
+
+def is_world(row):
+    return row.source.startswith("world:")
+
+
+def photos_of(wildcards):
+    """Files that a scene of photographs is made from; one more or one less reruns its poses."""
+    folder = Path(row_of(wildcards).source)
+    return sorted(str(path) for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
+
+
+def digest_of_model(section):
+    """Parameter: digest of the model folder that a stage reads; "none" where it reads none."""
+
+    def digest(wildcards):
+        stages = stages_of(wildcards)
+        if section == "masks" and stages.masks.segmenter != "sam":
+            return "none"
+        folder = Path(getattr(stages, section).model)
+        if not folder.is_dir():
+            return f"{folder} is missing"  # the stage itself says what to do
+        return memo_digest(folder)
+
+    return digest
+
+
+_digests = {}
+
+
+def memo_digest(folder):
+    """Digest of a folder's files, computed once while sizes and times of the files stay."""
+    if folder in _digests:
+        return _digests[folder]
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    stamp = json.dumps([[str(f), f.stat().st_size, f.stat().st_mtime_ns] for f in files])
+    memo = Path(CACHE) / "digests.json"
+    try:
+        known = json.loads(memo.read_text())
+    except (OSError, ValueError):
+        known = {}
+    if stamp not in known:
+        known[stamp] = sha256_of_path(folder)
+        memo.parent.mkdir(parents=True, exist_ok=True)
+        temporary = memo.with_suffix(f".{os.getpid()}")
+        temporary.write_text(json.dumps(known))
+        os.replace(temporary, memo)
+    _digests[folder] = known[stamp]
+    return known[stamp]

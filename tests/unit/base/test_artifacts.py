@@ -1,0 +1,95 @@
+"""Files are whole or absent; digests and caches follow content."""
+
+import errno
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilsplat.base import artifacts
+from hilsplat.base.errors import ArtifactError, DiskSpaceError
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    artifacts.write_text(path, "old")
+    with pytest.raises(RuntimeError), artifacts.atomic_path(path) as temporary:
+        temporary.write_text("half")
+        raise RuntimeError
+    assert path.read_text() == "old"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_a_failed_folder_is_absent(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError), artifacts.atomic_folder(tmp_path / "out") as folder:
+        (folder / "view.npz").write_bytes(b"x")
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_told_with_the_file_and_the_way_out(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    with pytest.raises(DiskSpaceError, match=r"no space left while writing .*a\.txt"), artifacts.atomic_path(path):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_too_little_space_is_refused_before_work_begins(tmp_path: Path) -> None:
+    with pytest.raises(DiskSpaceError, match="too little space"):
+        artifacts.require_free_space(tmp_path / "not" / "yet", 1e15)
+
+
+def test_npz_of_the_same_arrays_has_the_same_bytes(tmp_path: Path) -> None:
+    arrays = {"a": np.arange(5), "b": np.ones((2, 2), np.float32)}
+    artifacts.write_npz(tmp_path / "1.npz", **arrays)
+    artifacts.write_npz(tmp_path / "2.npz", **arrays)
+    assert (tmp_path / "1.npz").read_bytes() == (tmp_path / "2.npz").read_bytes()
+    back = artifacts.read_npz(tmp_path / "1.npz")
+    assert sorted(back) == ["a", "b"]
+    np.testing.assert_array_equal(back["b"], arrays["b"])
+
+
+def test_pickled_arrays_are_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "evil.npz", a=np.array([{"x": 1}], dtype=object))
+    with pytest.raises(ArtifactError, match=r"evil\.npz cannot be read"):
+        artifacts.read_npz(tmp_path / "evil.npz")
+
+
+def test_a_folder_without_index_is_incomplete(tmp_path: Path) -> None:
+    with pytest.raises(ArtifactError, match=r"incomplete: it has no index\.json"):
+        artifacts.read_index(tmp_path)
+
+
+def test_cache_computes_once_and_recovers_from_a_damaged_entry(tmp_path: Path) -> None:
+    calls = []
+
+    def compute() -> dict[str, np.ndarray]:
+        calls.append(1)
+        return {"x": np.array([1, 2])}
+
+    cache = artifacts.ViewCache(tmp_path)
+    key = artifacts.sha256_of_json({"image": "abc"})
+    for _ in range(2):
+        np.testing.assert_array_equal(cache.get(key, compute)["x"], [1, 2])
+    assert len(calls) == 1
+    cache.path(key).write_bytes(b"broken")
+    cache.get(key, compute)
+    assert len(calls) == 2
+
+
+def test_a_second_writer_is_refused(tmp_path: Path) -> None:
+    with (
+        artifacts.output_lock(tmp_path / "out"),
+        pytest.raises(ArtifactError, match="another process is writing"),
+        artifacts.output_lock(tmp_path / "out"),
+    ):
+        pass
+
+
+def test_folder_digest_follows_names_and_bytes(tmp_path: Path) -> None:
+    folder = tmp_path / "f"
+    folder.mkdir()
+    (folder / "a").write_bytes(b"1")
+    first = artifacts.sha256_of_path(folder)
+    (folder / "a").rename(folder / "b")
+    assert artifacts.sha256_of_path(folder) != first

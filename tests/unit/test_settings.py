@@ -1,0 +1,96 @@
+"""Settings: one default per knob, told errors, shared variants."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from snakemake.utils import update_config
+
+from hilsplat.base.errors import SettingsError
+from hilsplat.settings import SECTIONS, config_schema, parse_run, parse_section
+
+
+def load(project: Path, name: str) -> dict:
+    """A configuration file laid over config.yaml, as `snakemake --configfile` does."""
+    config = yaml.safe_load((project / "config" / "config.yaml").read_text())
+    update_config(config, yaml.safe_load((project / "config" / name).read_text()))
+    return config
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "paper.yaml", "ci.yaml"])
+def test_shipped_configurations_are_valid(project: Path, name: str) -> None:
+    parse_run(load(project, name))
+
+
+def test_a_misspelt_key_is_named_with_the_likely_one() -> None:
+    with pytest.raises(SettingsError, match=r"tree\.thetaa: unknown key; did you mean 'theta'\?"):
+        parse_run({"tree": {"thetaa": 0.5}})
+
+
+def test_a_misspelt_section_is_named() -> None:
+    with pytest.raises(SettingsError, match=r"langauge: unknown key; did you mean 'language'\?"):
+        parse_run({"langauge": {"omega": 2}})
+
+
+def test_a_value_out_of_range_is_named_with_place_and_value() -> None:
+    with pytest.raises(SettingsError, match=r"tree\.theta: Input should be less than 1; found 2"):
+        parse_run({"tree": {"theta": 2}})
+
+
+def test_a_variant_may_not_change_what_all_variants_share() -> None:
+    with pytest.raises(SettingsError, match=r"variants\.x\.poses: a variant cannot change this section"):
+        parse_run({"variants": {"x": {"poses": {"mapper": "global"}}}})
+
+
+def test_errors_inside_variants_name_the_variant() -> None:
+    with pytest.raises(SettingsError, match=r"variants\.x\.tree\.theta: Input should be less than 1"):
+        parse_run({"variants": {"x": {"tree": {"theta": 3}}}})
+
+
+def test_an_unknown_variant_is_named() -> None:
+    with pytest.raises(SettingsError, match="variant 'nope' is not defined"):
+        parse_run({"main_variants": ["nope"]})
+
+
+def test_overrides_apply_in_order_group_then_scene_then_variant() -> None:
+    run = parse_run(
+        {
+            "overrides": {"g": {"tree": {"theta": 0.6}}, "d/s": {"tree": {"theta": 0.7}}},
+            "variants": {"v": {"tree": {"theta": 0.8}}},
+        }
+    )
+    assert run.stages().tree.theta == 0.9
+    assert run.stages(scopes=("g", "d/t")).tree.theta == 0.6
+    assert run.stages(scopes=("g", "d/s")).tree.theta == 0.7
+    assert run.stages("v", scopes=("g", "d/s")).tree.theta == 0.8
+
+
+def test_every_knob_has_description_and_origin() -> None:
+    for section, model in SECTIONS.items():
+        for name, field in model.model_fields.items():
+            assert field.description, f"{section}.{name}"
+            assert field.json_schema_extra["origin"], f"{section}.{name}"
+
+
+def test_the_committed_schema_is_the_generated_one(project: Path) -> None:
+    committed = json.loads((project / "workflow" / "schemas" / "config.schema.json").read_text())
+    assert committed == json.loads(json.dumps(config_schema())), (
+        "run: hilsplat settings --schema > workflow/schemas/config.schema.json"
+    )
+
+
+def test_sections_round_trip_through_json() -> None:
+    for name, model in SECTIONS.items():
+        section = model()
+        assert parse_section(name, section.model_dump_json()) == section
+
+
+def test_the_paper_configuration_holds_the_papers_numbers(project: Path) -> None:
+    run = parse_run(load(project, "paper.yaml"))
+    stages = run.stages("paper")
+    assert stages.gaussians.iterations == 30_000
+    assert stages.masks.points_per_side == 32
+    assert (stages.tree.theta, stages.language.omega) == (0.9, 10)
+    assert (stages.language.weight_instance, stages.language.weight_part) == (1e-6, 1e-5)
+    assert stages.autoencoder.latent == 3

@@ -1,0 +1,134 @@
+"""The exported networks are what they were before export, for every batch size."""
+
+import json
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from tokenizers import Tokenizer
+
+from hilsplat.world.tiny_clip import CANONICAL, ClipText, ClipVision, word_tokenizer
+from hilsplat.world.tiny_export import export_clip, export_sam
+from hilsplat.world.tiny_sam import SamDecoder, SamEncoder, positional_embeddings
+
+
+def session(path) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+def round_to_half(module: torch.nn.Module) -> torch.nn.Module:
+    """Weights as the file stores them, so that only the arithmetic is compared."""
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter.copy_(parameter.half().float())
+    return module.eval()
+
+
+@pytest.fixture(scope="module")
+def sam(tmp_path_factory):
+    torch.manual_seed(0)
+    encoder, decoder = round_to_half(SamEncoder()), round_to_half(SamDecoder())
+    folder = tmp_path_factory.mktemp("sam")
+    export_sam(encoder, decoder, folder)
+    return encoder, decoder, folder
+
+
+@pytest.mark.parametrize(("batch", "prompts", "points"), [(1, 1, 1), (1, 5, 1), (2, 3, 2)])
+def test_exported_sam_equals_torch(sam, batch, prompts, points):
+    encoder, decoder, folder = sam
+    generator = torch.Generator().manual_seed(batch)
+    pixels = torch.randn(batch, 3, 256, 256, generator=generator)
+    points_xy = torch.rand(batch, prompts, points, 2, generator=generator) * 256
+    labels = torch.ones(batch, prompts, points, dtype=torch.int64)
+    if points > 1:
+        labels[:, 0, 1], labels[:, 1, 1] = 0, -1
+    vision = session(folder / "onnx" / "vision_encoder.onnx")
+    embeddings, positional = vision.run(None, {"pixel_values": pixels.numpy()})
+    scores, masks = session(folder / "onnx" / "prompt_encoder_mask_decoder.onnx").run(
+        ["iou_scores", "pred_masks"],
+        {
+            "input_points": points_xy.numpy(),
+            "input_labels": labels.numpy(),
+            "image_embeddings": embeddings,
+            "image_positional_embeddings": positional,
+        },
+    )
+    with torch.no_grad():
+        expected_embeddings = encoder(pixels)
+        windows = torch.tensor([[0.0, 0.0, 1.0]]).repeat(batch, 1)
+        expected_scores, expected_masks = decoder(
+            points_xy, labels, expected_embeddings, positional_embeddings(windows, 64)
+        )
+    assert masks.shape == (batch, prompts, 3, 128, 128)
+    # Batch normalisation is folded into weights before they become float16: that is the difference.
+    assert np.abs(embeddings - expected_embeddings.numpy()).max() < 5e-3
+    assert np.abs(scores - expected_scores.numpy()).max() < 1e-3
+    spread = np.abs(expected_masks.numpy()).max()
+    assert np.abs(masks - expected_masks.numpy()).max() / spread < 1e-3
+
+
+def test_padding_points_change_nothing(sam):
+    _, decoder, _ = sam
+    embeddings = torch.randn(1, 86, 64, 64, generator=torch.Generator().manual_seed(3))
+    positional = positional_embeddings(torch.tensor([[0.0, 0.0, 1.0]]), 64)
+    one = torch.tensor([[[[40.0, 90.0]]]])
+    two = torch.tensor([[[[40.0, 90.0], [0.0, 0.0]]]])
+    with torch.no_grad():
+        alone = decoder(one, torch.tensor([[[1]]]), embeddings, positional)
+        padded = decoder(two, torch.tensor([[[1, -1]]]), embeddings, positional)
+    assert torch.allclose(alone[1], padded[1], atol=1e-5)
+    assert torch.allclose(alone[0], padded[0], atol=1e-6)
+
+
+def test_sam_folder_says_how_to_prepare_an_image(sam):
+    folder = sam[2]
+    assert json.loads((folder / "config.json").read_text())["model_type"] == "sam"
+    prepare = json.loads((folder / "preprocessor_config.json").read_text())
+    assert prepare["size"] == {"longest_edge": 256}
+    assert prepare["pad_size"] == {"height": 256, "width": 256}
+
+
+def test_exported_clip_equals_torch(tmp_path):
+    torch.manual_seed(1)
+    tokenizer = word_tokenizer(["bear", "head of the bear", *CANONICAL])
+    vision = round_to_half(ClipVision())
+    text = round_to_half(ClipText(tokenizer.get_vocab_size()))
+    export_clip(vision, text, tokenizer, tmp_path)
+    for batch in (1, 3):
+        pixels = torch.randn(batch, 3, 64, 64)
+        (found,) = session(tmp_path / "onnx" / "vision_model.onnx").run(None, {"pixel_values": pixels.numpy()})
+        with torch.no_grad():
+            assert np.abs(found - vision(pixels).numpy()).max() < 1e-3
+        assert np.linalg.norm(found, axis=1) == pytest.approx(1.0, abs=1e-4)
+    stored = Tokenizer.from_file(str(tmp_path / "tokenizer.json"))
+    for phrases in (["bear"], ["bear", "the HEAD of a zebra", "object"]):
+        encoded = stored.encode_batch(phrases)
+        words = np.array([row.ids for row in encoded], dtype=np.int64)
+        mask = np.array([row.attention_mask for row in encoded], dtype=np.int64)
+        (found,) = session(tmp_path / "onnx" / "text_model.onnx").run(
+            None, {"input_ids": words, "attention_mask": mask}
+        )
+        with torch.no_grad():
+            expected = text(torch.from_numpy(words), torch.from_numpy(mask)).numpy()
+        assert np.abs(found - expected).max() < 1e-3
+
+
+def test_tokenizer_lowers_pads_and_knows_what_it_does_not_know():
+    tokenizer = word_tokenizer(["bear", "head of the bear"])
+    # words in order: bear 2, head 3, of 4, the 5
+    assert tokenizer.encode("HEAD of the Bear").ids == [3, 4, 5, 2]
+    short, long = tokenizer.encode_batch(["zebra", "the bear"])
+    assert (short.ids, short.attention_mask) == ([1, 0], [1, 0])
+    assert (long.ids, long.attention_mask) == ([5, 2], [1, 1])
+
+
+def test_a_text_does_not_depend_on_its_padding():
+    torch.manual_seed(2)
+    text = ClipText(10).eval()
+    with torch.no_grad():
+        alone = text(torch.tensor([[3, 4]]), torch.tensor([[1, 1]]))
+        padded = text(torch.tensor([[3, 4, 0, 0]]), torch.tensor([[1, 1, 0, 0]]))
+    assert torch.allclose(alone, padded, atol=1e-6)
