@@ -1,9 +1,9 @@
 # hilsplat: photographs to 3D scenes that answer text queries at three levels, and the paper's tables.
 #
-#   snakemake --cores 2                                   everything the configuration names
-#   snakemake --cores 2 results/synthetic/desk/gaussians.ply     one file and what it needs
-#   snakemake --cores 2 tables                            the tables
-#   snakemake --cores 2 report                            results/report.html
+#   snakemake --cores 2                                             everything the configuration names
+#   snakemake --cores 2 results/synthetic/table-1/gaussians.ply     one file and what it needs
+#   snakemake --cores 2 tables                                      the tables
+#   snakemake --report results/report.html                          the report of a finished run
 
 
 configfile: "config/config.yaml"
@@ -18,13 +18,6 @@ wildcard_constraints:
     variant=any_of(RUN.variant_names()),
 
 
-rule all:
-    input:
-        targets_of_tables(),
-        targets_of_figures(),
-    default_target: True
-
-
 include: "rules/world.smk"
 include: "rules/scene.smk"
 include: "rules/splat.smk"
@@ -32,6 +25,13 @@ include: "rules/segment.smk"
 include: "rules/language.smk"
 include: "rules/evaluate.smk"
 include: "rules/report.smk"
+
+
+rule all:
+    default_target: True
+    input:
+        targets_of_tables(),
+        targets_of_figures(),
 
 
 onsuccess:

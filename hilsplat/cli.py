@@ -516,7 +516,7 @@ def world_show(
 ) -> None:
     """Write a contact sheet: views, labels by level, the tree with its texts."""
     start_logging(None)
-    from hilsplat.world.stage import show_world
+    from hilsplat.world.sheet import show_world
 
     target = out or results / scene / "world.png"
     show_world(results / scene / "world", target)

@@ -33,6 +33,12 @@ class WorldSettings(Section):
     arc_deg: float = knob(360.0, "azimuth covered by the cameras; a ring is 360", unit="degree", gt=0, le=360)
     objects: int = knob(6, "objects asked for; placement reports how many fitted", unit="objects", ge=1, le=30)
     samples: int = knob(3, "sub-samples per pixel side", ge=1, le=8)
+    min_area_px: int = knob(
+        60, "wholes and parts with a smaller visible region are not scored", unit="px", ge=1
+    )
+    min_subpart_area_px: int = knob(
+        100, "the same for subparts in views of 384 px; scales with the area of the view", unit="px", ge=1
+    )
 
 
 class PosesSettings(Section):
@@ -43,7 +49,7 @@ class PosesSettings(Section):
         "auto", "lens model; auto takes simple_radial for photographs and simple_pinhole for renders"
     )
     single_camera: Literal["auto", "yes", "no"] = knob(
-        "auto", "all photographs share one camera; auto: where all sizes are equal"
+        "auto", "all photographs share one camera; auto: those of equal size and EXIF focal length do"
     )
     matcher: Literal["auto", "exhaustive", "sequential"] = knob(
         "auto", "pairs to match; auto: exhaustive up to 200 views, else sequential"
@@ -127,6 +133,9 @@ class ContributionsSettings(Section):
     """The frozen-geometry matrices."""
 
     min_weight: float = knob(1 / 255, "weights of a Gaussian at a pixel below are dropped", ge=0, lt=1)
+    keep: Literal["auto", "gram", "weights"] = knob(
+        "auto", "gram: pairs of Gaussians; weights: pixel weights of all views; auto: the one with fewer non-zeros"
+    )
 
 
 class SemanticTreeSettings(Section):
@@ -137,6 +146,13 @@ class SemanticTreeSettings(Section):
     min_member_share: float = knob(
         0.15, "a Gaussian joins its best node where more than this share of its weight lies in it", ge=0, lt=1
     )
+    min_visible_px: float = knob(
+        0.3, "a Gaussian counts as visible in a view from this mass", unit="px", ge=0
+    )
+    min_covisible: float = knob(
+        0.2, "pairs of masks that see less than this share of each other are no evidence", unit="share", ge=0, lt=1
+    )
+    min_fit: float = knob(0.25, "a mask stands for the node it fits best above this IoU in its view", ge=0, lt=1)
     parent_coverage: float = knob(0.5, "share of a node inside a coarser one that makes it a child", gt=0, lt=1)
 
 
@@ -148,6 +164,7 @@ class AutoencoderSettings(Section):
         "node", "node: the view-averaged vector of the mask's node, where it fits one; mask: its own", origin="paper: mask"
     )
     epochs: int = knob(100, "passes over all vectors", ge=1, origin="LangSplat: 100")
+    min_steps: int = knob(1500, "steps at least, however few vectors there are", ge=1)
     batch: int = knob(64, "vectors per step", ge=2, origin="LangSplat: 64")
     learning_rate: float = knob(7e-4, "Adam step", gt=0, origin="LangSplat: 7e-4")
     cosine_weight: float = knob(1e-3, "weight of 1 - cosine beside the squared error", ge=0, origin="LangSplat: 1e-3")
@@ -179,16 +196,26 @@ class EvaluateSettings(Section):
     )
     relevancy_scale: float = knob(10.0, "scale of the cosine in the relevancy", gt=0, origin="LangSplat")
     filter_px: int = knob(
-        0, "side of the mean filter; 0: 30 px at a height of 730, scaled", unit="px", ge=0, origin="LangSplat: 30, paper: 20"
+        0,
+        "side of the mean filter; 0: 30 px at a height of 730, scaled",
+        unit="px",
+        ge=0,
+        origin="LangSplat: 30, paper: 20",
     )
     mix: bool = knob(True, "average the filtered relevancy with the relevancy itself", origin="LangSplat")
-    relevancy_threshold: float = knob(0.4, "a map's mask is what exceeds it", ge=0, lt=1, origin="LangSplat, paper")
+    relevancy_threshold: float = knob(
+        0.4, "a map's mask is what exceeds it", ge=0, lt=1, origin="LangSplat, paper"
+    )
     threshold_on: Literal["normalised_pm1", "normalised_01", "raw"] = knob(
-        "normalised_pm1", "scale of the threshold; normalised_pm1: 0.4 means min-max above 0.7", origin="LangSplat's code"
+        "normalised_pm1",
+        "scale of the threshold; normalised_pm1: 0.4 means min-max above 0.7",
+        origin="LangSplat's code",
     )
     majority: bool = knob(True, "smooth a map's mask by the majority of 7 x 7 px", origin="LangSplat's code")
     level_rule: Literal["max", "mean_in_mask"] = knob(
-        "max", "level of a map where none is given: highest value, or highest mean in its mask", origin="LangSplat: max"
+        "max",
+        "level of a map where none is given: highest value, or highest mean in its mask",
+        origin="LangSplat: max",
     )
     node_select: float = knob(0.85, "nodes above this share of the best (min-max) are selected", ge=0, le=1)
     min_region_px: int = knob(60, "smaller true regions are not scored", unit="px", ge=1)

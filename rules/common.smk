@@ -1,5 +1,5 @@
-# What every rule uses: the validated configuration, the scenes, settings and code digests as
-# parameters, and the rule that shares stages between variants.
+# What all rules use, namely the validated configuration, the scenes, settings and code digests as
+# parameters, and how stages are shared between variants.
 import json
 import os
 import re
@@ -36,10 +36,8 @@ if not SCENES:
         f"{RUN.scenes} holds {[f'{row.scene} ({row.group})' for row in ALL_SCENES]}"
     )
 
-RESULTS = "results"
-SCENE = RESULTS + "/{dataset}/{scene}"
-VARIANT = SCENE + "/{variant}"
-CACHE = RESULTS + "/.cache"
+CACHE = Path("results/.cache")
+ENVIRONMENT = "../workflow/envs/hilsplat.yaml"
 
 # With at least as many scenes as cores, one thread a job keeps all cores busy.
 THREADS = max(1, (workflow.cores or 1) // min(len(SCENES), workflow.cores or 1))
@@ -63,7 +61,7 @@ def scopes_of(row):
 
 
 def stages_of(wildcards):
-    """All settings of a scene and, where the wildcards hold one, a variant."""
+    """All settings of a scene and, where a variant is named."""
     variant = getattr(wildcards, "variant", "default")
     return or_stop(RUN.stages, variant, scopes_of(row_of(wildcards)))
 
@@ -87,24 +85,19 @@ def shared_variant(stage, wildcards):
     wanted = or_stop(RUN.stages, wildcards.variant, scopes)
     for name in RUN.variant_names():
         other = or_stop(RUN.stages, name, scopes)
-        if all(getattr(other, section) == getattr(wanted, section) for section in UPSTREAM[stage]):
+        if all(
+            getattr(other, section) == getattr(wanted, section)
+            for section in UPSTREAM[stage]
+        ):
             return name
     return wildcards.variant
 
 
 def shared(stage, path):
     """Input function: a stage's output under the variant that it is shared with."""
-    return lambda wildcards: f"{RESULTS}/{wildcards.dataset}/{wildcards.scene}/{shared_variant(stage, wildcards)}/{path}"
-
-
-def variant_path(row, stage, variant, path):
-    """The same outside a rule: the file of a stage for a scene and variant."""
-
-    class Names:
-        dataset, scene = row.dataset, row.scene
-
-    Names.variant = variant
-    return shared(stage, path)(Names)
+    return (
+        lambda wildcards: f"results/{wildcards.dataset}/{wildcards.scene}/{shared_variant(stage, wildcards)}/{path}"
+    )
 
 
 def is_world(row):
@@ -114,7 +107,11 @@ def is_world(row):
 def photos_of(wildcards):
     """Files that a scene of photographs is made from; one more or one less reruns its poses."""
     folder = Path(row_of(wildcards).source)
-    return sorted(str(path) for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
+    return sorted(
+        str(path)
+        for path in folder.rglob("*")
+        if path.is_file() and not path.name.startswith(".")
+    )
 
 
 def digest_of_model(section):
@@ -140,8 +137,10 @@ def memo_digest(folder):
     if folder in _digests:
         return _digests[folder]
     files = sorted(path for path in folder.rglob("*") if path.is_file())
-    stamp = json.dumps([[str(f), f.stat().st_size, f.stat().st_mtime_ns] for f in files])
-    memo = Path(CACHE) / "digests.json"
+    stamp = json.dumps(
+        [[str(f), f.stat().st_size, f.stat().st_mtime_ns] for f in files]
+    )
+    memo = CACHE / "digests.json"
     try:
         known = json.loads(memo.read_text())
     except (OSError, ValueError):
@@ -154,3 +153,68 @@ def memo_digest(folder):
         os.replace(temporary, memo)
     _digests[folder] = known[stamp]
     return known[stamp]
+
+
+def images_of(wildcards):
+    """Folder that the poses of a scene are found from."""
+    row = row_of(wildcards)
+    return (
+        f"results/{row.dataset}/{row.scene}/world/images"
+        if is_world(row)
+        else row.source
+    )
+
+
+def image_files_of(wildcards):
+    """Input of poses: the rendered folder, or each file of a folder of photographs."""
+    return images_of(wildcards) if is_world(row_of(wildcards)) else photos_of(wildcards)
+
+
+def labelled(rows):
+    return [row for row in rows if is_world(row)]
+
+
+def scores_of(variants):
+    """Score files of all labelled scenes for some variants."""
+    return [
+        f"results/{row.dataset}/{row.scene}/{variant}/scores.csv"
+        for row in labelled(SCENES)
+        for variant in variants
+    ]
+
+
+TABLES = {
+    "hierarchy": RUN.main_variants,
+    "lerf": RUN.main_variants,
+    "ablation": RUN.ablation_variants,
+}
+
+
+def targets_of_tables():
+    """Tables that the configured scenes can fill; none where no scene has labels."""
+    if not labelled(SCENES):
+        return []
+    return [
+        f"results/tables/{name}.csv" for name, variants in TABLES.items() if variants
+    ]
+
+
+def targets_of_figures():
+    """The panel of every scene."""
+    return [f"results/figures/{row.dataset}/{row.scene}/panel.png" for row in SCENES]
+
+
+def queries_of(wildcards):
+    """Parameter: texts for the panel of a scene without labels, as JSON."""
+    return json.dumps(RUN.queries.get(f"{wildcards.dataset}/{wildcards.scene}", ()))
+
+
+def truth_of(wildcards):
+    """Input: the annotations of a scene, where it has some."""
+    row = row_of(wildcards)
+    return [f"results/{row.dataset}/{row.scene}/world/truth"] if is_world(row) else []
+
+
+def print_where_time_went():
+    """After a run: seconds and memory per stage, from the benchmark files."""
+    shell("hilsplat efficiency --results results --out results/efficiency.csv")

@@ -1,22 +1,24 @@
 # CLIP per mask, frozen-geometry matrices, semantic tree, autoencoder, language field.
 rule clip:
     input:
-        scene=SCENE + "/scene",
+        scene="results/{dataset}/{scene}/scene",
         masks=shared("masks", "masks"),
     output:
-        clip=directory(VARIANT + "/clip"),
-    params:
-        settings=settings_of("clip"),
-        model=digest_of_model("clip"),
-        cache=CACHE,
-        code=code("clip"),
+        clip=directory("results/{dataset}/{scene}/{variant}/clip"),
     log:
-        VARIANT + "/logs/clip.log",
+        "results/{dataset}/{scene}/{variant}/logs/clip.log",
     benchmark:
-        VARIANT + "/benchmarks/clip.jsonl"
+        "results/{dataset}/{scene}/{variant}/benchmarks/clip.jsonl"
+    conda:
+        ENVIRONMENT
     threads: THREADS
     resources:
         mem_mb=3000,
+    params:
+        settings=settings_of("clip"),
+        model=digest_of_model("clip"),
+        cache="results/.cache",
+        code=code("clip"),
     shell:
         "hilsplat clip --scene {input.scene} --masks {input.masks} --settings {params.settings:q}"
         " --threads {threads} --cache {params.cache} --out {output.clip} --log {log}"
@@ -24,22 +26,24 @@ rule clip:
 
 rule contributions:
     input:
-        scene=SCENE + "/scene",
-        gaussians=SCENE + "/gaussians.ply",
+        scene="results/{dataset}/{scene}/scene",
+        gaussians="results/{dataset}/{scene}/gaussians.ply",
         masks=shared("masks", "masks"),
     output:
-        contributions=directory(VARIANT + "/contributions"),
-    params:
-        settings=settings_of("contributions"),
-        cache=CACHE,
-        code=code("contributions"),
+        contributions=directory("results/{dataset}/{scene}/{variant}/contributions"),
     log:
-        VARIANT + "/logs/contributions.log",
+        "results/{dataset}/{scene}/{variant}/logs/contributions.log",
     benchmark:
-        VARIANT + "/benchmarks/contributions.jsonl"
+        "results/{dataset}/{scene}/{variant}/benchmarks/contributions.jsonl"
+    conda:
+        ENVIRONMENT
     threads: THREADS
     resources:
         mem_mb=4000,
+    params:
+        settings=settings_of("contributions"),
+        cache="results/.cache",
+        code=code("contributions"),
     shell:
         "hilsplat contributions --scene {input.scene} --gaussians {input.gaussians} --masks {input.masks}"
         " --settings {params.settings:q} --threads {threads} --cache {params.cache}"
@@ -52,17 +56,19 @@ rule semantic_tree:
         masks=shared("masks", "masks"),
         clip=shared("clip", "clip"),
     output:
-        semantic_tree=directory(VARIANT + "/semantic_tree"),
-    params:
-        settings=settings_of("semantic_tree"),
-        code=code("semantic_tree"),
+        semantic_tree=directory("results/{dataset}/{scene}/{variant}/semantic_tree"),
     log:
-        VARIANT + "/logs/semantic_tree.log",
+        "results/{dataset}/{scene}/{variant}/logs/semantic_tree.log",
     benchmark:
-        VARIANT + "/benchmarks/semantic_tree.jsonl"
+        "results/{dataset}/{scene}/{variant}/benchmarks/semantic_tree.jsonl"
+    conda:
+        ENVIRONMENT
     threads: 1
     resources:
         mem_mb=3000,
+    params:
+        settings=settings_of("semantic_tree"),
+        code=code("semantic_tree"),
     shell:
         "hilsplat semantic-tree --contributions {input.contributions} --masks {input.masks}"
         " --clip {input.clip} --settings {params.settings:q} --out {output.semantic_tree} --log {log}"
@@ -74,18 +80,20 @@ rule autoencoder:
         semantic_tree=shared("semantic_tree", "semantic_tree"),
         contributions=shared("contributions", "contributions"),
     output:
-        autoencoder=directory(VARIANT + "/autoencoder"),
+        autoencoder=directory("results/{dataset}/{scene}/{variant}/autoencoder"),
+    log:
+        "results/{dataset}/{scene}/{variant}/logs/autoencoder.log",
+    benchmark:
+        "results/{dataset}/{scene}/{variant}/benchmarks/autoencoder.jsonl"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        mem_mb=2000,
     params:
         settings=settings_of("autoencoder"),
         seed=RUN.seed,
         code=code("autoencoder"),
-    log:
-        VARIANT + "/logs/autoencoder.log",
-    benchmark:
-        VARIANT + "/benchmarks/autoencoder.jsonl"
-    threads: 1
-    resources:
-        mem_mb=2000,
     shell:
         "hilsplat autoencoder --clip {input.clip} --semantic-tree {input.semantic_tree}"
         " --contributions {input.contributions} --settings {params.settings:q} --seed {params.seed}"
@@ -98,18 +106,20 @@ rule language:
         tree=shared("tree", "tree"),
         autoencoder=shared("autoencoder", "autoencoder"),
     output:
-        language=VARIANT + "/language.safetensors",
+        language="results/{dataset}/{scene}/{variant}/language.safetensors",
+    log:
+        "results/{dataset}/{scene}/{variant}/logs/language.log",
+    benchmark:
+        "results/{dataset}/{scene}/{variant}/benchmarks/language.jsonl"
+    conda:
+        ENVIRONMENT
+    threads: THREADS
+    resources:
+        mem_mb=4000,
     params:
         settings=settings_of("language"),
         seed=RUN.seed,
         code=code("language"),
-    log:
-        VARIANT + "/logs/language.log",
-    benchmark:
-        VARIANT + "/benchmarks/language.jsonl"
-    threads: THREADS
-    resources:
-        mem_mb=4000,
     shell:
         "hilsplat language --contributions {input.contributions} --tree {input.tree}"
         " --autoencoder {input.autoencoder} --settings {params.settings:q} --seed {params.seed}"

@@ -1,28 +1,27 @@
 # Camera poses: structure from motion, or import.
-def images_of(wildcards):
-    row = row_of(wildcards)
-    return f"{RESULTS}/{row.dataset}/{row.scene}/world/images" if is_world(row) else row.source
-
-
 rule poses:
     input:
-        lambda wildcards: images_of(wildcards) if is_world(row_of(wildcards)) else photos_of(wildcards),
+        image_files_of,
     output:
-        scene=directory(SCENE + "/scene"),
-    params:
-        images=images_of,
-        unit=lambda wildcards: row_of(wildcards).unit,
-        lens=lambda wildcards: "--render" if is_world(row_of(wildcards)) else "--no-render",
-        settings=settings_of("poses"),
-        seed=RUN.seed,
-        code=code("poses"),
+        scene=directory("results/{dataset}/{scene}/scene"),
     log:
-        SCENE + "/logs/poses.log",
+        "results/{dataset}/{scene}/logs/poses.log",
     benchmark:
-        SCENE + "/benchmarks/poses.jsonl"
+        "results/{dataset}/{scene}/benchmarks/poses.jsonl"
+    conda:
+        ENVIRONMENT
     threads: THREADS
     resources:
         mem_mb=2000,
+    params:
+        images=images_of,
+        unit=lambda wildcards: row_of(wildcards).unit,
+        lens=lambda wildcards: (
+            "--render" if is_world(row_of(wildcards)) else "--no-render"
+        ),
+        settings=settings_of("poses"),
+        seed=RUN.seed,
+        code=code("poses"),
     shell:
         "hilsplat poses --images {params.images:q} --name {wildcards.dataset}/{wildcards.scene}"
         " --unit {params.unit} {params.lens} --settings {params.settings:q} --seed {params.seed}"

@@ -1,21 +1,23 @@
 # Masks at three levels and the coverage tree of each view.
 rule masks:
     input:
-        scene=SCENE + "/scene",
+        scene="results/{dataset}/{scene}/scene",
     output:
-        masks=directory(VARIANT + "/masks"),
-    params:
-        settings=settings_of("masks"),
-        model=digest_of_model("masks"),
-        cache=CACHE,
-        code=code("masks"),
+        masks=directory("results/{dataset}/{scene}/{variant}/masks"),
     log:
-        VARIANT + "/logs/masks.log",
+        "results/{dataset}/{scene}/{variant}/logs/masks.log",
     benchmark:
-        VARIANT + "/benchmarks/masks.jsonl"
+        "results/{dataset}/{scene}/{variant}/benchmarks/masks.jsonl"
+    conda:
+        ENVIRONMENT
     threads: THREADS
     resources:
         mem_mb=4000,
+    params:
+        settings=settings_of("masks"),
+        model=digest_of_model("masks"),
+        cache="results/.cache",
+        code=code("masks"),
     shell:
         "hilsplat masks --scene {input.scene} --settings {params.settings:q} --threads {threads}"
         " --cache {params.cache} --out {output.masks} --log {log}"
@@ -25,16 +27,18 @@ rule tree:
     input:
         masks=shared("masks", "masks"),
     output:
-        tree=directory(VARIANT + "/tree"),
-    params:
-        settings=settings_of("tree"),
-        code=code("tree"),
+        tree=directory("results/{dataset}/{scene}/{variant}/tree"),
     log:
-        VARIANT + "/logs/tree.log",
+        "results/{dataset}/{scene}/{variant}/logs/tree.log",
     benchmark:
-        VARIANT + "/benchmarks/tree.jsonl"
+        "results/{dataset}/{scene}/{variant}/benchmarks/tree.jsonl"
+    conda:
+        ENVIRONMENT
     threads: 1
     resources:
         mem_mb=2000,
+    params:
+        settings=settings_of("tree"),
+        code=code("tree"),
     shell:
         "hilsplat tree --masks {input.masks} --settings {params.settings:q} --out {output.tree} --log {log}"

@@ -1,20 +1,22 @@
 # Synthetic scenes: images for the stages, truth for evaluate alone.
 rule world:
     output:
-        images=directory(SCENE + "/world/images"),
-        truth=directory(SCENE + "/world/truth"),
+        images=directory("results/{dataset}/{scene}/world/images"),
+        truth=directory("results/{dataset}/{scene}/world/truth"),
+    log:
+        "results/{dataset}/{scene}/logs/world.log",
+    benchmark:
+        "results/{dataset}/{scene}/benchmarks/world.jsonl"
+    conda:
+        ENVIRONMENT
+    threads: THREADS
+    resources:
+        mem_mb=2000,
     params:
         source=lambda wildcards: row_of(wildcards).source,
         settings=settings_of("world"),
         code=code("world"),
-        out=SCENE + "/world",
-    log:
-        SCENE + "/logs/world.log",
-    benchmark:
-        SCENE + "/benchmarks/world.jsonl"
-    threads: THREADS
-    resources:
-        mem_mb=2000,
+        out="results/{dataset}/{scene}/world",
     shell:
         "hilsplat world make --source {params.source:q} --settings {params.settings:q}"
         " --threads {threads} --out {params.out} --log {log}"

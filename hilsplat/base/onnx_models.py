@@ -6,7 +6,6 @@ network's input is read from the folder, so folder and digest together are the m
 """
 
 import logging
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -96,7 +95,9 @@ class ModelFolder:
     @property
     def digest(self) -> str:
         """SHA-256 over names and bytes of the files used; independent of where the folder stands."""
-        return sha256_of_json([(path.relative_to(self.folder).as_posix(), sha256_of_file(path)) for path in self.files])
+        return sha256_of_json(
+            [(path.relative_to(self.folder).as_posix(), sha256_of_file(path)) for path in self.files]
+        )
 
     def network(self, name: str, threads: int = 1) -> "Network":
         """Open one of the model's networks and check its inputs and outputs.
@@ -154,9 +155,11 @@ def open_model_folder(folder: Path, kind: str | None = None, *, fix: str = "") -
         found = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
         raise ModelError(
             f"model folder {folder} lacks {', '.join(missing)}",
-            expected=", ".join([*DESCRIPTIONS[found_kind], *(f"onnx/{name}.onnx" for name in KINDS[found_kind])]),
+            expected=", ".join(
+                [*DESCRIPTIONS[found_kind], *(f"onnx/{name}.onnx" for name in KINDS[found_kind])]
+            ),
             found=", ".join(found[:20]),
-            fix=f"complete the folder (variants such as {next(iter(KINDS[found_kind]))}_quantized.onnx must be "
+            fix=f"complete the folder (files such as {next(iter(KINDS[found_kind]))}_quantized.onnx must be "
             "copied to the plain name)" + (f", or {fix}" if fix else ""),
         )
     optional = [folder / name for name in ("tokenizer_config.json", "special_tokens_map.json")]
@@ -168,11 +171,17 @@ def open_model_folder(folder: Path, kind: str | None = None, *, fix: str = "") -
         for path in sorted(network.parent.glob(f"{network.name}?data*"))
         if path.is_file()
     ]
+    try:
+        preprocessing = read_json(folder / "preprocessor_config.json")
+    except ArtifactError as error:
+        raise ModelError(
+            f"{folder / 'preprocessor_config.json'} cannot be read: {error}", fix="fetch a whole copy"
+        ) from error
     return ModelFolder(
         folder,
         found_kind,
         config,
-        read_json(folder / "preprocessor_config.json"),
+        preprocessing,
         networks,
         tuple(sorted({*described, *beside, *networks.values(), *weights})),
     )
@@ -222,7 +231,9 @@ class Network:
         self.providers = self.session.get_providers()
         logger.info("network %s runs on %s", path.name, self.providers[0])
 
-    def _check(self, what: str, expected: Mapping[str, int], found: dict[str, Any], optional: tuple[str, ...]) -> None:
+    def _check(
+        self, what: str, expected: Mapping[str, int], found: dict[str, Any], optional: tuple[str, ...]
+    ) -> None:
         """Compare names and numbers of axes."""
         wrong = [name for name in expected if name not in found]
         wrong += [name for name in found if name not in expected and name not in optional]
@@ -290,64 +301,6 @@ def input_side_px(model: ModelFolder) -> int:
         if model.preprocessing.get(key):
             return side_px(model.preprocessing[key], default)
     return default
-
-
-def check_model(folder: Path) -> str:
-    """Describe a model folder after running each of its networks once on an empty input.
-
-    Returns:
-        kind, image size, shapes, digest, execution provider and time, one per line.
-
-    Raises:
-        ModelError: as for `open_model_folder` and `Network`.
-    """
-    model = open_model_folder(folder)
-    side = input_side_px(model)
-    pixels = np.zeros((1, 3, side, side), dtype=np.float32)
-    lines = [f"folder     {model.folder}", f"kind       {model.kind}", f"image      {side} x {side} px"]
-    if model.kind == "sam":
-        encoder, decoder = (model.network(name) for name in KINDS["sam"])
-        start = time.perf_counter()
-        embeddings, positional = encoder(pixel_values=pixels)
-        encode_s = time.perf_counter() - start
-        prompts = decoder.fixed_axis("input_points", 1) or 1
-        start = time.perf_counter()
-        scores, masks = decoder(
-            input_points=np.full((1, prompts, 1, 2), side / 2),
-            input_labels=np.ones((1, prompts, 1)),
-            image_embeddings=embeddings,
-            image_positional_embeddings=positional,
-        )
-        decode_s = time.perf_counter() - start
-        require_three_heads(decoder.path, scores, masks)
-        lines += [
-            f"embedding  {' x '.join(map(str, embeddings.shape[1:]))}",
-            f"masks      3 heads (subpart, part, whole) of {masks.shape[-2]} x {masks.shape[-1]} px",
-            f"time       {encode_s:.3f} s for one image, {decode_s / prompts:.4f} s for one prompt",
-        ]
-        providers = encoder.providers
-    else:
-        vision, text = (model.network(name) for name in KINDS["clip"])
-        start = time.perf_counter()
-        (image_embeds,) = vision(pixel_values=pixels)
-        encode_s = time.perf_counter() - start
-        length = int(model.config.get("text_config", {}).get("max_position_embeddings", 77))
-        ids = np.zeros((1, length), dtype=np.int64)
-        (text_embeds,) = text(input_ids=ids, attention_mask=np.ones_like(ids))
-        if image_embeds.shape[1] != text_embeds.shape[1]:
-            raise ModelError(
-                f"the two networks of {folder} do not belong together",
-                expected=f"text vectors of {image_embeds.shape[1]} numbers, as the image vectors",
-                found=f"{text_embeds.shape[1]} numbers",
-                fix="export both networks, with their projections, from one model",
-            )
-        lines += [
-            f"vectors    {image_embeds.shape[1]} numbers, texts of up to {length} tokens",
-            f"time       {encode_s:.3f} s for one image",
-        ]
-        providers = vision.providers
-    lines += [f"runs on    {', '.join(providers)}", f"digest     {model.digest}"]
-    return "\n".join(lines)
 
 
 def require_three_heads(path: Path, iou_scores: np.ndarray, pred_masks: np.ndarray) -> None:

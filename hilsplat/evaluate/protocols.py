@@ -35,9 +35,10 @@ from hilsplat.evaluate.metrics.relevancy_rule import (
 )
 from hilsplat.settings import EvaluateSettings
 
-GIVEN, AUTO, PATH, ANNOTATIONS = (
-    f"hierarchy:{name}" for name in ("level=given", "level=auto", "path", "annotations")
-)
+GIVEN = "hierarchy:level=given"
+AUTO = "hierarchy:level=auto"
+PATH = "hierarchy:path"
+ANNOTATIONS = "hierarchy:annotations"
 NODES = "node_selection"
 RELEVANCY_CHUNK_MIB = 128
 """Relevancy maps of so many texts are held at once."""
@@ -47,19 +48,19 @@ RELEVANCY_CHUNK_MIB = 128
 class QueryableScene(Protocol):
     """What a scene must answer (`hilsplat.language.query.LanguageScene` does)."""
 
-    def field_relevancy(self, texts, view):  # noqa: ANN001, ANN201
+    def field_relevancy(self, texts, view):
         """Rendered relevancy, (T, 3, H, W)."""
 
-    def node_relevancy_map(self, texts, view):  # noqa: ANN001, ANN201
+    def node_relevancy_map(self, texts, view):
         """Relevancy of the node at each pixel, (T, 3, H, W)."""
 
-    def select_nodes(self, text, level=None, threshold=0.85, within=None):  # noqa: ANN001, ANN201
+    def select_nodes(self, text, level=None, threshold=0.85, within=None):
         """Nodes that answer a text, with the level they are of."""
 
-    def select_path(self, texts, threshold=0.85):  # noqa: ANN001, ANN201
+    def select_path(self, texts, threshold=0.85):
         """Nodes that answer the last of a chain of texts."""
 
-    def node_masks(self, view, ids):  # noqa: ANN001, ANN201
+    def node_masks(self, view, ids):
         """Union of the rendered nodes in a view, (H, W)."""
 
 
@@ -257,7 +258,7 @@ def measure_view(
     yield from _consistency_rows(truth, masks, settings.methods)
 
 
-def _relevancy(render, texts: Sequence[str], view: str) -> np.ndarray:  # noqa: ANN001
+def _relevancy(render, texts: Sequence[str], view: str) -> np.ndarray:
     return np.asarray(render(tuple(texts), view), dtype=np.float32)
 
 

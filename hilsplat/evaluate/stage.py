@@ -23,13 +23,13 @@ def run_evaluate(
     language: Path,
     autoencoder: Path,
     clip_folder: Path,
+    masks_folder: Path,
     out: Path,
     settings: EvaluateSettings,
     dataset: str,
     scene: str,
     variant: str,
     threads: int,
-    masks_label: str,
 ) -> None:
     """Score every annotated query in every annotated test view (see `protocols`).
 
@@ -41,18 +41,19 @@ def run_evaluate(
         language: language field.
         autoencoder: autoencoder artifact.
         clip_folder: mask embeddings; their index names the CLIP model, which embeds the texts.
+        masks_folder: masks artifact; its index says what made the masks.
         out: `scores.csv`.
         settings: queries and protocols.
-        dataset: written into every row, as are `scene`, `variant` and `masks_label`.
+        dataset: written into every row, as are `scene` and `variant`.
         scene: scene name.
         variant: named set of settings.
         threads: threads for rendering.
-        masks_label: what made the masks, such as `sam-tiny`.
 
     Raises:
         MisalignedArtifactError: label images are of another size than the cameras.
     """
     scores: list[Score] = []
+    label = masks_label(masks_folder)
     with stage_log("evaluate", f"{dataset}/{scene}/{variant}") as counts:
         if truth is None:
             logger.info("%s/%s has no annotations: nothing to score", dataset, scene)
@@ -88,7 +89,7 @@ def run_evaluate(
                             dataset=dataset,
                             scene=scene,
                             variant=variant,
-                            masks=masks_label,
+                            masks=label,
                             view=view,
                             **vars(measured),
                         )
@@ -96,3 +97,9 @@ def run_evaluate(
             counts["views"] = len(views)
         counts["rows"] = len(scores)
         write_scores(out, scores)
+
+
+def masks_label(masks_folder: Path) -> str:
+    """What made the masks, as rows name it: the model folder's name, or the segmenter without one."""
+    index = read_index(masks_folder)
+    return Path(index["model"]).name if index["model"] else index["segmenter"]

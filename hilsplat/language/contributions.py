@@ -14,19 +14,17 @@ Every loss of the language field, and the 3D semantic tree, need nothing else of
 
 import hashlib
 import logging
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float32, Float64, Int32, Int64, UInt8
+from jaxtyping import Float32, Int32, Int64
 
 from hilsplat.base.artifacts import (
+    INDEX,
     ViewCache,
     atomic_folder,
     read_index,
-    read_npy,
-    read_npz,
     sha256_of_bytes,
     sha256_of_file,
     sha256_of_json,
@@ -35,15 +33,9 @@ from hilsplat.base.artifacts import (
 )
 from hilsplat.base.code_hash import code_hash
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
-from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import stage_log, track
-from hilsplat.language.quadratic import (
-    Gram,
-    Quadratic,
-    StackedWeights,
-    choose_quadratic,
-    load_quadratic,
-)
+from hilsplat.language.quadratic import Gram, StackedWeights, choose_quadratic
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ContributionsSettings
@@ -92,9 +84,7 @@ def label_maps(masks: HierarchicalMasks) -> Int32[np.ndarray, "P 3"]:
     return np.stack([masks.label_map(level).reshape(-1) for level in LEVELS], axis=1)
 
 
-def painted_indicator(
-    labels: Int32[np.ndarray, "P 3"], num_masks: int, pixels: np.ndarray
-) -> sp.csr_matrix:
+def painted_indicator(labels: Int32[np.ndarray, "P 3"], num_masks: int, pixels: np.ndarray) -> sp.csr_matrix:
     """B: one row per mask, ones at the given pixels where it is painted (float64)."""
     rows, columns = [], []
     for index in range(labels.shape[1]):
@@ -135,9 +125,7 @@ def random_half(view: str, pixels: int) -> np.ndarray:
     return np.random.default_rng(seed).random(pixels) < 0.5
 
 
-def view_contributions(
-    view: str, weights: sp.csr_matrix, masks: HierarchicalMasks
-) -> dict[str, np.ndarray]:
+def view_contributions(view: str, weights: sp.csr_matrix, masks: HierarchicalMasks) -> dict[str, np.ndarray]:
     """All matrices of one view but W, as plain arrays (`A_data`, `A_indices`, `A_indptr`, ...).
 
     Args:
@@ -162,9 +150,7 @@ def view_contributions(
     return arrays
 
 
-def labelled_rows(
-    weights: sp.csr_matrix, labels: Int32[np.ndarray, "P 3"]
-) -> StackedWeights:
+def labelled_rows(weights: sp.csr_matrix, labels: Int32[np.ndarray, "P 3"]) -> StackedWeights:
     """The rows of W that have Gaussians and a mask at some level."""
     valid = (labels >= 0) & (np.diff(weights.indptr) > 0)[:, None]
     rows = np.flatnonzero(valid.any(axis=1))
@@ -175,93 +161,6 @@ def stack_weights(parts: list[StackedWeights]) -> StackedWeights:
     """One after the other."""
     matrix = sp.vstack([part.weights for part in parts], format="csr")
     return StackedWeights(matrix, np.concatenate([part.valid for part in parts]))
-
-
-@dataclass(frozen=True)
-class Contributions:
-    """The finished stage: its rows in memory, its matrices read when asked for.
-
-    M rows are the masks of all train views, view by view, in each view's own order.
-
-    Attributes:
-        folder: the artifact.
-        views: train views in the order of `view`.
-        num_gaussians: N.
-        gaussians_sha256: digest of the PLY the weights belong to.
-        view: index of each row's view in `views`.
-        mask: row of the mask among its view's masks.
-        level: `Level` of the mask.
-        area_px: pixels of the raw mask.
-        pixels: pixels at which the mask is painted and the Gaussians cover the image, n.
-        half_pixels: those of them in the random half.
-    """
-
-    folder: Path
-    views: tuple[str, ...]
-    num_gaussians: int
-    gaussians_sha256: str
-    view: Int32[np.ndarray, " M"]
-    mask: Int32[np.ndarray, " M"]
-    level: UInt8[np.ndarray, " M"]
-    area_px: Int64[np.ndarray, " M"]
-    pixels: Int64[np.ndarray, " M"]
-    half_pixels: Int64[np.ndarray, " M"]
-
-    def __len__(self) -> int:
-        return len(self.view)
-
-    def rows_of(self, level: Level) -> Int64[np.ndarray, " m"]:
-        """Rows of a level, in order."""
-        return np.flatnonzero(self.level == int(level))
-
-    def matrix(self, name: str) -> sp.csr_matrix:
-        """Read `A`, `A_half` or `S` (M x N)."""
-        arrays = read_npz(self.folder / f"{name}.npz")
-        return sp.csr_matrix(
-            (arrays["data"], arrays["indices"], arrays["indptr"]), shape=(len(self), self.num_gaussians)
-        )
-
-    def mass(self) -> Float32[np.ndarray, "V N"]:
-        """Visible mass of each Gaussian in each train view, px."""
-        return read_npz(self.folder / "mass.npz")["mass"]
-
-    def quadratic(self) -> Quadratic:
-        """Read G, or the stacked weights where those are smaller."""
-        return load_quadratic(self.folder)
-
-    @staticmethod
-    def load(folder: Path) -> "Contributions":
-        """Read the rows of a finished contributions folder."""
-        folder = Path(folder)
-        index = read_index(folder)
-        return Contributions(
-            folder,
-            tuple(index["views"]),
-            index["num_gaussians"],
-            index["gaussians_sha256"],
-            **read_npz(folder / "rows.npz"),
-        )
-
-
-def mask_embeddings(clip_folder: Path, contributions: Contributions) -> Float32[np.ndarray, "M C"]:
-    """CLIP vectors of all masks, in the contributions' row order.
-
-    Raises:
-        MisalignedArtifactError: a view has another number of vectors than masks.
-    """
-    parts = []
-    counts = np.bincount(contributions.view, minlength=len(contributions.views))
-    for view, count in zip(contributions.views, counts, strict=True):
-        vectors = read_npy(Path(clip_folder) / f"{view}.npy")
-        if len(vectors) != count:
-            raise MisalignedArtifactError(
-                f"CLIP vectors of view {view} do not belong to these contributions",
-                expected=f"{count} vectors, one per mask",
-                found=f"{len(vectors)} in {clip_folder}",
-                fix="run the clip and contributions stages again on the same masks",
-            )
-        parts.append(vectors.astype(np.float32))
-    return np.concatenate(parts)
 
 
 def run_contributions(
@@ -317,7 +216,10 @@ def run_contributions(
                 }
             )
             parts.append(
-                store.get(key, lambda view=view, weights=weights, masks=masks: view_contributions(view, weights, masks))
+                store.get(
+                    key,
+                    lambda view=view, weights=weights, masks=masks: view_contributions(view, weights, masks),
+                )
             )
             stacked.append(labelled_rows(weights, label_maps(masks)))
             rows["view"].append(np.full(len(masks), number, np.int32))
@@ -336,7 +238,11 @@ def run_contributions(
         with atomic_folder(out) as folder:
             for name in MATRICES:
                 _save_stacked(folder / f"{name}.npz", name, parts)
-            write_npz(folder / "mass.npz", mass=np.stack([part["mass"] for part in parts]))
+            write_npz(
+                folder / "mass.npz",
+                mass=np.stack([part["mass"] for part in parts]),
+                means=gaussians.means.detach().numpy().astype(np.float32),
+            )
             write_npz(
                 folder / "rows.npz",
                 **{name: np.concatenate(values) for name, values in rows.items()},
@@ -359,6 +265,7 @@ def run_contributions(
                 scene=scene.name,
                 num_gaussians=len(gaussians),
                 gaussians_sha256=gaussians_sha256,
+                masks_sha256=sha256_of_file(Path(masks_folder) / INDEX),
                 num_masks=num_masks,
                 quadratic=kept,
                 nonzeros={
@@ -388,16 +295,3 @@ def _single(matrix: sp.spmatrix) -> sp.csr_matrix:
         (matrix.data.astype(np.float32), matrix.indices.astype(np.int32), matrix.indptr.astype(np.int64)),
         shape=matrix.shape,
     )
-
-
-def dense_contributions(
-    weights: Float64[np.ndarray, "P N"], labels: Int32[np.ndarray, "P 3"], num_masks: int
-) -> tuple[Float64[np.ndarray, "M N"], Float64[np.ndarray, "3 N N"]]:
-    """A and G of one view by their definitions, for tests and small scenes."""
-    A = np.zeros((num_masks, weights.shape[1]))
-    for row in range(num_masks):
-        inside = (labels == row).any(axis=1)
-        if inside.any():
-            A[row] = weights[inside].mean(axis=0)
-    G = np.stack([weights[valid].T @ weights[valid] for valid in (labels >= 0).T])
-    return A, G

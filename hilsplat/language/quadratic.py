@@ -13,7 +13,7 @@ from pathlib import Path
 import numba
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32
 
 from hilsplat.base.artifacts import read_npz, write_npz
 from hilsplat.base.errors import ArtifactError
@@ -104,7 +104,7 @@ class StackedWeights:
             indptr=self.weights.indptr,
             indices=self.weights.indices,
             data=self.weights.data,
-            columns=np.array(self.weights.shape[1]),
+            columns=np.array([self.weights.shape[1]]),
             valid=self.valid,
         )
 
@@ -132,16 +132,17 @@ def build_gram(stacked: StackedWeights, limit: int | None, threads: int) -> Gram
     positions = sp.csr_matrix(
         (np.arange(weights.nnz, dtype=np.int64), weights.indices, weights.indptr), shape=weights.shape
     ).tocsc()
-    args = (weights.indptr, weights.indices, weights.data, positions.indptr, positions.indices, positions.data)
+    rows = (weights.indptr, weights.indices)
+    columns = (positions.indptr, positions.indices, positions.data)
     numba.set_num_threads(max(1, min(threads, numba.config.NUMBA_NUM_THREADS)))
     counts = np.zeros(num_gaussians, np.int64)
-    _count_pairs(*args[:2], *args[3:], BLOCKS, counts)
+    _count_pairs(*rows, *columns, BLOCKS, counts)
     indptr = np.concatenate(([0], np.cumsum(counts)))
     if limit is not None and indptr[-1] > limit:
         return None
     indices = np.zeros(indptr[-1], np.int32)
     values = np.zeros((indptr[-1], len(LEVELS)), np.float32)
-    _fill_pairs(*args, stacked.valid, BLOCKS, indptr, indices, values)
+    _fill_pairs(*rows, weights.data, *columns, stacked.valid, BLOCKS, indptr, indices, values)
     return Gram(indptr, indices, values)
 
 
@@ -169,17 +170,10 @@ def load_quadratic(folder: Path) -> Quadratic:
         return Gram(**read_npz(folder / "G.npz"))
     if (folder / "W.npz").is_file():
         arrays = read_npz(folder / "W.npz")
-        shape = (len(arrays["indptr"]) - 1, int(arrays["columns"]))
+        shape = (len(arrays["indptr"]) - 1, int(arrays["columns"][0]))
         matrix = sp.csr_matrix((arrays["data"], arrays["indices"], arrays["indptr"]), shape=shape)
         return StackedWeights(matrix, arrays["valid"])
     raise ArtifactError(f"{folder} holds neither G.npz nor W.npz", fix="run the contributions stage again")
-
-
-def dense_gram(quadratic: Quadratic) -> Float64[np.ndarray, "3 N N"]:
-    """G of every level as dense matrices, for tests and small scenes."""
-    identity = np.eye(quadratic.num_gaussians, dtype=np.float32)
-    columns = np.repeat(identity[:, None], len(LEVELS), axis=1)
-    return quadratic.product(columns).transpose(1, 0, 2).astype(np.float64)
 
 
 @compiled
@@ -233,7 +227,17 @@ def _count_pairs_loop(indptr, indices, col_indptr, col_rows, col_positions, bloc
 
 
 def _fill_pairs_loop(
-    indptr, indices, data, col_indptr, col_rows, col_positions, valid, blocks, out_indptr, out_indices, out_values
+    indptr,
+    indices,
+    data,
+    col_indptr,
+    col_rows,
+    col_positions,
+    valid,
+    blocks,
+    out_indptr,
+    out_indices,
+    out_values,
 ):
     num, levels = len(col_indptr) - 1, valid.shape[1]
     for block in numba.prange(blocks):

@@ -62,7 +62,8 @@ class Cameras:
             row = self.names.index(name)
         except ValueError as error:
             raise SceneError(
-                f"view {name!r} has no camera", expected=f"one of {len(self.names)} views: {', '.join(self.names[:5])}, ..."
+                f"view {name!r} has no camera",
+                expected=f"one of {len(self.names)} views: {', '.join(self.names[:5])}, ...",
             ) from error
         return Camera(name, self.cam_from_world[row], self.K[row], tuple(int(n) for n in self.size_hw[row]))
 

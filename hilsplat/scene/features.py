@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from PIL import Image, UnidentifiedImageError
 
 from hilsplat.base.errors import ImageError, SceneError
 from hilsplat.base.images import read_image, resize_to_fit, write_png
 from hilsplat.base.progress import track
+from hilsplat.scene.colmap import pycolmap
 from hilsplat.settings import PosesSettings
 
 logger = logging.getLogger(__name__)
@@ -161,6 +161,7 @@ def register_images(
     Extraction would enter them as its threads finish; the ids, and with them the result, would
     depend on timing.
     """
+    pycolmap.Database.open(database).close()  # creates the file
     for group in camera_groups(images, single_camera):
         options = pycolmap.ImageReaderOptions()
         options.camera_model = camera_model.upper()

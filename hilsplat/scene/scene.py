@@ -90,4 +90,3 @@ class Scene:
             points_rgb=points["rgb"],
             scene_from_source=points["scene_from_source"],
         )
-

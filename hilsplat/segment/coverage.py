@@ -36,7 +36,7 @@ def coverage_parents(
         >>> coverage_parents(np.array([whole, part], dtype=bool), theta=0.9)
         array([-1,  0], dtype=int32)
     """
-    pixels = masks.reshape(len(masks), -1).astype(np.float32)
+    pixels = masks.reshape(len(masks), masks.shape[1] * masks.shape[2]).astype(np.float32)
     # float32 counts exactly up to 2**24 px per mask, beyond any image we read.
     return parents_from_overlaps((pixels @ pixels.T).astype(np.int64), theta, level)
 
@@ -55,7 +55,7 @@ def parents_from_overlaps(
     if not len(area_px):
         return np.zeros(0, dtype=np.int32)
     share = overlap_px / area_px[:, None]  # [a, b]: share of a inside b
-    covered = (share > theta) & (share.T < theta)
+    covered = (share > theta) & (share < theta).T
     if level is not None:
         covered &= level[None, :] < level[:, None]
     # covered[a, b] implies area[a] < area[b]: chains of parents cannot form a cycle.

@@ -42,7 +42,7 @@ class HierarchicalMasks:
 
     Attributes:
         runs: run lengths of all masks (see `encode_runs`).
-        offsets: where each mask's runs begin.
+        offsets: where each mask's runs begin, and where the last ones end.
         level: `Level` of each mask as the segmenter gave it.
         predicted_iou: the segmenter's own estimate of each mask's quality, in [0, 1].
         stability: stability of each mask under a changed threshold, in [0, 1].
@@ -52,7 +52,7 @@ class HierarchicalMasks:
     """
 
     runs: UInt32[np.ndarray, " R"]
-    offsets: Int64[np.ndarray, " M+1"]
+    offsets: Int64[np.ndarray, " M_and_1"]
     level: UInt8[np.ndarray, " M"]
     predicted_iou: Float32[np.ndarray, " M"]
     stability: Float32[np.ndarray, " M"]
@@ -162,7 +162,9 @@ class HierarchicalMasks:
             name: np.concatenate([getattr(part, name) for part in parts])
             for name in ("runs", "level", "predicted_iou", "stability", "area_px", "box_xyxy")
         }
-        return HierarchicalMasks(offsets=np.concatenate([np.zeros(1, np.int64), *offsets]), size_hw=size_hw, **joined)
+        return HierarchicalMasks(
+            offsets=np.concatenate([np.zeros(1, np.int64), *offsets]), size_hw=size_hw, **joined
+        )
 
     def content_order(self) -> Int64[np.ndarray, " M"]:
         """Rows sorted by what they hold: level, large to small, box, predicted IoU, runs.

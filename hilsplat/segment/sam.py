@@ -94,11 +94,11 @@ class SamModel:
         Raises:
             ModelError: it is missing, incomplete or no SAM.
         """
-        return SamModel(open_model_folder(folder, "sam", fix="set masks.segmenter: graph, which needs no model"))
+        return SamModel(
+            open_model_folder(folder, "sam", fix="set masks.segmenter: graph, which needs no model")
+        )
 
-    def prepare(
-        self, image: UInt8[np.ndarray, "H W 3"]
-    ) -> tuple[Float32[np.ndarray, "1 3 h w"], Frame]:
+    def prepare(self, image: UInt8[np.ndarray, "H W 3"]) -> tuple[Float32[np.ndarray, "1 3 h w"], Frame]:
         """Resize to the longest edge, normalise, pad with zeros at the right and bottom."""
         original = (image.shape[0], image.shape[1])
         resized = resized_size(original, self.longest_edge)
@@ -116,9 +116,9 @@ class SamModel:
         embeddings, positional = self.encoder(pixel_values=pixels)
         return Encoded(embeddings, positional, frame)
 
-    def prompts_per_call(self, wanted: int) -> int:
-        """Prompts of one decoder call: the network's number where it fixes one."""
-        return self.decoder.fixed_axis("input_points", 1) or wanted
+    def prompts_per_call(self, wanted: int, asked: int) -> int:
+        """Prompts of one decoder call: the network's number where it fixes one, else at most those asked."""
+        return self.decoder.fixed_axis("input_points", 1) or min(wanted, asked)
 
     def decode(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]

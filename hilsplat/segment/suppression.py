@@ -13,9 +13,7 @@ INNER_COVERS = 0.5
 """Share of the container that the contained mask must stay below (LangSplat)."""
 
 
-def box_iou(
-    boxes_a: Int[np.ndarray, "A 4"], boxes_b: Int[np.ndarray, "B 4"]
-) -> Float[np.ndarray, "A B"]:
+def box_iou(boxes_a: Int[np.ndarray, "A 4"], boxes_b: Int[np.ndarray, "B 4"]) -> Float[np.ndarray, "A B"]:
     """IoU of boxes (xyxy, px, end exclusive); 0 where both are empty."""
     low = np.maximum(boxes_a[:, None, :2], boxes_b[None, :, :2])
     high = np.minimum(boxes_a[:, None, 2:], boxes_b[None, :, 2:])

@@ -1,6 +1,6 @@
 """Colours and solid materials that the objects of the synthetic world are made of."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -19,9 +19,6 @@ KINDS = (
     "fur",
 )
 """Solid textures, by the number that the shader knows them under."""
-
-COLUMNS = 15
-"""Numbers per material: kind, colour a (3), colour b (3), scale, specular, shininess, grain, offset (3), bump."""
 
 COLOURS: dict[str, tuple[float, float, float]] = {
     "red": (0.78, 0.14, 0.12),
@@ -102,8 +99,21 @@ class Paint:
         """Word for the texture, where there is one."""
         return ADJECTIVES.get(self.kind)
 
-    def row(self) -> Float[np.ndarray, " 15"]:
-        """Numbers for the shader, colours in linear light."""
+    def paled(self, share: float) -> "Paint":
+        """The same paint with both colours mixed with a light grey by `share`."""
+
+        def mixed(colour: tuple[float, float, float]) -> tuple[float, float, float]:
+            return tuple((1 - share) * value + share * 0.68 for value in colour)
+
+        return replace(self, first=mixed(self.first), second=mixed(self.second))
+
+    def row(self) -> Float[np.ndarray, " 14"]:
+        """Numbers for the shader.
+
+        Returns:
+            Kind, first colour (3) and second colour (3) in linear light, scale, specular, shininess,
+            grain, offset (3).
+        """
         return np.array(
             [
                 KINDS.index(self.kind),
@@ -114,7 +124,6 @@ class Paint:
                 self.shininess,
                 self.grain,
                 *self.offset,
-                0.0,
             ],
             dtype=np.float32,
         )
@@ -151,7 +160,9 @@ class PaintBox:
             colour = str(rng.choice(self._unused()))
         if colour in self._left:
             self._left.remove(colour)
-        first = np.clip(np.array(COLOURS[colour]) * rng.uniform(0.88, 1.1) + rng.normal(0, 0.015, 3), 0.03, 0.95)
+        first = np.clip(
+            np.array(COLOURS[colour]) * rng.uniform(0.88, 1.1) + rng.normal(0, 0.015, 3), 0.03, 0.95
+        )
         return Paint(
             colour,
             kind,

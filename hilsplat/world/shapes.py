@@ -7,6 +7,9 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float
 
+Number = float | int
+Point = tuple[Number, Number, Number]
+
 SMOOTH_BELOW_DEG = 40.0
 """Lathed profiles are shaded smoothly over corners that turn by less, sharply over others."""
 
@@ -26,22 +29,22 @@ class Mesh:
     def __len__(self) -> int:
         return len(self.triangles)
 
-    def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Mesh":
+    def moved(self, x: Number = 0.0, y: Number = 0.0, z: Number = 0.0) -> "Mesh":
         """Shift the mesh."""
         return Mesh(self.triangles + np.array([x, y, z]), self.normals)
 
-    def scaled(self, x: float, y: float | None = None, z: float | None = None) -> "Mesh":
+    def scaled(self, x: Number, y: Number | None = None, z: Number | None = None) -> "Mesh":
         """Scale about the origin; one factor scales all axes. Factors are positive."""
         factors = np.array([x, x if y is None else y, x if z is None else z])
         return Mesh(self.triangles * factors, _unit(self.normals / factors))
 
-    def turned(self, axis: str, degrees: float) -> "Mesh":
+    def turned(self, axis: str, degrees: Number) -> "Mesh":
         """Rotate about a coordinate axis, right-handed."""
         rotation = rotation_about(axis, degrees)
         return Mesh(self.triangles @ rotation.T, self.normals @ rotation.T)
 
 
-def rotation_about(axis: str, degrees: float) -> Float[np.ndarray, "3 3"]:
+def rotation_about(axis: str, degrees: Number) -> Float[np.ndarray, "3 3"]:
     """Right-handed rotation matrix about "x", "y" or "z"."""
     angle = np.radians(degrees)
     c, s = np.cos(angle), np.sin(angle)
@@ -75,9 +78,7 @@ def _fan(polygon: np.ndarray) -> list[np.ndarray]:
     return [np.stack([polygon[0], polygon[i], polygon[i + 1]]) for i in range(1, len(polygon) - 1)]
 
 
-def box(
-    size: tuple[float, float, float], centre: tuple[float, float, float] = (0.0, 0.0, 0.0), bevel: float = 0.0
-) -> Mesh:
+def box(size: Point, centre: Point = (0.0, 0.0, 0.0), bevel: Number = 0.0) -> Mesh:
     """Axis-aligned box with its edges cut off by `bevel`.
 
     Args:
@@ -89,7 +90,7 @@ def box(
     bevel = float(min(bevel, 0.45 * 2 * half.min()))
     triangles: list[np.ndarray] = []
 
-    def corner(signs: Sequence[float], inset_axis: int) -> np.ndarray:
+    def corner(signs: Sequence[Number] | np.ndarray, inset_axis: int) -> np.ndarray:
         """Corner of the face whose normal is `inset_axis`: full there, inset by the bevel elsewhere."""
         inset = np.full(3, bevel)
         inset[inset_axis] = 0.0
@@ -130,7 +131,7 @@ def box(
     return _flat(np.stack(triangles)).moved(*centre)
 
 
-def lathe(profile: Sequence[tuple[float, float]], segments: int = 28) -> Mesh:
+def lathe(profile: Sequence[tuple[Number, Number]], segments: int = 28) -> Mesh:
     """Surface of revolution about z.
 
     Args:
@@ -169,7 +170,7 @@ def lathe(profile: Sequence[tuple[float, float]], segments: int = 28) -> Mesh:
     return Mesh(np.concatenate(triangles), _unit(np.concatenate(shading)))
 
 
-def cylinder(radius: float, bottom: float, top: float, segments: int = 28, bevel: float = 0.0) -> Mesh:
+def cylinder(radius: Number, bottom: Number, top: Number, segments: int = 28, bevel: Number = 0.0) -> Mesh:
     """Closed upright cylinder about z."""
     if bevel <= 0:
         return lathe([(0, bottom), (radius, bottom), (radius, top), (0, top)], segments)
@@ -187,8 +188,8 @@ def cylinder(radius: float, bottom: float, top: float, segments: int = 28, bevel
 
 
 def ellipsoid(
-    radii: tuple[float, float, float],
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    radii: Point,
+    centre: Point = (0.0, 0.0, 0.0),
     segments: int = 24,
     rings: int = 12,
 ) -> Mesh:
@@ -199,12 +200,14 @@ def ellipsoid(
     return lathe(profile, segments).scaled(*radii).moved(*centre)
 
 
-def sphere(radius: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0), segments: int = 24) -> Mesh:
+def sphere(radius: Number, centre: Point = (0.0, 0.0, 0.0), segments: int = 24) -> Mesh:
     """Sphere."""
     return ellipsoid((radius, radius, radius), centre, segments)
 
 
-def sweep(path: Sequence[Sequence[float]], radius: float | Sequence[float], segments: int = 12) -> Mesh:
+def sweep(
+    path: Sequence[Sequence[Number] | np.ndarray], radius: Number | Sequence[Number], segments: int = 12
+) -> Mesh:
     """Round tube along a polyline, closed at both ends.
 
     Args:
@@ -228,7 +231,10 @@ def sweep(path: Sequence[Sequence[float]], radius: float | Sequence[float], segm
         normals.append(direction)
     triangles, shading = [], []
     for (p0, p1), (n0, n1) in zip(pairwise(rings), pairwise(normals), strict=True):
-        triangles += [np.stack([p0[:-1], p0[1:], p1[1:]], axis=1), np.stack([p0[:-1], p1[1:], p1[:-1]], axis=1)]
+        triangles += [
+            np.stack([p0[:-1], p0[1:], p1[1:]], axis=1),
+            np.stack([p0[:-1], p1[1:], p1[:-1]], axis=1),
+        ]
         shading += [np.stack([n0[:-1], n0[1:], n1[1:]], axis=1), np.stack([n0[:-1], n1[1:], n1[:-1]], axis=1)]
     first = np.broadcast_to(points[0], (segments, 3))
     last = np.broadcast_to(points[-1], (segments, 3))
@@ -244,14 +250,14 @@ def sweep(path: Sequence[Sequence[float]], radius: float | Sequence[float], segm
 
 
 def arc(
-    radii: tuple[float, float], start_deg: float, stop_deg: float, steps: int = 14
+    radii: tuple[Number, Number], start_deg: Number, stop_deg: Number, steps: int = 14
 ) -> list[tuple[float, float, float]]:
     """Points of an elliptic arc in the x-z plane, as a path for `sweep`; 0 degrees is +x, 90 is +z."""
     angle = np.radians(np.linspace(start_deg, stop_deg, steps + 1))
     return [(float(radii[0] * np.cos(a)), 0.0, float(radii[1] * np.sin(a))) for a in angle]
 
 
-def extrude(outline: Sequence[tuple[float, float]], depth: float) -> Mesh:
+def extrude(outline: Sequence[tuple[Number, Number]], depth: Number) -> Mesh:
     """Prism over a convex outline in the x-z plane, from y = -depth/2 to y = +depth/2."""
     points = np.asarray(outline, dtype=np.float64)
     shifted = np.roll(points, -1, axis=0)

@@ -5,6 +5,7 @@ surface point has one colour in all views. That is what structure from motion an
 """
 
 import math
+from typing import no_type_check
 
 import numba
 import numpy as np
@@ -13,6 +14,7 @@ _SETTINGS = {"cache": True, "nogil": True}
 
 
 @numba.njit(**_SETTINGS)
+@no_type_check  # the shape checks of the test-suite cannot be compiled
 def hash01(x: int, y: int, z: int, salt: int) -> float:
     """Number in [0, 1) of a lattice cell; a chain of 32-bit integer mixing steps."""
     mask = np.int64(0xFFFFFFFF)
@@ -27,11 +29,11 @@ def hash01(x: int, y: int, z: int, salt: int) -> float:
 
 
 @numba.njit(**_SETTINGS)
+@no_type_check  # the shape checks of the test-suite cannot be compiled
 def value_noise(x: float, y: float, z: float, salt: int) -> float:
     """Smoothly interpolated lattice noise in [0, 1)."""
-    fx, fy, fz = math.floor(x), math.floor(y), math.floor(z)
-    i, j, k = int(fx), int(fy), int(fz)
-    u, v, w = x - fx, y - fy, z - fz
+    i, j, k = math.floor(x), math.floor(y), math.floor(z)
+    u, v, w = x - i, y - j, z - k
     u, v, w = u * u * (3 - 2 * u), v * v * (3 - 2 * v), w * w * (3 - 2 * w)
     a = hash01(i, j, k, salt) * (1 - u) + hash01(i + 1, j, k, salt) * u
     b = hash01(i, j + 1, k, salt) * (1 - u) + hash01(i + 1, j + 1, k, salt) * u
@@ -41,6 +43,7 @@ def value_noise(x: float, y: float, z: float, salt: int) -> float:
 
 
 @numba.njit(**_SETTINGS)
+@no_type_check  # the shape checks of the test-suite cannot be compiled
 def fractal_noise(x: float, y: float, z: float, octaves: int, salt: int) -> float:
     """Sum of octaves of `value_noise`, each of half the size and amplitude, in [0, 1)."""
     total, amplitude, reach = 0.0, 0.5, 0.0
@@ -53,13 +56,14 @@ def fractal_noise(x: float, y: float, z: float, octaves: int, salt: int) -> floa
 
 
 @numba.njit(**_SETTINGS)
+@no_type_check  # the shape checks of the test-suite cannot be compiled
 def cell_noise(x: float, y: float, z: float, salt: int) -> tuple[float, float, float]:
     """Nearest and second nearest of one random point per cell (Worley).
 
     Returns:
         Distances to the two, in cells, and a number in [0, 1) that belongs to the nearest.
     """
-    i0, j0, k0 = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
+    i0, j0, k0 = math.floor(x), math.floor(y), math.floor(z)
     nearest, second, identity = 9.0, 9.0, 0.0
     for i in range(i0 - 1, i0 + 2):
         for j in range(j0 - 1, j0 + 2):
@@ -77,6 +81,7 @@ def cell_noise(x: float, y: float, z: float, salt: int) -> tuple[float, float, f
 
 
 @numba.njit(**_SETTINGS)
+@no_type_check  # the shape checks of the test-suite cannot be compiled
 def step_between(value: float, low: float, high: float) -> float:
     """0 below `low`, 1 above `high`, smooth between."""
     t = min(1.0, max(0.0, (value - low) / (high - low)))
@@ -84,6 +89,7 @@ def step_between(value: float, low: float, high: float) -> float:
 
 
 @numba.njit(**_SETTINGS)
+@no_type_check  # the shape checks of the test-suite cannot be compiled
 def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
     """Texture at a point given in pattern cells.
 
@@ -99,17 +105,19 @@ def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
         wave = math.sin(2 * math.pi * (0.75 * z + 0.2 * x + 0.2 * y + bend))
         return step_between(wave, -0.15, 0.15), 0.92 + 0.16 * value_noise(3 * x, 3 * y, 3 * z, 12)
     if kind == 2:  # checks
-        cell = int(math.floor(0.62 * x)) + int(math.floor(0.62 * y)) + int(math.floor(0.62 * z))
+        cell = math.floor(0.62 * x) + math.floor(0.62 * y) + math.floor(0.62 * z)
         return float(cell & 1), 0.92 + 0.16 * value_noise(3 * x, 3 * y, 3 * z, 21)
     if kind == 3:  # spots
         nearest, _, identity = cell_noise(0.7 * x, 0.7 * y, 0.7 * z, 31)
-        return 1 - step_between(nearest, 0.22 + 0.14 * identity, 0.27 + 0.14 * identity), 0.92 + 0.16 * value_noise(
-            3 * x, 3 * y, 3 * z, 35
-        )
+        return 1 - step_between(
+            nearest, 0.22 + 0.14 * identity, 0.27 + 0.14 * identity
+        ), 0.92 + 0.16 * value_noise(3 * x, 3 * y, 3 * z, 35)
     if kind == 4:  # wood: rings around a tilted axis, fine fibre along it
         rx = x + 0.9 * value_noise(0.4 * x, 0.4 * y, 0.12 * z, 41)
         ry = y + 0.25 * z
-        rings = math.sin(2.2 * math.sqrt(rx * rx + ry * ry) + 2.5 * value_noise(0.6 * x, 0.6 * y, 0.2 * z, 42))
+        rings = math.sin(
+            2.2 * math.sqrt(rx * rx + ry * ry) + 2.5 * value_noise(0.6 * x, 0.6 * y, 0.2 * z, 42)
+        )
         fibre = value_noise(6 * x, 6 * y, 0.7 * z, 43)
         return 0.55 * step_between(rings, -0.7, 0.9) + 0.4 * fibre, 0.9 + 0.2 * fibre
     if kind == 5:  # stone: clouds and thin veins
@@ -122,26 +130,33 @@ def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
         return identity, (0.7 + 0.3 * seam) * (0.8 + 0.45 * math.fabs(math.sin(37.0 * identity)))
     if kind == 7:  # weave
         warp, weft = math.sin(math.pi * (x + 0.4 * y)), math.sin(math.pi * (z - 0.4 * y))
-        return step_between(warp * weft, -0.5, 0.5), 0.88 + 0.2 * fractal_noise(0.3 * x, 0.3 * y, 0.3 * z, 3, 71)
+        return step_between(warp * weft, -0.5, 0.5), 0.88 + 0.2 * fractal_noise(
+            0.3 * x, 0.3 * y, 0.3 * z, 3, 71
+        )
     if kind == 8:  # brushed metal: streaks around z
         streak = value_noise(0.8 * x, 0.8 * y, 11 * z, 81)
         cloud = fractal_noise(0.9 * x, 0.9 * y, 0.9 * z, 3, 83)
         return 0.5 * streak + 0.35 * cloud, 0.85 + 0.3 * streak
     if kind == 9:  # brick: courses along z, joints along x + y so that no upright face loses them
         course = math.floor(0.9 * z)
-        along = 0.36 * (x + y) + 0.5 * (int(course) & 1)
+        along = 0.36 * (x + y) + 0.5 * (course & 1)
         brick = math.floor(along)
-        joint = min(min(along - brick, brick + 1 - along) / 0.36, min(0.9 * z - course, course + 1 - 0.9 * z) / 0.9)
-        tone = hash01(int(brick), int(course), 0, 91)
+        joint = min(
+            min(along - brick, brick + 1 - along) / 0.36, min(0.9 * z - course, course + 1 - 0.9 * z) / 0.9
+        )
+        tone = hash01(brick, course, 0, 91)
         return 1 - step_between(joint, 0.05, 0.1), 0.78 + 0.4 * tone
     if kind == 10:  # fur: short strokes
         stroke = fractal_noise(2.4 * x + 1.2 * z, 2.4 * y, 0.9 * z, 3, 101)
         cloud = fractal_noise(0.4 * x, 0.4 * y, 0.4 * z, 2, 105)
         return step_between(0.65 * stroke + 0.35 * cloud, 0.3, 0.7), 0.85 + 0.3 * stroke
-    return step_between(fractal_noise(x, y, z, 4, 1), 0.3, 0.72), 0.95 + 0.1 * value_noise(4 * x, 4 * y, 4 * z, 7)
+    return step_between(fractal_noise(x, y, z, 4, 1), 0.3, 0.72), 0.95 + 0.1 * value_noise(
+        4 * x, 4 * y, 4 * z, 7
+    )
 
 
 @numba.njit(**_SETTINGS)
+@no_type_check  # the shape checks of the test-suite cannot be compiled
 def albedo(material: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Linear-light colour of a surface point.
 
@@ -154,7 +169,7 @@ def albedo(material: np.ndarray, x: float, y: float, z: float) -> tuple[float, f
     share, brightness = pattern(int(material[0]), scale * x, scale * y, scale * z)
     # Grain of 6 cm down to 8 mm (in scene units): the finest is about a pixel of a 256 px view.
     grain = fractal_noise(16.0 * x, 16.0 * y, 16.0 * z, 4, 201)
-    brightness *= 1.0 + 2.4 * material[10] * (grain - 0.5)
+    brightness *= 1.0 + 4.5 * material[10] * (grain - 0.5)
     red = (material[1] * (1 - share) + material[4] * share) * brightness
     green = (material[2] * (1 - share) + material[5] * share) * brightness
     blue = (material[3] * (1 - share) + material[6] * share) * brightness

@@ -13,7 +13,14 @@ from torch import Tensor, nn
 
 from hilsplat.base.artifacts import atomic_path, write_json
 from hilsplat.world.tiny_clip import CROP_PX, DIMENSIONS, ClipText, ClipVision
-from hilsplat.world.tiny_sam import FRAME_PX, MASK_STRIDE, STRIDE, SamDecoder, SamEncoder, positional_embeddings
+from hilsplat.world.tiny_sam import (
+    FRAME_PX,
+    MASK_STRIDE,
+    STRIDE,
+    SamDecoder,
+    SamEncoder,
+    positional_embeddings,
+)
 
 MEAN = (0.485, 0.456, 0.406)
 STD = (0.229, 0.224, 0.225)
@@ -156,7 +163,7 @@ def export_sam(encoder: SamEncoder, decoder: SamDecoder, folder: Path) -> None:
 
 
 def export_clip(vision: ClipVision, text: ClipText, tokenizer: Tokenizer, folder: Path) -> None:
-    """Write `config.json`, `preprocessor_config.json`, `tokenizer.json` and the two networks of CLIP's layout."""
+    """Write the configuration, `tokenizer.json` and the two networks of CLIP's layout."""
     folder = Path(folder)
     export_onnx(
         vision,

@@ -7,6 +7,8 @@ the prompt (dynamic convolution, CondInst); and full-resolution pixel features t
 resize and a 3x3 convolution, so that masks show no checkerboard.
 """
 
+from itertools import pairwise
+
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
@@ -74,13 +76,13 @@ class SamEncoder(nn.Module):
         downs, previous = [], 24
         for width, depth in zip(widths, depths, strict=True):
             downs.append(
-                nn.Sequential(convolution(previous, width, stride=2), *(Residual(width) for _ in range(depth)))
+                nn.Sequential(
+                    convolution(previous, width, stride=2), *(Residual(width) for _ in range(depth))
+                )
             )
             previous = width
         self.downs = nn.ModuleList(downs)
-        self.laterals = nn.ModuleList(
-            nn.Conv2d(coarse, fine, 1) for fine, coarse in zip(widths, widths[1:], strict=False)
-        )
+        self.laterals = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(widths))
         self.merges = nn.ModuleList(convolution(width, width) for width in widths[:-1])
         self.fine = nn.Conv2d(24, FINE, 3, padding=1)
         self.semantic = nn.Conv2d(widths[0], SEMANTIC, 3, padding=1)
@@ -100,9 +102,7 @@ class SamEncoder(nn.Module):
         return torch.cat([fine, self.offsets(x), self.semantic(x)], dim=1)
 
 
-def positional_embeddings(
-    windows: Float[Tensor, "B 3"], cells: int
-) -> Float[Tensor, "B C cells cells"]:
+def positional_embeddings(windows: Float[Tensor, "B 3"], cells: int) -> Float[Tensor, "B C cells cells"]:
     """Where each cell of the embedding lies.
 
     Args:
@@ -195,9 +195,9 @@ class SamDecoder(nn.Module):
         first = parts[0].unflatten(-1, (HIDDEN, self.inputs))
         first, bias = _around_anchor(first, parts[1], anchor)
         hidden = torch.matmul(first.flatten(1, 2), shared).unflatten(1, (-1, HIDDEN))  # (B, P, H, n)
-        hidden = functional.relu(hidden + bias[..., None])
+        hidden = functional.relu(hidden.add_(bias[..., None]), inplace=True)
         second = parts[2].unflatten(-1, (HIDDEN, HIDDEN))
-        hidden = functional.relu(torch.matmul(second, hidden) + parts[3][..., None])
+        hidden = functional.relu(torch.matmul(second, hidden).add_(parts[3][..., None]), inplace=True)
         third = parts[4].unflatten(-1, (len(HEADS), HIDDEN))
         logits = torch.matmul(third, hidden) + parts[5][..., None]  # (B, P, 3, n)
         return self.predicted_iou(token, logits), logits.unflatten(-1, (side, side))
@@ -244,7 +244,7 @@ def _around_anchor(
     square = weights[..., PIXEL + 2 + OFFSETS :]  # (B, P, H, 3)
     near = anchor[:, :, None, :]
     centre = anchor[:, :, None, 2:]
-    doubled = square.repeat_interleave(2, dim=-1)  # one per x and y of each head's centre
+    doubled = square[..., [0, 0, 1, 1, 2, 2]]  # one per x and y of each head's centre
     shifted = torch.cat([linear[..., :2], linear[..., 2:] - 2 * doubled * centre], dim=-1)
     constant = (doubled * centre.square()).sum(dim=-1) - (linear * near).sum(dim=-1)
     return torch.cat([weights[..., :PIXEL], shifted, square], dim=-1), bias + constant

@@ -26,14 +26,14 @@ PAIRS = "mean over (view, query) pairs"
 VIEWS = "mean over views with at least one parent"
 
 METRICS: dict[str, Metric] = {
-    "iou": Metric("masks.iou", True, (0, 1), PAIRS),
-    "boundary_iou": Metric("masks.boundary_iou", True, (0, 1), PAIRS),
-    "best_threshold_iou": Metric("masks.best_threshold_iou", False, (0, 1), PAIRS, True),
-    "localization_box": Metric("localization.hits_a_box", False, (0, 1), PAIRS),
-    "localization_mask": Metric("localization.hits_the_mask", False, (0, 1), PAIRS),
-    "hc_containment": Metric("hierarchy.hierarchical_consistency", False, (0, 1), VIEWS),
-    "hc_literal": Metric("hierarchy.hierarchical_consistency", False, (0, 1), VIEWS),
-    "hc_anchored": Metric("hierarchy.hierarchical_consistency", False, (0, 1), VIEWS),
+    "iou": Metric("masks.iou", True, (0.0, 1.0), PAIRS),
+    "boundary_iou": Metric("masks.boundary_iou", True, (0.0, 1.0), PAIRS),
+    "best_threshold_iou": Metric("masks.best_threshold_iou", False, (0.0, 1.0), PAIRS, True),
+    "localization_box": Metric("localization.hits_a_box", False, (0.0, 1.0), PAIRS),
+    "localization_mask": Metric("localization.hits_the_mask", False, (0.0, 1.0), PAIRS),
+    "hc_containment": Metric("hierarchy.hierarchical_consistency", False, (0.0, 1.0), VIEWS),
+    "hc_literal": Metric("hierarchy.hierarchical_consistency", False, (0.0, 1.0), VIEWS),
+    "hc_anchored": Metric("hierarchy.hierarchical_consistency", False, (0.0, 1.0), VIEWS),
 }
 
 BUILDING_BLOCKS: frozenset[str] = frozenset(
@@ -55,4 +55,4 @@ BUILDING_BLOCKS: frozenset[str] = frozenset(
         "averages.mean_over_pairs",
     }
 )
-"""Public functions of this package that are no metric of a row; a test asks that nothing is in neither list."""
+"""Public functions of this package that are no metric of a row; a test lets none be in neither list."""

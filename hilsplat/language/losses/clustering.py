@@ -4,9 +4,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 
-def clustering_loss(
-    features: Float[Tensor, "H W D"], labels: Int[Tensor, "H W"]
-) -> Float[Tensor, ""]:
+def clustering_loss(features: Float[Tensor, "H W D"], labels: Int[Tensor, "H W"]) -> Float[Tensor, ""]:
     """Pull rendered features to the mean of their mask: one view and level of L_h (Eq. 2).
 
     Departs: Eq. 2 sums over pixels and masks; we average over the labelled pixels, so that its

@@ -99,7 +99,9 @@ def test_exported_clip_equals_torch(tmp_path):
     export_clip(vision, text, tokenizer, tmp_path)
     for batch in (1, 3):
         pixels = torch.randn(batch, 3, 64, 64)
-        (found,) = session(tmp_path / "onnx" / "vision_model.onnx").run(None, {"pixel_values": pixels.numpy()})
+        (found,) = session(tmp_path / "onnx" / "vision_model.onnx").run(
+            None, {"pixel_values": pixels.numpy()}
+        )
         with torch.no_grad():
             assert np.abs(found - vision(pixels).numpy()).max() < 1e-3
         assert np.linalg.norm(found, axis=1) == pytest.approx(1.0, abs=1e-4)

@@ -1,0 +1,151 @@
+"""Where the time went: Snakemake's benchmark files as a table.
+
+Times differ from run to run, so this table stands apart from those that must not change.
+"""
+
+import csv
+import io
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from hilsplat.base.artifacts import write_text
+from hilsplat.base.errors import ArtifactError
+
+STAGE_ORDER = (
+    "world",
+    "poses",
+    "gaussians",
+    "masks",
+    "tree",
+    "clip",
+    "contributions",
+    "semantic_tree",
+    "autoencoder",
+    "language",
+    "evaluate",
+    "figures",
+)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One finished job.
+
+    Attributes:
+        stage: its rule.
+        dataset: empty for a job that belongs to no scene, such as a table.
+        scene: likewise.
+        variant: empty where all variants share the stage.
+        elapsed_s: wall clock, s.
+        cpu_s: CPU time of the job and its children, s; 0 where it was too short to be sampled.
+        peak_mib: largest resident memory, MiB; likewise.
+    """
+
+    stage: str
+    dataset: str
+    scene: str
+    variant: str
+    elapsed_s: float
+    cpu_s: float
+    peak_mib: float
+
+
+def run_efficiency(results: Path, out: Path) -> str:
+    """Collect every benchmark file below `results`; write a CSV of jobs and a Markdown table of stages.
+
+    Args:
+        results: the results folder.
+        out: the CSV; `.md` is written beside it.
+
+    Returns:
+        the Markdown table.
+
+    Raises:
+        ArtifactError: there is no benchmark file, or one cannot be read.
+    """
+    files = sorted(Path(results).glob("**/benchmarks/*.jsonl"))
+    if not files:
+        raise ArtifactError(f"{results} holds no benchmark file", fix="run the workflow first")
+    jobs = [job for path in files for job in read_benchmark(path, Path(results))]
+    jobs.sort(key=lambda job: (_order(job.stage), job.dataset, job.scene, job.variant))
+    text = stage_table(jobs)
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(["stage", "dataset", "scene", "variant", "seconds", "cpu_seconds", "peak_mib"])
+    for job in jobs:
+        numbers = (f"{job.elapsed_s:.2f}", f"{job.cpu_s:.2f}", f"{job.peak_mib:.0f}")
+        writer.writerow([job.stage, job.dataset, job.scene, job.variant, *numbers])
+    write_text(Path(out), stream.getvalue())
+    write_text(Path(out).with_suffix(".md"), text)
+    return text
+
+
+def read_benchmark(path: Path, results: Path) -> list[Job]:
+    """Jobs of one file: `<dataset>/<scene>[/<variant>]/benchmarks/<stage>.jsonl`, one line each.
+
+    Raises:
+        ArtifactError: a line is no JSON object with a time.
+    """
+    place = path.relative_to(results).parts[:-2]
+    dataset, scene, variant = (*place, "", "", "")[:3]
+    jobs = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            record = json.loads(line)
+            elapsed_s = float(record["s"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise ArtifactError(f"{path} is no benchmark file: {error}", fix="delete it") from error
+        jobs.append(
+            Job(
+                path.stem,
+                dataset,
+                scene,
+                variant,
+                elapsed_s,
+                _number(record.get("cpu_time")),
+                _number(record.get("max_rss")),
+            )
+        )
+    return jobs
+
+
+def stage_table(jobs: Iterable[Job]) -> str:
+    """Markdown: per stage the number of jobs, time of one job, total, CPU and peak memory."""
+    jobs = list(jobs)
+    of_stage: dict[str, list[Job]] = {}
+    for job in jobs:
+        of_stage.setdefault(job.stage, []).append(job)
+    lines = [
+        "| stage | jobs | mean s | longest s | total s | CPU s | peak MiB |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    for stage in sorted(of_stage, key=_order):
+        lines.append(_line(stage, of_stage[stage]))
+    lines.append(_line("all", jobs))
+    return "\n".join(lines) + "\n"
+
+
+def _line(name: str, jobs: list[Job]) -> str:
+    times = [job.elapsed_s for job in jobs]
+    cells = [
+        name,
+        str(len(jobs)),
+        f"{sum(times) / len(times):.1f}",
+        f"{max(times):.1f}",
+        f"{sum(times):.1f}",
+        f"{sum(job.cpu_s for job in jobs):.1f}",
+        f"{max(job.peak_mib for job in jobs):.0f}",
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+def _order(stage: str) -> tuple[int, str]:
+    """Order of the workflow; what is not in it comes last, by name."""
+    return (STAGE_ORDER.index(stage) if stage in STAGE_ORDER else len(STAGE_ORDER), stage)
+
+
+def _number(value: object) -> float:
+    """Snakemake writes "-" or null for what it could not sample."""
+    return float(value) if isinstance(value, int | float) else 0.0

@@ -1,0 +1,129 @@
+"""Building blocks of figures: overlays of answers, relevancy colours, a map of the scene from above."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from hilsplat.base.artifacts import atomic_path
+from hilsplat.base.levels import Level
+from hilsplat.scene.cameras import Cameras
+from hilsplat.splat.gaussians import Gaussians
+
+ANSWER_RGB = (255, 122, 0)
+TRUTH_RGB = (0, 230, 255)
+RELEVANCY_COLOURS = "inferno"
+SH_CONSTANT = 0.28209479177387814
+"""Value of the constant spherical harmonic; colour is 0.5 + this times row 0 of `sh`."""
+
+MAX_POINTS = 30_000
+"""A map from above shows at most so many Gaussians."""
+
+
+def grey(image: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
+    """A photograph as a quiet background: luminance, 0 to 255."""
+    luminance = image @ np.array([0.299, 0.587, 0.114])
+    return np.repeat(luminance[..., None], 3, axis=2)
+
+
+def outline(mask: Bool[np.ndarray, "H W"], width_px: int) -> Bool[np.ndarray, "H W"]:
+    """A line along the inner border of a mask."""
+    import cv2
+
+    kernel = np.ones((2 * width_px + 1, 2 * width_px + 1), np.uint8)
+    inner = cv2.erode(mask.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=(1.0,))
+    return mask & (inner == 0)
+
+
+def line_px(image: UInt8[np.ndarray, "H W 3"]) -> int:
+    """Width of outlines: visible at any image size."""
+    return max(1, round(max(image.shape[:2]) / 256))
+
+
+def paint_answer(
+    image: UInt8[np.ndarray, "H W 3"],
+    answer: Bool[np.ndarray, "H W"] | None,
+    truth: Bool[np.ndarray, "H W"] | None = None,
+) -> UInt8[np.ndarray, "H W 3"]:
+    """An answer filled in orange over the dimmed photograph, the true region outlined in cyan."""
+    if answer is None:
+        painted = image.astype(float)
+    else:
+        painted = np.where(
+            answer[..., None], 0.4 * image + 0.6 * np.array(ANSWER_RGB), 0.25 * image + 0.4 * grey(image)
+        )
+        painted[outline(answer, line_px(image))] = ANSWER_RGB
+    if truth is not None:
+        painted[outline(truth, line_px(image))] = TRUTH_RGB
+    return painted.clip(0, 255).astype(np.uint8)
+
+
+def paint_relevancy(
+    image: UInt8[np.ndarray, "H W 3"], relevancy: Float[np.ndarray, "H W"], low: float, high: float
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Relevancy in colours, stretched from `low` to `high`, over the grey photograph."""
+    stretched = np.clip((relevancy - low) / max(high - low, 1e-6), 0, 1)
+    colours = colormaps[RELEVANCY_COLOURS](stretched)[..., :3] * 255
+    return (0.78 * colours + 0.22 * grey(image)).clip(0, 255).astype(np.uint8)
+
+
+def show(axes: Axes, picture: UInt8[np.ndarray, "H W 3"], title: str = "", bold: bool = False) -> None:
+    """A picture without ticks."""
+    axes.imshow(picture, interpolation="nearest" if max(picture.shape[:2]) < 300 else "antialiased")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_linewidth(2.0 if bold else 0.5)
+        spine.set_color("#ff7a00" if bold else "#888888")
+    axes.set_title(title, fontsize=8, pad=3, fontweight="bold" if bold else "normal")
+
+
+def label_left(axes: Axes, text: str, level: Level | None = None) -> None:
+    """Name of a row of pictures, upright at its left."""
+    axes.set_ylabel(f"{text}\n{level.label}" if level else text, fontsize=8)
+
+
+def show_from_above(
+    axes: Axes, gaussians: Gaussians, cameras: Cameras, selected: Bool[np.ndarray, " N"], title: str
+) -> None:
+    """Gaussians seen against the cameras' mean up direction, the selected ones in orange; cameras as dots."""
+    means = gaussians.means.detach().numpy().astype(np.float64)
+    centres = np.stack([cameras[name].centre for name in cameras.names])
+    rotation = _from_above(cameras)
+    flat, flat_cameras = means @ rotation.T, centres @ rotation.T
+    low, high = np.percentile(flat[:, :2], (1, 99), axis=0)
+    low, high = np.minimum(low, flat_cameras[:, :2].min(0)), np.maximum(high, flat_cameras[:, :2].max(0))
+    colours = np.clip(0.5 + SH_CONSTANT * gaussians.sh[:, 0].detach().numpy(), 0, 1)
+    colours = 0.5 * colours + 0.45
+    visible = np.flatnonzero((gaussians.opacities.detach().numpy() > 0.3) & ~selected)
+    shown = visible[:: max(1, len(visible) // MAX_POINTS)]
+    shown = shown[np.argsort(flat[shown, 2], kind="stable")]
+    axes.scatter(flat[shown, 0], flat[shown, 1], s=1.5, c=colours[shown].clip(0, 1), linewidths=0)
+    axes.scatter(flat[selected, 0], flat[selected, 1], s=4, color="#ff7a00", linewidths=0)
+    axes.scatter(flat_cameras[:, 0], flat_cameras[:, 1], s=10, color="#333333", marker="^", linewidths=0)
+    margin = 0.05 * (high - low).max()
+    axes.set_xlim(low[0] - margin, high[0] + margin)
+    axes.set_ylim(low[1] - margin, high[1] + margin)
+    axes.set_aspect("equal")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.set_title(title, fontsize=8, pad=3)
+
+
+def _from_above(cameras: Cameras) -> Float[np.ndarray, "3 3"]:
+    """Rotation whose third axis is the cameras' mean up direction (OpenCV cameras: up is -y)."""
+    up = -cameras.cam_from_world[:, 1, :3].mean(axis=0)
+    up = up / max(np.linalg.norm(up), 1e-9) if np.linalg.norm(up) > 1e-9 else np.array([0.0, 0.0, 1.0])
+    right = cameras.cam_from_world[0, 0, :3]
+    right = right - (right @ up) * up
+    right = right / np.linalg.norm(right)
+    return np.stack([right, np.cross(up, right), up])
+
+
+def save_figure(figure: Figure, out: Path, dpi: int = 110) -> None:
+    """Write a PNG atomically, without a library version in it."""
+    with atomic_path(out) as temporary:
+        figure.savefig(temporary, format="png", dpi=dpi, facecolor="white", metadata={"Software": None})

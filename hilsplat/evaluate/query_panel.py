@@ -1,0 +1,212 @@
+"""Ask a finished scene for a text: a ranked list in words, and a picture."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from hilsplat.base.artifacts import read_index, read_json
+from hilsplat.base.errors import ArtifactError
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.provenance import provenance_path
+from hilsplat.evaluate.pictures import (
+    label_left,
+    paint_answer,
+    paint_relevancy,
+    save_figure,
+    show,
+    show_from_above,
+)
+from hilsplat.language.query import PATH_SEPARATOR, Hit, LanguageScene
+
+LISTED = 10
+"""Answers told at most."""
+
+
+@dataclass(frozen=True)
+class Artifacts:
+    """Where the parts of a finished scene lie."""
+
+    scene: Path
+    gaussians: Path
+    semantic_tree: Path
+    language: Path
+    autoencoder: Path
+    clip: Path
+
+
+def answer(
+    folder: Path,
+    text: str,
+    *,
+    level: str = "auto",
+    variant: str = "default",
+    views: int = 3,
+    out: Path | None = None,
+    threads: int = 1,
+) -> str:
+    """Ask a scene; write `panel.png` and tell what was found.
+
+    Args:
+        folder: `results/<dataset>/<scene>`.
+        text: words, or a path such as "bear > head > nose".
+        level: auto, whole, part or subpart.
+        variant: whose files answer.
+        views: views in the panel.
+        out: folder of the panel; by default `queries/<text>` in the scene's folder.
+        threads: threads for rendering.
+
+    Raises:
+        ArtifactError: the scene is not finished.
+    """
+    folder = Path(folder)
+    parts = locate(folder, variant)
+    scene = LanguageScene.open(
+        parts.scene,
+        parts.gaussians,
+        parts.semantic_tree,
+        parts.language,
+        parts.autoencoder,
+        Path(read_index(parts.clip)["model"]),
+        threads=threads,
+    )
+    hits = scene.query(text, level, limit=LISTED)
+    panel = (Path(out) if out is not None else folder / "queries" / file_name(text)) / "panel.png"
+    shown = views_of(scene, hits, views)
+    query_panel(scene, text, shown, panel, level=level)
+    return "\n".join([told(text, hits, scene.scene.unit), f"wrote {panel}"])
+
+
+def query_panel(
+    scene: LanguageScene, text: str, views: Sequence[str], out_png: Path, *, level: str = "auto"
+) -> None:
+    """Draw a query: per view photograph, answer and relevancy at three levels; the scene from above."""
+    hits = scene.find(text, level)
+    last = text.split(PATH_SEPARATOR)[-1].strip()
+    size_hw = scene.scene.cameras[views[0]].size_hw
+    width_in, columns = 13.0, 5
+    row_in = width_in / columns * size_hw[0] / size_hw[1] + 0.1
+    map_in = 4.2
+    figure = Figure(figsize=(width_in, len(views) * row_in + map_in + 0.6), layout="constrained")
+    found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
+    figure.suptitle(f"“{text}” in {scene.scene.name}: {found}", fontsize=12, fontweight="bold")
+    upper, lower = figure.subfigures(2, 1, height_ratios=[len(views) * row_in, map_in])
+    grid = upper.subplots(len(views), columns, squeeze=False)
+    for axes, view in zip(grid, views, strict=True):
+        image = scene.scene.image(view)
+        mask = (
+            np.asarray(scene.node_masks(view, hits.ids)) if len(hits.ids) else np.zeros(image.shape[:2], bool)
+        )
+        relevancy = np.asarray(scene.node_relevancy_map([last], view))[0]
+        low, high = float(relevancy.min()), float(relevancy.max())
+        show(axes[0], image, view)
+        label_left(axes[0], f"{scene.scene.split[view]} view")
+        show(axes[1], paint_answer(image, mask), f"answer: {mask.mean():.1%} of the view")
+        for each in LEVELS:
+            top = float(relevancy[each.index].max())
+            picture = paint_relevancy(image, relevancy[each.index], low, high)
+            show(
+                axes[2 + each.index], picture, f"relevancy, {each.label}: {top:.2f}", bold=each is hits.level
+            )
+    selected = np.isin(scene.tree.node_of_gaussian, hits.ids).any(axis=1)
+    title = f"from above: {np.count_nonzero(selected)} of {len(selected)} Gaussians; triangles are cameras"
+    show_from_above(lower.subplots(), scene.gaussians, scene.scene.cameras, selected, title)
+    save_figure(figure, out_png)
+
+
+def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]:
+    """Views that show the best answers largest, each once; then others, spread over the scene."""
+    best = [view for hit in hits for view in hit.best_views[:1]] + [v for hit in hits for v in hit.best_views]
+    every = scene.scene.views()
+    spread = [every[number * len(every) // count] for number in range(count)]
+    return list(dict.fromkeys([*best, *spread, *every]))[:count]
+
+
+def told(text: str, hits: Sequence[Hit], unit: str) -> str:
+    """The answers in words."""
+    if not hits:
+        return f"no node of the scene answers {text!r}; try --level part or subpart"
+    lengths = "metres" if unit == "metre" else "scene units"
+    lines = [
+        f"{counted(len(hits), 'answer')} to {text!r}; lengths in {lengths}; "
+        "a relevancy of 0.5 is no better than a generic phrase",
+        f"{'node':>5}  {'level':<8} {'score':>5}  {'position':<24} {'box size':<20} best views",
+    ]
+    for hit in hits:
+        position = ", ".join(f"{value:.2f}" for value in hit.centroid)
+        size = " x ".join(f"{high - low:.2f}" for low, high in zip(*hit.box, strict=True))
+        views = ", ".join(hit.best_views)
+        lines.append(
+            f"{hit.node:>5}  {Level(hit.level).label:<8} {hit.score:>5.2f}  {position:<24} {size:<20} {views}"
+        )
+    if hits[0].route == "fallback":
+        lines.append(
+            "nothing of the kind lies inside the first answers: the whole scene was searched instead"
+        )
+    if hits[0].score < 0.5:
+        lines.append("all scores are below 0.5: the scene may hold nothing of the kind")
+    return "\n".join(lines)
+
+
+def counted(count: int, noun: str) -> str:
+    """A count with its noun: 1 node, 2 nodes."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def file_name(text: str) -> str:
+    """A folder name that is safe on every system, such as `bear--nose`."""
+    words = [re.sub(r"[^\w.-]+", "-", part.strip()).strip("-.") for part in text.split(PATH_SEPARATOR)]
+    return "--".join(word for word in words if word) or "query"
+
+
+def locate(folder: Path, variant: str) -> Artifacts:
+    """Parts of a variant, some of which it may share with another one.
+
+    What a stage read is written in its provenance; without one, the parts are expected beside it.
+
+    Raises:
+        ArtifactError: a part is missing.
+    """
+    folder = Path(folder)
+    language = folder / variant / "language.safetensors"
+    if not language.exists():
+        language = folder / "default" / "language.safetensors"
+        if variant != "default" and not (folder / variant).exists():
+            raise ArtifactError(
+                f"{folder} has no variant {variant!r}",
+                expected=f"one of {', '.join(_variants(folder)) or 'none yet'}",
+                fix="name it under ablation_variants and run the workflow",
+            )
+    autoencoder = _input_of(language, "autoencoder", folder)
+    parts = Artifacts(
+        folder / "scene",
+        folder / "gaussians.ply",
+        _input_of(autoencoder, "semantic_tree", folder),
+        language,
+        autoencoder,
+        _input_of(autoencoder, "clip", folder),
+    )
+    for path in vars(parts).values():
+        if not path.exists():
+            raise ArtifactError(
+                f"{folder} is not finished: {path} is missing", fix=f"snakemake --cores 2 {path}"
+            )
+    return parts
+
+
+def _variants(folder: Path) -> list[str]:
+    return sorted(path.parent.name for path in folder.glob("*/language.safetensors"))
+
+
+def _input_of(artifact: Path, name: str, folder: Path) -> Path:
+    """Where an artifact's input lies: as its provenance says, else beside it."""
+    record = provenance_path(artifact)
+    if record.is_file():
+        path = Path(read_json(record)["inputs"].get(name, {}).get("path", ""))
+        recorded = folder / path.parent.name / path.name
+        if path.name and recorded.exists():
+            return recorded
+    return artifact.parent / name

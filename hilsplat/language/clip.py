@@ -1,0 +1,137 @@
+"""CLIP by onnxruntime: crops of masks and texts as unit vectors of one space."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float16, Float32, UInt8
+from tokenizers import Tokenizer
+
+from hilsplat.base.crops import square_crop
+from hilsplat.base.errors import ModelError
+from hilsplat.base.onnx_models import ModelFolder, input_side_px, open_model_folder
+from hilsplat.base.parallel import in_order
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.settings import ClipSettings
+
+logger = logging.getLogger(__name__)
+
+
+class ClipModel:
+    """A CLIP folder, ready to run.
+
+    Attributes:
+        digest: SHA-256 of the model's files.
+        side_px: side of the square crops the vision network takes.
+        max_tokens: longest text the text network takes; None where the folder names no limit.
+    """
+
+    def __init__(self, model: ModelFolder, threads: int = 1) -> None:
+        self.model = model
+        self.threads = threads
+        self.digest = model.digest
+        self.vision = model.network("vision_model")
+        self.text = model.network("text_model")
+        self.side_px = input_side_px(model)
+        # CLIP's own statistics where the folder names none, as in transformers
+        preprocessing = model.preprocessing
+        self.mean = np.array(preprocessing.get("image_mean", (0.48145466, 0.4578275, 0.40821073)), np.float32)
+        self.std = np.array(preprocessing.get("image_std", (0.26862954, 0.26130258, 0.27577711)), np.float32)
+        self.rescale = np.float32(preprocessing.get("rescale_factor", 1 / 255))
+        path = model.folder / "tokenizer.json"
+        try:
+            self.tokenizer = Tokenizer.from_file(str(path))
+        except Exception as error:  # the tokenizers package raises bare Exception
+            raise ModelError(f"{path} cannot be read: {error}", fix="fetch a whole copy") from error
+        fixed = self.text.fixed_axis("input_ids", 1)
+        declared = model.config.get("text_config", {}).get("max_position_embeddings")
+        truncation = self.tokenizer.truncation or {}
+        self.max_tokens: int | None = fixed or declared or truncation.get("max_length")
+        if self.max_tokens:
+            self.tokenizer.enable_truncation(self.max_tokens)
+        if fixed:
+            pad = (self.tokenizer.padding or {}).get(
+                "pad_id", model.config.get("text_config", {}).get("pad_token_id")
+            )
+            self.tokenizer.enable_padding(length=fixed, pad_id=int(pad or 0))
+        else:
+            self.tokenizer.no_padding()
+
+    @staticmethod
+    def load(folder: Path, threads: int = 1) -> "ClipModel":
+        """Open a model folder.
+
+        Args:
+            folder: in the layout of the Hugging Face ONNX exports.
+            threads: batches of crops worked on at once; results do not depend on it.
+
+        Raises:
+            ModelError: it is missing, incomplete or no CLIP.
+        """
+        return ClipModel(open_model_folder(folder, "clip"), threads)
+
+    def prepare(self, crops: UInt8[np.ndarray, "B side side 3"]) -> Float32[np.ndarray, "B 3 side side"]:
+        """Normalise crops, channel first."""
+        values = (crops.astype(np.float32) * self.rescale - self.mean) / self.std
+        return np.ascontiguousarray(values.transpose(0, 3, 1, 2))
+
+    def embed_crops(self, crops: UInt8[np.ndarray, "B side side 3"]) -> Float32[np.ndarray, "B C"]:
+        """Unit vectors of square crops of `side_px`."""
+        (vectors,) = self.vision(pixel_values=self.prepare(crops))
+        return unit(vectors)
+
+    def embed_masks(
+        self,
+        image: UInt8[np.ndarray, "H W 3"],
+        masks: HierarchicalMasks,
+        settings: ClipSettings | None = None,
+    ) -> Float16[np.ndarray, "M C"]:
+        """A unit vector per mask of a view, from its crop (`square_crop`), rows as in the masks.
+
+        Args:
+            image: the view.
+            masks: its masks.
+            settings: what stands outside the mask, margin, crops per network call; None: defaults.
+        """
+        settings = settings or ClipSettings()
+
+        def embed(start: int) -> np.ndarray:
+            rows = np.arange(start, min(len(masks), start + settings.batch))
+            crops = [
+                square_crop(image, mask, settings.background, settings.context, self.side_px)
+                for mask in masks.dense(rows)
+            ]
+            return self.embed_crops(np.stack(crops))
+
+        parts = list(in_order(embed, range(0, len(masks), settings.batch), self.threads))
+        if not parts:
+            return np.zeros((0, self.embed_texts(["object"]).shape[1]), dtype=np.float16)
+        return np.concatenate(parts).astype(np.float16)
+
+    def embed_texts(self, texts: list[str]) -> Float32[np.ndarray, "T C"]:
+        """Unit vectors of texts, in order.
+
+        Texts run one by one: the vector of a query then never depends on the queries beside it.
+
+        Raises:
+            ModelError: a text has no token.
+        """
+        vectors = []
+        for text in texts:
+            encoding = self.tokenizer.encode(text)
+            if not sum(encoding.attention_mask):
+                raise ModelError(f"text {text!r} has no token", fix="give each query at least one word")
+            if encoding.overflowing:
+                logger.warning("text cut at %d tokens: %r", self.max_tokens, text)
+            (vector,) = self.text(
+                input_ids=np.array([encoding.ids], dtype=np.int64),
+                attention_mask=np.array([encoding.attention_mask], dtype=np.int64),
+            )
+            vectors.append(vector)
+        return unit(np.concatenate(vectors))
+
+
+def unit(vectors: Float32[np.ndarray, "N C"]) -> Float32[np.ndarray, "N C"]:
+    """Scale rows to length 1; a zero row stays zero."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return (vectors / np.where(length > 0, length, 1)).astype(np.float32)

@@ -1,0 +1,104 @@
+"""The finished contributions of a scene: one row per mask of all train views."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float32, Int32, Int64, UInt8
+
+from hilsplat.base.artifacts import read_index, read_npy, read_npz
+from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.levels import Level
+from hilsplat.language.quadratic import Quadratic, load_quadratic
+
+
+@dataclass(frozen=True)
+class Contributions:
+    """The finished stage: its rows in memory, its matrices read when asked for.
+
+    M rows are the masks of all train views, view by view, in each view's own order.
+
+    Attributes:
+        folder: the artifact.
+        views: train views in the order of `view`.
+        num_gaussians: N.
+        gaussians_sha256: digest of the PLY the weights belong to.
+        view: index of each row's view in `views`.
+        mask: row of the mask among its view's masks.
+        level: `Level` of the mask.
+        area_px: pixels of the raw mask.
+        pixels: pixels at which the mask is painted and the Gaussians cover the image, n.
+        half_pixels: those of them in the random half.
+    """
+
+    folder: Path
+    views: tuple[str, ...]
+    num_gaussians: int
+    gaussians_sha256: str
+    view: Int32[np.ndarray, " M"]
+    mask: Int32[np.ndarray, " M"]
+    level: UInt8[np.ndarray, " M"]
+    area_px: Int64[np.ndarray, " M"]
+    pixels: Int64[np.ndarray, " M"]
+    half_pixels: Int64[np.ndarray, " M"]
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+    def rows_of(self, level: Level) -> Int64[np.ndarray, " m"]:
+        """Rows of a level, in order."""
+        return np.flatnonzero(self.level == int(level))
+
+    def matrix(self, name: str) -> sp.csr_matrix:
+        """Read `A`, `A_half` or `S` (M x N)."""
+        arrays = read_npz(self.folder / f"{name}.npz")
+        return sp.csr_matrix(
+            (arrays["data"], arrays["indices"], arrays["indptr"]), shape=(len(self), self.num_gaussians)
+        )
+
+    def mass(self) -> Float32[np.ndarray, "V N"]:
+        """Visible mass of each Gaussian in each train view, px."""
+        return read_npz(self.folder / "mass.npz")["mass"]
+
+    def means(self) -> Float32[np.ndarray, "N 3"]:
+        """Centres of the Gaussians, scene units."""
+        return read_npz(self.folder / "mass.npz")["means"]
+
+    def quadratic(self) -> Quadratic:
+        """Read G, or the stacked weights where those are smaller."""
+        return load_quadratic(self.folder)
+
+    @staticmethod
+    def load(folder: Path) -> "Contributions":
+        """Read the rows of a finished contributions folder."""
+        folder = Path(folder)
+        index = read_index(folder)
+        return Contributions(
+            folder,
+            tuple(index["views"]),
+            index["num_gaussians"],
+            index["gaussians_sha256"],
+            **read_npz(folder / "rows.npz"),
+        )
+
+
+def mask_embeddings(clip_folder: Path, contributions: Contributions) -> Float32[np.ndarray, "M C"]:
+    """CLIP vectors of all masks, in the contributions' row order.
+
+    Raises:
+        MisalignedArtifactError: a view has another number of vectors than masks.
+    """
+    parts = []
+    counts = np.bincount(contributions.view, minlength=len(contributions.views))
+    for view, count in zip(contributions.views, counts, strict=True):
+        vectors = read_npy(Path(clip_folder) / f"{view}.npy")
+        if len(vectors) != count:
+            raise MisalignedArtifactError(
+                f"CLIP vectors of view {view} do not belong to these contributions",
+                expected=f"{count} vectors, one per mask",
+                found=f"{len(vectors)} in {clip_folder}",
+                fix="run the clip and contributions stages again on the same masks",
+            )
+        parts.append(vectors.astype(np.float32))
+    return np.concatenate(parts)

@@ -1,0 +1,248 @@
+"""From posed views to the scene artifact: pinhole images, sane coordinates, split, registration report."""
+
+import logging
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float64, UInt8
+
+from hilsplat.base.artifacts import atomic_folder, write_json
+from hilsplat.base.images import read_image, write_png
+from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.scene import Scene
+
+logger = logging.getLogger(__name__)
+
+MIN_VIEWS_FOR_TEST = 8
+"""With fewer views none is held out: each one is needed for the fit."""
+
+MIN_LEVELNESS_GAP = 3.0
+"""How much better "up" must explain level cameras than the next direction, to be taken from them."""
+
+
+@dataclass(frozen=True)
+class PosedView:
+    """One view with its lens, before undistortion.
+
+    Attributes:
+        view: view name.
+        image: PNG file whose pixels the lens describes.
+        camera: COLMAP camera of that image, distorted or not.
+        cam_from_source: world-to-camera transform in source coordinates.
+    """
+
+    view: str
+    image: Path
+    camera: pycolmap.Camera
+    cam_from_source: Float64[np.ndarray, "4 4"]
+
+    @property
+    def centre(self) -> Float64[np.ndarray, " 3"]:
+        """Camera centre, source coordinates."""
+        return -self.cam_from_source[:3, :3].T @ self.cam_from_source[:3, 3]
+
+
+def undistort(view: PosedView, folder: Path) -> PosedView:
+    """Write the pinhole image of a view into a folder, and return the view with its pinhole camera.
+
+    An image without distortion is copied byte for byte, so that labels stay aligned with it.
+    Otherwise the image is warped, as large as it can be without blank pixels.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    target = folder / view.view
+    if view.camera.is_undistorted():
+        shutil.copyfile(view.image, target)
+        return replace(view, image=target)
+    bitmap = pycolmap.Bitmap.from_array(read_image(view.image))
+    warped, camera = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, view.camera)
+    write_png(target, warped.to_array())
+    return replace(view, image=target, camera=camera)
+
+
+def up_direction(cam_from_source: Float64[np.ndarray, "V 4 4"]) -> Float64[np.ndarray, " 3"]:
+    """Estimate which way is up from cameras that were mostly held level.
+
+    Level cameras have their x axes in the horizontal plane, whatever their tilt, so up is the
+    direction most orthogonal to all of them. Where the x axes are nearly parallel (a camera that
+    only moved sideways) that is ambiguous, and the mean of the cameras' own up axes is taken.
+    """
+    right, up_of_camera = cam_from_source[:, 0, :3], -cam_from_source[:, 1, :3]
+    mean_up = up_of_camera.mean(axis=0)
+    values, vectors = np.linalg.eigh(right.T @ right / len(right))
+    if values[1] > MIN_LEVELNESS_GAP * values[0] and values[1] > 1e-3:
+        up = vectors[:, 0] * (1.0 if vectors[:, 0] @ mean_up >= 0 else -1.0)
+    else:
+        up = mean_up
+    length = float(np.linalg.norm(up))
+    return up / length if length > 1e-9 else np.array([0.0, 0.0, 1.0])
+
+
+def rotation_to_z_up(up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
+    """The shortest rotation that turns a unit vector to +z; +z itself gives the identity."""
+    z = np.array([0.0, 0.0, 1.0])
+    axis, cosine = np.cross(up, z), float(up @ z)
+    if cosine < -1 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + cross + cross @ cross / (1 + cosine)
+
+
+def normalising_similarity(
+    cam_from_source: Float64[np.ndarray, "V 4 4"],
+    points: Float64[np.ndarray, "P 3"],
+    *,
+    metric: bool,
+    turn: bool,
+) -> Float64[np.ndarray, "4 4"]:
+    """The similarity `scene_from_source` that gives every scene sane coordinates.
+
+    The origin is the median of the sparse points (of the camera centres where there are none). One
+    unit is the median distance of the cameras from it, so a scene fills a few units whatever its
+    size; metric sources keep their metre. With `turn`, +z is up as the cameras were held: structure
+    from motion leaves the rotation to chance, imported poses keep their own axes.
+    """
+    rotations = cam_from_source[:, :3, :3]
+    centres = -np.einsum("vji,vj->vi", rotations, cam_from_source[:, :3, 3])
+    origin = np.median(points if len(points) else centres, axis=0)
+    distance = float(np.median(np.linalg.norm(centres - origin, axis=1)))
+    scale = 1.0 if metric or distance < 1e-9 else 1.0 / distance
+    rotation = rotation_to_z_up(up_direction(cam_from_source)) if turn else np.eye(3)
+    similarity = np.eye(4)
+    similarity[:3, :3] = scale * rotation
+    similarity[:3, 3] = -scale * rotation @ origin
+    return similarity
+
+
+def move_cameras(
+    cam_from_source: Float64[np.ndarray, "V 4 4"], scene_from_source: Float64[np.ndarray, "4 4"]
+) -> Float64[np.ndarray, "V 4 4"]:
+    """World-to-camera transforms in scene coordinates; camera coordinates take the scene's scale."""
+    scale = np.cbrt(np.linalg.det(scene_from_source[:3, :3]))
+    rotation, offset = scene_from_source[:3, :3] / scale, scene_from_source[:3, 3]
+    moved = np.tile(np.eye(4), (len(cam_from_source), 1, 1))
+    moved[:, :3, :3] = cam_from_source[:, :3, :3] @ rotation.T
+    moved[:, :3, 3] = scale * cam_from_source[:, :3, 3] - moved[:, :3, :3] @ offset
+    return moved
+
+
+def split_views(names: Sequence[str], test_every: int) -> dict[str, str]:
+    """Hold out every `test_every`-th view by sorted name, beginning with the first (3DGS: index % 8 == 0).
+
+    None is held out with `test_every` 0, 1 (nothing would be left), or fewer than eight views.
+    """
+    ordered = sorted(names)
+    holds_out = test_every > 1 and len(ordered) >= MIN_VIEWS_FOR_TEST
+    return {
+        name: "test" if holds_out and index % test_every == 0 else "train"
+        for index, name in enumerate(ordered)
+    }
+
+
+def write_scene(
+    out: Path,
+    name: str,
+    unit: str,
+    views: Sequence[PosedView],
+    points_xyz: Float[np.ndarray, "P 3"],
+    points_rgb: UInt8[np.ndarray, "P 3"],
+    split: Mapping[str, str],
+    report: dict[str, Any],
+    *,
+    turn: bool,
+) -> None:
+    """Write the scene artifact with its registration report; the folder appears whole or not at all.
+
+    Args:
+        out: the scene folder.
+        name: `<dataset>/<scene>`.
+        unit: "metre" keeps the source's scale; any other lets it be normalised.
+        views: posed views, at least one.
+        points_xyz: sparse points, source coordinates.
+        points_rgb: their colours.
+        split: "train" or "test" per view.
+        report: what registration found; split and size per view are added here.
+        turn: turn the scene so that +z is up.
+    """
+    views = sorted(views, key=lambda view: view.view)
+    source_poses = np.stack([view.cam_from_source for view in views])
+    points = np.asarray(points_xyz, dtype=np.float64).reshape(-1, 3)
+    scene_from_source = normalising_similarity(source_poses, points, metric=unit == "metre", turn=turn)
+    points = points @ scene_from_source[:3, :3].T + scene_from_source[:3, 3]
+    with atomic_folder(out) as folder:
+        pinhole = [undistort(view, folder / "images") for view in views]
+        cameras = Cameras(
+            names=tuple(view.view for view in pinhole),
+            cam_from_world=move_cameras(source_poses, scene_from_source),
+            K=np.stack([view.camera.calibration_matrix() for view in pinhole]),
+            size_hw=np.array([(view.camera.height, view.camera.width) for view in pinhole], dtype=np.int32),
+        )
+        scene = Scene(
+            folder=folder,
+            name=name,
+            unit=unit,
+            cameras=cameras,
+            split={view: split[view] for view in cameras.names},
+            points_xyz=points.astype(np.float32),
+            points_rgb=points_rgb,
+            scene_from_source=scene_from_source,
+        )
+        for camera_row, view in enumerate(cameras.names):
+            entry = report["views"][view]
+            entry["split"] = scene.split[view]
+            entry["size_hw_px"] = [int(n) for n in cameras.size_hw[camera_row]]
+            entry["focal_px"] = round(float(cameras.K[camera_row, 0, 0]), 3)
+        write_json(folder / "registration.json", report)
+        plot_registration(folder / "registration.png", scene, report)
+        scene.save()
+
+
+def plot_registration(path: Path, scene: Scene, report: Mapping[str, Any]) -> None:
+    """Draw camera centres and sparse points from above and from the side."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    poses = scene.cameras.cam_from_world
+    rotation = rotation_to_z_up(up_direction(poses))
+    centres = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3]) @ rotation.T
+    looks = poses[:, 2, :3] @ rotation.T
+    points = scene.points_xyz.astype(np.float64) @ rotation.T
+    colours = scene.points_rgb / 255
+    is_test = np.array([scene.split[view] == "test" for view in scene.cameras.names])
+    # Far outliers would shrink the scene to a dot: frame the cameras and the middle 96 % of the points.
+    around = np.percentile(points, [2, 98], axis=0) if len(points) else np.zeros((0, 3))
+    framed = np.concatenate([centres, around])
+    low, high = framed.min(axis=0), framed.max(axis=0)
+    margin = 0.08 * float((high - low).max()) or 1.0
+    arrow = 0.08 * float((high - low).max())
+
+    figure = Figure(figsize=(12, 6), layout="constrained")
+    FigureCanvasAgg(figure)
+    for position, (title, x, y) in enumerate((("from above", 0, 1), ("from the side", 0, 2)), start=1):
+        axes = figure.add_subplot(1, 2, position)
+        axes.scatter(points[:, x], points[:, y], s=1.5, c=colours, linewidths=0)
+        for chosen, colour, label in ((~is_test, "tab:blue", "train"), (is_test, "tab:orange", "test")):
+            if chosen.any():
+                at, ahead = centres[chosen], centres[chosen] + arrow * looks[chosen]
+                axes.plot(
+                    [at[:, x], ahead[:, x]], [at[:, y], ahead[:, y]], color=colour, linewidth=0.8, zorder=2
+                )
+                count = int(chosen.sum())
+                axes.scatter(at[:, x], at[:, y], s=14, color=colour, label=f"{count} {label}", zorder=3)
+        axes.set_xlim(low[x] - margin, high[x] + margin)
+        axes.set_ylim(low[y] - margin, high[y] + margin)
+        axes.set_aspect("equal")
+        axes.set_xlabel("scene units")
+        axes.set_title(title)
+        axes.legend(loc="upper right", fontsize=8)
+    error = report["mean_reprojection_error_px"]
+    quality = f", reprojection error {error:.2f} px" if error is not None else ""
+    figure.suptitle(
+        f"{scene.name}: {report['registered']} of {report['images']} views, {len(points)} points{quality}"
+    )
+    # No date, no version of the library: the same scene gives the same bytes.
+    figure.savefig(path, format="png", dpi=100, metadata={"Software": None})

@@ -1,0 +1,38 @@
+"""Poses, points and residuals of a COLMAP model as arrays."""
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from hilsplat.scene.colmap import pycolmap
+
+
+def pose_matrix(pose: pycolmap.Rigid3d) -> Float64[np.ndarray, "4 4"]:
+    """4 x 4 matrix of a COLMAP pose."""
+    return np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]])
+
+
+def sparse_points(
+    model: pycolmap.Reconstruction,
+) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
+    """Sparse points and colours of a model, by point id."""
+    points = [model.points3D[point_id] for point_id in sorted(model.points3D)]
+    xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
+    rgb = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
+    return xyz, rgb
+
+
+def reprojection_errors(model: pycolmap.Reconstruction) -> dict[str, Float64[np.ndarray, " n"]]:
+    """Distance in px between each observation and its point's projection, per registered view."""
+    errors = {}
+    for image_id in model.reg_image_ids():
+        image = model.images[image_id]
+        seen = image.get_observation_points2D()
+        if not seen:
+            errors[image.name] = np.zeros(0)
+            continue
+        measured = np.array([point.xy for point in seen])
+        xyz = np.array([model.points3D[point.point3D_id].xyz for point in seen])
+        pose = image.cam_from_world().matrix()
+        projected = image.camera.img_from_cam(xyz @ pose[:, :3].T + pose[:, 3], check_cheirality=False)
+        errors[image.name] = np.linalg.norm(projected - measured, axis=1)
+    return errors

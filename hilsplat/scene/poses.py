@@ -1,0 +1,325 @@
+"""The poses stage: photographs, or images with known poses, to a posed scene."""
+
+import logging
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilsplat.base.errors import RegistrationError, SceneError
+from hilsplat.base.files import list_images
+from hilsplat.base.progress import stage_log
+from hilsplat.scene.assemble import PosedView, split_views, write_scene
+from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.features import (
+    MIN_INLIERS,
+    MatchCounts,
+    WorkImage,
+    count_matches,
+    extract_features,
+    match_features,
+    prepare_images,
+    register_images,
+)
+from hilsplat.scene.importers import find_known_poses, import_poses
+from hilsplat.scene.model import pose_matrix, reprojection_errors, sparse_points
+from hilsplat.scene.sheet import MIN_PHOTOS, photo_folder
+from hilsplat.settings import PosesSettings
+
+logger = logging.getLogger(__name__)
+
+INIT_MIN_INLIERS = 50
+"""Matches the first pair of a model needs (reference block; COLMAP: 100)."""
+
+POSE_MIN_INLIERS = 15
+"""Points that a further view must see to be posed (reference block; COLMAP: 30)."""
+
+WEAK_POINTS_PER_VIEW = 13
+"""Good runs on renders had at least this many points per registered view; worthless ones had 4 to 18."""
+
+
+def run_poses(
+    images: Path,
+    out: Path,
+    name: str,
+    unit: str,
+    is_render: bool,
+    settings: PosesSettings,
+    seed: int,
+    threads: int,
+) -> None:
+    """Pose the images of one scene and write its Scene artifact with a registration report.
+
+    A folder with a COLMAP model (`sparse/`) or a `transforms*.json` is imported; any other is posed
+    by structure from motion. The result depends on images, settings and seed, not on `threads`:
+    features and matches are computed pair by pair, the mapping itself runs on one thread.
+
+    Structure from motion knows no metre, so its scenes have the unit "arbitrary" whatever `unit` says.
+
+    Args:
+        images: folder of photographs, or of images with known poses.
+        out: scene folder to write.
+        name: `<dataset>/<scene>`.
+        unit: "metre" or "arbitrary": the unit of imported poses.
+        is_render: images are renders of a pinhole camera without distortion.
+        settings: the `poses` section.
+        seed: of RANSAC and of the mapper.
+        threads: for feature extraction and matching.
+
+    Raises:
+        SceneError: fewer than three images, or an unusable folder.
+        ImageError: an image is empty, truncated or unreadable.
+        RegistrationError: too few views were registered.
+    """
+    images, out = Path(images), Path(out)
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)  # COLMAP narrates each step on stderr
+    with stage_log("poses", name) as counts, _work_folder(out) as work:
+        known = find_known_poses(images) if images.is_dir() else None
+        if known is None:
+            report = _reconstruct(images, out, work, name, is_render, settings, seed, threads)
+        else:
+            report = import_poses(known, out, work, name, unit, settings, seed, threads)
+        counts["views"] = f"{report['registered']} of {report['images']}"
+        counts["points"] = report["points"]
+        if report["mean_reprojection_error_px"] is not None:
+            counts["reprojection error"] = f"{report['mean_reprojection_error_px']:.2f} px"
+
+
+@contextmanager
+def _work_folder(out: Path) -> Iterator[Path]:
+    """A temporary folder beside `out`, removed at the end."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(prefix=f".{out.name}-work-", dir=out.parent))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _reconstruct(
+    images: Path,
+    out: Path,
+    work: Path,
+    name: str,
+    is_render: bool,
+    settings: PosesSettings,
+    seed: int,
+    threads: int,
+) -> dict[str, Any]:
+    """Structure from motion on a folder of photographs; returns the registration report."""
+    if not images.is_dir():
+        raise SceneError(f"image folder {images} of {name} is missing", fix="correct its source")
+    sources = list_images(photo_folder(images))
+    if len(sources) < MIN_PHOTOS:
+        raise SceneError(
+            f"{images} of {name} has too few images to find camera poses",
+            expected=f"at least {MIN_PHOTOS} overlapping photographs (20 or more are better)",
+            found=f"{len(sources)}",
+            fix="add photographs of the same scene, neighbours less than about 10 degrees apart",
+        )
+    camera_model = settings.camera_model
+    if camera_model == "auto":
+        camera_model = "simple_pinhole" if is_render else "simple_radial"
+    work_images = prepare_images(sources, work / "images", settings.max_side_px)
+    database = work / "features.db"
+    register_images(database, work / "images", work_images, camera_model, settings.single_camera)
+    logger.info("%s: features of %d images", name, len(work_images))
+    extract_features(database, work / "images", [image.view for image in work_images], settings, threads)
+    logger.info("%s: matches", name)
+    matcher = match_features(database, len(work_images), settings, seed, threads)
+    matches = count_matches(database)
+    logger.info("%s: %s mapping", name, settings.mapper)
+    models = map_views(database, work / "images", work / "models", settings.mapper, seed)
+    model = models[0] if models else None
+    report = registration_report(work_images, matches, models, settings)
+    report = {
+        "scene": name,
+        "poses": f"structure from motion, {settings.mapper} mapper, {matcher} matching, {camera_model}",
+        "seed": seed,
+        **report,
+    }
+    _check_registration(images, name, report, settings)
+    assert model is not None
+    views = [
+        PosedView(image.name, work / "images" / image.name, image.camera, pose_matrix(image.cam_from_world()))
+        for image in (model.images[image_id] for image_id in model.reg_image_ids())
+    ]
+    xyz, rgb = sparse_points(model)
+    split = split_views([view.view for view in views], settings.test_every)
+    write_scene(out, name, "arbitrary", views, xyz, rgb, split, report, turn=True)
+    return report
+
+
+def map_views(
+    database: Path, images: Path, folder: Path, mapper: str, seed: int
+) -> list[pycolmap.Reconstruction]:
+    """Run the mapper on one thread with fixed seeds; returns its models, the largest first."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if mapper == "incremental":
+        options = pycolmap.IncrementalPipelineOptions()
+        options.num_threads = options.mapper.num_threads = 1
+        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+        options.min_num_matches = MIN_INLIERS
+        options.min_model_size = MIN_PHOTOS
+        options.mapper.init_min_num_inliers = INIT_MIN_INLIERS
+        options.mapper.abs_pose_min_num_inliers = POSE_MIN_INLIERS
+        models = pycolmap.incremental_mapping(database, images, folder, options)
+    else:
+        options = pycolmap.GlobalPipelineOptions()
+        options.num_threads = options.mapper.num_threads = 1
+        options.mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
+        options.min_num_matches = MIN_INLIERS
+        options.min_model_size = MIN_PHOTOS
+        for part in (
+            options,
+            options.mapper,
+            options.mapper.rotation_averaging,
+            options.mapper.global_positioning,
+            options.mapper.retriangulation,
+        ):
+            part.random_seed = seed
+        options.mapper.global_positioning.use_gpu = False
+        options.mapper.bundle_adjustment.ceres.use_gpu = False
+        models = pycolmap.global_mapping(database, images, folder, options)
+    return [
+        model
+        for _, model in sorted(
+            models.items(), key=lambda item: (-item[1].num_reg_images(), -item[1].num_points3D(), item[0])
+        )
+    ]
+
+
+def registration_report(
+    images: Sequence[WorkImage],
+    matches: Mapping[str, MatchCounts],
+    models: Sequence[pycolmap.Reconstruction],
+    settings: PosesSettings,
+) -> dict[str, Any]:
+    """What registration found: totals, models, and for each view whether it was posed and why not."""
+    errors = reprojection_errors(models[0]) if models else {}
+    members = [{model.images[i].name for i in model.reg_image_ids()} for model in models]
+    views: dict[str, Any] = {}
+    for image in images:
+        found = matches.get(image.view, MatchCounts(0, 0, 0))
+        entry: dict[str, Any] = {
+            "file": image.source.name,
+            "registered": image.view in errors,
+            "features": found.features,
+            "matched_views": found.pairs,
+            "best_pair_matches": found.best_pair,
+        }
+        if image.view in errors:
+            of_view = errors[image.view]
+            entry["observations"] = len(of_view)
+            entry["reprojection_error_px"] = round(float(of_view.mean()), 4) if len(of_view) else None
+        else:
+            entry["why_not"] = _why_not(image.view, found, members)
+        views[image.view] = entry
+    every_error = np.concatenate([*errors.values(), np.zeros(0)])
+    num_points = models[0].num_points3D() if models else 0
+    report = {
+        "images": len(images),
+        "registered": len(errors),
+        "models": [len(names) for names in members],
+        "points": num_points,
+        "points_per_view": round(num_points / len(errors), 1) if errors else 0.0,
+        "mean_track_length": round(models[0].compute_mean_track_length(), 3) if num_points else 0.0,
+        "mean_reprojection_error_px": round(float(every_error.mean()), 4) if len(every_error) else None,
+        "cameras": _camera_entries(models[0]) if models else [],
+        "warnings": [],
+        "views": views,
+    }
+    report["warnings"] = _warnings(report)
+    return report
+
+
+def _camera_entries(model: pycolmap.Reconstruction) -> list[dict[str, Any]]:
+    """Lenses as estimated, before undistortion."""
+    used = sorted({model.images[image_id].camera_id for image_id in model.reg_image_ids()})
+    return [
+        {
+            "model": camera.model_name,
+            "size_hw_px": [camera.height, camera.width],
+            "params": [round(float(value), 5) for value in camera.params],
+            "focal_px": round(float(camera.mean_focal_length()), 3),
+        }
+        for camera in (model.cameras[camera_id] for camera_id in used)
+    ]
+
+
+def _why_not(view: str, found: MatchCounts, members: Sequence[set[str]]) -> str:
+    """Why a view is not in the largest model, in words."""
+    if found.features == 0:
+        return "no features: the image is flat, dark or out of focus"
+    if found.pairs == 0:
+        return f"too few matches: no other view shares {MIN_INLIERS} verified ones"
+    for number, names in enumerate(members[1:], start=2):
+        if view in names:
+            return f"in model {number} of {len(names)} views, not in the largest"
+    return f"no pose found: too few matches with posed views (best pair: {found.best_pair} matches)"
+
+
+def _warnings(report: Mapping[str, Any]) -> list[str]:
+    """What a person should know before trusting these poses."""
+    warnings = []
+    lost = report["images"] - report["registered"]
+    if report["registered"] and lost:
+        warnings.append(f"{lost} of {report['images']} views are not registered")
+    if len(report["models"]) > 1:
+        sizes = ", ".join(str(size) for size in report["models"])
+        warnings.append(
+            f"the views fall into {len(report['models'])} models ({sizes} views); the largest is used"
+        )
+    if report["registered"] and report["points_per_view"] < WEAK_POINTS_PER_VIEW:
+        warnings.append(
+            f"only {report['points_per_view']} points per registered view (good runs: {WEAK_POINTS_PER_VIEW} "
+            "or more): the poses may be wrong"
+        )
+    return warnings
+
+
+def _check_registration(images: Path, name: str, report: Mapping[str, Any], settings: PosesSettings) -> None:
+    """Refuse a reconstruction that holds too few views; log what is doubtful about one that passes.
+
+    Raises:
+        RegistrationError: naming the lost photographs, the numbers and what to do.
+    """
+    total, registered = report["images"], report["registered"]
+    lost = [entry for entry in report["views"].values() if not entry["registered"]]
+    listing = "".join(f"\n            {entry['file']}: {entry['why_not']}" for entry in lost)
+    advice = (
+        "add photographs between those that were lost and the others (neighbours less than about 10 degrees "
+        "apart, sharp, with texture in sight), or leave the lost ones out of the folder"
+    )
+    if not report["models"]:
+        raise RegistrationError(
+            f"no camera pose could be found for {name} from {images}",
+            expected=f"a model of at least {MIN_PHOTOS} of the {total} photographs",
+            found=f"none{listing}",
+            fix=advice,
+        )
+    sizes = ", ".join(str(size) for size in report["models"])
+    if registered < settings.min_registered_share * total:
+        share = registered / total
+        raise RegistrationError(
+            f"too few photographs of {name} could be registered",
+            expected=f"at least {settings.min_registered_share:.0%} of {total} (poses.min_registered_share)",
+            found=f"{registered} ({share:.1%}); models of {sizes} views; not registered:{listing}",
+            fix=f"{advice}; to go on with {registered} views set poses.min_registered_share to "
+            f"{np.floor(share * 100) / 100:.2f} or less",
+        )
+    if settings.several_models == "stop" and len(report["models"]) > 1:
+        raise RegistrationError(
+            f"the photographs of {name} fall into {len(report['models'])} separate models",
+            expected="one model (poses.several_models is stop)",
+            found=f"models of {sizes} views; not in the largest:{listing}",
+            fix=f"{advice}; to go on with the largest set poses.several_models to largest",
+        )
+    for warning in report["warnings"]:
+        logger.warning("%s: %s", name, warning)
+    for entry in lost:
+        logger.warning("%s: %s is not registered: %s", name, entry["file"], entry["why_not"])

@@ -1,0 +1,255 @@
+"""Masks without a model: OpenCV's graph segmentation, merged into three nested scales.
+
+For photographs where no SAM weights are at hand. It knows nothing of objects: its levels are coarse,
+middle and fine regions of even colour, nested by construction, and its scores say how clearly a
+region stands out. A region that one scale shares with the next appears at both levels.
+"""
+
+import heapq
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int32, UInt8
+
+from hilsplat.base.images import resize_to_fit
+from hilsplat.base.levels import LEVELS
+from hilsplat.segment.masks import HierarchicalMasks
+
+WORK_SIDE_PX = 640
+"""Images are segmented at this longer side; finer texture is no part of anything."""
+
+BASE_SCALE = 80.0
+"""Scale `k` of the base segmentation (Felzenszwalb and Huttenlocher), in its colour units."""
+
+CONTRAST = 6.0
+"""Colour difference (CIELAB units) that a region of exactly a level's least size must have to all
+its neighbours in order to stay; larger regions stay with less, in proportion to their area."""
+
+THIN_PX = 4.0
+"""A region of less width (at working size) is the seam that blur leaves along a strong edge."""
+
+THIN_HURRY = 0.01
+"""Factor on the cost of merging a seam: seams go first, into the more similar side."""
+
+LIGHTNESS = 0.6
+"""Weight of lightness beside hue and chroma: shading changes lightness inside one thing."""
+
+CLEAR_EDGE = 40.0
+"""Colour difference across a border that counts as fully clear in the predicted IoU."""
+
+
+def segment_graph(
+    image: UInt8[np.ndarray, "H W 3"], scales: tuple[float, float, float], min_area_px: int
+) -> HierarchicalMasks:
+    """Segment a photograph into regions at three nested scales.
+
+    A fine segmentation (`cv2.ximgproc.segmentation`) is merged pair by pair, the cheapest first. A
+    merge of regions with colour difference D, the smaller of area A and perimeter P, costs D times
+    that one's width, `min(sqrt(A), 4 A / P)`: small or thin regions go into their most similar
+    neighbour, large ones stay apart though they differ less. A level of least size s (a share of
+    the image side) is the state in which every merge left costs at least
+    `CONTRAST * s * sqrt(image area)`.
+
+    Args:
+        image: the view.
+        scales: least size at whole, part, subpart; each at most the one before.
+        min_area_px: smaller regions give no mask.
+
+    Returns:
+        one mask per region and level. `predicted_iou` is the mean colour difference along the
+        region's border over `CLEAR_EDGE`, clipped to 1; `stability` is the share of scales,
+        on a logarithmic axis from the level's own to the one where everything is merged, over which
+        the region lives on unchanged.
+    """
+    height, width = image.shape[:2]
+    small = resize_to_fit(image, WORK_SIDE_PX)
+    lab = to_lab(small)
+    base = base_regions(small, min(scales))
+    merges = merge_regions(base, lab)
+    size_px = base.size
+    thresholds = [CONTRAST * scale * size_px**0.5 for scale in scales]
+    parts = []
+    for level, threshold in zip(LEVELS, thresholds, strict=True):
+        labels, dies = cut(base, merges, threshold)
+        border = border_contrast(labels, lab)
+        end = max(merges[-1][0] if merges else threshold, threshold * 1.001)
+        life = np.log(np.clip(dies, threshold, end) / threshold) / np.log(end / threshold)
+        full = cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST)
+        counts = np.bincount(full.reshape(-1), minlength=len(border))
+        large = np.flatnonzero(counts >= min_area_px)
+        for rows in np.array_split(large, len(large) // 16 + 1):  # a few at once: they are unpacked
+            parts.append(
+                HierarchicalMasks.from_dense(
+                    full[None] == rows[:, None, None].astype(np.int32),
+                    np.full(len(rows), int(level), np.uint8),
+                    np.clip(border[rows] / CLEAR_EDGE, 0, 1).astype(np.float32),
+                    life[rows].astype(np.float32),
+                )
+            )
+    masks = HierarchicalMasks.concatenate(parts, (height, width))
+    return masks.take(masks.content_order())
+
+
+Merge = tuple[float, int, int]
+"""Cost at which a merge happens (never falling) and the two regions that merge; the result is a new
+region, numbered on from the base regions in the order of merges."""
+
+
+def to_lab(image: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
+    """CIELAB of a slightly smoothed image, with lightness scaled by `LIGHTNESS`.
+
+    Smoothing takes out texture of a pixel or two.
+    """
+    smooth = cv2.bilateralFilter(image, d=7, sigmaColor=20, sigmaSpace=3)
+    lab = cv2.cvtColor(smooth.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2LAB)
+    return lab * np.array([LIGHTNESS, 1, 1], dtype=np.float32)
+
+
+def base_regions(image: UInt8[np.ndarray, "H W 3"], finest: float) -> Int32[np.ndarray, "H W"]:
+    """Fine segmentation, labels 0..n-1; regions hold at least a quarter of the finest least size."""
+    least_px = max(4, round((finest**2) * image.shape[0] * image.shape[1] / 4))
+    graph = cv2.ximgproc.segmentation.createGraphSegmentation(sigma=0.5, k=BASE_SCALE, min_size=least_px)
+    labels = graph.processImage(np.ascontiguousarray(image[..., ::-1]))
+    return np.unique(labels, return_inverse=True)[1].reshape(labels.shape).astype(np.int32)
+
+
+def steps_along(
+    axis: int, labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]
+) -> tuple[Int32[np.ndarray, "n m"], Int32[np.ndarray, "n m"], Float[np.ndarray, "n m"]]:
+    """Labels of each pair of pixels next to each other along an axis, and the colour difference there.
+
+    The difference is taken two pixels wider than the pair: a photograph's edge is never one pixel wide.
+    """
+    length = labels.shape[axis]
+    first, second = np.arange(length - 1), np.arange(1, length)
+    before, after = np.maximum(first - 1, 0), np.minimum(second + 1, length - 1)
+    contrast = np.linalg.norm(lab.take(before, axis) - lab.take(after, axis), axis=2)
+    return labels.take(first, axis), labels.take(second, axis), contrast
+
+
+def neighbours(
+    labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]
+) -> dict[tuple[int, int], tuple[float, int]]:
+    """Sum of colour differences across each border between two regions, and the border's length, px."""
+    pairs, contrasts = [], []
+    for axis in (0, 1):
+        first, second, contrast = steps_along(axis, labels, lab)
+        border = first != second
+        pairs.append(np.sort(np.stack([first[border], second[border]], axis=1), axis=1))
+        contrasts.append(contrast[border].astype(np.float64))
+    unique, place = np.unique(np.concatenate(pairs), axis=0, return_inverse=True)
+    sums = np.bincount(place.reshape(-1), weights=np.concatenate(contrasts), minlength=len(unique))
+    counts = np.bincount(place.reshape(-1), minlength=len(unique))
+    return {
+        (int(a), int(b)): (float(total), int(count))
+        for (a, b), total, count in zip(unique, sums, counts, strict=True)
+    }
+
+
+def roughness(labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, " n"]:
+    """Mean colour difference between pixels next to each other inside each region: its texture."""
+    total, count = np.zeros(labels.max() + 1), np.zeros(labels.max() + 1)
+    for axis in (0, 1):
+        first, second, contrast = steps_along(axis, labels, lab)
+        inside = first == second
+        total += np.bincount(first[inside], weights=contrast[inside], minlength=len(total))
+        count += np.bincount(first[inside], minlength=len(total))
+    return total / np.maximum(count, 1)
+
+
+def merge_regions(labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]) -> list[Merge]:
+    """Merge until one region is left, the cheapest pair first (equal costs: lower numbers first).
+
+    The colour difference of a pair is the mean of two: between mean colours, and across their
+    border beyond what their own texture shows anyway. It is halved where the smaller region is
+    enclosed by the larger one, and next to nothing where it is a seam (`THIN_PX`).
+    """
+    flat = labels.reshape(-1)
+    area = np.bincount(flat).astype(np.float64).tolist()
+    colour = [
+        np.array(sums)
+        for sums in zip(
+            *(np.bincount(flat, weights=lab[..., axis].reshape(-1)) for axis in range(3)), strict=True
+        )
+    ]
+    texture = (roughness(labels, lab) * np.array(area)).tolist()
+    border: list[dict[int, tuple[float, int]]] = [{} for _ in area]
+    for (a, b), edge in neighbours(labels, lab).items():
+        border[a][b] = border[b][a] = edge
+    perimeter = [sum(edge[1] for edge in around.values()) for around in border]
+
+    def cost(a: int, b: int) -> float:
+        contrast, length = border[a][b]
+        between = float(np.linalg.norm(colour[a] / area[a] - colour[b] / area[b]))
+        smaller = a if area[a] < area[b] else b
+        enclosed = length / max(1, perimeter[smaller])
+        texture_here = (texture[a] / area[a] + texture[b] / area[b]) / 2
+        across = max(0.0, contrast / length - texture_here)
+        width = min(area[smaller] ** 0.5, 4 * area[smaller] / max(1, perimeter[smaller]))
+        hurry = THIN_HURRY if width < THIN_PX else 1.0
+        return (between + across) / 2 * (1 - enclosed / 2) * width * hurry
+
+    queue = [(cost(a, b), a, b) for a in range(len(area)) for b in border[a] if a < b]
+    heapq.heapify(queue)
+    alive = [True] * len(area)
+    merges: list[Merge] = []
+    level = 0.0
+    while queue:
+        price, a, b = heapq.heappop(queue)
+        if not (alive[a] and alive[b]):
+            continue
+        level = max(level, price)
+        merges.append((level, a, b))
+        new = len(area)
+        alive[a] = alive[b] = False
+        alive.append(True)
+        area.append(area[a] + area[b])
+        colour.append(colour[a] + colour[b])
+        texture.append(texture[a] + texture[b])
+        joined: dict[int, tuple[float, int]] = {}
+        for old in (a, b):
+            for other, (contrast, length) in border[old].items():
+                if other not in (a, b):
+                    before = joined.get(other, (0.0, 0))
+                    joined[other] = (before[0] + contrast, before[1] + length)
+                    del border[other][old]
+        for other, edge in joined.items():
+            border[other][new] = edge
+        border.append(joined)
+        perimeter.append(sum(edge[1] for edge in joined.values()))
+        for other in joined:
+            heapq.heappush(queue, (cost(other, new), other, new))
+    return merges
+
+
+def cut(
+    labels: Int32[np.ndarray, "H W"], merges: list[Merge], threshold: float
+) -> tuple[Int32[np.ndarray, "H W"], Float[np.ndarray, " n"]]:
+    """Regions after all merges cheaper than `threshold`.
+
+    Returns:
+        labels 0..n-1, and the cost at which each region merges on (infinity for the last one).
+    """
+    num_base = int(labels.max()) + 1
+    owner = np.arange(num_base + len(merges))
+    dies = np.full(num_base + len(merges), np.inf)
+    for step, (price, a, b) in enumerate(merges):
+        dies[[a, b]] = price
+        if price < threshold:
+            owner[[a, b]] = num_base + step
+    # A region's owner has a higher number: walk down from the top.
+    for region in range(len(owner) - 1, -1, -1):
+        owner[region] = owner[owner[region]]
+    roots, new = np.unique(owner[labels], return_inverse=True)
+    return new.reshape(labels.shape).astype(np.int32), dies[roots]
+
+
+def border_contrast(
+    labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]
+) -> Float[np.ndarray, " n"]:
+    """Mean colour difference along the whole border of each region; 0 where it has none."""
+    total, length = np.zeros(labels.max() + 1), np.zeros(labels.max() + 1)
+    for (a, b), (contrast, count) in neighbours(labels, lab).items():
+        total[[a, b]] += contrast
+        length[[a, b]] += count
+    return total / np.maximum(length, 1)

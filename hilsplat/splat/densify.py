@@ -1,0 +1,103 @@
+"""Adaptive density control of 3DGS: clone, split, prune, reset opacities.
+
+The gradient that decides is that of the loss by a Gaussian's projected mean, in the units of 3DGS:
+its x part times half the image width, its y part times half the height (as by normalised device
+coordinates), its length averaged over the steps in which the Gaussian was drawn.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int32
+
+from hilsplat.settings import GaussiansSettings
+from hilsplat.splat.optimise import FIELDS, Adam
+
+SMALL = 0.01
+"""Largest axis, in units of the extent, up to which a Gaussian is cloned and beyond which it is split (3DGS)."""
+SPLIT_FACTOR = 1.6
+"""Halves of a split Gaussian are smaller by this factor (3DGS: 0.8 x 2)."""
+HUGE = 0.5
+"""Gaussians with a larger axis, in units of the extent, are pruned (3DGS: 0.1, after the first
+opacity reset; we have rooms whose walls are flat, wide Gaussians)."""
+RESET_OPACITY = 0.01  # 3DGS
+
+
+@dataclass
+class ScreenGradients:
+    """Running average, per Gaussian, of the screen-space gradient.
+
+    Attributes:
+        total: summed lengths.
+        seen: steps in which it was drawn.
+    """
+
+    total: Float64[np.ndarray, " N"]
+    seen: Int32[np.ndarray, " N"]
+
+    @staticmethod
+    def start(n: int) -> "ScreenGradients":
+        """No step yet."""
+        return ScreenGradients(np.zeros(n), np.zeros(n, np.int32))
+
+    def add(self, means_px: Float32[np.ndarray, "N 2"], drawn: np.ndarray, size_hw: tuple[int, int]) -> None:
+        """Add the gradients of one view's step."""
+        half = np.array([size_hw[1] / 2, size_hw[0] / 2], np.float32)
+        self.total += np.sqrt(np.square(means_px * half).sum(axis=1))
+        self.seen += drawn
+
+    def mean(self) -> Float64[np.ndarray, " N"]:
+        """Average length; 0 where never drawn."""
+        return self.total / np.maximum(self.seen, 1)
+
+
+def densify(
+    adam: Adam, gradients: ScreenGradients, settings: GaussiansSettings, extent: float, generator: np.random.Generator
+) -> None:
+    """Clone small and split large Gaussians whose screen gradient is large, largest first up to the cap."""
+    mean = gradients.mean()
+    wanted = np.flatnonzero(mean > settings.densify_gradient)
+    room = max(settings.max_gaussians - len(adam), 0)
+    if len(wanted) > room:
+        wanted = np.sort(wanted[np.argsort(-mean[wanted], kind="stable")[:room]])
+    p = adam.parameters
+    large = np.exp(p["log_scales"][wanted].max(axis=1, initial=-np.inf)) > SMALL * extent
+    clone, split = wanted[~large], wanted[large]
+    copies = {name: p[name][clone].copy() for name in FIELDS}
+    halves = {name: np.repeat(p[name][split], 2, axis=0) for name in FIELDS}
+    halves["means"] += _offsets(halves["log_scales"], halves["quats"], generator)
+    halves["log_scales"] -= np.float32(np.log(SPLIT_FACTOR))
+    keep = np.ones(len(adam), dtype=bool)
+    keep[split] = False
+    adam.keep(keep)
+    adam.append({name: np.concatenate([copies[name], halves[name]]) for name in FIELDS})
+
+
+def _offsets(
+    log_scales: Float32[np.ndarray, "N 3"], quats: Float32[np.ndarray, "N 4"], generator: np.random.Generator
+) -> Float32[np.ndarray, "N 3"]:
+    """One random draw from each Gaussian, about its mean."""
+    local = generator.normal(size=log_scales.shape) * np.exp(log_scales.astype(np.float64))
+    q = quats.astype(np.float64)
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    # rotate by the quaternion: v + 2 w (u x v) + 2 u x (u x v)
+    u = q[:, 1:]
+    turned = np.cross(u, local)
+    return (local + 2 * (q[:, :1] * turned + np.cross(u, turned))).astype(np.float32)
+
+
+def prune(adam: Adam, settings: GaussiansSettings, extent: float) -> None:
+    """Drop transparent and huge Gaussians."""
+    p = adam.parameters
+    threshold = np.log(settings.min_opacity / (1 - settings.min_opacity))
+    keep = (p["opacity_logits"] > threshold) & (p["log_scales"].max(axis=1, initial=-np.inf) < np.log(HUGE * extent))
+    if not keep.all():
+        adam.keep(keep)
+
+
+def reset_opacities(adam: Adam) -> None:
+    """Cap all opacities at RESET_OPACITY, so that only what the images need comes back (3DGS)."""
+    logit = np.float32(np.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+    np.minimum(adam.parameters["opacity_logits"], logit, out=adam.parameters["opacity_logits"])
+    adam.first["opacity_logits"][:] = 0
+    adam.second["opacity_logits"][:] = 0

@@ -1,0 +1,197 @@
+"""Photometric loss of a rendered view, L1 and D-SSIM in one pass with its gradient; PSNR and SSIM.
+
+SSIM is that of 3DGS: an 11x11 Gaussian window of sigma 1.5 px, applied as two 11-tap passes to each
+channel, zeros beyond the border, constants 0.01^2 and 0.03^2 for values in [0, 1].
+"""
+
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float32
+from numba import njit
+
+from hilsplat.splat.rasterise.cpu import over_ranges
+from hilsplat.splat.rasterise.lanes import lanes, load, reciprocal, store
+
+RADIUS = 5
+SIGMA_PX = 1.5
+_C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)
+_TAPS = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA_PX) ** 2)
+_TAPS = (_TAPS / _TAPS.sum()).astype(np.float32)
+_LANES = 16
+_SIDE = 16  # zero columns left and right of a padded row; at least 3 channels x RADIUS
+_ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def _ssim_rows(begin, end, num, stride, image, target, slopes, ssim_sums, l1_sums):
+    """SSIM of padded rows begin..end and, in `slopes`, its derivatives by mean, square and product.
+
+    `slopes` (3 padded maps, flat) receives dSSIM/dE[x] (means' own part and that of the variances),
+    dSSIM/dE[x^2], dSSIM/dE[x y] of every pixel's window. Empty: values only.
+    """
+    groups = (num + _LANES - 1) // _LANES
+    row_length = groups * _LANES + 2 * _SIDE
+    moments = np.zeros(5 * row_length, np.float32)
+    out = np.empty(4 * _LANES, np.float32)
+    zero, one, two = lanes(_ZERO), lanes(_ONE), lanes(_TWO)
+    c1, c2 = lanes(_C1), lanes(_C2)
+    map_size = len(slopes) // 3
+    for y in range(begin, end):
+        for group in range(groups):
+            at = _SIDE + group * _LANES
+            x_sum, t_sum, xx_sum, tt_sum, xt_sum = zero, zero, zero, zero, zero
+            for k in range(2 * RADIUS + 1):
+                tap = lanes(_TAPS[k])
+                x, t = load(image, (y + k) * stride + at), load(target, (y + k) * stride + at)
+                tap_x, tap_t = tap * x, tap * t
+                x_sum = x_sum + tap_x
+                t_sum = t_sum + tap_t
+                xx_sum = xx_sum + tap_x * x
+                tt_sum = tt_sum + tap_t * t
+                xt_sum = xt_sum + tap_x * t
+            store(moments, at, x_sum)
+            store(moments, row_length + at, t_sum)
+            store(moments, 2 * row_length + at, xx_sum)
+            store(moments, 3 * row_length + at, tt_sum)
+            store(moments, 4 * row_length + at, xt_sum)
+        total, total_l1 = 0.0, 0.0
+        for group in range(groups):
+            at = _SIDE + group * _LANES
+            x_mean, t_mean, xx, tt, xt = zero, zero, zero, zero, zero
+            for k in range(2 * RADIUS + 1):
+                tap = lanes(_TAPS[k])
+                here = at + 3 * (k - RADIUS)
+                x_mean = x_mean + tap * load(moments, here)
+                t_mean = t_mean + tap * load(moments, row_length + here)
+                xx = xx + tap * load(moments, 2 * row_length + here)
+                tt = tt + tap * load(moments, 3 * row_length + here)
+                xt = xt + tap * load(moments, 4 * row_length + here)
+            product = x_mean * t_mean
+            squares = x_mean * x_mean + t_mean * t_mean
+            a1 = two * product + c1
+            a2 = two * (xt - product) + c2
+            b1 = squares + c1
+            b2 = xx + tt - squares + c2
+            scale = reciprocal(b1 * b2)
+            value = a1 * a2 * scale
+            store(out, 0, value)
+            if map_size > 0:
+                # value = a1 a2 / (b1 b2); a2 and b2 hold the means too
+                by_xx = zero - value * b1 * scale
+                by_xt = two * a1 * scale
+                by_mean = two * (t_mean * (a2 - a1) * scale - x_mean * value * (b2 - b1) * scale)
+                store(out, _LANES, by_mean)
+                store(out, 2 * _LANES, by_xx)
+                store(out, 3 * _LANES, by_xt)
+            for lane in range(min(_LANES, num - group * _LANES)):
+                spot = (y + RADIUS) * stride + at + lane
+                total += out[lane]
+                total_l1 += abs(image[spot] - target[spot])
+                if map_size > 0:
+                    slopes[spot] = out[_LANES + lane]
+                    slopes[map_size + spot] = out[2 * _LANES + lane]
+                    slopes[2 * map_size + spot] = out[3 * _LANES + lane]
+        ssim_sums[y] = total
+        l1_sums[y] = total_l1
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def _gradient_rows(begin, end, num, stride, image, target, slopes, l1_weight, ssim_weight, gradient):
+    """dL/dimage of rows begin..end: the slopes spread back over their windows, and the sign for L1."""
+    groups = (num + _LANES - 1) // _LANES
+    row_length = groups * _LANES + 2 * _SIDE
+    rows = np.zeros(3 * row_length, np.float32)
+    out = np.empty(_LANES, np.float32)
+    zero, two = lanes(_ZERO), lanes(_TWO)
+    map_size = len(slopes) // 3
+    for y in range(begin, end):
+        for group in range(groups):
+            at = _SIDE + group * _LANES
+            a, b, c = zero, zero, zero
+            for k in range(2 * RADIUS + 1):
+                tap = lanes(_TAPS[k])
+                spot = (y + k) * stride + at
+                a = a + tap * load(slopes, spot)
+                b = b + tap * load(slopes, map_size + spot)
+                c = c + tap * load(slopes, 2 * map_size + spot)
+            store(rows, at, a)
+            store(rows, row_length + at, b)
+            store(rows, 2 * row_length + at, c)
+        for group in range(groups):
+            at = _SIDE + group * _LANES
+            a, b, c = zero, zero, zero
+            for k in range(2 * RADIUS + 1):
+                tap = lanes(_TAPS[k])
+                here = at + 3 * (k - RADIUS)
+                a = a + tap * load(rows, here)
+                b = b + tap * load(rows, row_length + here)
+                c = c + tap * load(rows, 2 * row_length + here)
+            spot = (y + RADIUS) * stride + at
+            store(out, 0, a + two * load(image, spot) * b + load(target, spot) * c)
+            for lane in range(min(_LANES, num - group * _LANES)):
+                difference = image[spot + lane] - target[spot + lane]
+                sign = l1_weight if difference > _ZERO else (-l1_weight if difference < _ZERO else _ZERO)
+                gradient[y, group * _LANES + lane] = sign - ssim_weight * out[lane]
+
+
+def _padded(image: Float32[np.ndarray, "H W 3"]) -> tuple[np.ndarray, int]:
+    """Rows with zeros around, flat, and their length."""
+    height, width, _ = image.shape
+    stride = -(-3 * width // _LANES) * _LANES + 2 * _SIDE
+    out = np.zeros((height + 2 * RADIUS, stride), np.float32)
+    out[RADIUS : RADIUS + height, _SIDE : _SIDE + 3 * width] = image.reshape(height, 3 * width)
+    return out.reshape(-1), stride
+
+
+def photometric_loss(
+    image: Float32[np.ndarray, "H W 3"],
+    target: Float32[np.ndarray, "H W 3"],
+    *,
+    ssim_weight: float,
+    threads: int = 1,
+) -> tuple[float, Float32[np.ndarray, "H W 3"]]:
+    """(1 - w) mean |image - target| + w (1 - SSIM), and its gradient by `image` (3DGS, Eq. 7).
+
+    Args:
+        image, target: RGB in [0, 1].
+        ssim_weight: w; 3DGS takes 0.2.
+        threads: the result is the same bytes for any number.
+    """
+    height, width, _ = image.shape
+    num = 3 * width
+    x, stride = _padded(image)
+    t, _ = _padded(target)
+    slopes = np.zeros(3 * len(x), np.float32)
+    ssim_sums, l1_sums = np.empty(height), np.empty(height)
+    over_ranges(
+        lambda begin, end: _ssim_rows(begin, end, num, stride, x, t, slopes, ssim_sums, l1_sums), height, threads
+    )
+    gradient = np.empty((height, num), np.float32)
+    count = height * num
+    weights = np.float32((1 - ssim_weight) / count), np.float32(ssim_weight / count)
+    over_ranges(
+        lambda begin, end: _gradient_rows(begin, end, num, stride, x, t, slopes, *weights, gradient),
+        height,
+        threads,
+    )
+    loss = (1 - ssim_weight) * l1_sums.sum() / count + ssim_weight * (1 - ssim_sums.sum() / count)
+    return float(loss), gradient.reshape(height, width, 3)
+
+
+def ssim(image: Float32[np.ndarray, "H W 3"], target: Float32[np.ndarray, "H W 3"]) -> float:
+    """Mean structural similarity of two RGB images in [0, 1], as 3DGS computes it."""
+    height, width, _ = image.shape
+    x, stride = _padded(image)
+    t, _ = _padded(target)
+    ssim_sums, l1_sums = np.empty(height), np.empty(height)
+    _ssim_rows(0, height, 3 * width, stride, x, t, np.empty(0, np.float32), ssim_sums, l1_sums)
+    return float(ssim_sums.sum() / (3 * width * height))
+
+
+def psnr(image: Float32[np.ndarray, "H W 3"], target: Float32[np.ndarray, "H W 3"]) -> float:
+    """Peak signal-to-noise ratio in dB of two RGB images in [0, 1]; infinite where they are equal."""
+    error = np.square(image.astype(np.float64) - target).mean()
+    return float("inf") if error == 0 else float(-10 * np.log10(error))

@@ -1,0 +1,98 @@
+"""Gaussians as a standard 3DGS PLY, which viewers and other implementations read."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement, PlyParseError
+
+from hilsplat.base.artifacts import atomic_path
+from hilsplat.base.errors import ArtifactError
+from hilsplat.splat.gaussians import Gaussians
+
+
+def _names(num_bases: int) -> list[str]:
+    """Property names in the order of 3DGS; f_rest is stored channel by channel."""
+    return [
+        *("x", "y", "z", "nx", "ny", "nz"),
+        *(f"f_dc_{k}" for k in range(3)),
+        *(f"f_rest_{k}" for k in range(3 * (num_bases - 1))),
+        "opacity",
+        *(f"scale_{k}" for k in range(3)),
+        *(f"rot_{k}" for k in range(4)),
+    ]
+
+
+def save_ply(path: Path, gaussians: Gaussians) -> None:
+    """Write Gaussians as a binary little-endian 3DGS PLY, atomically; same Gaussians, same bytes.
+
+    Raw parameters are stored as they are: log scales, opacity logits, quaternions wxyz of any
+    length. Normals are zero, as in 3DGS.
+    """
+    n = len(gaussians)
+    sh = gaussians.sh.detach().cpu()
+    columns = (
+        gaussians.means,
+        torch.zeros(n, 3),
+        sh[:, 0],
+        sh[:, 1:].transpose(1, 2).reshape(n, 3 * (sh.shape[1] - 1)),
+        gaussians.opacity_logits[:, None],
+        gaussians.log_scales,
+        gaussians.quats,
+    )
+    values = torch.cat([part.detach().cpu().float() for part in columns], dim=1).numpy()
+    names = _names(sh.shape[1])
+    table = np.ascontiguousarray(values, dtype="<f4").view([(name, "<f4") for name in names]).reshape(n)
+    with atomic_path(path) as temporary:
+        PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(temporary)
+
+
+def load_ply(path: Path) -> Gaussians:
+    """Read a 3DGS PLY, of this package or another; the number of f_rest columns gives the degree.
+
+    Raises:
+        ArtifactError: the file is missing, damaged, no 3DGS PLY or holds numbers that are not finite.
+    """
+    path = Path(path)
+    try:
+        vertex = PlyData.read(path)["vertex"]
+    except FileNotFoundError as error:
+        raise ArtifactError(f"{path} is missing", fix="run the gaussians stage") from error
+    except (PlyParseError, KeyError, ValueError, EOFError) as error:
+        raise ArtifactError(
+            f"{path} is no readable PLY: {error}", fix="delete it and run the gaussians stage again"
+        ) from error
+    found = {prop.name for prop in vertex.properties}
+    num_rest = sum(name.startswith("f_rest_") for name in found)
+    num_bases = num_rest // 3 + 1
+    missing = [name for name in _names(num_bases) if name not in found and name not in ("nx", "ny", "nz")]
+    if missing or num_rest not in (0, 9, 24, 45):
+        raise ArtifactError(
+            f"{path} is no 3DGS PLY",
+            expected="x y z, f_dc_0..2, 0, 9, 24 or 45 f_rest_*, opacity, scale_0..2, rot_0..3",
+            found=f"{num_rest} f_rest columns" + (f"; without {', '.join(missing[:5])}" if missing else ""),
+        )
+
+    def columns(*names: str) -> torch.Tensor:
+        values = [np.asarray(vertex[name], dtype=np.float32) for name in names]
+        return torch.from_numpy(np.stack(values, axis=1)) if values else torch.zeros(vertex.count, 0)
+
+    dc = columns(*(f"f_dc_{k}" for k in range(3)))[:, None]
+    rest = columns(*(f"f_rest_{k}" for k in range(num_rest)))
+    rest = rest.reshape(len(dc), 3, num_bases - 1).transpose(1, 2)
+    gaussians = Gaussians(
+        means=columns("x", "y", "z"),
+        log_scales=columns(*(f"scale_{k}" for k in range(3))),
+        quats=columns(*(f"rot_{k}" for k in range(4))),
+        opacity_logits=columns("opacity")[:, 0].clone(),
+        sh=torch.cat([dc, rest], dim=1).contiguous(),
+    )
+    finite = torch.isfinite(
+        torch.cat([gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.sh.flatten(1)], dim=1)
+    ).all(dim=1) & torch.isfinite(gaussians.opacity_logits)
+    if not finite.all():
+        raise ArtifactError(
+            f"{path} holds {int((~finite).sum())} of {len(gaussians)} Gaussians with numbers that are not finite",
+            fix="delete it and run the gaussians stage again",
+        )
+    return gaussians

@@ -1,0 +1,145 @@
+"""The world stage: a synthetic scene as images, and what is true of it for evaluation."""
+
+import logging
+import multiprocessing
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from hilsplat.base.artifacts import atomic_folder, require_free_space, write_index, write_json
+from hilsplat.base.errors import SceneError
+from hilsplat.base.images import write_png
+from hilsplat.base.levels import LEVELS
+from hilsplat.base.progress import stage_log, track
+from hilsplat.datasets.hierarchy import write_hierarchy
+from hilsplat.settings import WorldSettings
+from hilsplat.world.objects import GENERATOR_VERSION
+from hilsplat.world.render import label_view, render_view
+from hilsplat.world.scenes import KINDS, WorldScene, build_scene
+from hilsplat.world.seeds import TRAINING_SEEDS, split_of_seed
+from hilsplat.world.truth import annotated_nodes, smallest_areas, write_mesh
+from hilsplat.world.views import ring_cameras
+
+logger = logging.getLogger(__name__)
+
+
+def parse_source(source: str) -> tuple[str, int]:
+    """Read a source such as "world:tabletop:201".
+
+    Returns:
+        Kind of scene and its seed.
+
+    Raises:
+        SceneError: it is written otherwise, the kind is unknown, or the seed is one that the small
+            models were trained on.
+    """
+    words = source.split(":")
+    if len(words) != 3 or words[0] != "world" or words[1] not in KINDS or not words[2].isdecimal():
+        raise SceneError(
+            f"source {source!r} names no synthetic scene",
+            expected=f"world:<kind>:<seed>, where kind is one of: {', '.join(KINDS)}",
+            fix="correct the source in the scene sheet, as in world:tabletop:201",
+        )
+    seed = int(words[2])
+    if seed in TRAINING_SEEDS:
+        raise SceneError(
+            f"source {source!r} is a scene that the small models were trained on",
+            expected=f"a seed outside {TRAINING_SEEDS.start} to {TRAINING_SEEDS.stop - 1}",
+            fix="take a seed from 200 to 299 for scenes that are reported, from 100 to 199 for trials",
+        )
+    return words[1], seed
+
+
+def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> None:
+    """Render a synthetic scene and write what is true of it.
+
+    Writes two folders, each whole or absent: `out/images` (000.png, 001.png, ...), which is all that
+    the next stages see, and `out/truth` (annotations.json and labels/ in the hierarchy format,
+    cameras.npz, mesh.ply, scene.json), which only `evaluate` may read. The bytes depend on source and
+    settings, not on `threads`.
+
+    Raises:
+        SceneError: the source names no scene, or nothing found a place in it.
+        DiskSpaceError: the disk is too full.
+    """
+    kind, seed = parse_source(source)
+    out = Path(out)
+    with stage_log("world", source) as counts:
+        scene = _scene(kind, seed, settings.objects)
+        if not scene.placed:
+            raise SceneError(f"no object found a place in {source}", fix="take another seed")
+        cameras = ring_cameras(seed, settings.views, settings.image_px, settings.arc_deg)
+        require_free_space(out, needed_mib=5 + settings.views * settings.image_px**2 * 4 / 2**20)
+        smallest = smallest_areas(settings.image_px, settings.min_area_px, settings.min_subpart_area_px)
+        labels, annotated = {}, {}
+        size = {"height": settings.image_px, "width": settings.image_px}
+        with atomic_folder(out / "images") as folder:
+            results = _rendered(kind, seed, settings, threads)
+            for name, (image, label) in track(
+                zip(cameras.names, results, strict=True), "rendered views", total=len(cameras)
+            ):
+                write_png(folder / name, image)
+                labels[name] = {level: label[level.index] for level in LEVELS}
+                annotated[name] = annotated_nodes(label, scene.nodes, scene.background, smallest)
+            write_index(folder, dict.fromkeys(cameras.names, size), source=source)
+        with atomic_folder(out / "truth") as folder:
+            write_hierarchy(folder, scene.nodes, labels, annotated)
+            cameras.save(folder / "cameras.npz")
+            write_mesh(folder / "mesh.ply", scene)
+            write_json(folder / "scene.json", _record(source, scene))
+            write_index(
+                folder, {name: {"annotated": len(ids)} for name, ids in annotated.items()}, source=source
+            )
+        counts.update(
+            views=len(cameras),
+            objects=f"{len(scene.placed)} of {scene.asked}",
+            nodes=len(scene.nodes),
+            triangles=len(scene.triangles),
+        )
+
+
+def _record(source: str, scene: WorldScene) -> dict[str, object]:
+    return {
+        "source": source,
+        "kind": scene.kind,
+        "seed": scene.seed,
+        "split": split_of_seed(scene.seed),
+        "generator_version": GENERATOR_VERSION,
+        "objects_asked": scene.asked,
+        "objects_placed": len(scene.placed),
+        "placed": [asdict(thing) for thing in scene.placed],
+        "background": sorted(scene.background),
+        "style": asdict(scene.style),
+    }
+
+
+@lru_cache(maxsize=1)
+def _scene(kind: str, seed: int, objects: int) -> WorldScene:
+    return build_scene(kind, seed, objects)
+
+
+def _render(kind: str, seed: int, settings: WorldSettings, row: int) -> tuple[np.ndarray, np.ndarray]:
+    """Image and labels of one view; top level, so that worker processes can call it."""
+    scene = _scene(kind, seed, settings.objects)
+    cameras = ring_cameras(seed, settings.views, settings.image_px, settings.arc_deg)
+    camera = cameras[cameras.names[row]]
+    return render_view(scene, camera, settings.samples), label_view(scene, camera)
+
+
+def _rendered(
+    kind: str, seed: int, settings: WorldSettings, threads: int
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Image and labels of all views, in their order."""
+    rows = range(settings.views)
+    if threads <= 1:
+        for row in rows:
+            yield _render(kind, seed, settings, row)
+        return
+    # Processes, since Embree's wrapper holds Python's lock; spawned, since forking a process that
+    # has threads may hang.
+    with ProcessPoolExecutor(threads, mp_context=multiprocessing.get_context("spawn")) as pool:
+        yield from pool.map(_render, *zip(*[(kind, seed, settings, row) for row in rows], strict=True))

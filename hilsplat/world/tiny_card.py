@@ -1,0 +1,260 @@
+"""Model cards of the small models: where they come from, how good they are, what they are not."""
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from hilsplat.base.artifacts import sha256_of_file, write_json, write_text
+from hilsplat.base.images import write_png
+from hilsplat.base.levels import LEVELS
+from hilsplat.world.tiny_data import HEAD_LEVELS, LabelledViews, nested_targets
+from hilsplat.world.tiny_sam import SamDecoder, SamEncoder
+from hilsplat.world.tiny_steps import Curve
+from hilsplat.world.tiny_train_sam import predict_masks
+
+RECORD = "training.json"
+CARD = "README.md"
+PICTURES = ("curve.png", "masks.png")
+LEVEL_COLOURS = {"whole": "#1b6ca8", "part": "#d1791e", "subpart": "#3d8f4f"}
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """SHA-256 of each file of a model that is not about the model."""
+    folder = Path(folder)
+    about = {RECORD, CARD, *PICTURES}
+    return {
+        str(path.relative_to(folder)): sha256_of_file(path)
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name not in about
+    }
+
+
+def draw_curve(path: Path, curve: Curve, series: Mapping[str, str], what: str) -> None:
+    """Draw a small picture of a learning curve.
+
+    Args:
+        path: PNG.
+        curve: its rows.
+        series: name of the column by level label.
+        what: meaning of the values.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.6, 2.8), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    steps = [row["step"] for row in curve.rows]
+    for label, column in series.items():
+        values = [row.get(column, np.nan) for row in curve.rows]
+        axes.plot(steps, values, marker=".", color=LEVEL_COLOURS[label], label=label)
+    axes.set(xlabel="step", ylabel=what, ylim=(0, 1))
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None})
+    write_png(path, np.asarray(Image.open(buffer).convert("RGB")))
+
+
+def draw_masks(
+    path: Path, encoder: SamEncoder, decoder: SamDecoder, views: LabelledViews, rows: int = 4, seed: int = 1
+) -> None:
+    """Draw what the segmenter makes of single points in some views: image, three heads, three true masks.
+
+    Columns: the view with the point in red, then subpart, part, whole as predicted and as true.
+    """
+    import cv2
+
+    lines = []
+    for row in range(rows):
+        view = row * len(views) // rows
+        rng = np.random.default_rng((seed, row))
+        target = nested_targets(views.labels[view])
+        fine = np.argwhere(views.labels[view][2] >= 0)
+        if not len(fine):
+            fine = np.argwhere(target[0] >= 0)
+        y, x = fine[int(rng.integers(len(fine)))]
+        image = views.images[view]
+        _, logits = predict_masks(encoder, decoder, image, np.array([[x + 0.5, y + 0.5]]))
+        shown = image.copy()
+        cv2.circle(shown, (int(x), int(y)), 4, (255, 0, 0), -1)
+        cells = [shown]
+        for head in range(len(HEAD_LEVELS)):
+            guess = cv2.resize(logits[0, head], image.shape[1::-1], interpolation=cv2.INTER_LINEAR) > 0
+            cells.append(np.where(guess[..., None], image, image // 5))
+        for head in range(len(HEAD_LEVELS)):
+            truth = target[head] == target[head][y, x]
+            cells.append(np.where(truth[..., None], image, image // 5))
+        lines.append(
+            np.hstack([cv2.resize(cell, (160, 160), interpolation=cv2.INTER_AREA) for cell in cells])
+        )
+    write_png(path, np.vstack(lines))
+
+
+WARNING = (
+    "This network knows one synthetic world (tabletop scenes of `hilsplat.world`) and nothing else. It stands in"
+    " for {real} so that the whole method runs, is tested and is measured without any download. Its results on"
+    " photographs are meaningless, and its numbers say nothing about {real}."
+)
+
+
+def write_sam_card(
+    folder: Path,
+    encoder: SamEncoder,
+    decoder: SamDecoder,
+    unseen: LabelledViews,
+    recipe: Mapping[str, Any],
+    curve: Curve,
+    metrics: Mapping[str, Mapping[str, Mapping[str, float]]],
+) -> None:
+    """Write card, record, learning curve and a picture of masks beside an exported segmenter.
+
+    Args:
+        folder: the model folder.
+        encoder: of the segmenter.
+        decoder: of the segmenter.
+        unseen: views on which nothing was trained.
+        recipe: how it was trained.
+        curve: what was measured on the way.
+        metrics: by kind of prompt and level, from `measure_sam`.
+    """
+    folder = Path(folder)
+    draw_curve(folder / "curve.png", curve, {level.label: level.label for level in LEVELS}, "mean IoU")
+    draw_masks(folder / "masks.png", encoder, decoder, unseen)
+    rows = [
+        f"| {level.label} | {metrics['balanced'][level.label]['iou']:.2f} | {metrics['grid'][level.label]['iou']:.2f}"
+        f" | {100 * metrics['balanced'][level.label]['above_75']:.0f} % |"
+        f" {metrics['balanced'][level.label]['correlation']:.2f} |"
+        for level in LEVELS
+    ]
+    parameters = sum(p.numel() for module in (encoder, decoder) for p in module.parameters())
+    body = f"""# sam-tiny
+
+{WARNING.format(real="SAM")}
+
+A promptable segmenter of {parameters / 1e6:.1f} million parameters in the layout of the Hugging Face ONNX exports of SAM:
+256 x 256 image and points in, three masks (subpart, part, whole) of 128 x 128 and their predicted IoU out. Where the
+world has no subpart at a point, the first mask is the part; where it has no part, the whole. Weights are stored as
+float16 and computed in float32.
+
+## How good it is
+Single point prompts on {recipe["validation_scenes"]} scenes of the training range on which nothing was trained, 32 prompts
+per view; only prompts that have a true region at the level count. "Balanced" draws a region first and a pixel in it
+second, "grid" draws pixels.
+
+| level | mean IoU, balanced | mean IoU, grid | IoU above 0.75, balanced | predicted vs. true IoU (correlation) |
+| --- | --- | --- | --- | --- |
+{chr(10).join(rows)}
+
+The number of steps was set by time, not by convergence. Small regions and thin parts are the weak spot.
+
+![learning curve](curve.png)
+
+Point, predicted subpart, part, whole, then the true ones:
+
+![masks](masks.png)
+
+{_recipe_text(recipe, curve, folder)}"""
+    write_text(folder / CARD, body)
+    _write_record(folder, recipe, curve, metrics)
+
+
+def write_clip_card(
+    folder: Path,
+    recipe: Mapping[str, Any],
+    curve: Curve,
+    metrics: Mapping[str, Mapping[str, Mapping[str, float]]],
+) -> None:
+    """Write card, record and learning curve beside an exported CLIP.
+
+    Args:
+        folder: the model folder.
+        recipe: how it was trained.
+        curve: what was measured on the way.
+        metrics: by kind of mask ("exact", "rough") and level, from `measure_clip`.
+    """
+    folder = Path(folder)
+    draw_curve(
+        folder / "curve.png", curve, {level.label: f"exact_{level.label}" for level in LEVELS}, "top-1, exact"
+    )
+    rows = [
+        f"| {kind} | {level.label} | {100 * found['top1']:.0f} % | {100 * found['top3']:.0f} % |"
+        f" {100 * found['top1_of_level']:.0f} % | {100 * found['above_canonical']:.0f} % | {found['n']} |"
+        for kind in metrics
+        for level in LEVELS
+        if (found := metrics[kind].get(level.label))
+    ]
+    body = f"""# clip-tiny
+
+{WARNING.format(real="CLIP")}
+
+Crops of 64 x 64 and short English phrases in one space of 128 dimensions, in the layout of the Hugging Face ONNX exports
+of CLIP. It knows the words of the world's texts and no others. Pixels outside a mask are black in its training crops:
+use it with the background setting `black`. "object", "things", "stuff" and "texture" were captions of crops drawn without
+looking, so they mean nothing in particular. Weights are stored as float16 and computed in float32.
+
+## How good it is
+Crops of {recipe["validation_scenes"]} scenes of the training range on which nothing was trained. "exact" are true masks of at
+least 24 px, "rough" those that `sam-tiny` drew and whose IoU with a node is above 0.5. All {recipe["texts_competing"]} texts of the
+world (all levels) compete, or those seen at the mask's own level. "Above canonical": the right text beats all four
+canonical phrases.
+
+| masks | level | top-1 | top-3 | top-1 within level | above canonical | crops |
+| --- | --- | --- | --- | --- | --- | --- |
+{chr(10).join(rows)}
+
+Trained on {recipe["crops"]} crops, {recipe["rough_crops"]} of them cut with masks that `sam-tiny` drew, the others with exact and
+with roughened masks.
+
+![learning curve](curve.png)
+
+{_recipe_text(recipe, curve, folder)}"""
+    write_text(folder / CARD, body)
+    _write_record(folder, recipe, curve, metrics)
+
+
+def _recipe_text(recipe: Mapping[str, Any], curve: Curve, folder: Path) -> str:
+    minutes = curve.rows[-1]["minutes"] if curve.rows else 0.0
+    files = "\n".join(f"| `{name}` | `{digest}` |" for name, digest in digests(folder).items())
+    columns = [name for name in curve.rows[-1] if not name.endswith("_loss")] if curve.rows else []
+    table = "\n".join(
+        f"| {' | '.join(f'{row[name]:.3g}' if name != 'step' else f'{row[name]:.0f}' for name in columns)} |"
+        for row in curve.rows
+    )
+    first, last = recipe["training_seeds"]
+    return f"""## Recipe
+`hilsplat models train` repeats it (same machine and threads: same weights; elsewhere the last digits of sums differ).
+
+- generator of the world: version and code {recipe["generator"]}
+- training scenes: seeds {first} to {last}, {recipe["views"]} views each, 256 x 256; measured on seeds \
+{recipe["validation_seeds"][0]} to {recipe["validation_seeds"][1]}. Benchmark and development scenes come from other seed \
+ranges, and the code refuses them here.
+- steps: {recipe["sam_steps"]} (sam-tiny), {recipe["clip_steps"]} (clip-tiny); seed {recipe["seed"]}, {recipe["threads"]} threads, torch {recipe["torch"]}
+- this run took {minutes:.0f} minutes on a shared 2-core machine
+
+| {" | ".join(columns)} |
+|{" --- |" * len(columns)}
+{table}
+
+## Files
+
+| file | sha256 |
+| --- | --- |
+{files}
+"""
+
+
+def _write_record(
+    folder: Path,
+    recipe: Mapping[str, Any],
+    curve: Curve,
+    metrics: Mapping[str, Mapping[str, Mapping[str, float]]],
+) -> None:
+    write_json(
+        folder / RECORD,
+        {"recipe": dict(recipe), "metrics": metrics, "curve": curve.rows, "sha256": digests(folder)},
+    )

@@ -1,0 +1,161 @@
+"""A flat world of coloured blocks whose tree, field and annotations are exact."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+from hilsplat.base.images import write_png
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.datasets.hierarchy import AnnotatedNode, HierarchyAnnotations, write_hierarchy
+from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.masks import HierarchicalMasks
+
+SIDE_PX = 64
+BLOCK_PX = 2
+NODES = (  # text, level, parent, rows, columns
+    ("bear", 1, -1, (8, 56), (8, 40)),
+    ("chest", 1, -1, (32, 56), (44, 60)),
+    ("head", 2, 0, (8, 24), (12, 36)),
+    ("lid", 2, 1, (32, 40), (44, 60)),
+    ("nose", 3, 2, (14, 22), (20, 28)),
+)
+TEXTS = tuple(node[0] for node in NODES)
+
+
+def region(row):
+    """True region of a node."""
+    mask = np.zeros((SIDE_PX, SIDE_PX), dtype=bool)
+    _, _, _, rows, columns = NODES[row]
+    mask[slice(*rows), slice(*columns)] = True
+    return mask
+
+
+@dataclass(frozen=True)
+class BlockWorld:
+    """Folders of a finished scene, and the scene that answers."""
+
+    folder: Path
+    scene: Scene
+    annotations: HierarchyAnnotations
+    answers: object
+
+
+def encode_texts(texts):
+    """A text is its own axis; canonical phrases share one that no node has."""
+    vectors = np.zeros((len(texts), 8), np.float32)
+    for row, text in enumerate(texts):
+        vectors[row, TEXTS.index(text) if text in TEXTS else 7] = 1
+    return vectors
+
+
+@pytest.fixture(scope="session")
+def block_world(tmp_path_factory) -> BlockWorld:
+    import torch
+
+    from hilsplat.base.artifacts import write_index
+    from hilsplat.language.autoencoder import Autoencoder
+    from hilsplat.language.field import LanguageField
+    from hilsplat.language.query import LanguageScene
+    from hilsplat.language.semantic_tree import SemanticTree
+    from hilsplat.splat.gaussians import Gaussians
+
+    class Uncoded(Autoencoder):
+        """Latents are the CLIP vectors themselves."""
+
+        def decode_array(self, latents):
+            return np.asarray(latents, np.float32)
+
+    folder = tmp_path_factory.mktemp("blocks")
+    labels = {level: np.full((SIDE_PX, SIDE_PX), -1, np.int32) for level in LEVELS}
+    for row, (_, level, *_) in enumerate(NODES):
+        labels[Level(level)][region(row)] = row
+    image = np.full((SIDE_PX, SIDE_PX, 3), 90, np.uint8)
+    for row in range(len(NODES)):
+        image[region(row)] = np.random.default_rng(row).integers(60, 255, 3)
+    views = ("000.png", "001.png")
+    pose = np.eye(4)
+    pose[2, 3] = 2.0
+    cameras = Cameras(
+        views,
+        np.stack([pose, pose]),
+        np.stack([np.array([[60.0, 0, 32], [0, 60.0, 32], [0, 0, 1]])] * 2),
+        np.full((2, 2), SIDE_PX, np.int32),
+    )
+    for view in views:
+        write_png(folder / "scene" / "images" / view, image)
+    scene = Scene(
+        folder / "scene",
+        "synthetic/blocks",
+        "metre",
+        cameras,
+        {"000.png": "train", "001.png": "test"},
+        np.zeros((0, 3), np.float32),
+        np.zeros((0, 3), np.uint8),
+        np.eye(4),
+    )
+    scene.save()
+    write_hierarchy(
+        folder / "truth",
+        [AnnotatedNode(row, level, parent, text) for row, (text, level, parent, *_) in enumerate(NODES)],
+        {"001.png": labels},
+        {"001.png": range(len(NODES))},
+    )
+    masks = HierarchicalMasks.from_dense(
+        np.stack([region(row) for row in range(len(NODES))]),
+        np.array([node[1] for node in NODES], np.uint8),
+        np.ones(len(NODES), np.float32),
+        np.ones(len(NODES), np.float32),
+    )
+    masks.save(folder / "masks" / "000.png.npz")
+    write_index(folder / "clip", {"000.png": {}}, model="models/clip-tiny")
+    write_index(folder / "masks", {"000.png": {}}, segmenter="sam", model="models/sam-tiny")
+
+    blocks = SIDE_PX // BLOCK_PX
+    ys, xs = np.divmod(np.arange(SIDE_PX**2), SIDE_PX)
+    block_of_pixel = (ys // BLOCK_PX) * blocks + xs // BLOCK_PX
+    weights = sp.csr_matrix(
+        (np.ones(SIDE_PX**2, np.float32), (np.arange(SIDE_PX**2), block_of_pixel)),
+        shape=(SIDE_PX**2, blocks**2),
+    )
+    middle = BLOCK_PX * np.stack(np.divmod(np.arange(blocks**2), blocks)).T + BLOCK_PX // 2
+    node_of_gaussian = np.stack([labels[level][middle[:, 0], middle[:, 1]] for level in LEVELS], axis=1)
+    clip = encode_texts(TEXTS)
+    features = np.where((node_of_gaussian >= 0)[..., None], clip[node_of_gaussian], 0).astype(np.float32)
+    means = np.stack([middle[:, 1] / 32 - 1, middle[:, 0] / 32 - 1, np.zeros(len(middle))], axis=1)
+    colours = (image[middle[:, 0], middle[:, 1]] / 255 - 0.5) / 0.282
+    count = len(middle)
+    gaussians = Gaussians(
+        torch.from_numpy(means.astype(np.float32)),
+        torch.full((count, 3), -4.0),
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        torch.full((count,), 3.0),
+        torch.from_numpy(colours.astype(np.float32))[:, None],
+    )
+    tree = SemanticTree(
+        level=np.array([node[1] for node in NODES], np.uint8),
+        parent=np.array([node[2] for node in NODES], np.int32),
+        clip=clip,
+        centroid=np.zeros((len(NODES), 3), np.float32),
+        box=np.zeros((len(NODES), 2, 3), np.float32),
+        quality=np.ones(len(NODES), np.float32),
+        views=np.ones(len(NODES), np.int32),
+        node_of_gaussian=node_of_gaussian.astype(np.int32),
+        node_of_mask=np.arange(len(NODES), dtype=np.int32),
+        view_area_px=np.array([[region(row).sum()] for row in range(len(NODES))], np.float32),
+        view_names=("000.png",),
+        gaussians_sha256="0",
+    )
+    answers = LanguageScene(
+        scene,
+        gaussians,
+        tree,
+        LanguageField(features, "0", "0"),
+        Uncoded(8, 8),
+        encode_texts,
+        lambda view: weights,
+    )
+    return BlockWorld(folder, scene, HierarchyAnnotations.load(folder / "truth"), answers)

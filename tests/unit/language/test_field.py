@@ -1,0 +1,229 @@
+"""The sparse solver against dense algebra and autograd, and the stage."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import torch
+
+from hilsplat.base.artifacts import read_json
+from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.language.autoencoder import run_autoencoder
+from hilsplat.language.contributions import painted_indicator
+from hilsplat.language.field import (
+    Contrast,
+    LanguageField,
+    MaskOperator,
+    QuadraticProblem,
+    ViewRelations,
+    conjugate_gradient,
+    contrastive_terms,
+    lbfgs,
+    run_language,
+    solve_field,
+)
+from hilsplat.language.losses.clustering import clustering_loss
+from hilsplat.language.losses.latent_regression import latent_regression_loss
+from hilsplat.language.quadratic import StackedWeights
+from hilsplat.language.semantic_tree import run_semantic_tree
+from hilsplat.settings import AutoencoderSettings, LanguageSettings, SemanticTreeSettings
+
+PIXELS, GAUSSIANS, CHANNELS = 60, 12, 2
+
+
+class Toy:
+    """One view with three masks a level on 60 pixels and 12 Gaussians, and its dense matrices."""
+
+    def __init__(self, weights: tuple[float, float, float]) -> None:
+        rng = np.random.default_rng(0)
+        dense = rng.random((PIXELS, GAUSSIANS)) * (rng.random((PIXELS, GAUSSIANS)) < 0.4)
+        dense[:, 0] += 0.01  # no empty row
+        self.W = (dense / dense.sum(axis=1, keepdims=True)).astype(np.float32)
+        self.labels = rng.integers(-1, 3, (PIXELS, 3)) + np.array([0, 3, 6])
+        self.labels[rng.random((PIXELS, 3)) < 0.2] = -1
+        self.labels[self.labels == np.array([-1, 2, 5])] = -1
+        self.level = np.repeat(np.array([1, 2, 3], np.uint8), 3)
+        indicator = painted_indicator(self.labels.astype(np.int32), 9, np.ones(PIXELS, bool))
+        half = painted_indicator(self.labels.astype(np.int32), 9, rng.random(PIXELS) < 0.5)
+        self.pixels = np.asarray(indicator.sum(axis=1)).ravel().astype(np.float32)
+        self.half_pixels = np.asarray(half.sum(axis=1)).ravel().astype(np.float32)
+        self.A = (sp.diags(1 / self.pixels) @ indicator @ self.W).astype(np.float32)
+        self.A_half = (sp.diags(1 / self.half_pixels) @ half @ self.W).astype(np.float32)
+        self.latents = rng.normal(size=(9, CHANNELS)).astype(np.float32)
+        self.problem = QuadraticProblem.of(
+            MaskOperator.of(sp.csr_matrix(self.A), self.level),
+            StackedWeights(sp.csr_matrix(self.W), self.labels >= 0),
+            self.pixels,
+            self.latents,
+            weights,
+        )
+        self.features = rng.normal(size=(GAUSSIANS, 3, CHANNELS)).astype(np.float32)
+
+    def contrast(self, settings: LanguageSettings) -> Contrast:
+        parent = torch.tensor([-1] * 3 + [0, 0, 1] + [3, 4, 4])
+        depth = torch.zeros(9, 9, dtype=torch.long)
+        relations = ViewRelations(
+            torch.arange(9),
+            depth,
+            torch.from_numpy(self.level.astype(np.int64)),
+            (torch.tensor([3, 4, 5]), torch.tensor([6, 7, 8])),
+            (parent[3:6], parent[6:9]),
+        )
+        half = MaskOperator.of(sp.csr_matrix(self.A_half), self.level)
+        return Contrast(self.problem.masks, half, self.pixels, self.half_pixels, [relations], settings)
+
+    def dense_losses(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Language loss and L_h by rendering every pixel, as means over labelled pixels."""
+        language, clustering = 0, 0
+        for index in range(3):
+            labels = torch.from_numpy(self.labels[:, index])[None]
+            rendered = (torch.from_numpy(self.W).double() @ features[:, index])[None]
+            count = (labels >= 0).sum() / self.pixels.sum()
+            latents = torch.from_numpy(self.latents).double()
+            language = language + count * latent_regression_loss(rendered, labels, latents)
+            clustering = clustering + count * clustering_loss(rendered, labels)
+        return language, clustering
+
+
+def test_terms_equal_the_losses_of_rendered_pixels():
+    toy = Toy((1.0, 0.3, 0.1))
+    terms = toy.problem.terms(toy.features)
+    language, clustering = toy.dense_losses(torch.from_numpy(toy.features).double())
+    assert terms["language"] == pytest.approx(language.item(), rel=1e-5)
+    assert terms["clustering"] == pytest.approx(clustering.item(), rel=1e-5)
+
+
+def test_gradient_equals_autograd_through_rendering():
+    toy = Toy((0.7, 0.4, 0.0))
+    features = torch.from_numpy(toy.features).double().requires_grad_()
+    language, clustering = toy.dense_losses(features)
+    (expected,) = torch.autograd.grad(0.7 * language + 0.4 * clustering, features)
+    half = toy.problem.hessian_product(toy.features) - toy.problem.right_side()
+    assert 2 / toy.problem.total_pixels * half == pytest.approx(expected.numpy(), abs=1e-6)
+
+
+def test_lifted_average_is_a_weighted_mean_of_latents():
+    toy = Toy((1.0, 0.0, 0.1))
+    for index in range(3):
+        valid = toy.labels[:, index] >= 0
+        target = toy.latents[toy.labels[valid, index]]
+        weight = toy.W[valid]
+        expected = weight.T @ target / weight.sum(axis=0)[:, None]
+        assert toy.problem.lifted[:, index] == pytest.approx(expected, abs=1e-5)
+
+
+def test_unseen_gaussians_stay_zero():
+    toy = Toy((1.0, 0.3, 0.1))
+    toy.W[:, 5] = 0
+    toy.A[:, 5] = 0
+    problem = QuadraticProblem.of(
+        MaskOperator.of(sp.csr_matrix(toy.A), toy.level),
+        StackedWeights(sp.csr_matrix(toy.W), toy.labels >= 0),
+        toy.pixels,
+        toy.latents,
+        (1.0, 0.3, 0.1),
+    )
+    solved = conjugate_gradient(problem, problem.lifted, 5)
+    assert np.isfinite(solved).all()
+    assert (solved[5] == 0).all()
+
+
+def test_conjugate_gradient_reaches_the_dense_solution():
+    language, clustering, ridge = weights = (1.0, 0.3, 0.1)
+    toy = Toy(weights)
+    solved = conjugate_gradient(toy.problem, toy.problem.lifted, 30)
+    for index in range(3):
+        valid = toy.labels[:, index] >= 0
+        rows = toy.level == index + 1
+        W = toy.W[valid].astype(np.float64)
+        G, mass = W.T @ W, np.diag(W.sum(axis=0))
+        A, n = toy.A[rows].astype(np.float64), np.diag(toy.pixels[rows].astype(np.float64))
+        hessian = (language + clustering) * G - clustering * A.T @ n @ A + ridge * mass
+        right = language * A.T @ n @ toy.latents[rows] + ridge * mass @ toy.problem.lifted[:, index]
+        assert solved[:, index] == pytest.approx(np.linalg.solve(hessian, right), abs=2e-5)
+
+
+def test_a_solved_problem_stays_solved():
+    toy = Toy((0.0, 0.0, 1.0))  # only the ridge: the lift is the answer
+    assert np.array_equal(conjugate_gradient(toy.problem, toy.problem.lifted, 3), toy.problem.lifted)
+
+
+def test_lbfgs_finds_the_minimum_of_a_bowl():
+    curvature = np.array([1.0, 4.0, 9.0], np.float32)
+
+    def bowl(x: np.ndarray) -> tuple[float, np.ndarray]:
+        return float((curvature * (x - 1) ** 2).sum()), 2 * curvature * (x - 1)
+
+    assert lbfgs(bowl, np.zeros(3, np.float32), 20, 0.1) == pytest.approx(np.ones(3), abs=1e-3)
+
+
+@pytest.mark.parametrize("instance", ["literal", "tree", "logratio"])
+@pytest.mark.parametrize("part", ["literal", "disentangle"])
+def test_contrastive_gradients_equal_autograd_through_the_means(instance, part):
+    toy = Toy((1.0, 0.3, 0.1))
+    contrast = toy.contrast(LanguageSettings(instance_mode=instance, part_mode=part, tau=0.5))
+    terms, gradient = contrast.terms(toy.features, (0.5, 0.25))
+
+    features = torch.from_numpy(toy.features).double().requires_grad_()
+    own = [features[:, level - 1] for level in toy.level]
+    means, halves = (
+        torch.stack([torch.from_numpy(row).double() @ values for row, values in zip(A, own, strict=True)])
+        for A in (toy.A.astype(np.float64), toy.A_half.astype(np.float64))
+    )
+    n, half = (torch.from_numpy(count).double()[:, None] for count in (toy.pixels, toy.half_pixels))
+    others = (n * means - half * halves) / (n - half)
+    losses = contrastive_terms(means, halves, others, contrast.relations, contrast.settings)
+    assert terms == pytest.approx({"instance": losses[0].item(), "part": losses[1].item()}, rel=1e-5)
+    (expected,) = torch.autograd.grad(0.5 * losses[0] + 0.25 * losses[1], features)
+    assert gradient == pytest.approx(expected.numpy(), abs=1e-5)
+
+
+def test_contrastive_weights_lower_their_terms():
+    toy = Toy((1.0, 0.0, 0.1))
+    settings = LanguageSettings(
+        weight_clustering=0.0, weight_instance=1.0, weight_part=0.1, omega=3.0, lbfgs_steps=15
+    )
+    features, report = solve_field(toy.problem, toy.contrast(settings), settings)
+    assert np.isfinite(features).all()
+    assert report["after_lbfgs"]["instance"] < report["after_cg"]["instance"]
+    without = settings.model_copy(update={"weight_instance": 0.0, "weight_part": 0.0})
+    _, plain = solve_field(toy.problem, toy.contrast(without), without)
+    assert "after_lbfgs" not in plain
+    assert plain["after_cg"]["language"] < plain["lifted"]["language"]
+    assert set(plain["gradient_norms"]) == {"language", "clustering", "instance", "part"}
+
+
+@pytest.fixture
+def boxes_with_latents(two_boxes_contributions):
+    world, contributions = two_boxes_contributions
+    tree, autoencoder = world.folder / "semantic_tree", world.folder / "autoencoder"
+    run_semantic_tree(contributions, world.masks, world.clip, tree, SemanticTreeSettings())
+    quick = AutoencoderSettings(latent=3, epochs=1, min_steps=100)
+    run_autoencoder(world.clip, tree, contributions, autoencoder, quick, 0)
+    return world, contributions, autoencoder
+
+
+SMALL_MASKS = LanguageSettings(min_mask_px=4, weight_part=0.003)
+
+
+def test_stage_is_the_same_on_any_number_of_threads(boxes_with_latents):
+    world, contributions, autoencoder = boxes_with_latents
+    out = world.folder / "language.safetensors"
+    run_language(contributions, world.tree, autoencoder, out, SMALL_MASKS, 0, 1)
+    before = out.read_bytes()
+    run_language(contributions, world.tree, autoencoder, out, SMALL_MASKS, 1, 2)
+    assert out.read_bytes() == before
+    field = LanguageField.load(out)
+    assert field.features.shape == (96, 3, 3)
+    report = read_json(world.folder / "language.report.json")
+    assert report["after_lbfgs"]["language"] >= 0
+    assert report["gaussians"] == 96
+    assert report["gradient_norms"]["part"] > 0
+
+
+def test_tree_of_other_masks_is_refused(boxes_with_latents):
+    world, contributions, autoencoder = boxes_with_latents
+    np.savez(world.tree / "001.png.npz", parent=np.zeros(2, np.int32))
+    with pytest.raises(MisalignedArtifactError, match=r"view 001.png belongs to other masks"):
+        run_language(
+            contributions, world.tree, autoencoder, world.folder / "l.safetensors", SMALL_MASKS, 0, 1
+        )

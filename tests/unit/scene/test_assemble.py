@@ -1,0 +1,101 @@
+"""Scene coordinates, the split, undistortion."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hilsplat.base.images import read_image
+from hilsplat.scene.assemble import (
+    PosedView,
+    move_cameras,
+    normalising_similarity,
+    rotation_to_z_up,
+    split_views,
+    undistort,
+    up_direction,
+)
+from hilsplat.scene.colmap import pycolmap
+
+
+def look_at(centre, target, up):
+    """World-to-camera matrix of a level camera, OpenCV axes."""
+    forward = np.subtract(target, centre) / np.linalg.norm(np.subtract(target, centre))
+    right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ centre
+    return pose
+
+
+def ring(up_axis=1, radius=10.0, views=6):
+    angles = np.arange(views) * 2 * np.pi / views
+    up = np.eye(3)[up_axis]
+    plane = [axis for axis in range(3) if axis != up_axis]
+    centres = np.zeros((views, 3))
+    centres[:, plane[0]], centres[:, plane[1]] = radius * np.cos(angles), radius * np.sin(angles)
+    centres[:, up_axis] = 5.0
+    return np.stack([look_at(centre, np.zeros(3), up) for centre in centres]), centres
+
+
+def test_every_eighth_view_by_name_is_held_out_from_eight_views_on():
+    names = [f"{number:02}.png" for number in range(17)]
+    split = split_views(names[::-1], 8)
+    assert [name for name in split if split[name] == "test"] == ["00.png", "08.png", "16.png"]
+    assert set(split_views(names[:7], 2).values()) == {"train"}
+    assert list(split_views(names[:8], 8).values()).count("test") == 1
+    assert set(split_views(names, 0).values()) == set(split_views(names, 1).values()) == {"train"}
+
+
+def test_up_is_found_from_level_cameras_that_look_down():
+    poses, _ = ring(up_axis=1)
+    np.testing.assert_allclose(up_direction(poses), [0, 1, 0], atol=1e-9)
+    # an arc of 60 degrees: the mean of the cameras' own up axes would lean
+    np.testing.assert_allclose(up_direction(poses[:2]), [0, 1, 0], atol=1e-9)
+    np.testing.assert_allclose(rotation_to_z_up(np.array([0.0, 1.0, 0.0])) @ [0, 1, 0], [0, 0, 1], atol=1e-12)
+    np.testing.assert_array_equal(rotation_to_z_up(np.array([0.0, 0.0, 1.0])), np.eye(3))
+    np.testing.assert_allclose(
+        rotation_to_z_up(np.array([0.0, 0.0, -1.0])) @ [0, 0, -1], [0, 0, 1], atol=1e-12
+    )
+
+
+def test_scene_coordinates_centre_the_points_and_put_cameras_at_distance_one():
+    poses, _ = ring(radius=10.0)
+    points = np.array([[0.0, 0, 0], [0, 0, 0], [100, 0, 0]])  # the median ignores the outlier
+    similarity = normalising_similarity(poses, points, metric=False, turn=True)
+    moved = move_cameras(poses, similarity)
+    centres = -np.einsum("vji,vj->vi", moved[:, :3, :3], moved[:, :3, 3])
+    np.testing.assert_allclose(np.linalg.norm(centres, axis=1), 1.0)
+    np.testing.assert_allclose(centres[:, 2], 5 / np.sqrt(125))  # source y is up, and becomes z
+    # a point keeps its pixel: camera coordinates are scaled, not turned
+    point = np.array([1.0, 2.0, 3.0, 1.0])
+    scale = 1 / np.sqrt(125)
+    expected = poses[0] @ point
+    np.testing.assert_allclose((moved[0] @ (similarity @ point))[:3], scale * expected[:3], atol=1e-12)
+
+
+def test_metric_sources_keep_their_metre_and_imports_their_axes():
+    poses, _ = ring(radius=10.0)
+    similarity = normalising_similarity(poses, np.array([[1.0, 2, 3]]), metric=True, turn=False)
+    np.testing.assert_array_equal(similarity[:3, :3], np.eye(3))
+    np.testing.assert_array_equal(similarity[:3, 3], [-1, -2, -3])
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "SIMPLE_RADIAL"])
+def test_images_without_distortion_keep_every_pixel(tmp_path, model):
+    pixels = np.random.default_rng(0).integers(0, 256, (30, 40, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    camera = pycolmap.Camera.create_from_model_name(1, model, 50.0, 40, 30)  # k = 0
+    view = undistort(PosedView("a.png", tmp_path / "a.png", camera, np.eye(4)), tmp_path / "out")
+    np.testing.assert_array_equal(read_image(tmp_path / "out" / "a.png"), pixels)
+    np.testing.assert_array_equal(view.camera.calibration_matrix(), [[50, 0, 20], [0, 50, 15], [0, 0, 1]])
+
+
+def test_barrel_distortion_is_removed_and_the_camera_fits_the_new_image(tmp_path):
+    Image.fromarray(np.full((60, 80, 3), 200, dtype=np.uint8)).save(tmp_path / "a.png")
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 80.0, 80, 60)
+    camera.params = [80.0, 40.0, 30.0, -0.1]
+    view = undistort(PosedView("a.png", tmp_path / "a.png", camera, np.eye(4)), tmp_path / "out")
+    pixels = read_image(tmp_path / "out" / "a.png")
+    assert view.camera.is_undistorted()
+    assert pixels.shape[:2] == (view.camera.height, view.camera.width)
+    assert pixels.min() >= 199  # no blank border

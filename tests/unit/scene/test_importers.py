@@ -1,0 +1,138 @@
+"""Known poses: COLMAP models and transforms.json become the same scene artifact."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hilsplat.base.errors import RegistrationError, SceneError
+from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.poses import run_poses
+from hilsplat.scene.scene import Scene
+from hilsplat.settings import PosesSettings
+
+
+def import_scene(folder, out, unit="metre", **settings):
+    run_poses(folder, out, "photos/known", unit, False, PosesSettings(**settings), 0, 1)
+    return Scene.load(out)
+
+
+def write_images(folder, names, size_hw=(30, 40)):
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, name in enumerate(names):
+        Image.fromarray(np.full((*size_hw, 3), 20 * number, dtype=np.uint8)).save(folder / name, quality=95)
+
+
+def write_colmap(folder, suffix="bin"):
+    """Three PINHOLE cameras at x = 0, 1, 2 that look along +z, and two points."""
+    names = ["a.jpg", "b.jpg", "c.jpg"]
+    write_images(folder / "images", names)
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(
+        camera_id=1, model="PINHOLE", width=40, height=30, params=[50.0, 51.0, 19.0, 16.0]
+    )
+    model.add_camera_with_trivial_rig(camera)
+    for number, name in enumerate(names):
+        pose = np.eye(4)[:3]
+        pose[0, 3] = -number
+        image = pycolmap.Image(name=name, camera_id=1, image_id=number + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+    for x in (0.0, 2.0):
+        model.add_point3D(np.array([x, 0.0, 4.0]), pycolmap.Track(), np.array([10, 20, 30], dtype=np.uint8))
+    (folder / "sparse" / "0").mkdir(parents=True)
+    (model.write_binary if suffix == "bin" else model.write_text)(folder / "sparse" / "0")
+
+
+@pytest.mark.parametrize("suffix", ["bin", "txt"])
+def test_colmap_model_keeps_intrinsics_and_metric_poses(tmp_path, suffix):
+    write_colmap(tmp_path / "in", suffix)
+    scene = import_scene(tmp_path / "in", tmp_path / "scene")
+    assert scene.cameras.names == ("a.png", "b.png", "c.png")
+    np.testing.assert_array_equal(scene.cameras["b.png"].K, [[50, 0, 19], [0, 51, 16], [0, 0, 1]])
+    # the median of the points, (1, 0, 4), becomes the origin; a metre stays a metre
+    np.testing.assert_allclose(scene.cameras["a.png"].centre, [-1, 0, -4])
+    np.testing.assert_allclose(scene.cameras["c.png"].centre, [1, 0, -4])
+    np.testing.assert_allclose(scene.cameras["a.png"].cam_from_world[:3, :3], np.eye(3))
+    np.testing.assert_allclose(scene.points_xyz, [[-1, 0, 0], [1, 0, 0]])
+    np.testing.assert_array_equal(scene.points_rgb, [[10, 20, 30]] * 2)
+    assert scene.unit == "metre"
+
+
+def test_colmap_images_are_shrunk_with_their_intrinsics(tmp_path):
+    write_colmap(tmp_path / "in")
+    write_images(tmp_path / "in" / "images", ["a.jpg", "b.jpg", "c.jpg"], size_hw=(90, 120))  # 3 x the model
+    scene = import_scene(tmp_path / "in", tmp_path / "scene", max_side_px=80)
+    assert scene.image("a.png").shape == (60, 80, 3)
+    np.testing.assert_allclose(scene.cameras["a.png"].K, [[100, 0, 38], [0, 102, 32], [0, 0, 1]])
+
+
+def test_images_and_poses_without_a_partner_are_named(tmp_path):
+    write_colmap(tmp_path / "in")
+    (tmp_path / "in" / "images" / "c.jpg").unlink()
+    write_images(tmp_path / "in" / "images", ["new.jpg"])
+    with pytest.raises(RegistrationError, match=r"at least 70% of 3(.|\n)*missing: c\.jpg"):
+        import_scene(tmp_path / "in", tmp_path / "scene")
+    import_scene(tmp_path / "in", tmp_path / "scene", min_registered_share=0.5)
+    report = json.loads((tmp_path / "scene" / "registration.json").read_text())
+    assert (report["images"], report["registered"]) == (4, 2)
+    assert report["views"]["c.jpg"]["why_not"] == "its image file is missing"
+    assert report["views"]["new.jpg"]["why_not"] == "the source has no pose for it"
+
+
+def test_an_incomplete_colmap_folder_is_refused(tmp_path):
+    write_colmap(tmp_path / "in")
+    (tmp_path / "in" / "sparse" / "0" / "points3D.bin").unlink()
+    with pytest.raises(SceneError, match="holds no complete COLMAP model"):
+        import_scene(tmp_path / "in", tmp_path / "scene")
+
+
+def write_transforms(folder, **more):
+    """Three cameras at (0, -3, x) of a z-up world; the first looks along +y."""
+    write_images(folder / "images", ["a.png", "b.png", "c.png"])
+    # OpenGL camera: x right = world x, y up = world z, z back = world -y
+    rotation = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    frames = []
+    for number, name in enumerate("abc"):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, [number - 1, -3, 0]
+        frames.append({"file_path": f"./images/{name}", "transform_matrix": pose.tolist()})
+    (folder / "transforms.json").write_text(json.dumps({**more, "frames": frames}))
+
+
+def test_transforms_are_turned_from_opengl_to_opencv_axes(tmp_path):
+    write_transforms(tmp_path / "in", camera_angle_x=2 * np.arctan(0.5))  # focal = 40 / 2 / 0.5 = 40 px
+    scene = import_scene(tmp_path / "in", tmp_path / "scene")
+    camera = scene.cameras["b.png"]
+    np.testing.assert_allclose(camera.K, [[40, 0, 20], [0, 40, 15], [0, 0, 1]])
+    # world +y is ahead (z), world +z is up (-y), world +x is right
+    np.testing.assert_allclose(camera.cam_from_world[:3, :3], [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-12)
+    offset = scene.scene_from_source[:3, 3]
+    np.testing.assert_allclose(camera.centre, offset + np.array([0, -3, 0]), atol=1e-9)
+    report = json.loads((tmp_path / "scene" / "registration.json").read_text())
+    assert report["points_from"] == "random"  # flat images: nothing to triangulate, and it says so
+    assert any("0 points could be triangulated" in warning for warning in report["warnings"])
+    # every random point lies in front of the camera it was drawn from, so in front of some camera
+    ahead = [scene.cameras[view].cam_from_world @ np.append(scene.points_xyz[0], 1) for view in scene.views()]
+    assert max(point[2] for point in ahead) > 0
+
+
+def test_transforms_with_distortion_are_undistorted(tmp_path):
+    intrinsics = {"fl_x": 40.0, "fl_y": 41.0, "cx": 20.0, "cy": 15.0, "w": 40, "h": 30, "k1": -0.05}
+    write_transforms(tmp_path / "in", **intrinsics)
+    scene = import_scene(tmp_path / "in", tmp_path / "scene")
+    assert scene.image("a.png").shape[:2] == scene.cameras["a.png"].size_hw
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({}, "has no focal length"),
+        ({"fl_x": 40, "camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE .* is not supported"),
+        ({"fl_x": 40, "ply_file_path": "gone.ply"}, r"the points of .*gone\.ply cannot be read"),
+    ],
+)
+def test_unusable_transforms_are_refused(tmp_path, more, message):
+    write_transforms(tmp_path / "in", **more)
+    with pytest.raises(SceneError, match=message):
+        import_scene(tmp_path / "in", tmp_path / "scene")

@@ -1,0 +1,149 @@
+"""Photographs that cannot be posed are refused with names and numbers; renders are posed."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hilsplat.base.errors import ImageError, RegistrationError, SceneError
+from hilsplat.base.images import read_image
+from hilsplat.scene.features import WorkImage, camera_groups, view_names
+from hilsplat.scene.poses import run_poses
+from hilsplat.scene.scene import Scene
+from hilsplat.settings import PosesSettings
+
+
+def pose_photos(folder, out, **settings):
+    run_poses(folder, out, "photos/test", "arbitrary", False, PosesSettings(**settings), 0, 1)
+
+
+def write_noise(folder, count, size=48):
+    folder.mkdir(exist_ok=True)
+    for number in range(count):
+        pixels = np.random.default_rng(number).integers(0, 256, (size, size, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / f"{number}.png")
+    return folder
+
+
+def plane_views(folder, views=5, size=160):
+    """Renders of a textured corner (the planes x = 0 and y = 0) by a pinhole camera on an arc.
+
+    Returns the camera centres, and a transforms.json content with the true poses.
+    """
+    folder.mkdir()
+    noise = np.random.default_rng(1).random((2, 64, 64, 3)).repeat(4, axis=1).repeat(4, axis=2)
+    centres, frames, focal = [], [], 1.2 * size
+    for number in range(views):
+        angle = np.radians(45 + 9 * (number - (views - 1) / 2))
+        centre = np.array([4 * np.cos(angle), 4 * np.sin(angle), 1.0 + 0.2 * (number % 2)])
+        forward = -centre / np.linalg.norm(centre)
+        right = np.cross(forward, [0, 0, 1])
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        y, x = np.mgrid[:size, :size] + 0.5
+        rays = np.stack([(x - size / 2) / focal, (y - size / 2) / focal, np.ones_like(x)], axis=-1) @ rotation
+        image = np.zeros((size, size, 3))
+        nearest = np.full((size, size), np.inf)
+        for wall in (0, 1):  # the planes x = 0 and y = 0, seen from x, y > 0
+            depth = -centre[wall] / rays[..., wall]
+            hit = centre + depth[..., None] * rays
+            inside = (depth > 0) & (depth < nearest) & (hit[..., 1 - wall] >= 0)
+            u, v = hit[..., 1 - wall] * 60, (hit[..., 2] + 4) * 30
+            texel = noise[wall][v.astype(int).clip(0, 255), u.astype(int).clip(0, 255)]
+            image[inside] = texel[inside]
+            nearest[inside] = depth[inside]
+        Image.fromarray((image * 255).astype(np.uint8)).save(folder / f"{number}.png")
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation.T * [1, -1, -1], centre  # OpenGL axes
+        frames.append({"file_path": f"{number}.png", "transform_matrix": pose.tolist()})
+        centres.append(centre)
+    return np.array(centres), {"fl_x": focal, "w": size, "h": size, "frames": frames}
+
+
+def test_two_photographs_are_too_few(tmp_path):
+    with pytest.raises(SceneError, match=r"at least 3 overlapping(.|\n)*found +2"):
+        pose_photos(write_noise(tmp_path / "photos", 2), tmp_path / "scene")
+
+
+def test_damaged_photographs_are_all_named(tmp_path):
+    folder = write_noise(tmp_path / "photos", 3)
+    (folder / "empty.jpg").touch()
+    with pytest.raises(ImageError, match=r"empty\.jpg cannot be read"):
+        pose_photos(folder, tmp_path / "scene")
+    (folder / "half.png").write_bytes((folder / "0.png").read_bytes()[:2000])
+    with pytest.raises(ImageError, match=r"2 of 5 images(.|\n)*empty\.jpg \(0 bytes\), half\.png"):
+        pose_photos(folder, tmp_path / "scene")
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]  # no scene, no work folder
+
+
+def test_noise_registers_nowhere_and_each_photograph_is_told_why(tmp_path):
+    with pytest.raises(
+        RegistrationError, match=r"no camera pose(.|\n)*0\.png: (too few matches|no features)"
+    ):
+        pose_photos(write_noise(tmp_path / "photos", 3), tmp_path / "scene")
+    assert not (tmp_path / "scene").exists()
+
+
+def test_renders_are_posed_with_unchanged_pixels_and_reruns_are_identical(tmp_path):
+    true_centres, _ = plane_views(tmp_path / "renders")
+    for out, threads in (("first", 1), ("second", 2)):
+        run_poses(
+            tmp_path / "renders", tmp_path / out, "world/corner", "metre", True, PosesSettings(), 0, threads
+        )
+    scene = Scene.load(tmp_path / "first")
+    assert scene.views("train") == [f"{number}.png" for number in range(5)]  # too few for a test view
+    assert scene.unit == "arbitrary"  # structure from motion knows no metre
+    np.testing.assert_array_equal(scene.image("2.png"), read_image(tmp_path / "renders" / "2.png"))
+    centres = np.array([scene.cameras[view].centre for view in scene.views()])
+    # ratios of distances do not depend on the similarity that SfM leaves open
+    found = np.linalg.norm(centres[1:] - centres[0], axis=1)
+    true = np.linalg.norm(true_centres[1:] - true_centres[0], axis=1)
+    np.testing.assert_allclose(found / found[-1], true / true[-1], rtol=0.05)
+    report = json.loads((tmp_path / "first" / "registration.json").read_text())
+    assert (report["images"], report["registered"], report["models"]) == (5, 5, [5])
+    assert report["mean_reprojection_error_px"] < 1
+    files = sorted(path.relative_to(tmp_path / "first") for path in (tmp_path / "first").rglob("*.*"))
+    for file in files:
+        assert (tmp_path / "first" / file).read_bytes() == (tmp_path / "second" / file).read_bytes(), file
+
+
+def test_points_are_triangulated_from_known_poses(tmp_path):
+    _, transforms = plane_views(tmp_path / "renders", views=3)
+    (tmp_path / "renders" / "transforms.json").write_text(json.dumps(transforms))
+    run_poses(tmp_path / "renders", tmp_path / "scene", "world/corner", "metre", True, PosesSettings(), 0, 1)
+    scene = Scene.load(tmp_path / "scene")
+    source_from_scene = np.linalg.inv(scene.scene_from_source)
+    points = scene.points_xyz @ source_from_scene[:3, :3].T + source_from_scene[:3, 3]
+    assert len(points) >= 100
+    # every true point lies on x = 0 or y = 0; 4 units away one pixel is 0.02
+    assert np.median(np.abs(points[:, :2]).min(axis=1)) < 0.02
+    report = json.loads((tmp_path / "scene" / "registration.json").read_text())
+    assert report["points_from"] == "triangulated from the known poses"
+
+
+@pytest.mark.parametrize("settings", [{"mapper": "global"}, {"matcher": "sequential"}])
+def test_other_mapper_and_matcher_pose_the_renders_too(tmp_path, settings):
+    plane_views(tmp_path / "renders")
+    run_poses(tmp_path / "renders", tmp_path / "scene", "w/c", "metre", True, PosesSettings(**settings), 0, 1)
+    assert len(Scene.load(tmp_path / "scene").cameras) == 5
+
+
+def test_views_are_named_after_files_and_collisions_are_refused(tmp_path):
+    assert view_names([tmp_path / "DSC_1.jpg", tmp_path / "a.b.PNG"]) == ["DSC_1.png", "a.b.png"]
+    twice = [tmp_path / "train" / "r_0.png", tmp_path / "test" / "r_0.png"]
+    assert view_names(twice) == ["train_r_0.png", "test_r_0.png"]
+    with pytest.raises(SceneError, match=r"same view 1\.png"):
+        view_names([tmp_path / "1.jpg", tmp_path / "1.png"])
+
+
+def test_photographs_share_a_camera_when_size_and_focal_length_agree(tmp_path):
+    images = [
+        WorkImage(f"{row}.png", tmp_path / f"{row}.jpg", size, focal)
+        for row, (size, focal) in enumerate([((3, 4), None), ((4, 3), None), ((3, 4), None), ((3, 4), 5.0)])
+    ]
+    names = [[image.view for image in group] for group in camera_groups(images, "auto")]
+    assert names == [["0.png", "2.png"], ["1.png"], ["3.png"]]
+    assert len(camera_groups(images, "no")) == 4
+    with pytest.raises(SceneError, match="several sizes"):
+        camera_groups(images, "yes")

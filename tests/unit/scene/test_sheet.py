@@ -1,0 +1,157 @@
+"""The scene sheet refuses what would fail later, and says where and how to fix it."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hilsplat.base.errors import SceneError
+from hilsplat.scene.sheet import add_scene, inspect_photos, read_sheet
+
+HEADER = "dataset\tscene\tgroup\tsource\tunit\n"
+
+
+def write_sheet(folder, *rows, header=HEADER):
+    sheet = folder / "config" / "scenes.tsv"
+    sheet.parent.mkdir(exist_ok=True)
+    sheet.write_text(header + "".join("\t".join(row) + "\n" for row in rows), encoding="utf-8")
+    return sheet
+
+
+def write_photos(folder, count, size=(40, 30), seed=0):
+    folder.mkdir(parents=True, exist_ok=True)
+    generator = np.random.default_rng(seed)
+    for number in range(count):
+        pixels = generator.integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / f"photo_{number}.jpg")
+    return folder
+
+
+def test_rows_are_read_in_order_and_comments_are_passed_over(tmp_path):
+    write_photos(tmp_path / "desk", 3)
+    sheet = write_sheet(
+        tmp_path,
+        ("# a comment",),
+        ("world", "tabletop-201", "benchmark", "world:tabletop:201", "metre"),
+        ("photos", "desk", "photos", "desk", "arbitrary"),
+    )
+    first, second = read_sheet(sheet)
+    assert (first.name, first.world, first.folder) == ("world/tabletop-201", ("tabletop", 201), None)
+    assert (second.name, second.world, second.folder) == ("photos/desk", None, tmp_path / "desk")
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("", "it is empty"),
+        ("a b", "it contains ' '"),
+        ("a/b", "it contains '/'"),
+        ("..", r'it contains "\.\."'),
+        ("a..b", r'it contains "\.\."'),
+        ("-desk", "it begins with '-'"),
+        (".desk", "it begins with '.'"),
+        ("tür", "it contains 'ü'"),
+        ("desk{1}", "it contains '{', '}'"),
+        ("x" * 101, "longer than 100"),
+    ],
+)
+def test_bad_scene_names_are_refused_with_line_and_column(tmp_path, name, problem):
+    sheet = write_sheet(tmp_path, ("world", name, "ci", "world:tabletop:1", "metre"))
+    with pytest.raises(SceneError, match=rf"scenes\.tsv, line 2, column scene: (.|\n)*{problem}"):
+        read_sheet(sheet)
+    with pytest.raises(SceneError, match=problem):
+        add_scene(sheet, name, tmp_path)
+
+
+def test_names_that_differ_only_in_case_count_as_duplicates(tmp_path):
+    rows = [("world", name, "ci", "world:tabletop:1", "metre") for name in ("desk", "Desk")]
+    with pytest.raises(SceneError, match=r"line 3, column scene: world/Desk is listed twice(.|\n)*line 2"):
+        read_sheet(write_sheet(tmp_path, *rows))
+
+
+def test_missing_and_misspelt_columns_are_named(tmp_path):
+    with pytest.raises(SceneError, match=r"line 1(.|\n)*missing: 'unit'; unknown: 'units'"):
+        read_sheet(write_sheet(tmp_path, header="dataset\tscene\tgroup\tsource\tunits\n"))
+    with pytest.raises(SceneError, match="wrong number of columns"):
+        read_sheet(write_sheet(tmp_path, ("world", "a", "ci", "world:tabletop:1")))
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        (("world", "a", "paper", "world:tabletop:1", "metre"), "column group: 'paper' is unknown"),
+        (("world", "a", "ci", "world:tabletop:1", "cm"), "column unit: 'cm' is unknown"),
+        (("world", "a", "ci", "world:tabletop", "metre"), "names no synthetic world"),
+        (("photos", "a", "photos", "gone", "arbitrary"), "gone is missing"),
+        (("photos", "a", "photos", "", "arbitrary"), "column source: it is empty"),
+    ],
+)
+def test_bad_cells_are_named(tmp_path, row, message):
+    with pytest.raises(SceneError, match=message):
+        read_sheet(write_sheet(tmp_path, row))
+
+
+def test_a_folder_of_unread_photographs_says_what_it_holds(tmp_path):
+    (tmp_path / "phone").mkdir()
+    (tmp_path / "phone" / "a.HEIC").write_bytes(b"x")
+    row = ("photos", "a", "photos", "phone", "arbitrary")
+    with pytest.raises(SceneError, match=r"has no images(.|\n)*1 files \.heic"):
+        read_sheet(write_sheet(tmp_path, row))
+    assert len(read_sheet(write_sheet(tmp_path, row), check_sources=False)) == 1
+
+
+def test_inspection_finds_damaged_turned_and_copied_photographs(tmp_path):
+    folder = write_photos(tmp_path / "images", 3)
+    upright = Image.open(folder / "photo_0.jpg")
+    exif = Image.Exif()
+    exif[0x0112] = 6  # a quarter turn: 40 x 30 is shown as 30 x 40
+    upright.save(folder / "turned.jpg", exif=exif)
+    (folder / "copy.jpg").write_bytes((folder / "photo_1.jpg").read_bytes())
+    (folder / "empty.jpg").touch()
+    whole = (folder / "photo_2.jpg").read_bytes()
+    (folder / "truncated.jpg").write_bytes(whole[: len(whole) // 2])
+    (folder / "text.png").write_text("no image")
+    (folder / "phone.heic").write_bytes(b"x")
+
+    report = inspect_photos(tmp_path)  # the folder above images/ is understood too
+    assert report.folder == folder
+    assert report.sizes == {(30, 40): 4, (40, 30): 1}  # height, width
+    assert (report.num_readable, report.num_distinct, report.num_rotated) == (5, 4, 1)
+    assert report.duplicates == (("copy.jpg", "photo_1.jpg"),)
+    assert [name for name, _ in report.unreadable] == ["empty.jpg", "text.png", "truncated.jpg"]
+    assert dict(report.unreadable)["empty.jpg"] == "the file is empty"
+    assert "truncated" in dict(report.unreadable)["truncated.jpg"]
+    assert report.passed_over == {".heic": 1}
+    assert "5 photographs in" in str(report) and "4  of 40 x 30 px" in str(report)
+
+
+def test_adding_a_scene_appends_one_row_with_a_relative_source(tmp_path):
+    sheet = write_sheet(tmp_path, ("world", "a", "ci", "world:tabletop:1", "metre"))
+    before = sheet.read_text().rstrip("\n")
+    sheet.write_text(before)  # an editor may have dropped the last newline
+    report = add_scene(sheet, "desk", write_photos(tmp_path / "desk photos", 3))
+    assert report.num_readable == 3
+    assert sheet.read_text() == before + "\nphotos\tdesk\tphotos\tdesk photos\tarbitrary\n"
+    assert [row.name for row in read_sheet(sheet)] == ["world/a", "photos/desk"]
+    with pytest.raises(SceneError, match="photos/desk is already in"):
+        add_scene(sheet, "Desk", tmp_path / "desk photos")
+
+
+def test_adding_too_few_or_damaged_photographs_leaves_the_sheet_alone(tmp_path):
+    sheet = tmp_path / "scenes.tsv"
+    folder = write_photos(tmp_path / "desk", 2)
+    (folder / "copy.jpg").write_bytes((folder / "photo_1.jpg").read_bytes())
+    with pytest.raises(SceneError, match=r"too few photographs(.|\n)*2 different"):
+        add_scene(sheet, "desk", folder)
+    (folder / "empty.jpg").touch()
+    with pytest.raises(SceneError, match=r"empty\.jpg: the file is empty"):
+        add_scene(sheet, "desk", folder)
+    with pytest.raises(SceneError, match=r"photo folder .* is missing"):
+        add_scene(sheet, "desk", tmp_path / "gone")
+    assert not sheet.exists()
+
+
+def test_photographs_that_differ_only_in_suffix_are_refused(tmp_path):
+    folder = write_photos(tmp_path / "desk", 3)
+    Image.open(folder / "photo_0.jpg").save(folder / "photo_0.png")
+    with pytest.raises(SceneError, match=r"same view(.|\n)*photo_0\.jpg, photo_0\.png"):
+        inspect_photos(folder)

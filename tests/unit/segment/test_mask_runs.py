@@ -1,0 +1,98 @@
+"""Run-length coded masks: nothing is lost, and overlaps are counted without unpacking everything."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from hilsplat.base.errors import EmptyMaskError
+from hilsplat.base.levels import Level
+from hilsplat.segment import masks as masks_module
+from hilsplat.segment.masks import HierarchicalMasks, encode_runs
+
+shapes = st.tuples(st.integers(0, 6), st.integers(1, 5), st.integers(1, 5))
+nonempty_masks = hnp.arrays(bool, shapes).filter(lambda masks: masks.any(axis=(1, 2)).all())
+
+
+def pack(dense: np.ndarray, level=None, iou=None) -> HierarchicalMasks:
+    number = len(dense)
+    return HierarchicalMasks.from_dense(
+        dense,
+        np.full(number, 1, np.uint8) if level is None else np.asarray(level, np.uint8),
+        np.full(number, 0.5, np.float32) if iou is None else np.asarray(iou, np.float32),
+        np.ones(number, np.float32),
+    )
+
+
+def test_runs_of_a_small_mask_by_hand():
+    runs, offsets = encode_runs(np.array([[[0, 1, 1], [1, 0, 0]], [[1, 0, 0], [0, 0, 0]]], dtype=bool))
+    assert runs.tolist() == [1, 3, 2, 0, 1, 5]
+    assert offsets.tolist() == [0, 3, 6]
+
+
+@given(nonempty_masks)
+def test_dense_masks_come_back_equal(dense):
+    np.testing.assert_array_equal(pack(dense).dense(), dense)
+
+
+@given(nonempty_masks, st.data())
+def test_a_band_is_a_slice_of_the_flattened_image(dense, data):
+    size = dense.shape[1] * dense.shape[2]
+    start = data.draw(st.integers(0, size - 1))
+    stop = data.draw(st.integers(start + 1, size))
+    np.testing.assert_array_equal(
+        pack(dense).band(start, stop),
+        dense.reshape(len(dense), dense.shape[1] * dense.shape[2])[:, start:stop],
+    )
+
+
+@given(nonempty_masks, st.integers(1, 40))
+def test_overlaps_are_counts_of_shared_pixels_whatever_the_band(dense, elements):
+    flat = dense.reshape(len(dense), dense.shape[1] * dense.shape[2]).astype(int)
+    before = masks_module.BAND_ELEMENTS
+    masks_module.BAND_ELEMENTS = elements
+    try:
+        np.testing.assert_array_equal(pack(dense).overlaps_px(), flat @ flat.T)
+    finally:
+        masks_module.BAND_ELEMENTS = before
+
+
+@given(nonempty_masks, st.randoms(use_true_random=False))
+def test_content_order_does_not_depend_on_the_order_of_rows(dense, random):
+    level = [1 + row % 3 for row in range(len(dense))]
+    masks = pack(dense, level)
+    shuffled = list(range(len(dense)))
+    random.shuffle(shuffled)
+    again = masks.take(np.array(shuffled, dtype=np.int64))
+    first, second = masks.take(masks.content_order()), again.take(again.content_order())
+    for name, array in first.arrays().items():
+        np.testing.assert_array_equal(array, second.arrays()[name], err_msg=name)
+
+
+def test_taken_and_joined_masks_keep_their_pixels(tmp_path):
+    dense = np.random.default_rng(0).random((5, 4, 6)) > 0.5
+    masks = pack(dense, [1, 2, 3, 1, 2])
+    joined = HierarchicalMasks.concatenate([masks.take(np.array([3, 0])), masks.take(np.array([4]))], (4, 6))
+    np.testing.assert_array_equal(joined.dense(), dense[[3, 0, 4]])
+    assert joined.level.tolist() == [1, 1, 2]
+    joined.save(tmp_path / "view.npz")
+    np.testing.assert_array_equal(HierarchicalMasks.load(tmp_path / "view.npz").dense(), dense[[3, 0, 4]])
+
+
+def test_no_masks_at_all_is_a_valid_view():
+    none = HierarchicalMasks.concatenate([], (3, 4))
+    assert len(none) == 0
+    assert none.dense().shape == (0, 3, 4)
+    assert (none.label_map(Level.WHOLE) == -1).all()
+    assert none.overlaps_px().shape == (0, 0)
+
+
+def test_label_map_paints_small_masks_over_large_ones():
+    small, large = [[0, 1, 0]], [[1, 1, 1]]
+    assert pack(np.array([small, large], dtype=bool)).label_map(Level.WHOLE).tolist() == [[1, 0, 1]]
+
+
+def test_empty_mask_is_refused():
+    with pytest.raises(EmptyMaskError, match=r"masks \[1\] of 2"):
+        pack(np.array([[[True]], [[False]]]))

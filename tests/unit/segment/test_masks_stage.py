@@ -1,0 +1,143 @@
+"""The stages masks and tree on a small scene, and what a user reads when a model is missing."""
+
+import json
+
+import numpy as np
+import pytest
+
+from hilsplat.base.artifacts import read_index, read_npz, sha256_of_path
+from hilsplat.base.errors import ModelError
+from hilsplat.base.onnx_models import Network, model_digest, open_model_folder
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.pictures import masks_overview
+from hilsplat.segment.sam import SamModel
+from hilsplat.segment.stage import run_masks
+from hilsplat.segment.tree_stage import run_tree
+from hilsplat.settings import MasksSettings, TreeSettings
+
+
+@pytest.fixture
+def settings(disc_sam) -> MasksSettings:
+    return MasksSettings(
+        model=str(disc_sam), points_per_side=2, points_per_batch=2, stability_min=0.0, min_area_px=1
+    )
+
+
+@pytest.fixture
+def calls(monkeypatch) -> list[str]:
+    """Names of the networks that ran."""
+    ran: list[str] = []
+    run = Network.__call__
+
+    def count(self: Network, **feeds: np.ndarray):
+        ran.append(self.path.stem)
+        return run(self, **feeds)
+
+    monkeypatch.setattr(Network, "__call__", count)
+    return ran
+
+
+def test_second_run_calls_no_network_and_writes_the_same_bytes(make_scene, tmp_path, settings, calls):
+    scene = make_scene(views=3)
+    run_masks(scene, tmp_path / "first", tmp_path / "cache", settings, threads=2)
+    # two training views: one encoder call each, four prompts in calls of two
+    assert sorted(calls) == ["prompt_encoder_mask_decoder"] * 4 + ["vision_encoder"] * 2
+    calls.clear()
+    run_masks(scene, tmp_path / "second", tmp_path / "cache", settings, threads=1)
+    assert calls == []
+    assert sha256_of_path(tmp_path / "first") == sha256_of_path(tmp_path / "second")
+    stricter = settings.model_copy(update={"predicted_iou_min": 0.75})
+    run_masks(scene, tmp_path / "third", tmp_path / "cache", stricter, threads=1)
+    assert calls == []
+    assert read_index(tmp_path / "third")["views"]["000.png"] == {"whole": 0, "part": 4, "subpart": 4}
+
+
+def test_masks_do_not_depend_on_the_number_of_threads(make_scene, tmp_path, settings):
+    scene = make_scene(views=5)
+    for threads in (1, 3):
+        run_masks(scene, tmp_path / f"masks-{threads}", tmp_path / f"cache-{threads}", settings, threads)
+    assert sha256_of_path(tmp_path / "masks-1") == sha256_of_path(tmp_path / "masks-3")
+
+
+def test_index_names_the_model_and_test_views_stay_out(make_scene, tmp_path, settings, disc_sam):
+    run_masks(make_scene(views=3), tmp_path / "masks", tmp_path / "cache", settings, threads=1)
+    index = read_index(tmp_path / "masks")
+    assert list(index["views"]) == ["000.png", "001.png"]
+    assert index["model_sha256"] == model_digest(disc_sam)
+    assert len(HierarchicalMasks.load(tmp_path / "masks" / "000.png.npz")) == 12
+
+
+def test_tree_hangs_discs_into_discs(make_scene, tmp_path, settings):
+    run_masks(make_scene(views=2), tmp_path / "masks", tmp_path / "cache", settings, threads=1)
+    run_tree(tmp_path / "masks", tmp_path / "tree", TreeSettings())
+    arrays = read_npz(tmp_path / "tree" / "000.png.npz")
+    masks = HierarchicalMasks.load(tmp_path / "masks" / "000.png.npz")
+    assert arrays["parent"].dtype == np.int32
+    assert arrays["depth"].dtype == np.uint8
+    np.testing.assert_array_equal(arrays["depth"], masks.level)  # each subpart in a part in a whole
+    entry = read_index(tmp_path / "tree")["views"]["000.png"]
+    assert (entry["roots"], entry["part_with_parent"], entry["subpart_with_parent"]) == (4, 4, 4)
+
+
+def test_graph_segmenter_needs_no_model(make_scene, tmp_path):
+    settings = MasksSettings(segmenter="graph", model="nowhere")
+    run_masks(make_scene(views=2), tmp_path / "masks", tmp_path / "cache", settings, threads=1)
+    assert read_index(tmp_path / "masks")["segmenter"] == "graph"
+
+
+def test_overview_shows_the_photo_and_three_levels(make_scene, tmp_path, settings):
+    scene = make_scene(views=2)
+    run_masks(scene, tmp_path / "masks", tmp_path / "cache", settings, threads=1)
+    masks_overview(scene, tmp_path / "masks", tmp_path / "masks.png")
+    assert (tmp_path / "masks.png").stat().st_size > 1000
+
+
+def test_missing_model_names_the_way_out(make_scene, tmp_path):
+    with pytest.raises(ModelError, match=r"model folder .*nowhere is missing(.|\n)*masks.segmenter: graph"):
+        run_masks(
+            make_scene(), tmp_path / "masks", tmp_path / "cache", MasksSettings(model="nowhere"), threads=1
+        )
+    assert not (tmp_path / "masks").exists()
+
+
+def test_missing_file_is_listed(make_disc_sam, tmp_path):
+    folder = make_disc_sam(tmp_path / "sam")
+    (folder / "onnx" / "vision_encoder.onnx").rename(folder / "onnx" / "vision_encoder_quantized.onnx")
+    with pytest.raises(
+        ModelError, match=r"lacks onnx/vision_encoder.onnx(.|\n)*vision_encoder_quantized.onnx"
+    ):
+        open_model_folder(folder, "sam")
+
+
+def test_networks_may_stand_beside_the_configuration(make_disc_sam, tmp_path):
+    folder = make_disc_sam(tmp_path / "sam")
+    for path in (folder / "onnx").iterdir():
+        path.rename(folder / path.name)
+    assert SamModel.load(folder).longest_edge == 32
+
+
+def test_another_kind_of_model_is_refused(make_disc_sam, tmp_path):
+    folder = make_disc_sam(tmp_path / "sam")
+    with pytest.raises(ModelError, match=r"another kind(.|\n)*model_type clip(.|\n)*'sam'"):
+        open_model_folder(folder, "clip")
+
+
+def test_wrong_input_name_is_shown_beside_the_right_one(make_disc_sam, tmp_path):
+    folder = make_disc_sam(tmp_path / "sam", points_name="point_coords")
+    with pytest.raises(ModelError, match=r"other inputs than expected: input_points, point_coords"):
+        SamModel.load(folder)
+
+
+def test_four_masks_per_prompt_are_refused(make_disc_sam, tmp_path):
+    model = SamModel.load(make_disc_sam(tmp_path / "sam", heads=4))
+    encoded = model.encode(np.zeros((32, 32, 3), dtype=np.uint8))
+    with pytest.raises(ModelError, match="three masks per prompt"):
+        model.decode(encoded, np.zeros((1, 2)))
+
+
+def test_digest_follows_content_and_not_place(make_disc_sam, tmp_path):
+    first, second = make_disc_sam(tmp_path / "a"), make_disc_sam(tmp_path / "b")
+    assert model_digest(first) == model_digest(second)
+    settings = json.loads((second / "preprocessor_config.json").read_text())
+    (second / "preprocessor_config.json").write_text(json.dumps(settings | {"resample": 3}))
+    assert model_digest(first) != model_digest(second)

@@ -1,0 +1,106 @@
+"""Suppression of boxes and masks against small cases by hand and a plain double loop."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.suppression import box_iou, keep_best_masks, suppress_boxes, suppress_masks
+
+shapes = st.tuples(st.integers(1, 8), st.just(3), st.just(5))
+nonempty_masks = hnp.arrays(bool, shapes).filter(lambda masks: masks.any(axis=(1, 2)).all())
+scores_of = st.sampled_from([0.1, 0.25, 0.5, 0.75, 1.0])
+
+
+def overlaps(masks: np.ndarray) -> np.ndarray:
+    flat = masks.reshape(len(masks), -1).astype(np.int64)
+    return flat @ flat.T
+
+
+def naive_keep(
+    masks: np.ndarray, score: np.ndarray, iou_max: float, score_min: float, inner: float
+) -> list[bool]:
+    """LangSplat's rules, pair by pair."""
+    order = sorted(range(len(masks)), key=lambda row: (-score[row], row))
+    keep = [score[row] >= score_min for row in range(len(masks))]
+    for first in range(len(order)):
+        for second in range(first + 1, len(order)):
+            i, j = order[first], order[second]
+            shared = np.logical_and(masks[i], masks[j]).sum()
+            in_i, in_j = shared / masks[i].sum(), shared / masks[j].sum()
+            if shared / np.logical_or(masks[i], masks[j]).sum() > iou_max:
+                keep[j] = False
+            if in_i < 0.5 and in_j >= 0.85 and in_i * in_j < inner:
+                keep[j] = False
+            if in_j < 0.5 and in_i >= 0.85 and in_i * in_j < inner:
+                keep[i] = False
+    return keep
+
+
+def test_box_iou_by_hand():
+    a = np.array([[0, 0, 4, 4]])
+    b = np.array([[0, 0, 4, 4], [2, 0, 6, 4], [4, 0, 8, 4]])
+    assert box_iou(a, b)[0].tolist() == [1.0, pytest.approx(8 / 24), 0.0]
+
+
+def test_best_box_stays_and_its_neighbour_goes():
+    boxes = np.array([[0, 0, 10, 10], [0, 0, 10, 9], [20, 20, 30, 30]])
+    assert suppress_boxes(boxes, np.array([0.5, 0.9, 0.1]), iou_max=0.7).tolist() == [1, 2]
+
+
+def test_a_dropped_box_drops_no_other():
+    # 0-1 and 1-2 overlap by 0.6, 0-2 by a third: 1 goes because of 0, so 2 stays
+    boxes = np.array([[0, 0, 8, 1], [2, 0, 10, 1], [4, 0, 12, 1]])
+    assert suppress_boxes(boxes, np.array([0.9, 0.8, 0.7]), iou_max=0.5).tolist() == [0, 2]
+
+
+def test_contained_mask_goes_even_with_the_better_score():
+    masks = np.array([[[1, 1, 1, 1, 1]], [[1, 1, 0, 0, 0]]], dtype=bool)
+    score = np.array([0.2, 0.9])
+    keep = keep_best_masks(overlaps(masks), score, iou_max=0.8, score_min=0.0, inner=0.5)
+    assert keep.tolist() == [True, False]
+    keep = keep_best_masks(overlaps(masks), score, iou_max=0.8, score_min=0.0, inner=0.0)
+    assert keep.tolist() == [True, True]  # inner 0 keeps nesting inside a level
+
+
+@given(
+    nonempty_masks,
+    st.data(),
+    st.sampled_from([0.3, 0.6, 0.8]),
+    st.sampled_from([0.0, 0.3]),
+    st.sampled_from([0.0, 0.2, 0.5]),
+)
+def test_matrices_agree_with_a_double_loop(masks, data, iou_max, score_min, inner):
+    score = np.array(data.draw(st.lists(scores_of, min_size=len(masks), max_size=len(masks))))
+    keep = keep_best_masks(overlaps(masks), score, iou_max=iou_max, score_min=score_min, inner=inner)
+    assert keep.tolist() == naive_keep(masks, score, iou_max, score_min, inner)
+
+
+@given(nonempty_masks, st.data())
+def test_result_does_not_depend_on_the_order_of_masks(masks, data):
+    number = len(masks)
+    score = np.array(data.draw(st.lists(scores_of, min_size=number, max_size=number)), np.float32)
+    level = np.array(data.draw(st.lists(st.integers(1, 3), min_size=number, max_size=number)), np.uint8)
+    shuffle = np.array(data.draw(st.permutations(range(number))))
+    results = [
+        suppress_masks(
+            HierarchicalMasks.from_dense(
+                masks[order], level[order], score[order], np.ones(number, np.float32)
+            ),
+            iou_max=0.8,
+            score_min=0.2,
+            inner=0.5,
+        )
+        for order in (np.arange(number), shuffle)
+    ]
+    for name, array in results[0].arrays().items():
+        np.testing.assert_array_equal(array, results[1].arrays()[name], err_msg=name)
+
+
+def test_levels_do_not_suppress_each_other():
+    mask = np.ones((3, 2, 2), dtype=bool)
+    ones = np.ones(3, np.float32)
+    masks = HierarchicalMasks.from_dense(mask, np.array([1, 2, 3], np.uint8), ones, ones)
+    assert len(suppress_masks(masks, iou_max=0.8, score_min=0.0, inner=0.5)) == 3

@@ -1,0 +1,162 @@
+"""Labels follow analytic projection; a surface point looks the same from everywhere."""
+
+import numpy as np
+import pytest
+
+from hilsplat.datasets.hierarchy import AnnotatedNode
+from hilsplat.scene.cameras import Camera
+from hilsplat.world.paints import Paint
+from hilsplat.world.render import depth_view, label_view, render_view
+from hilsplat.world.scenes import Style, WorldScene, build_scene
+from hilsplat.world.shapes import Mesh, box, joined, sphere
+from hilsplat.world.textures import albedo
+from hilsplat.world.views import looking_at, pinhole, random_camera, ring_cameras
+
+GREY = Paint("grey", "mottled", (0.5, 0.5, 0.5), (0.5, 0.5, 0.5), 9.0, 0.0, 10.0, 0.0, (5.0, 6.0, 7.0))
+STONE = Paint("grey", "stone", (0.6, 0.5, 0.4), (0.3, 0.3, 0.3), 8.0, 0.0, 10.0, 0.3, (5.0, 6.0, 7.0))
+
+
+def scene_of(mesh: Mesh, paint: Paint = GREY) -> WorldScene:
+    """One node, one material, no room."""
+    count = len(mesh)
+    corners = mesh.triangles.astype(np.float32)
+    return WorldScene(
+        "test", 0, 1, (), corners, mesh.normals.astype(np.float32), corners,
+        np.tile(np.int32([0, -1, -1]), (count, 1)), np.zeros(count, np.int32), paint.row()[None],
+        (AnnotatedNode(0, 1, -1, "thing"),), frozenset(), Style(),
+    )  # fmt: skip
+
+
+def test_label_image_of_a_box_is_its_analytic_projection():
+    # Camera 4 in front of the face at x = 0.5 of a box of 1 x 0.6 x 0.4, focal length 100 px: the
+    # near face spans 100 * 0.6 / 3.5 = 17.14 px by 100 * 0.4 / 3.5 = 11.43 px around the centre (32, 32).
+    K = np.array([[100.0, 0, 32], [0, 100, 32], [0, 0, 1]])
+    pose = looking_at(np.array([4.0, 0, 0]), np.zeros(3))
+    camera = Camera("a.png", pose, K, (64, 64))
+    scene = scene_of(box((1.0, 0.6, 0.4)))
+    x = np.arange(64) + 0.5 - 32
+    expected = (np.abs(x)[None, :] < 8.571) & (np.abs(x)[:, None] < 5.714)
+    labels = label_view(scene, camera)
+    assert np.array_equal(labels[0] == 0, expected)
+    assert (labels[1:] == -1).all()
+    assert depth_view(scene, camera)[32, 32] == pytest.approx(3.5, abs=1e-5)
+
+
+def test_label_image_of_a_sphere_is_its_analytic_silhouette():
+    # A sphere of radius r at distance d on the axis is a disc of radius f * r / sqrt(d^2 - r^2).
+    K = np.array([[150.0, 0, 48], [0, 150, 48], [0, 0, 1]])
+    camera = Camera("a.png", looking_at(np.array([0, -3.0, 0]), np.zeros(3)), K, (96, 96))
+    labels = label_view(scene_of(sphere(0.5, segments=96)), camera)[0]
+    radius = 150 * 0.5 / np.sqrt(9 - 0.25)
+    away = np.hypot(*(np.mgrid[:96, :96] + 0.5 - 48))
+    certain = np.abs(away - radius) > 0.6  # the facets lie up to 0.9 % inside the sphere
+    assert np.array_equal((labels == 0)[certain], (away < radius)[certain])
+
+
+def test_image_axes_are_x_right_and_y_down():
+    # From +x, looking at the origin, +y is to the right and +z is up.
+    things = {0: (0.0, 0.4, 0.0), 1: (0.0, 0.0, 0.4)}
+    for index, place in things.items():
+        camera = Camera("a.png", looking_at(np.array([3.0, 0, 0]), np.zeros(3)), pinhole(64), (64, 64))
+        rows, columns = np.nonzero(label_view(scene_of(sphere(0.1, place)), camera)[0] == 0)
+        assert (columns.mean() > 40, rows.mean() < 24) == (index == 0, index == 1)
+
+
+def test_a_surface_point_has_one_colour_in_all_views():
+    # A wide floor with a block that shadows it, seen from two sides. The same floor points are
+    # compared in both images; what differs is only where the nine sub-samples of a pixel fall.
+    mesh = joined(box((4, 4, 0.1), (0, 0, -0.05)), box((0.4, 0.4, 0.5), (0, 0, 0.25)))
+    scene = scene_of(mesh, STONE)
+    cameras = [
+        Camera(
+            "a.png",
+            looking_at(np.array([0.3 * side, -2.2, 3.0]), np.array([0.0, -0.9, 0])),
+            pinhole(256, 30),
+            (256, 256),
+        )
+        for side in (-1, 1)
+    ]
+    points = np.stack(
+        np.meshgrid(np.linspace(-0.4, 0.4, 25), np.linspace(-1.2, -0.6, 25), [0.0]), -1
+    ).reshape(-1, 3)
+    found = []
+    for camera in cameras:
+        image = render_view(scene, camera, 3).astype(np.float64)
+        seen = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+        xy = (seen @ camera.K.T)[:, :2] / seen[:, 2:]
+        found.append(bilinear(image, xy))
+    difference = np.abs(found[0] - found[1])
+    assert found[0].std() > 10  # there is something to see: texture and shadow
+    # A few grey values of 255 come from resampling texture that is one pixel fine.
+    assert np.median(difference) < 4 and np.corrcoef(found[0].ravel(), found[1].ravel())[0, 1] > 0.93
+
+
+def bilinear(image, xy):
+    """Values of an image between pixel centres, which lie at +0.5."""
+    x, y = xy[:, 0] - 0.5, xy[:, 1] - 0.5
+    i, j = np.floor(y).astype(int), np.floor(x).astype(int)
+    v, u = (y - i)[:, None], (x - j)[:, None]
+    top = image[i, j] * (1 - u) + image[i, j + 1] * u
+    return top * (1 - v) + (image[i + 1, j] * (1 - u) + image[i + 1, j + 1] * u) * v
+
+
+def test_a_shadow_falls_where_the_light_is_hidden():
+    # Light straight above a floating slab: the floor right below is dark, far from it bright.
+    scene = scene_of(joined(box((4, 4, 0.1), (0, 0, -0.05)), box((0.6, 0.6, 0.02), (0, 0, 0.8))))
+    style = Style(light_position=(0.0, 0.0, 4.0))
+    camera = Camera("a.png", looking_at(np.array([2.0, 0, 0.5]), np.zeros(3)), pinhole(64), (64, 64))
+    image = render_view(scene, camera, 3, style).astype(int)
+    seen = (
+        camera.cam_from_world[:3, :3] @ np.array([[0.0, 0.0], [0.0, 0.8], [0.0, 0.0]])
+        + camera.cam_from_world[:3, 3:]
+    )
+    columns, rows = ((camera.K @ seen)[:2] / seen[2]).astype(int)
+    under, beside = image[rows[0], columns[0]].mean(), image[rows[1], columns[1]].mean()
+    assert under < 0.75 * beside
+
+
+def test_textures_depend_on_the_point_alone_and_vary():
+    material = STONE.row()
+    points = np.random.default_rng(0).uniform(-1, 1, (200, 3))
+    first = np.array([albedo(material, *point) for point in points])
+    assert np.array_equal(first, np.array([albedo(material, *point) for point in points]))
+    assert first.std(axis=0).min() > 0.01
+    assert first.min() >= 0 and first.max() <= 1
+
+
+def test_rendering_twice_gives_the_same_bytes_and_the_style_matters():
+    scene = build_scene("tabletop", 100, 3)
+    camera = ring_cameras(100, 12, 48, 100.0)["005.png"]
+    image = render_view(scene, camera, 2)
+    assert np.array_equal(image, render_view(build_scene("tabletop", 100, 3), camera, 2))
+    other = render_view(scene, camera, 2, Style.draw(np.random.default_rng(5)))
+    assert not np.array_equal(image, other)
+
+
+def test_ring_cameras_alternate_in_elevation_and_are_nine_degrees_apart():
+    cameras = ring_cameras(100, 40, 256)
+    centres = np.stack(_centres(cameras))
+    azimuth = np.unwrap(np.arctan2(centres[:, 1], centres[:, 0]))
+    # Jitter moves each by at most 1 degree.
+    assert np.degrees(np.diff(azimuth)) == pytest.approx(9.0, abs=2.1)
+    assert (np.diff(centres[:, 2]) * np.tile([1, -1], 20)[:39] > 0).all()
+    rotations = cameras.cam_from_world[:, :3, :3]
+    assert np.linalg.det(rotations) == pytest.approx(1.0)
+
+
+def test_an_arc_covers_its_azimuth_around_the_front():
+    centres = np.stack(_centres(ring_cameras(100, 12, 128, 100.0)))
+    azimuth = np.degrees(np.arctan2(centres[:, 1], centres[:, 0]))
+    assert azimuth[0] == pytest.approx(-50, abs=1.1) and azimuth[-1] == pytest.approx(50, abs=1.1)
+
+
+def _centres(cameras):
+    return [cameras[name].centre for name in cameras.names]
+
+
+def test_random_cameras_see_objects():
+    scene = build_scene("tabletop", 100, 6)
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        labels = label_view(scene, random_camera(scene, rng, 48))
+        assert (labels[1] >= 0).mean() > 0.03

@@ -1,0 +1,83 @@
+"""Scenes follow from their seed, their objects do not touch, and seeds of different use are apart."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from hilsplat.base.errors import SceneError
+from hilsplat.world.scenes import TABLE_RADIUS, build_scene
+from hilsplat.world.seeds import SPLITS, require_split, split_of_seed
+
+
+def test_splits_of_seeds_do_not_meet():
+    for (_, first), (_, second) in itertools.combinations(SPLITS.items(), 2):
+        assert first.stop <= second.start or second.stop <= first.start
+
+
+def test_a_seed_knows_its_split():
+    assert [split_of_seed(seed) for seed in (99, 100, 199, 200, 299, 300, 1_000_000, 1_999_999)] == [
+        "free", "development", "development", "benchmark", "benchmark", "free", "training", "training",
+    ]  # fmt: skip
+
+
+def test_a_seed_of_another_split_is_refused():
+    require_split(201, "benchmark")
+    with pytest.raises(SceneError, match=r"seed 201 is not of the training split"):
+        require_split(201, "training")
+    with pytest.raises(SceneError, match=r"unknown split 'test'"):
+        require_split(201, "test")
+
+
+def test_the_same_seed_gives_the_same_scene_and_another_seed_another():
+    first, again, other = (build_scene("tabletop", seed, 4) for seed in (100, 100, 101))
+    for name in ("triangles", "normals", "coords", "node_ids", "material_ids", "materials"):
+        assert np.array_equal(getattr(first, name), getattr(again, name))
+    assert first.nodes == again.nodes and first.placed == again.placed and first.style == again.style
+    assert first.nodes != other.nodes
+
+
+def test_placed_objects_do_not_intersect_and_stand_on_the_table():
+    for seed in range(100, 106):
+        scene = build_scene("tabletop", seed, 7)
+        points = {
+            thing.node: scene.triangles[scene.node_ids[:, 0] == thing.node].reshape(-1, 3)
+            for thing in scene.placed
+        }
+        for thing in scene.placed:
+            away = np.linalg.norm(points[thing.node][:, :2] - np.array(thing.centre_xy), axis=1)
+            assert away.max() == pytest.approx(thing.footprint, abs=1e-4)
+            assert points[thing.node][:, 2].min() == pytest.approx(0, abs=1e-6)
+            assert np.linalg.norm(thing.centre_xy) < TABLE_RADIUS
+        for a, b in itertools.combinations(scene.placed, 2):
+            # Disjoint circles from above: whatever their shapes, the objects cannot meet.
+            assert np.linalg.norm(np.subtract(a.centre_xy, b.centre_xy)) > a.footprint + b.footprint
+
+
+def test_ids_of_a_triangle_nest_in_the_scene_too():
+    scene = build_scene("tabletop", 102, 5)
+    parents = np.array([node.parent for node in scene.nodes])
+    whole, part, subpart = scene.node_ids.T
+    assert (parents[whole] == -1).all()
+    assert (parents[part[part >= 0]] == whole[part >= 0]).all()
+    assert (parents[subpart[subpart >= 0]] == part[subpart >= 0]).all()
+    assert [node.id for node in scene.nodes] == list(range(len(scene.nodes)))
+
+
+def test_the_room_is_labelled_as_background_wholes():
+    scene = build_scene("tabletop", 102, 3)
+    assert {scene.nodes[node].text for node in scene.background} == {"table", "floor", "wall"}
+    assert {scene.nodes[node].level for node in scene.background} == {1}
+
+
+def test_objects_that_find_no_place_are_counted(caplog):
+    scene = build_scene("tabletop", 104, 30)
+    assert scene.asked == 30 and len(scene.placed) <= 30
+    assert len(caplog.records) == 30 - len(scene.placed)
+
+
+def test_an_unknown_kind_names_the_known_ones():
+    with pytest.raises(SceneError, match=r"'forest'\n  expected  one of: tabletop"):
+        build_scene("forest", 1, 3)
+    with pytest.raises(SceneError, match=r"seed -1, 3 objects"):
+        build_scene("tabletop", -1, 3)

@@ -1,0 +1,135 @@
+"""The world stage writes images for the next stages, and truth for evaluation alone."""
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from hilsplat.base.artifacts import read_index, read_json, sha256_of_path
+from hilsplat.base.errors import ArtifactError, SceneError
+from hilsplat.base.images import list_images, read_image
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.datasets.hierarchy import AnnotatedNode, HierarchyAnnotations
+from hilsplat.scene.cameras import Cameras
+from hilsplat.settings import WorldSettings
+from hilsplat.world.objects import GENERATOR_VERSION
+from hilsplat.world.render import label_view
+from hilsplat.world.scenes import build_scene
+from hilsplat.world.sheet import node_colours, show_world, tree_lines
+from hilsplat.world.stage import parse_source, run_world
+from hilsplat.world.truth import annotated_nodes, smallest_areas
+
+SETTINGS = WorldSettings(views=3, image_px=64, arc_deg=30, objects=3, samples=1)
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene") / "world"
+    run_world("world:tabletop:100", SETTINGS, folder, threads=1)
+    return folder
+
+
+def test_images_and_truth_belong_together(world):
+    assert [path.name for path in list_images(world / "images")] == ["000.png", "001.png", "002.png"]
+    assert read_image(world / "images" / "000.png").shape == (64, 64, 3)
+    cameras = Cameras.load(world / "truth" / "cameras.npz")
+    truth = HierarchyAnnotations.load(world / "truth")
+    scene = build_scene("tabletop", 100, 3)
+    assert truth.nodes == scene.nodes
+    for name in cameras.names:
+        labels = label_view(scene, cameras[name])
+        for level in LEVELS:
+            assert np.array_equal(truth.label_image(name, level), labels[level.index])
+    for folder in ("images", "truth"):
+        assert list(read_index(world / folder)["views"]) == list(cameras.names)
+
+
+def test_true_regions_nest(world):
+    truth = HierarchyAnnotations.load(world / "truth")
+    for view, ids in truth.views.items():
+        assert ids
+        for node in (truth.nodes[i] for i in ids):
+            if node.parent >= 0:
+                assert not (truth.mask(view, [node.id]) & ~truth.mask(view, [node.parent])).any()
+
+
+def test_the_room_is_never_scored(world):
+    truth = HierarchyAnnotations.load(world / "truth")
+    background = read_json(world / "truth" / "scene.json")["background"]
+    assert {truth.nodes[node].text for node in background} == {"table", "floor", "wall"}
+    assert not any(set(background) & set(ids) for ids in truth.views.values())
+
+
+def test_the_record_says_what_was_placed(world):
+    record = read_json(world / "truth" / "scene.json")
+    assert (record["kind"], record["seed"], record["split"]) == ("tabletop", 100, "development")
+    assert record["generator_version"] == GENERATOR_VERSION
+    assert record["objects_asked"] == 3 and record["objects_placed"] == len(record["placed"]) == 3
+
+
+def test_the_mesh_carries_node_ids(world):
+    scene = build_scene("tabletop", 100, 3)
+    mesh = PlyData.read(world / "truth" / "mesh.ply")
+    faces = mesh["face"].data
+    corners = np.stack([mesh["vertex"][axis] for axis in "xyz"], axis=1)
+    triangles = corners[np.stack(faces["vertex_indices"])]
+    assert np.array_equal(triangles, scene.triangles)
+    assert np.array_equal(np.stack([faces[level.label] for level in LEVELS], axis=1), scene.node_ids)
+
+
+def test_bytes_do_not_depend_on_run_or_threads(world, tmp_path):
+    run_world("world:tabletop:100", SETTINGS, tmp_path / "again", threads=2)
+    for folder in ("images", "truth"):
+        assert sha256_of_path(world / folder) == sha256_of_path(tmp_path / "again" / folder)
+
+
+def test_instances_of_a_text_are_annotated_together_or_not_at_all():
+    nodes = (
+        AnnotatedNode(0, 1, -1, "chair"),
+        AnnotatedNode(1, 2, 0, "chair leg"),
+        AnnotatedNode(2, 2, 0, "chair leg"),
+        AnnotatedNode(3, 2, 0, "chair seat"),
+        AnnotatedNode(4, 1, -1, "table"),
+    )
+    labels = np.full((3, 10, 10), -1, np.int32)
+    labels[0] = 4
+    labels[0, :5] = 0  # 50 px of chair, 50 px of table
+    labels[1, 0, :7], labels[1, 1, :4], labels[1, 2, :6] = 1, 2, 3  # legs of 7 and 4 px, seat of 6
+    smallest = {Level.WHOLE: 10, Level.PART: 10, Level.SUBPART: 10}
+    # The legs have 11 px between them, the seat 6, and the table is background.
+    assert annotated_nodes(labels, nodes, {4}, smallest) == (0, 1, 2)
+
+
+def test_the_smallest_subpart_scales_with_the_area_of_the_view():
+    assert smallest_areas(384, 60, 100) == {Level.WHOLE: 60, Level.PART: 60, Level.SUBPART: 100}
+    assert smallest_areas(192, 60, 100)[Level.SUBPART] == pytest.approx(25)
+
+
+@pytest.mark.parametrize("source", ["tabletop:100", "world:forest:1", "world:tabletop:-1", "world:tabletop"])
+def test_a_malformed_source_is_answered_with_the_form(source):
+    with pytest.raises(SceneError, match=r"expected  world:<kind>:<seed>, where kind is one of: tabletop"):
+        parse_source(source)
+
+
+def test_scenes_that_trained_the_models_are_refused():
+    with pytest.raises(SceneError, match="that the small models were trained on"):
+        parse_source("world:tabletop:1000003")
+    assert parse_source("world:tabletop:201") == ("tabletop", 201)
+
+
+def test_the_contact_sheet_is_drawn(world, tmp_path):
+    show_world(world, tmp_path / "sheet.png")
+    assert min(read_image(tmp_path / "sheet.png").shape[:2]) > 400
+    with pytest.raises(ArtifactError, match="missing or incomplete"):
+        show_world(tmp_path, tmp_path / "sheet.png")
+
+
+def test_the_tree_lists_a_shared_text_once():
+    nodes = (
+        AnnotatedNode(0, 1, -1, "chair"),
+        AnnotatedNode(1, 2, 0, "chair leg"),
+        AnnotatedNode(2, 3, 1, "chair foot"),
+        AnnotatedNode(3, 2, 0, "chair leg"),
+        AnnotatedNode(4, 3, 3, "chair foot"),
+    )
+    assert [(depth, node.id) for depth, node in tree_lines(nodes)] == [(0, 0), (1, 1), (2, 2)]
+    assert len(np.unique(node_colours(100), axis=0)) > 95

@@ -1,0 +1,109 @@
+"""Whole runs in copies of the project: edits there never touch the checkout."""
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+PARTS = ("Snakefile", "rules", "workflow", "config", "hilsplat", "models")
+SCENE = Path("results/synthetic/tiny")
+
+
+@dataclass(frozen=True)
+class Project:
+    """A copy of the project in which commands run on the copy's own code."""
+
+    root: Path
+
+    def run(self, *command: str, check: bool = True, **environment: str) -> subprocess.CompletedProcess[str]:
+        """Run a command there and capture what it prints."""
+        result = subprocess.run(
+            command,
+            cwd=self.root,
+            env=self.environment(**environment),
+            capture_output=True,
+            text=True,
+            timeout=1500,
+            check=False,
+        )
+        if check and result.returncode != 0:
+            raise AssertionError(f"{command} ended with {result.returncode}:\n{result.stdout}\n{result.stderr}")
+        return result
+
+    def environment(self, **more: str) -> dict[str, str]:
+        """The environment in which `hilsplat` and `snakemake` are the copy's."""
+        scripts = sysconfig.get_path("scripts")
+        return {
+            **os.environ,
+            "PATH": f"{scripts}{os.pathsep}{os.environ['PATH']}",
+            "PYTHONPATH": str(self.root),
+            "PYTHONDONTWRITEBYTECODE": "1",
+            **more,
+        }
+
+    def snakemake(self, *words: str, cores: int = 2, check: bool = True) -> subprocess.CompletedProcess[str]:
+        """Run Snakemake with the CI configuration."""
+        command = [sys.executable, "-m", "snakemake", "--cores", str(cores), "--configfile", "config/ci.yaml"]
+        return self.run(*command, *words, check=check)
+
+    def planned(self, *words: str) -> set[str]:
+        """Rules that a dry run would run."""
+        result = self.snakemake("-n", "--quiet", "rules", *words)
+        dry = self.snakemake("-n", *words).stdout if "Nothing to be done" not in result.stdout else ""
+        return {
+            line.split()[1].rstrip(":")
+            for line in dry.splitlines()
+            if line.startswith(("rule ", "localrule "))
+        } - {"all"}
+
+    def edit(self, path: str, old: str, new: str) -> None:
+        """Replace a text that must be there."""
+        file = self.root / path
+        text = file.read_text()
+        assert old in text, f"{old!r} is not in {path}"
+        file.write_text(text.replace(old, new))
+
+    def files(self, folder: Path | str) -> dict[str, bytes]:
+        """Bytes of all files under a folder."""
+        base = self.root / folder
+        return {str(f.relative_to(base)): f.read_bytes() for f in sorted(base.rglob("*")) if f.is_file()}
+
+
+def copy_project(source: Path, target: Path, *, results: bool) -> Project:
+    """Copy the project's own files and, where asked, results with Snakemake's records; times stay."""
+    target.mkdir(parents=True)
+    parts = [*PARTS, *(["results", ".snakemake"] if results else [])]
+    for part in parts:
+        origin = source / part
+        if origin.is_dir():
+            shutil.copytree(origin, target / part, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+        elif origin.exists():
+            shutil.copy2(origin, target / part)
+    return Project(target)
+
+
+@pytest.fixture(scope="session")
+def finished(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Project:
+    """A copy in which the CI configuration ran to its end."""
+    copy = copy_project(project, tmp_path_factory.mktemp("finished") / "project", results=False)
+    copy.snakemake()
+    return copy
+
+
+@pytest.fixture
+def copy_of_finished(finished: Project, tmp_path: Path) -> Project:
+    """A fresh copy of the finished run, to edit."""
+    return copy_project(finished.root, tmp_path / "project", results=True)
+
+
+@pytest.fixture
+def fresh(project: Path, tmp_path: Path) -> Callable[[], Project]:
+    """Makes copies of the project without results."""
+    numbers = iter(range(100))
+    return lambda: copy_project(project, tmp_path / f"fresh-{next(numbers)}", results=False)

@@ -1,0 +1,74 @@
+"""What an edit reruns, and what it leaves alone."""
+
+import pytest
+
+from tests.workflow.conftest import Project
+
+AFTER_LANGUAGE = {"language", "evaluate", "table", "figures"}
+VARIANT_STAGES = {
+    "masks",
+    "tree",
+    "clip",
+    "contributions",
+    "semantic_tree",
+    "autoencoder",
+} | AFTER_LANGUAGE
+
+
+def test_nothing_is_planned_after_a_finished_run(copy_of_finished: Project) -> None:
+    assert copy_of_finished.planned() == set()
+
+
+def test_a_comment_and_a_docstring_rerun_nothing(copy_of_finished: Project) -> None:
+    for path in ("hilsplat/segment/coverage.py", "hilsplat/language/field.py", "hilsplat/base/images.py"):
+        file = copy_of_finished.root / path
+        file.write_text(file.read_text() + "\n# a comment\n")
+    copy_of_finished.edit("hilsplat/base/images.py", '"""Reading and writing images', '"""Reading, writing images')
+    assert copy_of_finished.planned() == set()
+
+
+@pytest.mark.parametrize(
+    ("module", "expected"),
+    [
+        ("hilsplat/language/field.py", AFTER_LANGUAGE),
+        ("hilsplat/language/clip_stage.py", VARIANT_STAGES - {"masks", "tree", "contributions"}),
+        ("hilsplat/evaluate/tables.py", {"table"}),
+    ],
+)
+def test_an_edit_reruns_its_stage_and_what_follows(
+    copy_of_finished: Project, module: str, expected: set[str]
+) -> None:
+    file = copy_of_finished.root / module
+    file.write_text(file.read_text() + "\nEDITED = True\n")
+    assert copy_of_finished.planned() == expected
+
+
+def test_omega_reruns_fields_and_later_only(copy_of_finished: Project) -> None:
+    copy_of_finished.edit("config/config.yaml", "omega: 10", "omega: 5")
+    assert copy_of_finished.planned() == AFTER_LANGUAGE
+
+
+def test_theta_reruns_trees_and_later_only(copy_of_finished: Project) -> None:
+    copy_of_finished.edit("config/config.yaml", "theta: 0.9", "theta: 0.8")
+    assert copy_of_finished.planned() == {"tree"} | AFTER_LANGUAGE
+
+
+def test_a_model_that_changed_reruns_what_reads_it(copy_of_finished: Project) -> None:
+    card = copy_of_finished.root / "models/clip-tiny/config.json"
+    card.write_text(card.read_text() + "\n")
+    assert copy_of_finished.planned() == VARIANT_STAGES - {"masks", "tree", "contributions"}
+
+
+def test_variants_share_what_they_do_not_change(finished: Project) -> None:
+    folder = finished.root / "results/synthetic/tiny"
+    assert (folder / "paper/language.safetensors").is_file()
+    assert (folder / "paper/autoencoder").is_dir()
+    for shared in ("masks", "tree", "clip", "contributions", "semantic_tree"):
+        assert not (folder / "paper" / shared).exists(), shared
+
+
+def test_every_rule_carries_the_digest_of_its_code(project) -> None:  # noqa: ANN001
+    for path in sorted((project / "rules").glob("*.smk")):
+        for rule in path.read_text().split("\nrule ")[1:]:
+            if "shell:" in rule:
+                assert "code=code(" in rule, (path.name, rule.split(":")[0])

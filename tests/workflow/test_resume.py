@@ -1,0 +1,91 @@
+"""A killed stage goes on where it was and ends with the bytes of an undisturbed run."""
+
+import json
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.workflow.conftest import SCENE, Project
+
+
+def kill_when(project: Project, command: list[str], cache: Path, entries: int) -> None:
+    """Start a command and SIGKILL it once its cache holds so many finished entries."""
+    process = subprocess.Popen(
+        command,
+        cwd=project.root,
+        env=project.environment(),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 300
+    while process.poll() is None and time.monotonic() < deadline:
+        if len(list(cache.rglob("*.npz"))) >= entries:
+            process.send_signal(signal.SIGKILL)
+            break
+        time.sleep(0.005)
+    process.wait(timeout=60)
+    assert process.returncode == -signal.SIGKILL, "the stage ended before it could be killed"
+
+
+@pytest.mark.parametrize(
+    ("name", "entries"),
+    [("default/masks", 2), ("default/clip", 2), ("default/contributions", 2), ("gaussians.ply", 1)],
+)
+def test_a_killed_stage_resumes(copy_of_finished: Project, name: str, entries: int) -> None:
+    project = copy_of_finished
+    path = project.root / SCENE / name
+    expected = project.files(path) if path.is_dir() else {"": path.read_bytes()}
+    record = json.loads(path.with_name(f"{path.name}.provenance.json").read_text())
+    command = list(record["command"])
+    if name == "gaussians.ply":
+        settings = json.loads(command[command.index("--settings") + 1])
+        assert settings["checkpoint_every"] < settings["iterations"], "the fit writes no checkpoint"
+    cache = project.root / "results/.cache"
+    shutil.rmtree(cache)
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    kill_when(project, command, cache, entries)
+    assert not path.exists(), "a killed stage left an output"
+    kept = {file: file.stat().st_mtime_ns for file in cache.rglob("*.npz")}
+    assert kept
+
+    project.run(*command)
+    after = project.files(path) if path.is_dir() else {"": path.read_bytes()}
+    assert after == expected
+    if path.is_dir():
+        assert all(file.exists() for file in kept), "finished views were thrown away"
+        log = (project.root / SCENE / f"default/logs/{path.name}.log").read_text()
+        assert "from cache" in log
+
+
+def test_one_more_view_costs_one_view(copy_of_finished: Project) -> None:
+    """Masks and CLIP of the views that were there come from the cache when one view is added."""
+    from hilsplat.scene.scene import Scene
+
+    project = copy_of_finished
+    scene = Scene.load(project.root / SCENE / "scene")
+    for stage in ("masks", "clip"):
+        folder = project.root / SCENE / "default" / stage
+        record = json.loads(folder.with_name(f"{stage}.provenance.json").read_text())
+        view = scene.views("train")[0]
+        cache = project.root / "results/.cache"
+        before = {file for file in cache.rglob("*.npz")}
+        index = json.loads((project.root / SCENE / "scene/index.json").read_text())
+        index["views"][view]["split"] = "test"
+        (project.root / SCENE / "scene/index.json").write_text(json.dumps(index))
+        shutil.rmtree(folder)
+        project.run(*record["command"])  # one view fewer: nothing is computed
+        assert {file for file in cache.rglob("*.npz")} == before
+        index["views"][view]["split"] = "train"
+        index["views"][scene.views("test")[0]]["split"] = "train"
+        (project.root / SCENE / "scene/index.json").write_text(json.dumps(index))
+        if stage == "masks":
+            shutil.rmtree(folder)
+            project.run(*record["command"])  # one view more: one entry more per kind of cache
+            new = {file for file in cache.rglob("*.npz")} - before
+            assert 1 <= len(new) <= 2
