@@ -70,7 +70,7 @@ class GaussiansSettings(Section):
     """Base 3D Gaussian Splatting fit."""
 
     iterations: int = knob(3000, "optimisation steps, one view each", ge=1, origin="3DGS: 30000")
-    max_gaussians: int = knob(60_000, "the fit never holds more", ge=100)
+    max_gaussians: int = knob(50_000, "the fit never holds more", ge=100)
     image_scale: float = knob(1.0, "images are shrunk by this factor for the fit", gt=0, le=1)
     sh_degree: int = knob(2, "degree of the colour's spherical harmonics", ge=0, le=3, origin="3DGS: 3")
     ssim_weight: float = knob(0.2, "weight of D-SSIM against L1", ge=0, le=1, origin="3DGS")
@@ -78,7 +78,7 @@ class GaussiansSettings(Section):
     densify_until: float = knob(0.6, "densify until this share of the iterations", ge=0, le=1, origin="3DGS: 0.5")
     densify_every: int = knob(100, "steps between densifications", ge=1, origin="3DGS")
     densify_gradient: float = knob(
-        2e-4, "screen-space gradient above which a Gaussian is cloned or split", gt=0, origin="3DGS"
+        4e-4, "screen-space gradient above which a Gaussian is cloned or split", gt=0, origin="3DGS: 2e-4"
     )
     opacity_reset_every: int = knob(3000, "steps between opacity resets", ge=1, origin="3DGS")
     min_opacity: float = knob(0.005, "Gaussians below are pruned", gt=0, lt=1, origin="3DGS")
@@ -164,9 +164,9 @@ class AutoencoderSettings(Section):
         "node", "node: the view-averaged vector of the mask's node, where it fits one; mask: its own", origin="paper: mask"
     )
     epochs: int = knob(100, "passes over all vectors", ge=1, origin="LangSplat: 100")
-    min_steps: int = knob(1500, "steps at least, however few vectors there are", ge=1)
+    min_steps: int = knob(2000, "steps at least, however few vectors there are", ge=1)
     batch: int = knob(64, "vectors per step", ge=2, origin="LangSplat: 64")
-    learning_rate: float = knob(7e-4, "Adam step", gt=0, origin="LangSplat: 7e-4")
+    learning_rate: float = knob(2e-3, "first Adam step, cosine-decayed", gt=0, origin="LangSplat: 7e-4")
     cosine_weight: float = knob(1e-3, "weight of 1 - cosine beside the squared error", ge=0, origin="LangSplat: 1e-3")
 
 

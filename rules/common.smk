@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 from snakemake.exceptions import WorkflowError
+from snakemake.logging import logger
 
 from hilsplat.base.artifacts import sha256_of_path
 from hilsplat.base.code_hash import code_hash as code_of
@@ -24,16 +25,21 @@ def or_stop(function, *arguments):
 
 
 RUN = or_stop(parse_run, config)
-ALL_SCENES = or_stop(read_sheet, Path(RUN.scenes))
-SCENES = [
+ALL_SCENES = or_stop(read_sheet, Path(RUN.scenes), RUN.groups, RUN.data_root)
+CHOSEN = [
     row
     for row in ALL_SCENES
     if row.group in RUN.groups and (not RUN.only or row.scene in RUN.only)
 ]
+SCENES = [row for row in CHOSEN if row.world or row.folder]
+for row in CHOSEN:
+    if row not in SCENES:
+        logger.warning(f"{row.name} is skipped: data_root is not set")
 if not SCENES:
     raise WorkflowError(
-        f"no scene to run: groups {list(RUN.groups)}, only {list(RUN.only)}; "
-        f"{RUN.scenes} holds {[f'{row.scene} ({row.group})' for row in ALL_SCENES]}"
+        f"no scene to run: groups {list(RUN.groups)}, only {list(RUN.only)}, "
+        f"data_root {RUN.data_root!r}; {RUN.scenes} holds "
+        f"{', '.join(f'{row.name} ({row.group})' for row in ALL_SCENES)}"
     )
 
 CACHE = Path("results/.cache")
@@ -57,6 +63,7 @@ def row_of(wildcards):
 
 
 def scopes_of(row):
+    """Keys of `overrides` that apply to a scene, general first."""
     return (row.group, f"{row.dataset}/{row.scene}")
 
 
@@ -100,13 +107,9 @@ def shared(stage, path):
     )
 
 
-def is_world(row):
-    return row.source.startswith("world:")
-
-
 def photos_of(wildcards):
     """Files that a scene of photographs is made from; one more or one less reruns its poses."""
-    folder = Path(row_of(wildcards).source)
+    folder = row_of(wildcards).folder
     return sorted(
         str(path)
         for path in folder.rglob("*")
@@ -160,18 +163,19 @@ def images_of(wildcards):
     row = row_of(wildcards)
     return (
         f"results/{row.dataset}/{row.scene}/world/images"
-        if is_world(row)
-        else row.source
+        if row.world
+        else str(row.folder)
     )
 
 
 def image_files_of(wildcards):
     """Input of poses: the rendered folder, or each file of a folder of photographs."""
-    return images_of(wildcards) if is_world(row_of(wildcards)) else photos_of(wildcards)
+    return images_of(wildcards) if row_of(wildcards).world else photos_of(wildcards)
 
 
 def labelled(rows):
-    return [row for row in rows if is_world(row)]
+    """Scenes that have annotations to be scored against."""
+    return [row for row in rows if row.world]
 
 
 def scores_of(variants):
@@ -212,7 +216,7 @@ def queries_of(wildcards):
 def truth_of(wildcards):
     """Input: the annotations of a scene, where it has some."""
     row = row_of(wildcards)
-    return [f"results/{row.dataset}/{row.scene}/world/truth"] if is_world(row) else []
+    return [f"results/{row.dataset}/{row.scene}/world/truth"] if row.world else []
 
 
 def print_where_time_went():

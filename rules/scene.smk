@@ -17,7 +17,7 @@ rule poses:
         images=images_of,
         unit=lambda wildcards: row_of(wildcards).unit,
         lens=lambda wildcards: (
-            "--render" if is_world(row_of(wildcards)) else "--no-render"
+            "--render" if row_of(wildcards).world else "--no-render"
         ),
         settings=settings_of("poses"),
         seed=RUN.seed,

@@ -51,9 +51,9 @@ def one_torch_thread() -> Iterator[None]:
 class Autoencoder(nn.Module):
     """LangSplat's scene autoencoder, C -> 256 -> 128 -> 64 -> 32 -> d and back, unit length at both ends.
 
-    Departs: layer widths never exceed C, and hidden layers of the encoder are normalised per vector
-    (LayerNorm), not per batch: BatchNorm fails on a last batch of one row, couples the vectors of a
-    batch, and behaves differently in training and use.
+    Departs: layer widths never exceed C. The encoder's BatchNorm (measured better than LayerNorm or
+    none) only ever sees full batches, and ends with the statistics of all vectors: see
+    `train_autoencoder`.
 
     Args:
         channels: C, of the CLIP vectors.
@@ -66,7 +66,7 @@ class Autoencoder(nn.Module):
         widths = [min(width, channels) for width in ENCODER_WIDTHS]
         layers: list[nn.Module] = [nn.Linear(channels, widths[0])]
         for before, after in zip(widths, [*widths[1:], latent], strict=True):
-            layers += [nn.LayerNorm(before), nn.ReLU(), nn.Linear(before, after)]
+            layers += [nn.BatchNorm1d(before), nn.ReLU(), nn.Linear(before, after)]
         self.encoder = nn.Sequential(*layers)
         widths = [min(width, channels) for width in DECODER_WIDTHS]
         layers = [nn.Linear(latent, widths[0])]
@@ -93,7 +93,7 @@ class Autoencoder(nn.Module):
         out = np.empty((len(latents), self.channels), np.float32)
         for start in range(0, len(latents), CHUNK_ROWS):
             part = torch.from_numpy(np.ascontiguousarray(latents[start : start + CHUNK_ROWS]))
-            out[start : start + CHUNK_ROWS] = self.decode(part).numpy()
+            out[start : start + len(part)] = self.decode(part).numpy()
         return out
 
     def save(self, path: Path) -> None:
@@ -157,6 +157,8 @@ def train_autoencoder(
         torch.manual_seed(seed)
         data = torch.from_numpy(np.ascontiguousarray(vectors))
         model = Autoencoder(data.shape[1], settings.latent)
+        if len(data) == 1:
+            data = data.repeat(2, 1)  # BatchNorm needs two rows
         batch = min(settings.batch, len(data))
         per_epoch = len(data) // batch
         steps = max(settings.epochs * per_epoch, settings.min_steps)
@@ -172,7 +174,19 @@ def train_autoencoder(
             loss.backward()
             optimiser.step()
             schedule.step()
+        settle_batch_norm(model, data)
         return model.eval()
+
+
+@torch.no_grad()
+def settle_batch_norm(model: Autoencoder, data: Float[Tensor, "B C"]) -> None:
+    """Replace the running statistics of the last batches by those of all vectors."""
+    for module in model.modules():
+        if isinstance(module, nn.BatchNorm1d):
+            module.reset_running_stats()
+            module.momentum = None  # a plain average over what follows: one pass over everything
+    model.train()
+    model.encoder(data)
 
 
 def mask_targets(

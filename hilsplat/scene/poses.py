@@ -142,7 +142,7 @@ def _reconstruct(
         "seed": seed,
         **report,
     }
-    _check_registration(images, name, report, settings)
+    check_registration(images, name, report, settings)
     assert model is not None
     views = [
         PosedView(image.name, work / "images" / image.name, image.camera, pose_matrix(image.cam_from_world()))
@@ -157,7 +157,10 @@ def _reconstruct(
 def map_views(
     database: Path, images: Path, folder: Path, mapper: str, seed: int
 ) -> list[pycolmap.Reconstruction]:
-    """Run the mapper on one thread with fixed seeds; returns its models, the largest first."""
+    """Run the mapper on one thread with fixed seeds; returns its models, the largest first.
+
+    The mapper may leave a last model of two views whatever its least size; such are dropped.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     if mapper == "incremental":
         options = pycolmap.IncrementalPipelineOptions()
@@ -185,12 +188,11 @@ def map_views(
         options.mapper.global_positioning.use_gpu = False
         options.mapper.bundle_adjustment.ceres.use_gpu = False
         models = pycolmap.global_mapping(database, images, folder, options)
-    return [
-        model
-        for _, model in sorted(
-            models.items(), key=lambda item: (-item[1].num_reg_images(), -item[1].num_points3D(), item[0])
-        )
+    large_enough = [
+        (number, model) for number, model in models.items() if model.num_reg_images() >= MIN_PHOTOS
     ]
+    large_enough.sort(key=lambda item: (-item[1].num_reg_images(), -item[1].num_points3D(), item[0]))
+    return [model for _, model in large_enough]
 
 
 def registration_report(
@@ -282,7 +284,7 @@ def _warnings(report: Mapping[str, Any]) -> list[str]:
     return warnings
 
 
-def _check_registration(images: Path, name: str, report: Mapping[str, Any], settings: PosesSettings) -> None:
+def check_registration(images: Path, name: str, report: Mapping[str, Any], settings: PosesSettings) -> None:
     """Refuse a reconstruction that holds too few views; log what is doubtful about one that passes.
 
     Raises:

@@ -6,6 +6,7 @@ The workflow imports this module at start-up, so nothing heavy is imported at it
 import hashlib
 import re
 from collections import Counter, defaultdict
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from hilsplat.base.errors import SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, list_images
 
 COLUMNS = ("dataset", "scene", "group", "source", "unit")
-GROUPS = ("benchmark", "development", "ci", "photos")
+GROUPS = ("benchmark", "development", "ci", "photos", "lerf")
 UNITS = ("metre", "arbitrary")
 PHOTOS = "photos"
 """Data set and group of one's own photographs."""
@@ -26,6 +27,8 @@ MAX_NAME = 100
 
 NAME_RULE = "letters a-z A-Z, digits, dot, dash and underscore, beginning with a letter or digit"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+DATA_PREFIX = "data:"
+"""Begins a source that lies below the folder of real data sets (`data_root`)."""
 WORLD_SOURCE = re.compile(r"world:([a-z][a-z0-9_-]*):([0-9]{1,9})")
 OTHER_PHOTO_SUFFIXES = frozenset(
     {".heic", ".heif", ".avif", ".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".gif"}
@@ -40,10 +43,10 @@ class SceneRow:
     Attributes:
         dataset: data set, first part of its place under `results/`.
         scene: scene name, second part.
-        group: "benchmark", "development", "ci" or "photos".
-        source: `world:<kind>:<seed>`, or a folder as the sheet gives it.
+        group: "benchmark", "development", "ci", "photos" or a real data set such as "lerf".
+        source: `world:<kind>:<seed>`, `data:<folder below data_root>`, or a folder.
         unit: unit of the source's lengths, "metre" or "arbitrary".
-        folder: the source folder, resolved against the project root; None for a world.
+        folder: the source folder, resolved; None for a world, and for `data:` without a data root.
     """
 
     dataset: str
@@ -100,13 +103,17 @@ def has_known_poses(folder: Path) -> bool:
     return (folder / "sparse").is_dir() or any(folder.glob("transforms*.json"))
 
 
-def read_sheet(path: Path, check_sources: bool = True) -> list[SceneRow]:
+def read_sheet(
+    path: Path, checked_groups: Collection[str] | None = None, data_root: str = ""
+) -> list[SceneRow]:
     """Read and check the scene sheet: tab-separated, one header line, `#` begins a comment line.
 
     Args:
         path: the sheet; relative sources start from its project root.
-        check_sources: also check that source folders exist and hold images. A benchmark's folder
-            has its data set's own layout and is only asked to exist.
+        checked_groups: groups whose source folders must exist and hold images; None for all. A
+            run checks the groups it runs, so that a lost folder of another group does not stop it.
+        data_root: folder of the real data sets, which `data:` sources start from; where it is
+            empty such rows have no folder.
 
     Raises:
         SceneError: naming sheet, line, column and the way out.
@@ -129,7 +136,7 @@ def read_sheet(path: Path, check_sources: bool = True) -> list[SceneRow]:
                 found=f"{len(cells)}: {text!r}",
                 fix="separate the columns by one tab each, and leave none out",
             )
-        row = _row(path, line, dict(zip(header, cells, strict=True)), check_sources)
+        row = _row(path, line, dict(zip(header, cells, strict=True)), checked_groups, data_root)
         # Names that differ in case only would share a folder on some file systems.
         if (key := row.name.casefold()) in line_of:
             raise SceneError(
@@ -184,7 +191,9 @@ def _check_header(path: Path, line: int, header: list[str]) -> None:
         )
 
 
-def _row(path: Path, line: int, cells: dict[str, str], check_sources: bool) -> SceneRow:
+def _row(
+    path: Path, line: int, cells: dict[str, str], checked_groups: Collection[str] | None, data_root: str
+) -> SceneRow:
     """Check one line of the sheet and make its row."""
     for column in ("dataset", "scene"):
         if problem := name_problem(cells[column]):
@@ -213,14 +222,17 @@ def _row(path: Path, line: int, cells: dict[str, str], check_sources: bool) -> S
                 fix="correct the source",
             )
         folder = None
+    elif source.startswith(DATA_PREFIX) and not data_root:
+        folder = None
     else:
-        folder = (project_root(path) / Path(source).expanduser()).resolve()
-        if check_sources:
-            _check_source(where, folder, is_benchmark=cells["group"] == "benchmark")
+        start = project_root(path) / Path(data_root).expanduser() if source.startswith(DATA_PREFIX) else project_root(path)
+        folder = (start / Path(source.removeprefix(DATA_PREFIX)).expanduser()).resolve()
+        if checked_groups is None or cells["group"] in checked_groups:
+            _check_source(where, folder)
     return SceneRow(cells["dataset"], cells["scene"], cells["group"], source, cells["unit"], folder)
 
 
-def _check_source(where: str, folder: Path, *, is_benchmark: bool) -> None:
+def _check_source(where: str, folder: Path) -> None:
     """Refuse a source folder that is missing or has no images."""
     if not folder.is_dir():
         raise SceneError(
@@ -228,12 +240,6 @@ def _check_source(where: str, folder: Path, *, is_benchmark: bool) -> None:
             expected="a folder of images; relative paths start from the project folder",
             fix="correct the path, or remove the line",
         )
-    if is_benchmark:
-        if not any(folder.iterdir()):
-            raise SceneError(
-                f"{where}: folder {folder} is empty", fix="put the data set there, or remove the line"
-            )
-        return
     if not list_images(photo_folder(folder)) and not has_known_poses(folder):
         raise SceneError(
             f"{where}: folder {folder} has no images",
@@ -386,7 +392,7 @@ def add_scene(sheet: Path, name: str, photos: Path, unit: str = "arbitrary") -> 
         )
     if unit not in UNITS:
         raise SceneError(f"unit {unit!r} is unknown", expected=f"one of {', '.join(UNITS)}")
-    rows = read_sheet(sheet, check_sources=False) if sheet.exists() else []
+    rows = read_sheet(sheet, checked_groups=()) if sheet.exists() else []
     taken = {row.name.casefold(): row for row in rows}
     if (row := taken.get(f"{PHOTOS}/{name}".casefold())) is not None:
         raise SceneError(

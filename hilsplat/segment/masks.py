@@ -10,8 +10,8 @@ from hilsplat.base.artifacts import read_npz, write_npz
 from hilsplat.base.errors import EmptyMaskError
 from hilsplat.base.levels import NONE, Level
 
-BAND_ELEMENTS = 2**25
-"""Elements of masks that are unpacked at once for overlaps: 128 MiB as float32."""
+BAND_ELEMENTS = 2**24
+"""Elements (masks x segments) that are held at once for overlaps: 64 MiB as float32."""
 
 
 def encode_runs(
@@ -107,27 +107,30 @@ class HierarchicalMasks:
             masks[out] = np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
         return masks.reshape(len(rows), height, width)
 
-    def band(self, start_px: int, stop_px: int) -> Bool[np.ndarray, "M n"]:
-        """Unpack all masks between two positions of the flattened image."""
-        masks = np.empty((len(self), stop_px - start_px), dtype=bool)
-        for row in range(len(self)):
-            ends = np.cumsum(self.runs[self.offsets[row] : self.offsets[row + 1]], dtype=np.int64)
-            clipped = np.clip(ends, start_px, stop_px)
-            masks[row] = np.repeat(np.arange(len(ends)) % 2 == 1, np.diff(clipped, prepend=start_px))
-        return masks
-
     def overlaps_px(self) -> Int64[np.ndarray, "M M"]:
-        """Pixels that each pair of masks shares, as a product of flattened masks.
+        """Pixels that each pair of masks shares.
 
-        float32 counts exactly up to 2**24 px, which no band reaches, so the result does not depend
-        on the order of summation or on the number of threads.
+        The borders of all runs cut the flattened image into segments that lie wholly inside or
+        outside each mask; there are far fewer of them than pixels. Overlaps are then one product of
+        (masks x segments) matrices, weighted by segment lengths. Floating point counts pixels
+        exactly here, so the result does not depend on the order of summation.
         """
-        shared = np.zeros((len(self), len(self)), dtype=np.int64)
         size_px = self.size_hw[0] * self.size_hw[1]
-        step = max(1, min(2**23, BAND_ELEMENTS // max(1, len(self))))
-        for start in range(0, size_px, step):
-            band = self.band(start, min(size_px, start + step)).astype(np.float32)
-            shared += (band @ band.T).astype(np.int64)
+        exact = np.float32 if size_px < 2**24 else np.float64
+        ends = [
+            np.cumsum(self.runs[start:stop], dtype=np.int64)
+            for start, stop in zip(self.offsets[:-1], self.offsets[1:], strict=True)
+        ]
+        borders = np.unique(np.concatenate([np.array([0, size_px]), *ends]))
+        starts, lengths = borders[:-1], np.diff(borders).astype(exact)
+        shared = np.zeros((len(self), len(self)), dtype=np.int64)
+        step = max(1, BAND_ELEMENTS // max(1, len(self)))
+        for first in range(0, len(starts), step):
+            at = starts[first : first + step]
+            # a mask's runs alternate, beginning outside: an odd number of ended runs means inside
+            inside = np.array([np.searchsorted(end, at, side="right") % 2 == 1 for end in ends], dtype=exact)
+            inside = inside.reshape(len(self), len(at))
+            shared += ((inside * lengths[first : first + step]) @ inside.T).astype(np.int64)
         return shared
 
     def take(self, rows: Int64[np.ndarray, " m"]) -> "HierarchicalMasks":

@@ -14,7 +14,7 @@ from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.optimise import FIELDS, Adam
 
 SMALL = 0.01
-"""Largest axis, in units of the extent, up to which a Gaussian is cloned and beyond which it is split (3DGS)."""
+"""Largest axis, in units of the extent, up to which a Gaussian is cloned; larger ones are split (3DGS)."""
 SPLIT_FACTOR = 1.6
 """Halves of a split Gaussian are smaller by this factor (3DGS: 0.8 x 2)."""
 HUGE = 0.5
@@ -52,7 +52,11 @@ class ScreenGradients:
 
 
 def densify(
-    adam: Adam, gradients: ScreenGradients, settings: GaussiansSettings, extent: float, generator: np.random.Generator
+    adam: Adam,
+    gradients: ScreenGradients,
+    settings: GaussiansSettings,
+    extent: float,
+    generator: np.random.Generator,
 ) -> None:
     """Clone small and split large Gaussians whose screen gradient is large, largest first up to the cap."""
     mean = gradients.mean()
@@ -90,7 +94,9 @@ def prune(adam: Adam, settings: GaussiansSettings, extent: float) -> None:
     """Drop transparent and huge Gaussians."""
     p = adam.parameters
     threshold = np.log(settings.min_opacity / (1 - settings.min_opacity))
-    keep = (p["opacity_logits"] > threshold) & (p["log_scales"].max(axis=1, initial=-np.inf) < np.log(HUGE * extent))
+    keep = (p["opacity_logits"] > threshold) & (
+        p["log_scales"].max(axis=1, initial=-np.inf) < np.log(HUGE * extent)
+    )
     if not keep.all():
         adam.keep(keep)
 

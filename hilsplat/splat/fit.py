@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import UInt8
 from PIL import Image
 from scipy.spatial import cKDTree
 
@@ -174,7 +174,8 @@ class FitState:
             logger.info("checkpoint %s belongs to other inputs; the fit starts anew", path)
             return None
         tables = [
-            {name: arrays[f"{table}_{name}"] for name in FIELDS} for table in ("parameters", "first", "second")
+            {name: arrays[f"{table}_{name}"] for name in FIELDS}
+            for table in ("parameters", "first", "second")
         ]
         generator = np.random.default_rng()
         generator.bit_generator.state = json.loads(arrays["generator"].item())
@@ -233,7 +234,13 @@ def fit_step(
 
 
 def fit_gaussians(
-    scene: Scene, settings: GaussiansSettings, *, seed: int, threads: int = 1, checkpoint: Path | None = None, key: str = ""
+    scene: Scene,
+    settings: GaussiansSettings,
+    *,
+    seed: int,
+    threads: int = 1,
+    checkpoint: Path | None = None,
+    key: str = "",
 ) -> tuple[Gaussians, np.ndarray]:
     """Fit Gaussians to the training views of a scene.
 
@@ -290,11 +297,18 @@ def run_gaussians(
     """Stage: fit, write `gaussians.ply` and the report folder (test PSNR/SSIM, curves, pictures)."""
     scene = Scene.load(scene_folder)
     key = sha256_of_json(
-        [settings.model_dump(mode="json"), seed, sha256_of_path(scene_folder), code_hash("hilsplat.splat.fit")]
+        [
+            settings.model_dump(mode="json"),
+            seed,
+            sha256_of_path(scene_folder),
+            code_hash("hilsplat.splat.fit"),
+        ]
     )
     checkpoint = Path(cache) / "gaussians" / f"{key[:16]}.npz"
     with stage_log("gaussians", scene.name) as counts:
-        gaussians, curve = fit_gaussians(scene, settings, seed=seed, threads=threads, checkpoint=checkpoint, key=key)
+        gaussians, curve = fit_gaussians(
+            scene, settings, seed=seed, threads=threads, checkpoint=checkpoint, key=key
+        )
         views = load_views(scene, "test", settings.image_scale)
         split = "test" if views else "train"
         views = views or load_views(scene, "train", settings.image_scale)
@@ -303,5 +317,7 @@ def run_gaussians(
         report = write_report(out_report, gaussians, targets, split, path, curve, settings, threads)
         save_ply(out_ply, gaussians)
         counts.update(
-            gaussians=len(gaussians), psnr=f"{report['psnr_db']:.2f} dB", ssim=f"{report['ssim']:.3f} ({split})"
+            gaussians=len(gaussians),
+            psnr=f"{report['psnr_db']:.2f} dB",
+            ssim=f"{report['ssim']:.3f} ({split})",
         )

@@ -69,7 +69,12 @@ def write_report(
         write_png(temporary / "flyaround.png", _sheet(fly, columns=4))
         _draw_curves(temporary / "curves.png", curve)
         write_index(
-            temporary, scores, split=split, psnr_db=report["psnr_db"], ssim=report["ssim"], gaussians=len(gaussians)
+            temporary,
+            scores,
+            split=split,
+            psnr_db=report["psnr_db"],
+            ssim=report["ssim"],
+            gaussians=len(gaussians),
         )
     return report
 

@@ -18,10 +18,12 @@ SH_RATE, SH_REST_RATE = 2.5e-3, 2.5e-3 / 20  # constant term, other terms; 3DGS
 
 @njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
-def _adam_rows(begin, end, values, gradients, first, second, rate, rate_rest, columns, head, root, one_minus1):
-    """Adam for rows begin..end; the first `head` of `columns` numbers of a row step by rate, the others by rate_rest.
+def _adam_rows(
+    begin, end, values, gradients, first, second, rate, rate_rest, columns, head, root, one_minus1
+):
+    """Adam for rows begin..end, in place.
 
-    `root` is sqrt(1 - beta2^t), `one_minus1` 1 - beta1^t.
+    The first `head` of the `columns` numbers of a row step by `rate`, the others by `rate_rest`; `root` is sqrt(1 - beta2^t), `one_minus1` 1 - beta1^t.
     """
     beta1, rest1 = np.float32(BETA1), np.float32(1.0 - BETA1)
     beta2, rest2 = np.float32(BETA2), np.float32(1.0 - BETA2)

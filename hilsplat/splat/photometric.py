@@ -20,7 +20,7 @@ _TAPS = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA_PX) ** 2)
 _TAPS = (_TAPS / _TAPS.sum()).astype(np.float32)
 _LANES = 16
 _SIDE = 16  # zero columns left and right of a padded row; at least 3 channels x RADIUS
-_ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
+_ZERO, _TWO = np.float32(0.0), np.float32(2.0)
 
 
 @njit(nogil=True, cache=True)
@@ -35,7 +35,7 @@ def _ssim_rows(begin, end, num, stride, image, target, slopes, ssim_sums, l1_sum
     row_length = groups * _LANES + 2 * _SIDE
     moments = np.zeros(5 * row_length, np.float32)
     out = np.empty(4 * _LANES, np.float32)
-    zero, one, two = lanes(_ZERO), lanes(_ONE), lanes(_TWO)
+    zero, two = lanes(_ZERO), lanes(_TWO)
     c1, c2 = lanes(_C1), lanes(_C2)
     map_size = len(slopes) // 3
     for y in range(begin, end):
@@ -167,7 +167,9 @@ def photometric_loss(
     slopes = np.zeros(3 * len(x), np.float32)
     ssim_sums, l1_sums = np.empty(height), np.empty(height)
     over_ranges(
-        lambda begin, end: _ssim_rows(begin, end, num, stride, x, t, slopes, ssim_sums, l1_sums), height, threads
+        lambda begin, end: _ssim_rows(begin, end, num, stride, x, t, slopes, ssim_sums, l1_sums),
+        height,
+        threads,
     )
     gradient = np.empty((height, num), np.float32)
     count = height * num

@@ -92,7 +92,7 @@ def load_ply(path: Path) -> Gaussians:
     ).all(dim=1) & torch.isfinite(gaussians.opacity_logits)
     if not finite.all():
         raise ArtifactError(
-            f"{path} holds {int((~finite).sum())} of {len(gaussians)} Gaussians with numbers that are not finite",
+            f"{path}: {int((~finite).sum())} of {len(gaussians)} Gaussians hold a number that is not finite",
             fix="delete it and run the gaussians stage again",
         )
     return gaussians

@@ -96,9 +96,9 @@ def draw_masks(
 
 
 WARNING = (
-    "This network knows one synthetic world (tabletop scenes of `hilsplat.world`) and nothing else. It stands in"
-    " for {real} so that the whole method runs, is tested and is measured without any download. Its results on"
-    " photographs are meaningless, and its numbers say nothing about {real}."
+    "This network knows one synthetic world (the tabletop scenes of `hilsplat.world`) and nothing else.\n"
+    "It stands in for {real} so that the whole method runs, is tested and is measured without a download.\n"
+    "Its results on photographs are meaningless, and its numbers say nothing about {real}."
 )
 
 
@@ -125,28 +125,30 @@ def write_sam_card(
     folder = Path(folder)
     draw_curve(folder / "curve.png", curve, {level.label: level.label for level in LEVELS}, "mean IoU")
     draw_masks(folder / "masks.png", encoder, decoder, unseen)
-    rows = [
-        f"| {level.label} | {metrics['balanced'][level.label]['iou']:.2f} | {metrics['grid'][level.label]['iou']:.2f}"
-        f" | {100 * metrics['balanced'][level.label]['above_75']:.0f} % |"
-        f" {metrics['balanced'][level.label]['correlation']:.2f} |"
-        for level in LEVELS
-    ]
+    rows = []
+    for level in LEVELS:
+        balanced, grid = metrics["balanced"][level.label], metrics["grid"][level.label]
+        rows.append(
+            f"| {level.label} | {balanced['iou']:.2f} | {grid['iou']:.2f} |"
+            f" {100 * balanced['above_75']:.0f} % | {balanced['correlation']:.2f} |"
+        )
     parameters = sum(p.numel() for module in (encoder, decoder) for p in module.parameters())
     body = f"""# sam-tiny
 
 {WARNING.format(real="SAM")}
 
-A promptable segmenter of {parameters / 1e6:.1f} million parameters in the layout of the Hugging Face ONNX exports of SAM:
-256 x 256 image and points in, three masks (subpart, part, whole) of 128 x 128 and their predicted IoU out. Where the
-world has no subpart at a point, the first mask is the part; where it has no part, the whole. Weights are stored as
-float16 and computed in float32.
+A promptable segmenter of {parameters / 1e6:.1f} million parameters in the layout of the Hugging Face ONNX
+exports of SAM: an image of 256 x 256 and points in, three masks (subpart, part, whole) of 128 x 128 and
+their predicted IoU out. Where the world has no subpart at a point, the first mask is the part; where it
+has no part, the whole. Weights are stored as float16 and computed in float32.
 
 ## How good it is
-Single point prompts on {recipe["validation_scenes"]} scenes of the training range on which nothing was trained, 32 prompts
-per view; only prompts that have a true region at the level count. "Balanced" draws a region first and a pixel in it
-second, "grid" draws pixels.
+Single point prompts on {recipe["validation_scenes"]} scenes of the training range on which nothing was
+trained, 32 prompts per view; only prompts that have a true region at the level count. "Balanced" draws a
+region first and a pixel in it second, "grid" draws pixels. The last two columns are balanced prompts; the
+correlation is that of predicted and true IoU.
 
-| level | mean IoU, balanced | mean IoU, grid | IoU above 0.75, balanced | predicted vs. true IoU (correlation) |
+| level | mean IoU, balanced | mean IoU, grid | IoU above 0.75 | correlation |
 | --- | --- | --- | --- | --- |
 {chr(10).join(rows)}
 
@@ -192,23 +194,24 @@ def write_clip_card(
 
 {WARNING.format(real="CLIP")}
 
-Crops of 64 x 64 and short English phrases in one space of 128 dimensions, in the layout of the Hugging Face ONNX exports
-of CLIP. It knows the words of the world's texts and no others. Pixels outside a mask are black in its training crops:
-use it with the background setting `black`. "object", "things", "stuff" and "texture" were captions of crops drawn without
-looking, so they mean nothing in particular. Weights are stored as float16 and computed in float32.
+Crops of 64 x 64 and short English phrases in one space of 128 dimensions, in the layout of the Hugging
+Face ONNX exports of CLIP. It knows the words of the world's texts and no others. Pixels outside a mask are
+black in its training crops: use it with the background setting `black`. "object", "things", "stuff" and
+"texture" were captions of crops drawn without looking, so they mean nothing in particular. Weights are
+stored as float16 and computed in float32.
 
 ## How good it is
-Crops of {recipe["validation_scenes"]} scenes of the training range on which nothing was trained. "exact" are true masks of at
-least 24 px, "rough" those that `sam-tiny` drew and whose IoU with a node is above 0.5. All {recipe["texts_competing"]} texts of the
-world (all levels) compete, or those seen at the mask's own level. "Above canonical": the right text beats all four
-canonical phrases.
+Crops of {recipe["validation_scenes"]} scenes of the training range on which nothing was trained. "exact" are
+true masks of at least 24 px, "rough" those that `sam-tiny` drew and whose IoU with a node is above 0.5. All
+{recipe["texts_competing"]} texts of the world (all levels) compete, or those seen at the mask's own level.
+"Above canonical": the right text beats all four canonical phrases.
 
 | masks | level | top-1 | top-3 | top-1 within level | above canonical | crops |
 | --- | --- | --- | --- | --- | --- | --- |
 {chr(10).join(rows)}
 
-Trained on {recipe["crops"]} crops, {recipe["rough_crops"]} of them cut with masks that `sam-tiny` drew, the others with exact and
-with roughened masks.
+Trained on {recipe["crops"]} crops, {recipe["rough_crops"]} of them cut with masks that `sam-tiny` drew, the
+others with exact and with roughened masks.
 
 ![learning curve](curve.png)
 
@@ -226,15 +229,17 @@ def _recipe_text(recipe: Mapping[str, Any], curve: Curve, folder: Path) -> str:
         for row in curve.rows
     )
     first, last = recipe["training_seeds"]
+    lowest, highest = recipe["validation_seeds"]
     return f"""## Recipe
-`hilsplat models train` repeats it (same machine and threads: same weights; elsewhere the last digits of sums differ).
+`hilsplat models train` repeats it: the same weights on the same machine with the same number of threads;
+elsewhere the last digits of sums differ, and so do the weights.
 
-- generator of the world: version and code {recipe["generator"]}
-- training scenes: seeds {first} to {last}, {recipe["views"]} views each, 256 x 256; measured on seeds \
-{recipe["validation_seeds"][0]} to {recipe["validation_seeds"][1]}. Benchmark and development scenes come from other seed \
-ranges, and the code refuses them here.
-- steps: {recipe["sam_steps"]} (sam-tiny), {recipe["clip_steps"]} (clip-tiny); seed {recipe["seed"]}, {recipe["threads"]} threads, torch {recipe["torch"]}
-- this run took {minutes:.0f} minutes on a shared 2-core machine
+- generator of the world: version and digest of its output {recipe["generator"]}
+- training scenes: seeds {first} to {last}, {recipe["views"]} views each, 256 x 256
+- measured on: seeds {lowest} to {highest}. Benchmark and development scenes come from other ranges of
+  seeds, and the code refuses them here.
+- steps: {recipe["sam_steps"]} (sam-tiny), {recipe["clip_steps"]} (clip-tiny); seed {recipe["seed"]}
+- {recipe["threads"]} threads, torch {recipe["torch"]}; {minutes:.0f} minutes on a shared machine
 
 | {" | ".join(columns)} |
 |{" --- |" * len(columns)}

@@ -130,7 +130,9 @@ def render(
     if depth:
         with torch.no_grad():
             summed, covered = render_features(gaussians, camera, depths[:, None], threads=threads)
-            depth_map = torch.from_numpy(np.divide(summed[..., 0], covered, out=np.zeros_like(covered), where=covered > 0))
+            depth_map = torch.from_numpy(
+                np.divide(summed[..., 0], covered, out=np.zeros_like(covered), where=covered > 0)
+            )
     return Rendering(color, alpha, image[..., 3:] if features is not None else None, depth_map)
 
 
@@ -152,7 +154,9 @@ def render_features(
     values = _to_array(features)
     if len(values) != len(gaussians):
         raise HilsplatError(
-            "features do not fit the Gaussians", expected=f"{len(gaussians)} rows", found=f"{len(values)} rows"
+            "features do not fit the Gaussians",
+            expected=f"{len(gaussians)} rows",
+            found=f"{len(values)} rows",
         )
     view = _project(gaussians, camera, threads)
     out = np.empty((*camera.size_hw, values.shape[1]), np.float32)
@@ -163,9 +167,7 @@ def render_features(
     return out, alpha
 
 
-def pixel_weights(
-    gaussians: Gaussians, camera: Camera, *, min_weight: float, threads: int = 1
-) -> csr_matrix:
+def pixel_weights(gaussians: Gaussians, camera: Camera, *, min_weight: float, threads: int = 1) -> csr_matrix:
     """Blending weight alpha_i T_i of each Gaussian at each pixel, as a sparse matrix.
 
     Args:

@@ -99,9 +99,7 @@ def _bin(box, keys, tiles_x, tiles_y):
     return tile_start, gaussian, pair, pair_start
 
 
-def bin_gaussians(
-    box: Int32[np.ndarray, "N 4"], depths: np.ndarray, size_hw: tuple[int, int]
-) -> TileLists:
+def bin_gaussians(box: Int32[np.ndarray, "N 4"], depths: np.ndarray, size_hw: tuple[int, int]) -> TileLists:
     """Sort the visible Gaussians by depth and list them per tile (row-major tiles).
 
     Args:

@@ -139,7 +139,20 @@ def blend(begin, end, tiles_x, tile_start, gaussian, geometry, box, colours, ima
 @njit(nogil=True, cache=True)
 @no_type_check
 def blend_backward(
-    begin, end, tiles_x, tile_start, gaussian, pair, geometry, box, colours, image, alpha, grad_image, grad_alpha, slots
+    begin,
+    end,
+    tiles_x,
+    tile_start,
+    gaussian,
+    pair,
+    geometry,
+    box,
+    colours,
+    image,
+    alpha,
+    grad_image,
+    grad_alpha,
+    slots,
 ):
     """Gradient of `blend` for tiles begin..end, into one slot per (tile, Gaussian).
 
@@ -260,7 +273,9 @@ def blend_backward(
 
 @njit(nogil=True, cache=True)
 @no_type_check
-def blend_weights(begin, end, tiles_x, size_hw, tile_start, gaussian, geometry, box, least, cursor, columns, weights):
+def blend_weights(
+    begin, end, tiles_x, size_hw, tile_start, gaussian, geometry, box, least, cursor, columns, weights
+):
     """Weights of tiles begin..end as sparse rows, one row per pixel (row-major).
 
     Called twice. With empty `columns` it counts: cursor[pixel] grows by one per weight >= least.

@@ -105,13 +105,24 @@ def project_gaussians(parameters: Parameters, camera: Camera, degree: int, threa
 
     def work(begin: int, end: int) -> int:
         return project(
-            begin, end, p.means, p.log_scales, p.quats, p.opacity_logits, p.sh, degree, row, geometry, box, colours
+            begin,
+            end,
+            p.means,
+            p.log_scales,
+            p.quats,
+            p.opacity_logits,
+            p.sh,
+            degree,
+            row,
+            geometry,
+            box,
+            colours,
         )
 
     broken = sum(over_ranges(work, n, threads))
     if broken:
         raise HilsplatError(
-            f"{broken} of {n} Gaussians cannot be drawn: a parameter is not a finite number, or a quaternion is zero",
+            f"{broken} of {n} Gaussians cannot be drawn: not finite, or a zero quaternion",
             expected="finite means, log_scales, quats, opacity_logits and sh",
             fix="drop these Gaussians, or run the gaussians stage again",
         )
@@ -128,7 +139,16 @@ def blend_forward(
     t = view.tiles
     over_ranges(
         lambda begin, end: blend(
-            begin, end, view.tiles_x, t.tile_start, t.gaussian, view.geometry, view.box, channels, image, alpha
+            begin,
+            end,
+            view.tiles_x,
+            t.tile_start,
+            t.gaussian,
+            view.geometry,
+            view.box,
+            channels,
+            image,
+            alpha,
         ),
         view.num_tiles,
         threads,
@@ -248,7 +268,5 @@ def sparse_weights(
     columns, weights = np.empty(row_start[-1], np.int32), np.empty(row_start[-1], np.float32)
     if len(columns):
         walk(row_start[:-1].copy(), columns, weights)
-        over_ranges(
-            lambda begin, end: sort_rows(begin, end, row_start, columns, weights), pixels, threads
-        )
+        over_ranges(lambda begin, end: sort_rows(begin, end, row_start, columns, weights), pixels, threads)
     return row_start, columns, weights

@@ -44,7 +44,9 @@ _C30, _C31, _C32, _C33, _C35 = (
 
 
 def pack_camera(camera: Camera) -> Float[np.ndarray, " 25"]:
-    """A camera as one row: rotation (9), translation (3), fx, fy, cx, cy, centre (3), ray limits (4), height, width.
+    """A camera as one row.
+
+    In order: rotation (9), translation (3), fx, fy, cx, cy, centre (3), ray limits (4), height, width.
 
     Ray limits are the range of x/z and y/z inside which the Jacobian is taken: the image widened
     by 0.3 of its half field of view on each side (gsplat).
@@ -340,9 +342,7 @@ def project_backward(
                     + camera[6 + row] * grad_factor[2, k]
                 )
         d = rotation_grad
-        dw = 2.0 * (
-            qx * (d[2, 1] - d[1, 2]) + qy * (d[0, 2] - d[2, 0]) + qz * (d[1, 0] - d[0, 1])
-        )
+        dw = 2.0 * (qx * (d[2, 1] - d[1, 2]) + qy * (d[0, 2] - d[2, 0]) + qz * (d[1, 0] - d[0, 1]))
         dx = 2.0 * (
             -2.0 * qx * (d[1, 1] + d[2, 2])
             + qy * (d[0, 1] + d[1, 0])

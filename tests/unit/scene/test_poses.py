@@ -9,7 +9,7 @@ from PIL import Image
 from hilsplat.base.errors import ImageError, RegistrationError, SceneError
 from hilsplat.base.images import read_image
 from hilsplat.scene.features import WorkImage, camera_groups, view_names
-from hilsplat.scene.poses import run_poses
+from hilsplat.scene.poses import check_registration, run_poses
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import PosesSettings
 
@@ -147,3 +147,31 @@ def test_photographs_share_a_camera_when_size_and_focal_length_agree(tmp_path):
     assert len(camera_groups(images, "no")) == 4
     with pytest.raises(SceneError, match="several sizes"):
         camera_groups(images, "yes")
+
+
+def found(registered, models):
+    views = {
+        f"{number}.png": {
+            "file": f"{number}.jpg",
+            "registered": number < registered,
+            "why_not": "no features",
+        }
+        for number in range(10)
+    }
+    return {"images": 10, "registered": registered, "models": models, "warnings": [], "views": views}
+
+
+def test_the_gate_on_the_registered_share_names_the_lost_photographs(tmp_path):
+    settings = PosesSettings(min_registered_share=0.7)
+    check_registration(tmp_path, "photos/test", found(7, [7]), settings)
+    with pytest.raises(
+        RegistrationError,
+        match=r"at least 70% of 10(.|\n)*6 \(60\.0%\); models of 6, 4 (.|\n)*9\.jpg: no features(.|\n)*0\.60",
+    ):
+        check_registration(tmp_path, "photos/test", found(6, [6, 4]), settings)
+
+
+def test_several_models_stop_the_stage_only_where_asked(tmp_path):
+    check_registration(tmp_path, "photos/test", found(8, [8, 3]), PosesSettings())
+    with pytest.raises(RegistrationError, match=r"2 separate models(.|\n)*8\.jpg"):
+        check_registration(tmp_path, "photos/test", found(8, [8, 3]), PosesSettings(several_models="stop"))

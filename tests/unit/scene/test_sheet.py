@@ -96,7 +96,7 @@ def test_a_folder_of_unread_photographs_says_what_it_holds(tmp_path):
     row = ("photos", "a", "photos", "phone", "arbitrary")
     with pytest.raises(SceneError, match=r"has no images(.|\n)*1 files \.heic"):
         read_sheet(write_sheet(tmp_path, row))
-    assert len(read_sheet(write_sheet(tmp_path, row), check_sources=False)) == 1
+    assert len(read_sheet(write_sheet(tmp_path, row), checked_groups=())) == 1
 
 
 def test_inspection_finds_damaged_turned_and_copied_photographs(tmp_path):
@@ -155,3 +155,16 @@ def test_photographs_that_differ_only_in_suffix_are_refused(tmp_path):
     Image.open(folder / "photo_0.jpg").save(folder / "photo_0.png")
     with pytest.raises(SceneError, match=r"same view(.|\n)*photo_0\.jpg, photo_0\.png"):
         inspect_photos(folder)
+
+
+def test_data_sources_lie_below_the_data_root(tmp_path):
+    row = ("lerf", "figurines", "lerf", "data:lerf_ovs/figurines", "arbitrary")
+    sheet = write_sheet(tmp_path, row)
+    assert read_sheet(sheet)[0].folder is None
+    with pytest.raises(SceneError, match=r"lerf_ovs/figurines is missing"):
+        read_sheet(sheet, data_root=str(tmp_path / "data"))
+
+
+def test_a_group_that_is_not_run_is_not_checked(tmp_path):
+    row = ("photos", "lost", "photos", "nowhere", "arbitrary")
+    assert len(read_sheet(write_sheet(tmp_path, row), checked_groups=("ci",))) == 1

@@ -36,17 +36,6 @@ def test_dense_masks_come_back_equal(dense):
     np.testing.assert_array_equal(pack(dense).dense(), dense)
 
 
-@given(nonempty_masks, st.data())
-def test_a_band_is_a_slice_of_the_flattened_image(dense, data):
-    size = dense.shape[1] * dense.shape[2]
-    start = data.draw(st.integers(0, size - 1))
-    stop = data.draw(st.integers(start + 1, size))
-    np.testing.assert_array_equal(
-        pack(dense).band(start, stop),
-        dense.reshape(len(dense), dense.shape[1] * dense.shape[2])[:, start:stop],
-    )
-
-
 @given(nonempty_masks, st.integers(1, 40))
 def test_overlaps_are_counts_of_shared_pixels_whatever_the_band(dense, elements):
     flat = dense.reshape(len(dense), dense.shape[1] * dense.shape[2]).astype(int)

@@ -10,7 +10,7 @@ import torch
 from hilsplat.base.artifacts import read_index
 from hilsplat.base.errors import SceneError
 from hilsplat.base.images import write_png
-from hilsplat.scene.cameras import Camera, Cameras
+from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat import fit
@@ -22,7 +22,9 @@ from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import render
 from hilsplat.splat.rasterise.cpu import Gradients
 
-SETTINGS = GaussiansSettings(iterations=60, densify_every=10, checkpoint_every=25, sh_degree=1, max_gaussians=400)
+SETTINGS = GaussiansSettings(
+    iterations=60, densify_every=10, checkpoint_every=25, sh_degree=1, max_gaussians=400
+)
 
 
 def ring(number: int, size: int) -> Cameras:
@@ -89,7 +91,9 @@ def outputs(folder: Path) -> dict[str, bytes]:
 def test_stage_writes_the_same_bytes_on_any_threads_and_after_a_stop(scene, tmp_path, monkeypatch):
     def stage(name: str, threads: int) -> dict[str, bytes]:
         out = tmp_path / name
-        fit.run_gaussians(scene.folder, out / "g.ply", out / "report", tmp_path / "cache", SETTINGS, 3, threads)
+        fit.run_gaussians(
+            scene.folder, out / "g.ply", out / "report", tmp_path / "cache", SETTINGS, 3, threads
+        )
         return outputs(out)
 
     undisturbed = stage("one", threads=1)
@@ -122,7 +126,9 @@ def test_stage_writes_the_same_bytes_on_any_threads_and_after_a_stop(scene, tmp_
 
 
 def test_another_fits_checkpoint_is_not_used(scene, tmp_path):
-    adam = Adam.start(fit.first_gaussians(scene, [scene.cameras["000.png"]], SETTINGS, np.random.default_rng(0)))
+    adam = Adam.start(
+        fit.first_gaussians(scene, [scene.cameras["000.png"]], SETTINGS, np.random.default_rng(0))
+    )
     state = fit.FitState(adam, ScreenGradients.start(len(adam)), np.random.default_rng(0))
     state.save(tmp_path / "c.npz", "this")
     assert fit.FitState.load(tmp_path / "c.npz", "other") is None
@@ -159,11 +165,15 @@ def test_small_is_cloned_and_large_is_split():
 
 def test_the_cap_takes_the_largest_gradient_first():
     adam = Adam.start(two_gaussians())
-    settings = GaussiansSettings(densify_gradient=0.5, max_gaussians=100).model_copy(update={"max_gaussians": 3})
+    settings = GaussiansSettings(densify_gradient=0.5, max_gaussians=100).model_copy(
+        update={"max_gaussians": 3}
+    )
     gradients = ScreenGradients(np.array([1.0, 2.0]), np.ones(2, np.int32))
     densify(adam, gradients, settings, 1.0, np.random.default_rng(0))
     assert len(adam) == 3
-    np.testing.assert_allclose(np.exp(adam.parameters["log_scales"][:, 0]), [0.001, 0.0625, 0.0625], rtol=1e-5)
+    np.testing.assert_allclose(
+        np.exp(adam.parameters["log_scales"][:, 0]), [0.001, 0.0625, 0.0625], rtol=1e-5
+    )
 
 
 def test_transparent_and_huge_are_pruned_and_opacity_is_reset():
@@ -189,7 +199,9 @@ def test_first_adam_step_moves_by_the_rate_against_the_sign():
     adam = Adam.start(two_gaussians())
     before = {name: values.copy() for name, values in adam.parameters.items()}
     ones = {name: np.ones_like(values) for name, values in before.items()}
-    gradients = Gradients(**ones, features=np.zeros((2, 0), np.float32), means_px=np.zeros((2, 2), np.float32))
+    gradients = Gradients(
+        **ones, features=np.zeros((2, 0), np.float32), means_px=np.zeros((2, 2), np.float32)
+    )
     adam.step(gradients, progress=0.0, extent=2.0, threads=1)
     np.testing.assert_allclose(before["means"] - adam.parameters["means"], 3.2e-4, rtol=1e-3)
     np.testing.assert_allclose(before["sh"] - adam.parameters["sh"], 2.5e-3, rtol=1e-3)
