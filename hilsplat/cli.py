@@ -7,7 +7,7 @@ package and writes the provenance. Heavy libraries are imported by the functions
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -110,7 +110,9 @@ def stage(
     try:
         for what, path in (inputs or {}).items():
             if not path.exists():
-                raise HilsplatError(f"{name}: input {what} is missing: {path}", fix="run the stage that writes it")
+                raise HilsplatError(
+                    f"{name}: input {what} is missing: {path}", fix="run the stage that writes it"
+                )
         require_free_space(out.parent, MIN_FREE_MIB)
         with output_lock(out):
             yield
@@ -427,7 +429,10 @@ def figures(
     with stage("figures", out, log, settings=section, threads=threads, inputs=inputs):
         from hilsplat.evaluate.figures import run_figures
 
-        for source, name in ((scene / "registration.png", "registration.png"), (fit / "test_views.png", "fit.png")):
+        for source, name in (
+            (scene / "registration.png", "registration.png"),
+            (fit / "test_views.png", "fit.png"),
+        ):
             with atomic_path(out.with_name(name)) as temporary:
                 shutil.copyfile(source, temporary)
         run_figures(
@@ -481,7 +486,9 @@ def new(
 @app.command()
 def query(
     scene: Annotated[str, typer.Argument(help="dataset/scene, such as photos/bear")],
-    text: Annotated[str, typer.Argument(help="what to look for; 'bear > nose' searches a nose inside a bear")],
+    text: Annotated[
+        str, typer.Argument(help="what to look for; 'bear > nose' searches a nose inside a bear")
+    ],
     level: Annotated[str, typer.Option(help="auto, whole, part or subpart")] = "auto",
     variant: Annotated[str, typer.Option(help="variant whose files answer")] = "default",
     results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
@@ -493,7 +500,9 @@ def query(
     start_logging(None)
     from hilsplat.evaluate.query_panel import answer
 
-    typer.echo(answer(results / scene, text, level=level, variant=variant, views=views, out=out, threads=threads))
+    typer.echo(
+        answer(results / scene, text, level=level, variant=variant, views=views, out=out, threads=threads)
+    )
 
 
 @app.command()
@@ -555,7 +564,9 @@ def cache_command(
     import time
 
     files = [path for path in folder.rglob("*") if path.is_file()] if folder.is_dir() else []
-    old = [path for path in files if prune_days >= 0 and time.time() - path.stat().st_mtime > prune_days * 86400]
+    old = [
+        path for path in files if prune_days >= 0 and time.time() - path.stat().st_mtime > prune_days * 86400
+    ]
     typer.echo(f"{folder}: {len(files)} files, {sum(path.stat().st_size for path in files) / 2**20:.1f} MiB")
     if old:
         freed = sum(path.stat().st_size for path in old)

@@ -31,7 +31,9 @@ class WorldSettings(Section):
     views: int = knob(40, "number of views", unit="views", ge=3, le=1000)
     image_px: int = knob(256, "height and width of a view", unit="px", ge=32, le=4096)
     arc_deg: float = knob(360.0, "azimuth covered by the cameras; a ring is 360", unit="degree", gt=0, le=360)
-    objects: int = knob(6, "objects asked for; placement reports how many fitted", unit="objects", ge=1, le=30)
+    objects: int = knob(
+        6, "objects asked for; placement reports how many fitted", unit="objects", ge=1, le=30
+    )
     samples: int = knob(3, "sub-samples per pixel side", ge=1, le=8)
     min_area_px: int = knob(
         60, "wholes and parts with a smaller visible region are not scored", unit="px", ge=1
@@ -44,7 +46,9 @@ class WorldSettings(Section):
 class PosesSettings(Section):
     """Camera poses by structure from motion, or imported."""
 
-    max_side_px: int = knob(1600, "images are shrunk to this longer side", unit="px", ge=64, origin="3DGS: 1600")
+    max_side_px: int = knob(
+        1600, "images are shrunk to this longer side", unit="px", ge=64, origin="3DGS: 1600"
+    )
     camera_model: Literal["auto", "simple_pinhole", "simple_radial", "opencv"] = knob(
         "auto", "lens model; auto takes simple_radial for photographs and simple_pinhole for renders"
     )
@@ -54,7 +58,9 @@ class PosesSettings(Section):
     matcher: Literal["auto", "exhaustive", "sequential"] = knob(
         "auto", "pairs to match; auto: exhaustive up to 200 views, else sequential"
     )
-    mapper: Literal["incremental", "global"] = knob("incremental", "structure-from-motion algorithm", origin="COLMAP")
+    mapper: Literal["incremental", "global"] = knob(
+        "incremental", "structure-from-motion algorithm", origin="COLMAP"
+    )
     max_features: int = knob(4096, "SIFT features per image", ge=100, le=32768, origin="COLMAP: 8192")
     first_octave: Literal[-1, 0] = knob(-1, "-1 doubles the image first: more features, four times the time")
     min_registered_share: float = knob(
@@ -63,7 +69,9 @@ class PosesSettings(Section):
     several_models: Literal["largest", "stop"] = knob(
         "largest", "what to do where the photographs fall into several models"
     )
-    test_every: int = knob(8, "every n-th view is held out for testing; 0: none", unit="views", ge=0, origin="3DGS")
+    test_every: int = knob(
+        8, "every n-th view is held out for testing; 0: none", unit="views", ge=0, origin="3DGS"
+    )
 
 
 class GaussiansSettings(Section):
@@ -74,15 +82,21 @@ class GaussiansSettings(Section):
     image_scale: float = knob(1.0, "images are shrunk by this factor for the fit", gt=0, le=1)
     sh_degree: int = knob(2, "degree of the colour's spherical harmonics", ge=0, le=3, origin="3DGS: 3")
     ssim_weight: float = knob(0.2, "weight of D-SSIM against L1", ge=0, le=1, origin="3DGS")
-    densify_from: float = knob(0.06, "densify from this share of the iterations", ge=0, le=1, origin="3DGS: 500 / 30000")
-    densify_until: float = knob(0.6, "densify until this share of the iterations", ge=0, le=1, origin="3DGS: 0.5")
+    densify_from: float = knob(
+        0.06, "densify from this share of the iterations", ge=0, le=1, origin="3DGS: 500 / 30000"
+    )
+    densify_until: float = knob(
+        0.6, "densify until this share of the iterations", ge=0, le=1, origin="3DGS: 0.5"
+    )
     densify_every: int = knob(100, "steps between densifications", ge=1, origin="3DGS")
     densify_gradient: float = knob(
         4e-4, "screen-space gradient above which a Gaussian is cloned or split", gt=0, origin="3DGS: 2e-4"
     )
     opacity_reset_every: int = knob(3000, "steps between opacity resets", ge=1, origin="3DGS")
     min_opacity: float = knob(0.005, "Gaussians below are pruned", gt=0, lt=1, origin="3DGS")
-    background: Literal["black", "white", "random"] = knob("black", "colour behind the Gaussians", origin="3DGS")
+    background: Literal["black", "white", "random"] = knob(
+        "black", "colour behind the Gaussians", origin="3DGS"
+    )
     checkpoint_every: int = knob(1000, "steps between checkpoints", ge=1)
 
 
@@ -96,18 +110,27 @@ class MasksSettings(Section):
     points_per_side: int = knob(32, "prompts per image side", ge=1, le=128, origin="LangSplat: 32")
     points_per_batch: int = knob(64, "prompts per decoder call", ge=1, le=4096, origin="LangSplat: 64")
     crop_layers: int = knob(0, "layers of overlapping crops", ge=0, le=2, origin="LangSplat: 1")
-    predicted_iou_min: float = knob(0.35, "masks below are dropped", ge=0, le=1, origin="SAM: 0.88, LangSplat: 0.7")
-    stability_min: float = knob(0.5, "masks below are dropped", ge=0, le=1, origin="SAM: 0.95, LangSplat: 0.85")
+    predicted_iou_min: float = knob(
+        0.35, "masks below are dropped", ge=0, le=1, origin="SAM: 0.88, LangSplat: 0.7"
+    )
+    stability_min: float = knob(
+        0.5, "masks below are dropped", ge=0, le=1, origin="SAM: 0.95, LangSplat: 0.85"
+    )
     stability_offset: float = knob(1.0, "logit offset of the stability test", gt=0, origin="SAM")
     box_nms_iou: float = knob(0.7, "box IoU above which the worse mask is dropped", gt=0, le=1, origin="SAM")
-    min_area_px: int = knob(16, "smaller masks, islands and holes are dropped", unit="px", ge=1, origin="LangSplat: 100")
-    nms_iou: float = knob(0.8, "mask IoU above which the worse mask is dropped", gt=0, le=1, origin="LangSplat")
+    min_area_px: int = knob(
+        16, "smaller masks, islands and holes are dropped", unit="px", ge=1, origin="LangSplat: 100"
+    )
+    nms_iou: float = knob(
+        0.8, "mask IoU above which the worse mask is dropped", gt=0, le=1, origin="LangSplat"
+    )
     nms_score: float = knob(
         0.0, "masks whose predicted IoU x stability is below are dropped", ge=0, le=1, origin="LangSplat: 0.7"
     )
     nms_inner: float = knob(0.5, "inner-mask suppression threshold", ge=0, le=1, origin="LangSplat")
     graph_scales: tuple[float, float, float] = knob(
-        (0.12, 0.04, 0.015), "least segment size at whole, part, subpart as a share of the image side; graph only"
+        (0.12, 0.04, 0.015),
+        "least segment size at whole, part, subpart as a share of the image side; graph only",
     )
 
 
@@ -134,14 +157,20 @@ class ContributionsSettings(Section):
 
     min_weight: float = knob(1 / 255, "weights of a Gaussian at a pixel below are dropped", ge=0, lt=1)
     keep: Literal["auto", "gram", "weights"] = knob(
-        "auto", "gram: pairs of Gaussians; weights: pixel weights of all views; auto: the one with fewer non-zeros"
+        "auto",
+        "gram: pairs of Gaussians; weights: pixel weights of all views; auto: the one with fewer non-zeros",
     )
 
 
 class SemanticTreeSettings(Section):
     """3D semantic tree: masks linked across views by the Gaussians they share."""
 
-    link_threshold: float = knob(0.12, "pooled average IoU above which clusters of masks are joined", gt=0, lt=1)
+    overlap: Literal["tanimoto", "soft"] = knob(
+        "tanimoto", "overlap of two masks on their Gaussians; soft suits Gaussians that keep to one region"
+    )
+    link_threshold: float = knob(
+        0.3, "pooled average IoU above which clusters of masks are joined", gt=0, lt=1
+    )
     min_views: int = knob(3, "a node is seen in at least this many views", ge=1)
     min_member_share: float = knob(
         0.15, "a Gaussian joins its best node where more than this share of its weight lies in it", ge=0, lt=1
@@ -150,10 +179,18 @@ class SemanticTreeSettings(Section):
         0.3, "a Gaussian counts as visible in a view from this mass", unit="px", ge=0
     )
     min_covisible: float = knob(
-        0.2, "pairs of masks that see less than this share of each other are no evidence", unit="share", ge=0, lt=1
+        0.2,
+        "pairs of masks that see less than this share of each other are no evidence",
+        unit="share",
+        ge=0,
+        lt=1,
     )
-    min_fit: float = knob(0.25, "a mask stands for the node it fits best above this IoU in its view", ge=0, lt=1)
-    parent_coverage: float = knob(0.5, "share of a node inside a coarser one that makes it a child", gt=0, lt=1)
+    min_fit: float = knob(
+        0.25, "a mask stands for the node it fits best above this IoU in its view", ge=0, lt=1
+    )
+    parent_coverage: float = knob(
+        0.5, "share of a node inside a coarser one that makes it a child", gt=0, lt=1
+    )
 
 
 class AutoencoderSettings(Section):
@@ -161,38 +198,52 @@ class AutoencoderSettings(Section):
 
     latent: int = knob(8, "latent numbers d", ge=1, le=64, origin="paper, LangSplat: 3")
     targets: Literal["node", "mask"] = knob(
-        "node", "node: the view-averaged vector of the mask's node, where it fits one; mask: its own", origin="paper: mask"
+        "node",
+        "node: the view-averaged vector of the mask's node, where it fits one; mask: its own",
+        origin="paper: mask",
     )
     epochs: int = knob(100, "passes over all vectors", ge=1, origin="LangSplat: 100")
     min_steps: int = knob(2000, "steps at least, however few vectors there are", ge=1)
     batch: int = knob(64, "vectors per step", ge=2, origin="LangSplat: 64")
     learning_rate: float = knob(2e-3, "first Adam step, cosine-decayed", gt=0, origin="LangSplat: 7e-4")
-    cosine_weight: float = knob(1e-3, "weight of 1 - cosine beside the squared error", ge=0, origin="LangSplat: 1e-3")
+    cosine_weight: float = knob(
+        1e-3, "weight of 1 - cosine beside the squared error", ge=0, origin="LangSplat: 1e-3"
+    )
 
 
 class LanguageSettings(Section):
     """Language field: per Gaussian one latent for each level."""
 
-    weight_language: float = knob(1.0, "weight of the regression to the latents", ge=0, origin="paper: not stated")
+    weight_language: float = knob(
+        1.0, "weight of the regression to the latents", ge=0, origin="paper: not stated"
+    )
     weight_clustering: float = knob(0.3, "weight of L_h (Eq. 2)", ge=0, origin="paper: 1")
     weight_instance: float = knob(0.03, "weight of L_ins (Eq. 3), lambda_1", ge=0, origin="paper: e-6")
     weight_part: float = knob(0.0, "weight of L_part (Eq. 5), lambda_2", ge=0, origin="paper: e-5")
-    instance_mode: Literal["literal", "tree", "logratio"] = knob("tree", "reading of L_ins", origin="paper: literal")
-    part_mode: Literal["literal", "disentangle"] = knob("disentangle", "reading of L_part", origin="paper: literal")
+    instance_mode: Literal["literal", "tree", "logratio"] = knob(
+        "tree", "reading of L_ins", origin="paper: literal"
+    )
+    part_mode: Literal["literal", "disentangle"] = knob(
+        "disentangle", "reading of L_part", origin="paper: literal"
+    )
     omega: float = knob(10.0, "similarity degree Omega", gt=1, origin="paper: 10")
     tau: float = knob(0.1, "temperature of L_part", gt=0, origin="paper: not given; VCH: 0.1")
     ridge: float = knob(0.1, "pull towards the lifted average, in units of the visible mass", ge=0)
     cg_steps: int = knob(10, "conjugate-gradient steps of the quadratic part", ge=0)
     lbfgs_steps: int = knob(30, "L-BFGS steps where L_ins or L_part are on", ge=0)
     min_mask_px: int = knob(50, "smaller masks stay out of L_ins and L_part", unit="px", ge=1)
-    max_masks_per_level: int = knob(96, "masks of one view and level in L_ins and L_part, largest first", ge=2)
+    max_masks_per_level: int = knob(
+        96, "masks of one view and level in L_ins and L_part, largest first", ge=2
+    )
 
 
 class EvaluateSettings(Section):
     """Queries and protocols."""
 
     canonical: tuple[str, ...] = knob(
-        ("object", "things", "stuff", "texture"), "canonical phrases of the relevancy", origin="LERF, LangSplat"
+        ("object", "things", "stuff", "texture"),
+        "canonical phrases of the relevancy",
+        origin="LERF, LangSplat",
     )
     relevancy_scale: float = knob(10.0, "scale of the cosine in the relevancy", gt=0, origin="LangSplat")
     filter_px: int = knob(
@@ -356,7 +407,8 @@ class RunSettings(StageSettings):
         if variant != "default" or variant in self.variants:
             if variant not in self.variants:
                 raise SettingsError(
-                    f"variant {variant!r} is not defined", expected=f"one of default, {', '.join(self.variants)}"
+                    f"variant {variant!r} is not defined",
+                    expected=f"one of default, {', '.join(self.variants)}",
                 )
             layers.append((f"variants.{variant}", self.variants[variant]))
         for where, layer in layers:

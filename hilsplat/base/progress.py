@@ -59,4 +59,6 @@ def stage_log(stage: str, scene: str) -> Iterator[dict[str, object]]:
     start = time.monotonic()
     yield counts
     text = ", ".join(f"{name} {value}" for name, value in counts.items())
-    logger.info("%s %s: done in %.1f s%s", stage, scene, time.monotonic() - start, f" ({text})" if text else "")
+    logger.info(
+        "%s %s: done in %.1f s%s", stage, scene, time.monotonic() - start, f" ({text})" if text else ""
+    )

@@ -108,14 +108,19 @@ def mask_evidence(
     visible: Bool[np.ndarray, "V N"],
     view: Int32[np.ndarray, " M"],
     min_covisible: float,
+    overlap: str = "tanimoto",
 ) -> tuple[Float[np.ndarray, "M M"], Float[np.ndarray, "M M"]]:
     """Soft intersection and union of every two masks of one level, on the Gaussians both views see.
 
     With s the share of a Gaussian's visible weight that lies in a mask and w its importance, the
     intersection of a and b is sum w s_a s_b, the size of a as seen from the view of b is the sum of
-    w s_a over Gaussians visible there. Two masks of one view are different things: they are evidence
-    against a link (intersection 0, union both full sizes). Masks that see less than `min_covisible`
-    of each other, both ways, are no evidence at all (0 and 0).
+    w s_a^2 (Tanimoto) or w s_a (soft) over Gaussians visible there. For shares of 0 and 1 the two
+    agree. A fitted Gaussian reaches across borders and has shares between: there soft sizes shrink
+    the IoU of one region with itself (shares of 0.3 give 0.18), Tanimoto keeps it at 1.
+
+    Two masks of one view are different things: they are evidence against a link (intersection 0,
+    union both full sizes). Masks that see less than `min_covisible` of each other, both ways, are no
+    evidence at all (0 and 0).
 
     Args:
         shares: s, one row per mask; zero where the Gaussian is not visible in the mask's view.
@@ -123,10 +128,12 @@ def mask_evidence(
         visible: which Gaussians each view sees.
         view: view of each mask.
         min_covisible: share below which a pair is dropped.
+        overlap: "tanimoto" or "soft".
     """
     weighted = (shares @ sp.diags(importance)).tocsr()
     intersection = (weighted @ shares.T).toarray()
-    seen_from = np.asarray(weighted @ visible.T.astype(np.float64))  # [mask, view]
+    sizes = weighted.multiply(shares).tocsr() if overlap == "tanimoto" else weighted
+    seen_from = np.asarray(sizes @ visible.T.astype(np.float64))  # [mask, view]
     size = seen_from[np.arange(len(view)), view]
     seen_by_other = seen_from[:, view]  # [a, b]: size of a in the view of b
     union = seen_by_other + seen_by_other.T - intersection

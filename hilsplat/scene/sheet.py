@@ -225,7 +225,11 @@ def _row(
     elif source.startswith(DATA_PREFIX) and not data_root:
         folder = None
     else:
-        start = project_root(path) / Path(data_root).expanduser() if source.startswith(DATA_PREFIX) else project_root(path)
+        start = (
+            project_root(path) / Path(data_root).expanduser()
+            if source.startswith(DATA_PREFIX)
+            else project_root(path)
+        )
         folder = (start / Path(source.removeprefix(DATA_PREFIX)).expanduser()).resolve()
         if checked_groups is None or cells["group"] in checked_groups:
             _check_source(where, folder)

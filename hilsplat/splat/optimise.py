@@ -23,7 +23,8 @@ def _adam_rows(
 ):
     """Adam for rows begin..end, in place.
 
-    The first `head` of the `columns` numbers of a row step by `rate`, the others by `rate_rest`; `root` is sqrt(1 - beta2^t), `one_minus1` 1 - beta1^t.
+    The first `head` of the `columns` numbers of a row step by `rate`, the others by `rate_rest`;
+    `root` is sqrt(1 - beta2^t), `one_minus1` 1 - beta1^t.
     """
     beta1, rest1 = np.float32(BETA1), np.float32(1.0 - BETA1)
     beta2, rest2 = np.float32(BETA2), np.float32(1.0 - BETA2)

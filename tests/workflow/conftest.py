@@ -33,7 +33,9 @@ class Project:
             check=False,
         )
         if check and result.returncode != 0:
-            raise AssertionError(f"{command} ended with {result.returncode}:\n{result.stdout}\n{result.stderr}")
+            raise AssertionError(
+                f"{command} ended with {result.returncode}:\n{result.stdout}\n{result.stderr}"
+            )
         return result
 
     def environment(self, **more: str) -> dict[str, str]:
@@ -82,7 +84,9 @@ def copy_project(source: Path, target: Path, *, results: bool) -> Project:
     for part in parts:
         origin = source / part
         if origin.is_dir():
-            shutil.copytree(origin, target / part, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copytree(
+                origin, target / part, symlinks=True, ignore=shutil.ignore_patterns("__pycache__")
+            )
         elif origin.exists():
             shutil.copy2(origin, target / part)
     return Project(target)

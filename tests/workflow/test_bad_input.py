@@ -116,7 +116,11 @@ def test_a_broken_scene_fails_and_the_others_go_on(copy_of_finished: Project, tm
 
 @pytest.mark.parametrize("section", ["masks", "clip"])
 def test_a_missing_model_folder_is_told(copy_of_finished: Project, section: str) -> None:
-    copy_of_finished.edit("config/config.yaml", f"model: models/{'sam' if section == 'masks' else 'clip'}-tiny", "model: models/nope")
+    copy_of_finished.edit(
+        "config/config.yaml",
+        f"model: models/{'sam' if section == 'masks' else 'clip'}-tiny",
+        "model: models/nope",
+    )
     result = copy_of_finished.snakemake(check=False)
     assert result.returncode != 0
     text = result.stdout + result.stderr

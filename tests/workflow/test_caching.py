@@ -23,7 +23,9 @@ def test_a_comment_and_a_docstring_rerun_nothing(copy_of_finished: Project) -> N
     for path in ("hilsplat/segment/coverage.py", "hilsplat/language/field.py", "hilsplat/base/images.py"):
         file = copy_of_finished.root / path
         file.write_text(file.read_text() + "\n# a comment\n")
-    copy_of_finished.edit("hilsplat/base/images.py", '"""Reading and writing images', '"""Reading, writing images')
+    copy_of_finished.edit(
+        "hilsplat/base/images.py", '"""Reading and writing images', '"""Reading, writing images'
+    )
     assert copy_of_finished.planned() == set()
 
 
@@ -67,7 +69,7 @@ def test_variants_share_what_they_do_not_change(finished: Project) -> None:
         assert not (folder / "paper" / shared).exists(), shared
 
 
-def test_every_rule_carries_the_digest_of_its_code(project) -> None:  # noqa: ANN001
+def test_every_rule_carries_the_digest_of_its_code(project) -> None:
     for path in sorted((project / "rules").glob("*.smk")):
         for rule in path.read_text().split("\nrule ")[1:]:
             if "shell:" in rule:

@@ -74,18 +74,18 @@ def test_one_more_view_costs_one_view(copy_of_finished: Project) -> None:
         record = json.loads(folder.with_name(f"{stage}.provenance.json").read_text())
         view = scene.views("train")[0]
         cache = project.root / "results/.cache"
-        before = {file for file in cache.rglob("*.npz")}
+        before = set(cache.rglob("*.npz"))
         index = json.loads((project.root / SCENE / "scene/index.json").read_text())
         index["views"][view]["split"] = "test"
         (project.root / SCENE / "scene/index.json").write_text(json.dumps(index))
         shutil.rmtree(folder)
         project.run(*record["command"])  # one view fewer: nothing is computed
-        assert {file for file in cache.rglob("*.npz")} == before
+        assert set(cache.rglob("*.npz")) == before
         index["views"][view]["split"] = "train"
         index["views"][scene.views("test")[0]]["split"] = "train"
         (project.root / SCENE / "scene/index.json").write_text(json.dumps(index))
         if stage == "masks":
             shutil.rmtree(folder)
             project.run(*record["command"])  # one view more: one entry more per kind of cache
-            new = {file for file in cache.rglob("*.npz")} - before
+            new = set(cache.rglob("*.npz")) - before
             assert 1 <= len(new) <= 2

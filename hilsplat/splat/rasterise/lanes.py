@@ -7,7 +7,8 @@ the machine has (one register with AVX-512, two with AVX2, four with NEON).
 
 Operations, for use inside `numba.njit` functions: `+ - *` between lanes, `lanes(x)` (all lanes equal
 x), `load(array, i)`, `store(array, i, v)`, `exp2_negative(v)`, `smaller(a, b)`, `keep_ge(a, b, v)`,
-`keep_gt(a, b, v)`, `any_ge(a, b)`, `lane_sum(v)`, `reciprocal(v)`. Sums run in a fixed order.
+`keep_gt(a, b, v)`, `keep_lt(a, b, v)`, `any_ge(a, b)`, `lane_sum(v)`, `reciprocal(v)`. Sums run in a
+fixed order.
 """
 
 import operator

@@ -44,7 +44,9 @@ def test_an_unrelated_module_does_not_count(tmp_path: Path) -> None:
 
 
 def test_imports_inside_functions_and_relative_ones_are_followed(tmp_path: Path) -> None:
-    root = package(tmp_path, a="def g():\n    from . import b\n    return b.f()\n", b="import hilsplat.c\n", c="")
+    root = package(
+        tmp_path, a="def g():\n    from . import b\n    return b.f()\n", b="import hilsplat.c\n", c=""
+    )
     assert import_closure("hilsplat.a", root=root) == ["hilsplat", "hilsplat.a", "hilsplat.b", "hilsplat.c"]
 
 

@@ -1,5 +1,5 @@
 """Fixtures of the tiny world with two boxes."""
 
-from two_boxes_world import two_boxes, two_boxes_contributions
+from tests.unit.language.two_boxes_world import two_boxes, two_boxes_contributions
 
 __all__ = ["two_boxes", "two_boxes_contributions"]

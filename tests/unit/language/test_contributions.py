@@ -5,7 +5,6 @@ import shutil
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from two_boxes_world import HEIGHT, REGIONS, WIDTH, two_boxes_weights
 
 from hilsplat.base.artifacts import sha256_of_path
 from hilsplat.base.errors import MisalignedArtifactError
@@ -23,6 +22,7 @@ from hilsplat.language.mask_rows import Contributions, mask_embeddings
 from hilsplat.language.quadratic import build_gram, choose_quadratic, level_mass, load_quadratic
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ContributionsSettings
+from tests.unit.language.two_boxes_world import HEIGHT, REGIONS, WIDTH, two_boxes_weights
 
 SIZE = (9, 7)
 PIXELS = 63

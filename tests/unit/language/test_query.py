@@ -5,16 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from two_boxes_world import (
-    HEIGHT,
-    NUM_GAUSSIANS,
-    REGIONS,
-    WIDTH,
-    build_contributions,
-    build_two_boxes,
-    region_mask,
-    two_boxes_weights,
-)
 
 from hilsplat.base.errors import MisalignedArtifactError, SettingsError
 from hilsplat.base.levels import Level
@@ -25,6 +15,16 @@ from hilsplat.language.semantic_tree import SemanticTree, run_semantic_tree
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import AutoencoderSettings, LanguageSettings, SemanticTreeSettings
 from hilsplat.splat.gaussians import Gaussians
+from tests.unit.language.two_boxes_world import (
+    HEIGHT,
+    NUM_GAUSSIANS,
+    REGIONS,
+    WIDTH,
+    build_contributions,
+    build_two_boxes,
+    region_mask,
+    two_boxes_weights,
+)
 
 NAMES = ("A", "B", "A top", "B top", "A bottom", "A top left", "B corner")
 NODE = {name: node for node, name in enumerate(NAMES)}

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from two_boxes_world import HEIGHT, NUM_GAUSSIANS, REGIONS, WIDTH, region_mask
 
 from hilsplat.base.artifacts import read_index, read_json, sha256_of_path, write_index
 from hilsplat.base.errors import MisalignedArtifactError
@@ -17,6 +16,7 @@ from hilsplat.language.semantic_tree import (
     run_semantic_tree,
 )
 from hilsplat.settings import SemanticTreeSettings
+from tests.unit.language.two_boxes_world import HEIGHT, NUM_GAUSSIANS, REGIONS, WIDTH, region_mask
 
 
 def test_evidence_counts_only_gaussians_both_views_see():
@@ -27,6 +27,14 @@ def test_evidence_counts_only_gaussians_both_views_see():
     # on Gaussian 1 both agree fully: intersection 1, union 1 + 1 - 1
     assert intersection[0, 1] == pytest.approx(1)
     assert union[0, 1] == pytest.approx(1)
+
+
+@pytest.mark.parametrize(("overlap", "iou"), [("tanimoto", 1.0), ("soft", 0.09 / 0.51)])
+def test_a_blurred_region_agrees_with_itself_only_by_tanimoto(overlap, iou):
+    visible, shares = np.ones((2, 1), bool), sp.csr_matrix(np.array([[0.3], [0.3]]))
+    view = np.array([0, 1], np.int32)
+    intersection, union = mask_evidence(shares, np.ones(1), visible, view, 0.2, overlap)
+    assert intersection[0, 1] / union[0, 1] == pytest.approx(iou)
 
 
 def test_masks_of_one_view_are_evidence_against_a_link():
