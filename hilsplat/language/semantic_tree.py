@@ -108,7 +108,7 @@ def mask_evidence(
     visible: Bool[np.ndarray, "V N"],
     view: Int32[np.ndarray, " M"],
     min_covisible: float,
-    overlap: str = "tanimoto",
+    overlap: str,
 ) -> tuple[Float[np.ndarray, "M M"], Float[np.ndarray, "M M"]]:
     """Soft intersection and union of every two masks of one level, on the Gaussians both views see.
 
@@ -342,7 +342,9 @@ def build_tree(
     for each in LEVELS:
         rows = contributions.rows_of(each)
         view = contributions.view[rows]
-        evidence = mask_evidence(shares_in_view[rows], importance, visible, view, settings.min_covisible)
+        evidence = mask_evidence(
+            shares_in_view[rows], importance, visible, view, settings.min_covisible, settings.overlap
+        )
         cluster, cluster_quality = pooled_linkage(*evidence, settings.link_threshold)
         seen = [len(np.unique(view[cluster == c])) for c in range(int(cluster.max(initial=-1)) + 1)]
         large = np.flatnonzero(np.array(seen, dtype=np.int64) >= settings.min_views)

@@ -23,7 +23,9 @@ def test_evidence_counts_only_gaussians_both_views_see():
     # three Gaussians; view 0 sees 0 and 1, view 1 sees 1 and 2
     visible = np.array([[True, True, False], [False, True, True]])
     shares = sp.csr_matrix(np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 0.5]]))
-    intersection, union = mask_evidence(shares, np.ones(3), visible, np.array([0, 1], np.int32), 0.2)
+    intersection, union = mask_evidence(
+        shares, np.ones(3), visible, np.array([0, 1], np.int32), 0.2, "tanimoto"
+    )
     # on Gaussian 1 both agree fully: intersection 1, union 1 + 1 - 1
     assert intersection[0, 1] == pytest.approx(1)
     assert union[0, 1] == pytest.approx(1)
@@ -40,7 +42,7 @@ def test_a_blurred_region_agrees_with_itself_only_by_tanimoto(overlap, iou):
 def test_masks_of_one_view_are_evidence_against_a_link():
     visible = np.ones((1, 2), bool)
     shares = sp.csr_matrix(np.array([[1.0, 0.0], [1.0, 1.0]]))
-    intersection, union = mask_evidence(shares, np.ones(2), visible, np.zeros(2, np.int32), 0.2)
+    intersection, union = mask_evidence(shares, np.ones(2), visible, np.zeros(2, np.int32), 0.2, "tanimoto")
     assert intersection[0, 1] == 0
     assert union[0, 1] == pytest.approx(3)  # sizes 1 and 2
 
@@ -50,8 +52,8 @@ def test_masks_that_hardly_see_each_other_are_no_evidence():
     visible[0, 5:], visible[1, :4] = False, False  # common: Gaussian 4 alone
     shares = sp.csr_matrix(np.where(visible, 1.0, 0.0))
     view = np.array([0, 1], np.int32)
-    assert mask_evidence(shares, np.ones(11), visible, view, 0.1)[1][0, 1] == pytest.approx(1)
-    assert mask_evidence(shares, np.ones(11), visible, view, 0.25)[1][0, 1] == 0
+    assert mask_evidence(shares, np.ones(11), visible, view, 0.1, "soft")[1][0, 1] == pytest.approx(1)
+    assert mask_evidence(shares, np.ones(11), visible, view, 0.25, "soft")[1][0, 1] == 0
 
 
 def test_linkage_pools_intersections_over_unions():
@@ -169,6 +171,17 @@ def test_second_run_writes_the_same_bytes(tree_of_boxes):
     before = sha256_of_path(out)
     run_semantic_tree(world.folder / "contributions", world.masks, world.clip, out, SemanticTreeSettings())
     assert sha256_of_path(out) == before
+
+
+def test_soft_overlap_sees_less_agreement_where_gaussians_cross_borders(two_boxes_contributions):
+    world, contributions = two_boxes_contributions
+    quality = {}
+    for overlap in ("tanimoto", "soft"):
+        out = world.folder / overlap
+        settings = SemanticTreeSettings(overlap=overlap, link_threshold=0.12)
+        run_semantic_tree(contributions, world.masks, world.clip, out, settings)
+        quality[overlap] = SemanticTree.load(out).quality
+    assert (quality["soft"] < quality["tanimoto"]).all()
 
 
 def test_more_views_asked_for_than_there_are_leave_an_empty_tree(two_boxes_contributions, caplog):
