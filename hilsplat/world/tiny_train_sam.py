@@ -354,6 +354,8 @@ def segment_everything(
         stability = (values > 1).sum(axis=(1, 2)) / np.maximum((values > -1).sum(axis=(1, 2)), 1)
         keep = np.flatnonzero((scores[:, head] > iou_min) & (stability > stability_min) & (area > 4))
         keep = keep[np.argsort(-(scores[keep, head] * stability[keep]), kind="stable")]
+        if not len(keep):
+            continue
         small = (values[keep] > 0).reshape(len(keep), -1).astype(np.float32)
         overlap = small @ small.T
         size = small.sum(axis=1)

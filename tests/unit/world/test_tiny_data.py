@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from drawn import drawn_views
 
 from hilsplat.world.tiny_clip import CANONICAL
 from hilsplat.world.tiny_data import (
@@ -16,6 +15,7 @@ from hilsplat.world.tiny_data import (
     region_centres,
     roughen,
 )
+from tests.unit.world.drawn import drawn_views
 
 
 def test_a_missing_subpart_is_its_part_and_a_missing_part_its_whole():

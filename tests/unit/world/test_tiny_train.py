@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from drawn import drawn_views
 
 from hilsplat.world.tiny_clip import contrastive_loss
 from hilsplat.world.tiny_data import RoughMask, collect_crops
@@ -17,6 +16,7 @@ from hilsplat.world.tiny_train_sam import (
     target_masks,
     train_sam,
 )
+from tests.unit.world.drawn import drawn_views
 
 SMALL = (CropStage(1.0, 64, 4, 8),)
 
@@ -109,3 +109,9 @@ def test_levels_are_drawn_equally_often():
     for level in (1, 2, 3):
         assert weights[crops.level == level].sum() == pytest.approx(1 / 3)
     assert weights[(crops.level == 1) & crops.rough].sum() == pytest.approx(0.4 / 3)
+
+
+def test_a_segmenter_that_trusts_no_mask_gives_none(trained):
+    encoder, decoder, _ = trained
+    image = drawn_views(1, 64).images[0]
+    assert segment_everything(encoder, decoder, image, 4, iou_min=1.1) == []
