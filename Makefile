@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: run test lint report models bench clean-cache setup
+.PHONY: run test lint report setup
 
 run: $(STAMP)
 	snakemake --cores $(CORES) --workflow-profile workflow/profiles/default

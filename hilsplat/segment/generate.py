@@ -36,19 +36,21 @@ def masks_from_candidates(
     )
     streams = []
     for head, level in enumerate(HEADS):
-        per_crop = []
+        per_crop, layers = [], []
         for crop, crop_box in enumerate(boxes):
             rows = np.flatnonzero(enough & (candidates.head == head) & (candidates.crop == crop))
             frame = _frame(crop_box, model)
-            masks, changed = _upscale(candidates, rows, frame, crop_box, size_hw, int(level), settings)
+            masks = _upscale(candidates, rows, frame, crop_box, size_hw, int(level))
             keep = suppress_boxes(masks.box_xyxy, masks.predicted_iou, settings.box_nms_iou)
-            per_crop.append((masks.take(keep), changed[keep], np.full(len(keep), layer_of[crop])))
-        masks = HierarchicalMasks.concatenate([part[0] for part in per_crop], size_hw)
-        changed = np.concatenate([part[1] for part in per_crop])
-        layer = np.concatenate([part[2] for part in per_crop])
+            per_crop.append(masks.take(keep))
+            layers.append(np.full(len(keep), layer_of[crop]))
+        masks, layer = HierarchicalMasks.concatenate(per_crop, size_hw), np.concatenate(layers)
         if settings.crop_layers:  # smaller crops saw more detail (SAM)
-            keep = suppress_boxes(masks.box_xyxy, layer + masks.predicted_iou / 2, settings.box_nms_iou)
-            masks, changed = masks.take(keep), changed[keep]
+            masks = masks.take(
+                suppress_boxes(masks.box_xyxy, layer + masks.predicted_iou / 2, settings.box_nms_iou)
+            )
+        # Mending costs most, so it comes after the boxes have thinned the masks out, as in SAM.
+        masks, changed = _mend(masks, settings.min_area_px)
         if changed.any():  # mending moved boxes; masks that needed none are better (SAM)
             keep = suppress_boxes(masks.box_xyxy, ~changed + masks.predicted_iou / 2, settings.box_nms_iou)
             masks = masks.take(keep)
@@ -75,21 +77,15 @@ def _upscale(
     crop_box: Int32[np.ndarray, " 4"],
     size_hw: tuple[int, int],
     level: int,
-    settings: MasksSettings,
-) -> tuple[HierarchicalMasks, Bool[np.ndarray, " m"]]:
-    """Masks of the given candidates in the view, mended, without those cut by the crop's edge.
-
-    Returns:
-        the masks left, and which of them were mended.
-    """
+) -> HierarchicalMasks:
+    """Masks of the given candidates in the view, without empty ones and those cut by the crop's edge."""
     left, top, right, bottom = (int(number) for number in crop_box)
-    parts, mended = [], []
+    parts = []
     for row in rows:
-        inside, changed = remove_small_regions(restore(candidates.logits[row], frame), settings.min_area_px)
-        if inside.sum() < settings.min_area_px:
-            continue
         full = np.zeros((1, *size_hw), dtype=bool)
-        full[0, top:bottom, left:right] = inside
+        full[0, top:bottom, left:right] = restore(candidates.logits[row], frame)
+        if not full.any():
+            continue
         mask = HierarchicalMasks.from_dense(
             full,
             np.array([level], np.uint8),
@@ -98,8 +94,28 @@ def _upscale(
         )
         if not _cut_by_crop(mask.box_xyxy[0], crop_box, size_hw):
             parts.append(mask)
-            mended.append(changed)
-    return HierarchicalMasks.concatenate(parts, size_hw), np.array(mended, dtype=bool)
+    return HierarchicalMasks.concatenate(parts, size_hw)
+
+
+def _mend(masks: HierarchicalMasks, min_area_px: int) -> tuple[HierarchicalMasks, Bool[np.ndarray, " m"]]:
+    """Masks without small holes and islands, those that are small as a whole left out.
+
+    Returns:
+        the masks left, and which of them were changed.
+    """
+    parts, mended = [], []
+    for row in range(len(masks)):
+        inside, changed = remove_small_regions(masks.dense(np.array([row]))[0], min_area_px)
+        if inside.sum() < min_area_px:
+            continue
+        one = slice(row, row + 1)
+        parts.append(
+            HierarchicalMasks.from_dense(
+                inside[None], masks.level[one], masks.predicted_iou[one], masks.stability[one]
+            )
+        )
+        mended.append(changed)
+    return HierarchicalMasks.concatenate(parts, masks.size_hw), np.array(mended, dtype=bool)
 
 
 def _cut_by_crop(
