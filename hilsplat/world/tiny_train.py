@@ -57,7 +57,7 @@ def train_models(
     out: Path,
     cache: Path,
     sam_steps: int = 1700,
-    clip_steps: int = 500,
+    clip_steps: int = 1500,
     seed: int = 0,
     threads: int = 2,
     scenes: int = 400,

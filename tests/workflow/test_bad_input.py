@@ -71,10 +71,15 @@ def test_fewer_than_three_photographs_are_refused(plain: Project, tmp_path: Path
 def test_new_tells_what_it_found_and_adds_the_scene(plain: Project, tmp_path: Path) -> None:
     photos = noise_photos(tmp_path / "photos", 4)
     (photos / "broken.jpg").write_bytes(b"\xff\xd8\xff\xe0 truncated")
-    text = plain.run("hilsplat", "new", "noise", str(photos)).stdout
-    assert "4" in text
-    assert "broken.jpg" in text
-    assert "noise" in (plain.root / "config/scenes.tsv").read_text()
+    sheet = plain.root / "config/scenes.tsv"
+    before = sheet.read_text()
+    refusal = plain.run("hilsplat", "new", "noise", str(photos), check=False)
+    assert refusal.returncode == 1
+    assert "broken.jpg" in refusal.stderr
+    assert sheet.read_text() == before
+    (photos / "broken.jpg").unlink()
+    assert "4 photographs" in plain.run("hilsplat", "new", "noise", str(photos)).stdout
+    assert "photos\tnoise\tphotos" in sheet.read_text()
     assert plain.run("hilsplat", "new", "noise", str(photos), check=False).returncode == 1
 
 
