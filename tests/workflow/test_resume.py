@@ -64,28 +64,29 @@ def test_a_killed_stage_resumes(copy_of_finished: Project, name: str, entries: i
 
 
 def test_one_more_view_costs_one_view(copy_of_finished: Project) -> None:
-    """Masks and CLIP of the views that were there come from the cache when one view is added."""
+    """Masks and CLIP of the views that were there come from the cache when a view is added."""
     from hilsplat.scene.scene import Scene
 
     project = copy_of_finished
-    scene = Scene.load(project.root / SCENE / "scene")
-    for stage in ("masks", "clip"):
-        folder = project.root / SCENE / "default" / stage
-        record = json.loads(folder.with_name(f"{stage}.provenance.json").read_text())
-        view = scene.views("train")[0]
-        cache = project.root / "results/.cache"
-        before = set(cache.rglob("*.npz"))
-        index = json.loads((project.root / SCENE / "scene/index.json").read_text())
-        index["views"][view]["split"] = "test"
-        (project.root / SCENE / "scene/index.json").write_text(json.dumps(index))
-        shutil.rmtree(folder)
-        project.run(*record["command"])  # one view fewer: nothing is computed
-        assert set(cache.rglob("*.npz")) == before
-        index["views"][view]["split"] = "train"
-        index["views"][scene.views("test")[0]]["split"] = "train"
-        (project.root / SCENE / "scene/index.json").write_text(json.dumps(index))
-        if stage == "masks":
-            shutil.rmtree(folder)
-            project.run(*record["command"])  # one view more: one entry more per kind of cache
-            new = set(cache.rglob("*.npz")) - before
-            assert 1 <= len(new) <= 2
+    folder = project.root / SCENE
+    scene = Scene.load(folder / "scene")
+    cache = {stage: project.root / "results/.cache" / stage for stage in ("masks", "clip")}
+
+    def run_with_training_views(views: list[str]) -> dict[str, set[Path]]:
+        index = json.loads((folder / "scene/index.json").read_text())
+        for name, entry in index["views"].items():
+            entry["split"] = "train" if name in views else "test"
+        (folder / "scene/index.json").write_text(json.dumps(index))
+        for stage in cache:
+            shutil.rmtree(folder / "default" / stage)
+            record = json.loads((folder / f"default/{stage}.provenance.json").read_text())
+            project.run(*record["command"])
+        return {stage: set(path.rglob("*.npz")) for stage, path in cache.items()}
+
+    train, added = scene.views("train"), scene.views("test")[0]
+    before = {stage: set(path.rglob("*.npz")) for stage, path in cache.items()}
+    assert run_with_training_views(train[1:]) == before, "one view fewer computed something"
+    after = run_with_training_views([*train, added])
+    for stage in cache:
+        assert before[stage] < after[stage]
+        assert len(after[stage] - before[stage]) == 1, stage
