@@ -45,8 +45,12 @@ if not SCENES:
 CACHE = Path("results/.cache")
 ENVIRONMENT = "../workflow/envs/hilsplat.yaml"
 
+try:
+    CORES = workflow.cores
+except WorkflowError:  # not given, as with --report and --lint, which run no job
+    CORES = 1
 # With at least as many scenes as cores, one thread a job keeps all cores busy.
-THREADS = max(1, (workflow.cores or 1) // min(len(SCENES), workflow.cores or 1))
+THREADS = max(1, CORES // min(len(SCENES), CORES))
 
 
 def any_of(names):

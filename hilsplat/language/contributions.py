@@ -185,7 +185,7 @@ def run_contributions(
     views = scene.views("train")
     gaussians = load_ply(gaussians_ply)
     gaussians_sha256 = sha256_of_file(gaussians_ply)
-    store = ViewCache(cache)
+    store = ViewCache(Path(cache) / "contributions")
     code = code_hash("hilsplat.language.contributions")
     parts: list[dict[str, np.ndarray]] = []
     stacked: list[StackedWeights] = []
@@ -257,7 +257,7 @@ def run_contributions(
                 "kept": kept,
                 "nonzeros": quadratic.nonzeros,
                 "nonzeros of W": everything.nonzeros,
-                "cached views": store.hits,
+                "from_cache": store.hits,
             }
             write_index(
                 folder,
