@@ -9,6 +9,9 @@
 configfile: "config/config.yaml"
 
 
+report: "workflow/report/overview.rst"
+
+
 include: "rules/common.smk"
 
 

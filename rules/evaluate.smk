@@ -41,7 +41,7 @@ rule table:
         tex="results/tables/{table}.tex",
         html=report(
             "results/tables/{table}.html",
-            caption="../workflow/report/{table}.rst",
+            caption="../workflow/report/table.rst",
             category="Tables",
             labels={"table": "{table}"},
         ),
