@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Float32, Int8, Int32, UInt8
 
@@ -15,6 +16,9 @@ from hilsplat.settings import MasksSettings
 LOOSE = 0.1
 """Masks below this predicted IoU or stability, or below a lower threshold of the settings, are not cached."""
 
+BAND_PX = 3
+"""Low-resolution pixels on either side of a mask's edge whose logits are kept (see `flatten_far`)."""
+
 CROP_OVERLAP = 512 / 1500
 """Overlap of the first layer's crops, as a share of the image's shorter side (SAM)."""
 
@@ -24,7 +28,7 @@ class Candidates:
     """K masks as the decoder gave them, before any threshold that a user may want to turn.
 
     Attributes:
-        logits: low-resolution logits in steps of `sam.LOGIT_STEP`.
+        logits: low-resolution logits in steps of `sam.LOGIT_STEP`, flat far from a mask's edge.
         head: row of `HEADS`.
         predicted_iou: as the network gives it, clipped to [0, 1].
         stability: `sam.stability_of`.
@@ -115,6 +119,29 @@ def decode_candidates(
             keep = (scores >= iou_floor) & (stability >= stability_floor) & (steps > 0).any(axis=(1, 2))
             head = np.tile(np.arange(len(HEADS), dtype=np.uint8), len(asked))
             parts.append(
-                (steps[keep], head[keep], scores[keep], stability[keep], np.full(keep.sum(), crop, np.uint8))
+                (
+                    flatten_far(steps[keep]),
+                    head[keep],
+                    scores[keep],
+                    stability[keep],
+                    np.full(keep.sum(), crop, np.uint8),
+                )
             )
     return Candidates(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def flatten_far(logits: Int8[np.ndarray, "K h w"]) -> Int8[np.ndarray, "K h w"]:
+    """Set logits that lie farther than `BAND_PX` from a change of sign to the extreme of their sign.
+
+    The two bilinear resizings up to the view read logits at most three pixels apart, so every pixel
+    of every mask stays what it was; what is left is constant almost everywhere and packs ten times
+    smaller.
+    """
+    extreme = np.iinfo(np.int8).max
+    window = np.ones((2 * BAND_PX + 1, 2 * BAND_PX + 1), np.uint8)
+    flat = np.where(logits > 0, extreme, -extreme).astype(np.int8)
+    for row, mask in enumerate(logits > 0):
+        inside = mask.astype(np.uint8)
+        band = (cv2.dilate(inside, window) > 0) & (cv2.erode(inside, window) == 0)
+        flat[row][band] = logits[row][band]
+    return flat
