@@ -1,6 +1,8 @@
 """The CI configuration from nothing to tables and figures."""
 
 import json
+import shutil
+import sys
 from collections.abc import Callable
 
 import pandas as pd
@@ -67,8 +69,6 @@ def test_one_core_gives_the_same_bytes_as_two(finished: Project, fresh: Callable
 
 def test_no_stage_before_evaluate_needs_the_truth(copy_of_finished: Project) -> None:
     """Without the labels every stage runs again from its own recorded command, to the same bytes."""
-    import shutil
-
     shutil.rmtree(copy_of_finished.root / SCENE / "world" / "truth")
     artifacts = ["scene", "gaussians.ply", *(f"default/{name}" for name in LAST_BEFORE_EVALUATE)]
     artifacts[-1] = "default/language.safetensors"
@@ -82,3 +82,25 @@ def test_no_stage_before_evaluate_needs_the_truth(copy_of_finished: Project) -> 
         copy_of_finished.run(*record["command"])
         after = copy_of_finished.files(path) if path.is_dir() else path.read_bytes()
         assert after == before, name
+
+
+def test_the_report_holds_tables_and_panels(finished: Project) -> None:
+    finished.snakemake("--report", "report.html")
+    text = (finished.root / "report.html").read_text()
+    for name in ("hierarchy.html", "lerf.html", "ablation.html", "panel.png", "registration.png", "fit.png"):
+        assert name in text, name
+
+
+def test_the_paper_configuration_plans_every_stage_of_lerf(fresh: Callable[[], Project]) -> None:
+    project = fresh()
+    for scene in ("figurines", "ramen", "teatime", "waldo_kitchen"):
+        for part in ("images", "sparse/0"):
+            (project.root / "data/lerf_ovs" / scene / part).mkdir(parents=True)
+        (project.root / "data/lerf_ovs" / scene / "images/frame_00001.jpg").write_bytes(b"")
+    command = [sys.executable, "-m", "snakemake", "-n", "--configfile", "config/paper.yaml"]
+    planned = project.run(*command, "--config", "data_root=data").stdout
+    for stage in ("poses", "gaussians", "masks", "tree", "clip", "contributions", "language", "figures"):
+        assert f"rule {stage}:" in planned, stage
+    skipped = project.run(*command, check=False)
+    assert skipped.returncode != 0
+    assert "lerf/figurines is skipped: data_root is not set" in skipped.stdout + skipped.stderr
