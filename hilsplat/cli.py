@@ -127,11 +127,9 @@ def stage(
             )
     except HilsplatError:
         raise
-    except BaseException as error:
-        if not isinstance(error, KeyboardInterrupt | SystemExit | typer.Exit):
-            logging.getLogger("hilsplat").exception("%s failed on %s", name, out)
-            sys.exit(1)
-        raise
+    except Exception:  # a mistake of ours: the traceback belongs into the log
+        logging.getLogger("hilsplat").exception("%s failed on %s", name, out)
+        sys.exit(1)
 
 
 def _section(name: str, text: str) -> Any:

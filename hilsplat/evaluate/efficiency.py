@@ -12,21 +12,10 @@ from pathlib import Path
 
 from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import ArtifactError
+from hilsplat.settings import SECTIONS
 
-STAGE_ORDER = (
-    "world",
-    "poses",
-    "gaussians",
-    "masks",
-    "tree",
-    "clip",
-    "contributions",
-    "semantic_tree",
-    "autoencoder",
-    "language",
-    "evaluate",
-    "figures",
-)
+STAGE_ORDER = tuple(SECTIONS)
+"""Stages in the order of the settings, which is that of the data."""
 
 
 @dataclass(frozen=True)
