@@ -548,7 +548,7 @@ def models_train(
 ) -> None:
     """Train the small SAM and CLIP on training scenes of the synthetic world (about 20 minutes)."""
     start_logging(None)
-    from hilsplat.world.tiny_train import train_models
+    from hilsplat.world.tiny.train import train_models
 
     train_models(out, cache, seed=seed, threads=threads)
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
 from hilsplat.scene.cameras import Camera
-from hilsplat.world.scenes import Style, WorldScene
+from hilsplat.world.scenes.scene import Style, WorldScene
 from hilsplat.world.textures import albedo, hash01
 
 RAYS_PER_PIXEL = 9

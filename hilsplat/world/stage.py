@@ -17,12 +17,12 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.hierarchy import write_hierarchy
 from hilsplat.settings import WorldSettings
-from hilsplat.world.objects import GENERATOR_VERSION
+from hilsplat.world.objects.catalogue import GENERATOR_VERSION
 from hilsplat.world.render import label_view, render_view
-from hilsplat.world.scenes import KINDS, WorldScene, build_scene
+from hilsplat.world.scenes.kinds import KINDS, build_scene, scene_cameras
+from hilsplat.world.scenes.scene import WorldScene
 from hilsplat.world.seeds import TRAINING_SEEDS, split_of_seed
 from hilsplat.world.truth import annotated_nodes, smallest_areas, write_mesh
-from hilsplat.world.views import ring_cameras
 
 logger = logging.getLogger(__name__)
 
@@ -72,7 +72,7 @@ def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> 
         scene = _scene(kind, seed, settings.objects)
         if not scene.placed:
             raise SceneError(f"no object found a place in {source}", fix="take another seed")
-        cameras = ring_cameras(seed, settings.views, settings.image_px, settings.arc_deg)
+        cameras = scene_cameras(scene, settings.views, settings.image_px, settings.arc_deg)
         require_free_space(out, needed_mib=5 + settings.views * settings.image_px**2 * 4 / 2**20)
         smallest = smallest_areas(settings.image_px, settings.min_area_px, settings.min_subpart_area_px)
         labels, annotated = {}, {}
@@ -125,7 +125,7 @@ def _scene(kind: str, seed: int, objects: int) -> WorldScene:
 def _render(kind: str, seed: int, settings: WorldSettings, row: int) -> tuple[np.ndarray, np.ndarray]:
     """Image and labels of one view; top level, so that worker processes can call it."""
     scene = _scene(kind, seed, settings.objects)
-    cameras = ring_cameras(seed, settings.views, settings.image_px, settings.arc_deg)
+    cameras = scene_cameras(scene, settings.views, settings.image_px, settings.arc_deg)
     camera = cameras[cameras.names[row]]
     return render_view(scene, camera, settings.samples), label_view(scene, camera)
 

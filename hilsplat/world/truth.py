@@ -10,7 +10,7 @@ from jaxtyping import Int32
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.hierarchy import AnnotatedNode
-from hilsplat.world.scenes import WorldScene
+from hilsplat.world.scenes.scene import WorldScene
 
 SUBPART_AREA_AT_PX = 384
 """Size of the view for which the smallest area of a subpart is stated."""

@@ -7,10 +7,12 @@ from hilsplat.datasets.hierarchy import AnnotatedNode
 from hilsplat.scene.cameras import Camera
 from hilsplat.world.paints import Paint
 from hilsplat.world.render import depth_view, label_view, render_view
-from hilsplat.world.scenes import Style, WorldScene, build_scene
+from hilsplat.world.scenes.kinds import build_scene
+from hilsplat.world.scenes.scene import Style, WorldScene
+from hilsplat.world.scenes.tabletop import ring_cameras, training_camera
 from hilsplat.world.shapes import Mesh, box, joined, sphere
 from hilsplat.world.textures import albedo
-from hilsplat.world.views import looking_at, pinhole, random_camera, ring_cameras
+from hilsplat.world.views import looking_at, pinhole
 
 GREY = Paint("grey", "mottled", (0.5, 0.5, 0.5), (0.5, 0.5, 0.5), 9.0, 0.0, 10.0, 0.0, (5.0, 6.0, 7.0))
 STONE = Paint("grey", "stone", (0.6, 0.5, 0.4), (0.3, 0.3, 0.3), 8.0, 0.0, 10.0, 0.3, (5.0, 6.0, 7.0))
@@ -57,7 +59,7 @@ def test_image_axes_are_x_right_and_y_down():
     # From +x, looking at the origin, +y is to the right and +z is up.
     things = {0: (0.0, 0.4, 0.0), 1: (0.0, 0.0, 0.4)}
     for index, place in things.items():
-        camera = Camera("a.png", looking_at(np.array([3.0, 0, 0]), np.zeros(3)), pinhole(64), (64, 64))
+        camera = Camera("a.png", looking_at(np.array([3.0, 0, 0]), np.zeros(3)), pinhole(64, 50), (64, 64))
         rows, columns = np.nonzero(label_view(scene_of(sphere(0.1, place)), camera)[0] == 0)
         assert (columns.mean() > 40, rows.mean() < 24) == (index == 0, index == 1)
 
@@ -104,7 +106,7 @@ def test_a_shadow_falls_where_the_light_is_hidden():
     # Light straight above a floating slab: the floor right below is dark, far from it bright.
     scene = scene_of(joined(box((4, 4, 0.1), (0, 0, -0.05)), box((0.6, 0.6, 0.02), (0, 0, 0.8))))
     style = Style(light_position=(0.0, 0.0, 4.0))
-    camera = Camera("a.png", looking_at(np.array([2.0, 0, 0.5]), np.zeros(3)), pinhole(64), (64, 64))
+    camera = Camera("a.png", looking_at(np.array([2.0, 0, 0.5]), np.zeros(3)), pinhole(64, 50), (64, 64))
     image = render_view(scene, camera, 3, style).astype(int)
     seen = (
         camera.cam_from_world[:3, :3] @ np.array([[0.0, 0.0], [0.0, 0.8], [0.0, 0.0]])
@@ -126,7 +128,7 @@ def test_textures_depend_on_the_point_alone_and_vary():
 
 def test_rendering_twice_gives_the_same_bytes_and_the_style_matters():
     scene = build_scene("tabletop", 100, 3)
-    camera = ring_cameras(100, 12, 48, 100.0)["005.png"]
+    camera = ring_cameras(scene, 12, 48, 100.0)["005.png"]
     image = render_view(scene, camera, 2)
     assert np.array_equal(image, render_view(build_scene("tabletop", 100, 3), camera, 2))
     other = render_view(scene, camera, 2, Style.draw(np.random.default_rng(5)))
@@ -134,7 +136,7 @@ def test_rendering_twice_gives_the_same_bytes_and_the_style_matters():
 
 
 def test_ring_cameras_alternate_in_elevation_and_are_nine_degrees_apart():
-    cameras = ring_cameras(100, 40, 256)
+    cameras = ring_cameras(build_scene("tabletop", 100, 1), 40, 256)
     centres = np.stack(_centres(cameras))
     azimuth = np.unwrap(np.arctan2(centres[:, 1], centres[:, 0]))
     # Jitter moves each by at most 1 degree.
@@ -145,7 +147,7 @@ def test_ring_cameras_alternate_in_elevation_and_are_nine_degrees_apart():
 
 
 def test_an_arc_covers_its_azimuth_around_the_front():
-    centres = np.stack(_centres(ring_cameras(100, 12, 128, 100.0)))
+    centres = np.stack(_centres(ring_cameras(build_scene("tabletop", 100, 1), 12, 128, 100.0)))
     azimuth = np.degrees(np.arctan2(centres[:, 1], centres[:, 0]))
     assert azimuth[0] == pytest.approx(-50, abs=1.1) and azimuth[-1] == pytest.approx(50, abs=1.1)
 
@@ -158,5 +160,5 @@ def test_random_cameras_see_objects():
     scene = build_scene("tabletop", 100, 6)
     rng = np.random.default_rng(0)
     for _ in range(10):
-        labels = label_view(scene, random_camera(scene, rng, 48))
+        labels = label_view(scene, training_camera(scene, rng, 48))
         assert (labels[1] >= 0).mean() > 0.03

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from hilsplat.base.errors import SceneError
-from hilsplat.world import scenes
-from hilsplat.world.scenes import TABLE_RADIUS, build_scene
+from hilsplat.world.scenes import tabletop
+from hilsplat.world.scenes.kinds import build_scene
+from hilsplat.world.scenes.tabletop import TABLE_RADIUS
 from hilsplat.world.seeds import SPLITS, require_split, split_of_seed
 
 
@@ -72,7 +73,7 @@ def test_the_room_is_labelled_as_background_wholes():
 
 
 def test_objects_that_find_no_place_are_left_out_and_said(monkeypatch, caplog):
-    monkeypatch.setattr(scenes, "GAP", 5.0)  # wider than the table: a second object has no place
+    monkeypatch.setattr(tabletop, "GAP", 5.0)  # wider than the table: a second object has no place
     scene = build_scene("tabletop", 104, 3)
     assert (scene.asked, len(scene.placed)) == (3, 1)
     assert len([record for record in caplog.records if "no place left" in record.message]) == 2

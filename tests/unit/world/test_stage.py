@@ -11,9 +11,9 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.hierarchy import AnnotatedNode, HierarchyAnnotations
 from hilsplat.scene.cameras import Cameras
 from hilsplat.settings import WorldSettings
-from hilsplat.world.objects import GENERATOR_VERSION
+from hilsplat.world.objects.catalogue import GENERATOR_VERSION
 from hilsplat.world.render import label_view
-from hilsplat.world.scenes import build_scene
+from hilsplat.world.scenes.kinds import build_scene
 from hilsplat.world.sheet import node_colours, show_world, tree_lines
 from hilsplat.world.stage import parse_source, run_world
 from hilsplat.world.truth import annotated_nodes, smallest_areas

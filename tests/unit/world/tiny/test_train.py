@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from hilsplat.world.tiny_clip import contrastive_loss
-from hilsplat.world.tiny_data import RoughMask, collect_crops
-from hilsplat.world.tiny_steps import learning_rate
-from hilsplat.world.tiny_train_clip import crop_weights, train_clip
-from hilsplat.world.tiny_train_sam import (
+from hilsplat.world.tiny.clip import contrastive_loss
+from hilsplat.world.tiny.data import RoughMask, collect_crops
+from hilsplat.world.tiny.steps import learning_rate
+from hilsplat.world.tiny.train_clip import crop_weights, train_clip
+from hilsplat.world.tiny.train_sam import (
     CropStage,
     segment_everything,
     segmentation_loss,
@@ -16,7 +16,7 @@ from hilsplat.world.tiny_train_sam import (
     target_masks,
     train_sam,
 )
-from tests.unit.world.drawn import drawn_views
+from tests.unit.world.tiny.drawn import drawn_views
 
 SMALL = (CropStage(1.0, 64, 4, 8),)
 

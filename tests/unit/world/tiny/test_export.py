@@ -8,9 +8,9 @@ import pytest
 import torch
 from tokenizers import Tokenizer
 
-from hilsplat.world.tiny_clip import CANONICAL, ClipText, ClipVision, word_tokenizer
-from hilsplat.world.tiny_export import export_clip, export_sam
-from hilsplat.world.tiny_sam import SamDecoder, SamEncoder, positional_embeddings
+from hilsplat.world.tiny.clip import CANONICAL, ClipText, ClipVision, word_tokenizer
+from hilsplat.world.tiny.export import export_clip, export_sam
+from hilsplat.world.tiny.sam import SamDecoder, SamEncoder, positional_embeddings
 
 
 def session(path) -> onnxruntime.InferenceSession:

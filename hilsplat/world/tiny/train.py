@@ -11,14 +11,14 @@ from torch import nn
 
 from hilsplat.base.artifacts import atomic_folder, atomic_path, read_json, sha256_of_json, write_json
 from hilsplat.base.progress import stage_log, track
-from hilsplat.world.tiny_card import write_clip_card, write_sam_card
-from hilsplat.world.tiny_data import LabelledViews, RoughMask, collect_crops
-from hilsplat.world.tiny_export import export_clip, export_sam
-from hilsplat.world.tiny_render import generator_digest, render_training_views, training_seeds
-from hilsplat.world.tiny_sam import SamDecoder, SamEncoder
-from hilsplat.world.tiny_steps import Curve
-from hilsplat.world.tiny_train_clip import measure_clip, train_clip
-from hilsplat.world.tiny_train_sam import measure_sam, segment_everything, train_sam
+from hilsplat.world.tiny.card import write_clip_card, write_sam_card
+from hilsplat.world.tiny.data import LabelledViews, RoughMask, collect_crops
+from hilsplat.world.tiny.export import export_clip, export_sam
+from hilsplat.world.tiny.render import generator_digest, render_training_views, training_seeds
+from hilsplat.world.tiny.sam import SamDecoder, SamEncoder
+from hilsplat.world.tiny.steps import Curve
+from hilsplat.world.tiny.train_clip import measure_clip, train_clip
+from hilsplat.world.tiny.train_sam import measure_sam, segment_everything, train_sam
 
 logger = logging.getLogger(__name__)
 

@@ -11,10 +11,10 @@ from PIL import Image
 from hilsplat.base.artifacts import sha256_of_file, write_json, write_text
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS
-from hilsplat.world.tiny_data import HEAD_LEVELS, LabelledViews, nested_targets
-from hilsplat.world.tiny_sam import SamDecoder, SamEncoder
-from hilsplat.world.tiny_steps import Curve
-from hilsplat.world.tiny_train_sam import predict_masks
+from hilsplat.world.tiny.data import HEAD_LEVELS, LabelledViews, nested_targets
+from hilsplat.world.tiny.sam import SamDecoder, SamEncoder
+from hilsplat.world.tiny.steps import Curve
+from hilsplat.world.tiny.train_sam import predict_masks
 
 RECORD = "training.json"
 CARD = "README.md"

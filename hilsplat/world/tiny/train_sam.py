@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.world.tiny_data import (
+from hilsplat.world.tiny.data import (
     HEAD_LEVELS,
     LabelledViews,
     RoughMask,
@@ -22,7 +22,7 @@ from hilsplat.world.tiny_data import (
     recolour,
     region_centres,
 )
-from hilsplat.world.tiny_sam import (
+from hilsplat.world.tiny.sam import (
     FINE,
     HEADS,
     MASK_STRIDE,
@@ -33,7 +33,7 @@ from hilsplat.world.tiny_sam import (
     SamEncoder,
     positional_embeddings,
 )
-from hilsplat.world.tiny_steps import Curve, learning_rate, prefetched
+from hilsplat.world.tiny.steps import Curve, learning_rate, prefetched
 
 SEMANTIC_PIXELS = 4096
 """Pixels per batch that the auxiliary classifier is trained on."""

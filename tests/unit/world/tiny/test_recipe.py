@@ -6,9 +6,9 @@ import pytest
 from hilsplat.base.artifacts import read_json
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.hierarchy import AnnotatedNode
-from hilsplat.world.tiny_card import RECORD, digests
-from hilsplat.world.tiny_render import phrases_of, scene_of_seed, training_seeds
-from hilsplat.world.tiny_train import train_models
+from hilsplat.world.tiny.card import RECORD, digests
+from hilsplat.world.tiny.render import phrases_of, scene_of_seed, training_seeds
+from hilsplat.world.tiny.train import train_models
 
 
 def test_only_training_scenes_are_rendered_for_training():

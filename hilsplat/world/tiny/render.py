@@ -15,13 +15,13 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.base.progress import track
 from hilsplat.datasets.hierarchy import AnnotatedNode
-from hilsplat.world.objects import GENERATOR_VERSION
+from hilsplat.world.objects.catalogue import GENERATOR_VERSION
 from hilsplat.world.render import label_view, render_view
-from hilsplat.world.scenes import WorldScene, build_scene
+from hilsplat.world.scenes.kinds import build_scene, scene_cameras, training_camera
+from hilsplat.world.scenes.scene import WorldScene
 from hilsplat.world.seeds import TRAINING_SEEDS, require_split
-from hilsplat.world.tiny_data import LabelledNode, LabelledViews
-from hilsplat.world.tiny_sam import FRAME_PX
-from hilsplat.world.views import random_camera, ring_cameras
+from hilsplat.world.tiny.data import LabelledNode, LabelledViews
+from hilsplat.world.tiny.sam import FRAME_PX
 
 logger = logging.getLogger(__name__)
 
@@ -69,11 +69,11 @@ def render_training_scene(seed: int, views: int, path: Path) -> None:
     """
     scene = scene_of_seed(seed)
     rng = np.random.default_rng((seed, 12))
-    ring = ring_cameras(seed, 40, FRAME_PX)
+    ring = scene_cameras(scene, 40, FRAME_PX, 360)
     images, labels = [], []
     for view in range(views):
         ringed = view % 2 == 0
-        camera = ring[str(rng.choice(ring.names))] if ringed else random_camera(scene, rng, FRAME_PX)
+        camera = ring[str(rng.choice(ring.names))] if ringed else training_camera(scene, rng, FRAME_PX)
         images.append(render_view(scene, camera, SAMPLES))
         labels.append(label_view(scene, camera).astype(np.int16))
     nodes = json.dumps([asdict(node) for node in phrases_of(scene.nodes)]).encode()
@@ -90,7 +90,7 @@ def generator_digest() -> str:
     parts = []
     for seed in (TRAINING_SEEDS.start, TRAINING_SEEDS.stop - 1):
         scene = scene_of_seed(seed)
-        camera = random_camera(scene, np.random.default_rng((seed, 13)), 96)
+        camera = training_camera(scene, np.random.default_rng((seed, 13)), 96)
         nodes = json.dumps([asdict(node) for node in phrases_of(scene.nodes)])
         parts += [
             render_view(scene, camera, 1).tobytes(),

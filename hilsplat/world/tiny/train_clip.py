@@ -9,9 +9,9 @@ from tokenizers import Tokenizer
 from torch import Tensor, nn
 
 from hilsplat.base.levels import LEVELS
-from hilsplat.world.tiny_clip import CANONICAL, ClipText, ClipVision, contrastive_loss, word_tokenizer
-from hilsplat.world.tiny_data import FRAMES, GENERIC_FRAMES, CaptionedCrops, Captioner, normalised
-from hilsplat.world.tiny_steps import Curve, learning_rate, prefetched
+from hilsplat.world.tiny.clip import CANONICAL, ClipText, ClipVision, contrastive_loss, word_tokenizer
+from hilsplat.world.tiny.data import FRAMES, GENERIC_FRAMES, CaptionedCrops, Captioner, normalised
+from hilsplat.world.tiny.steps import Curve, learning_rate, prefetched
 
 
 def tokenised(tokenizer: Tokenizer, texts: Sequence[str]) -> tuple[Tensor, Tensor]:

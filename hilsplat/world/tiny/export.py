@@ -12,8 +12,8 @@ from tokenizers import Tokenizer
 from torch import Tensor, nn
 
 from hilsplat.base.artifacts import atomic_path, write_json
-from hilsplat.world.tiny_clip import CROP_PX, DIMENSIONS, ClipText, ClipVision
-from hilsplat.world.tiny_sam import (
+from hilsplat.world.tiny.clip import CROP_PX, DIMENSIONS, ClipText, ClipVision
+from hilsplat.world.tiny.sam import (
     FRAME_PX,
     MASK_STRIDE,
     STRIDE,

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hilsplat.world.tiny_clip import CANONICAL
-from hilsplat.world.tiny_data import (
+from hilsplat.world.tiny.clip import CANONICAL
+from hilsplat.world.tiny.data import (
     Captioner,
     RoughMask,
     best_node,
@@ -15,7 +15,7 @@ from hilsplat.world.tiny_data import (
     region_centres,
     roughen,
 )
-from tests.unit.world.drawn import drawn_views
+from tests.unit.world.tiny.drawn import drawn_views
 
 
 def test_a_missing_subpart_is_its_part_and_a_missing_part_its_whole():

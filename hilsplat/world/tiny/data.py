@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float32, Int64, Shaped, UInt8
 
 from hilsplat.base.crops import square_crop
 from hilsplat.base.levels import LEVELS, NONE, Level
-from hilsplat.world.tiny_clip import CANONICAL, CROP_PX
-from hilsplat.world.tiny_export import MEAN, STD
-from hilsplat.world.tiny_sam import HEADS, UNIT_PX
+from hilsplat.world.tiny.clip import CANONICAL, CROP_PX
+from hilsplat.world.tiny.export import MEAN, STD
+from hilsplat.world.tiny.sam import HEADS, UNIT_PX
 
 HEAD_LEVELS = (Level.SUBPART, Level.PART, Level.WHOLE)
 """Level of each output head."""

@@ -8,15 +8,14 @@ import pytest
 from tokenizers import Tokenizer
 
 from hilsplat.base.artifacts import read_json
-from hilsplat.world.objects import GENERATOR_VERSION
+from hilsplat.world.objects.catalogue import GENERATOR_VERSION
 from hilsplat.world.render import render_view
-from hilsplat.world.scenes import build_scene
+from hilsplat.world.scenes.kinds import build_scene, scene_cameras
 from hilsplat.world.seeds import TRAINING_SEEDS
-from hilsplat.world.tiny_card import CARD, RECORD, digests
-from hilsplat.world.tiny_data import normalised
-from hilsplat.world.views import ring_cameras
+from hilsplat.world.tiny.card import CARD, RECORD, digests
+from hilsplat.world.tiny.data import normalised
 
-MODELS = Path(__file__).resolve().parents[3] / "models"
+MODELS = Path(__file__).resolve().parents[4] / "models"
 NAMES = ("sam-tiny", "clip-tiny")
 
 
@@ -51,8 +50,9 @@ def test_the_committed_segmenter_loads_and_predicts_from_fine_to_coarse():
         str(folder / "prompt_encoder_mask_decoder.onnx"), providers=providers
     )
     seed = read_json(MODELS / "sam-tiny" / RECORD)["recipe"]["validation_seeds"][0]
-    camera = ring_cameras(seed, 8, 256)
-    image = render_view(build_scene("tabletop", seed, 6), camera[camera.names[0]], 1)
+    scene = build_scene("tabletop", seed, 6)
+    camera = scene_cameras(scene, 8, 256, 360)
+    image = render_view(scene, camera[camera.names[0]], 1)
     pixels = normalised(image[None])
     embeddings, positional = vision.run(None, {"pixel_values": pixels})
     steps = (np.arange(8, dtype=np.float32) + 0.5) * 32

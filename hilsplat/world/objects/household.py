@@ -1,0 +1,297 @@
+"""Things of a household, in small: one function draws one class of object."""
+
+import numpy as np
+
+from hilsplat.world.objects.builder import Builder, Maker
+from hilsplat.world.shapes import box, cylinder, ellipsoid, lathe, sphere, sweep
+
+
+def _chair(b: Builder) -> None:
+    wood, cloth, accent = b.paints.draw("wood"), b.paints.draw("cloth"), b.paints.draw("plain")
+    w, seat_z, top = b.between(0.50, 0.60), b.between(0.42, 0.50), b.between(1.0, 1.15)
+    seat = b.part("seat")
+    b.put(seat, wood, box((w, w, 0.07), (0, 0, seat_z), 0.015))
+    cushion = b.subpart(seat, "cushion", "pillow")
+    b.put(cushion, cloth, box((w * 0.86, w * 0.86, 0.11), (0.01, 0, seat_z + 0.085), 0.04))
+    back = b.part("back", "backrest")
+    for side in (-1, 1):
+        b.put(
+            back,
+            wood,
+            box(
+                (0.075, 0.085, top - seat_z),
+                (-w / 2 + 0.04, side * (w / 2 - 0.045), (top + seat_z) / 2),
+                0.015,
+            ),
+        )
+    rail = b.subpart(back, "top rail", "headrest")
+    b.put(rail, accent, box((0.09, w + 0.04, 0.17), (-w / 2 + 0.04, 0, top - 0.05), 0.03))
+    slats = b.subpart(back, "slats", "bars")
+    slat_paint = b.paints.draw("plain")
+    low, high = seat_z + 0.06, top - 0.14
+    for i in range(3):
+        b.put(
+            slats,
+            slat_paint,
+            box((0.05, 0.10, high - low), (-w / 2 + 0.04, (i - 1) * w * 0.26, (low + high) / 2), 0.01),
+        )
+    for x in (-1, 1):
+        for y in (-1, 1):
+            leg = b.part("leg")
+            px, py = x * (w / 2 - 0.05), y * (w / 2 - 0.05)
+            b.put(leg, wood, box((0.09, 0.09, seat_z - 0.13), (px, py, (seat_z + 0.07) / 2), 0.012))
+            foot = b.subpart(leg, "foot", "leg tip")
+            b.put(foot, accent, box((0.115, 0.115, 0.13), (px, py, 0.065), 0.02))
+
+
+def _cabinet(b: Builder) -> None:
+    wood, front, metal = b.paints.draw("wood"), b.paints.draw("plain"), b.paints.draw("metal")
+    d, w, h = b.between(0.42, 0.5), b.between(0.62, 0.75), b.between(0.75, 0.9)
+    body = b.part("body", "case", "frame")
+    b.put(body, wood, box((d, w, h - 0.1), (0, 0, h / 2 + 0.05), 0.012))
+    b.put(
+        body,
+        wood,
+        *[
+            box((0.09, 0.09, 0.12), (x * (d / 2 - 0.06), y * (w / 2 - 0.06), 0.05))
+            for x in (-1, 1)
+            for y in (-1, 1)
+        ],
+    )
+    top = b.subpart(body, "top", "board")
+    b.put(top, b.paints.draw("stone"), box((d + 0.08, w + 0.08, 0.08), (0, 0, h + 0.03), 0.02))
+    x, split = d / 2, h * 0.66
+    for side in (-1, 1):
+        door = b.part("door")
+        door_w, door_h = w / 2 - 0.05, split - 0.17
+        y, z = side * (w / 4 - 0.003), 0.13 + door_h / 2
+        b.put(door, front, box((0.05, door_w, door_h), (x + 0.02, y, z), 0.012))
+        panel = b.subpart(door, "panel", "inlay")
+        b.put(
+            panel,
+            b.paints.draw("cloth"),
+            box((0.05, door_w * 0.52, door_h * 0.66), (x + 0.04, y + side * door_w * 0.13, z), 0.015),
+        )
+        knob = b.subpart(door, "knob", "doorknob")
+        b.put(knob, metal, sphere(0.062, (x + 0.08, y - side * door_w * 0.34, z)))
+    drawer = b.part("drawer")
+    z = (split + h) / 2 - 0.01
+    b.put(drawer, b.paints.draw("plain"), box((0.05, w - 0.09, h - split - 0.07), (x + 0.02, 0, z), 0.012))
+    pull = b.subpart(drawer, "handle", "pull")
+    b.put(pull, metal, box((0.07, w * 0.40, 0.085), (x + 0.075, 0, z), 0.025))
+
+
+def _lamp(b: Builder) -> None:
+    metal, cloth, accent = b.paints.draw("metal"), b.paints.draw("cloth"), b.paints.draw("ceramic")
+    h, shade_r = b.between(0.95, 1.15), b.between(0.32, 0.40)
+    base = b.part("base", "foot")
+    b.put(base, accent, lathe([(0, 0), (0.28, 0), (0.28, 0.07), (0.20, 0.13), (0, 0.14)]))
+    button = b.subpart(base, "button", "switch")
+    b.put(button, b.paints.draw("plastic"), ellipsoid((0.075, 0.085, 0.06), (0.215, 0, 0.12)))
+    pole = b.part("pole", "stem")
+    b.put(pole, metal, cylinder(0.055, 0.1, h - 0.22))
+    ball = b.subpart(pole, "ball", "joint")
+    b.put(ball, b.paints.draw("ceramic"), sphere(b.between(0.115, 0.14), (0, 0, 0.34)))
+    shade = b.part("shade", "lampshade")
+    low, upper = h - 0.46, shade_r * b.between(0.55, 0.7)
+
+    def radius(z: float) -> float:
+        return shade_r + (upper - shade_r) * (z - low) / 0.46
+
+    b.put(
+        shade,
+        cloth,
+        lathe([(shade_r, low), (upper, h), (upper - 0.03, h), (shade_r - 0.03, low), (shade_r, low)]),
+    )
+    trim = b.paints.draw("cloth")
+    lower_band = b.subpart(shade, "border", "trim")
+    b.put(
+        lower_band,
+        trim,
+        lathe(
+            [
+                (shade_r - 0.035, low - 0.01),
+                (shade_r + 0.022, low - 0.01),
+                (radius(low + 0.115) + 0.022, low + 0.115),
+                (radius(low + 0.115), low + 0.12),
+            ]
+        ),
+    )
+    bulb = b.subpart(shade, "finial", "top knob")
+    b.put(
+        bulb,
+        accent,
+        lathe([(0, h - 0.03), (upper - 0.01, h - 0.03), (0.06, h + 0.01), (0.075, h + 0.07), (0, h + 0.12)]),
+    )
+
+
+def _shelf(b: Builder) -> None:
+    wood, back = b.paints.draw("wood"), b.paints.draw("plain")
+    d, w, h = b.between(0.32, 0.38), b.between(0.66, 0.8), b.between(0.85, 1.0)
+    frame = b.part("frame", "case")
+    for side in (-1, 1):
+        b.put(frame, wood, box((d, 0.06, h), (0, side * (w / 2 - 0.03), h / 2), 0.012))
+    back_wall = b.subpart(frame, "back wall", "backboard")
+    b.put(back_wall, back, box((0.04, w - 0.12, h - 0.04), (-d / 2 + 0.02, 0, h / 2)))
+    boards = b.subpart(frame, "boards", "planks")
+    board_paint = b.paints.draw("wood")
+    for z in (0.05, h * 0.5, h - 0.035):
+        b.put(boards, board_paint, box((d + 0.03, w - 0.11, 0.07), (0.015, 0, z), 0.012))
+    books = b.part("books", "row of books")
+    y, bottom = -w / 2 + 0.08, h * 0.5 + 0.035
+    while y < 0.04:
+        thick, tall = b.between(0.085, 0.12), b.between(0.27, 0.34)
+        book = b.subpart(books, "book")
+        b.put(
+            book,
+            b.paints.draw("cloth"),
+            box((d * b.between(0.72, 0.9), thick, tall), (0.02, y + thick / 2, bottom + tall / 2), 0.01),
+        )
+        y += thick + 0.006
+    vase = b.part("vase", "pot")
+    vy, vz = w / 2 - 0.18, bottom
+    b.put(
+        vase,
+        b.paints.draw("ceramic"),
+        lathe([(0, 0), (0.07, 0), (0.12, 0.10), (0.10, 0.20), (0.05, 0.25)]).moved(0.03, vy, vz),
+    )
+    b.put(
+        b.subpart(vase, "rim", "mouth"),
+        b.paints.draw("ceramic"),
+        lathe([(0.05, 0.22), (0.095, 0.29), (0.08, 0.31), (0, 0.28)]).moved(0.03, vy, vz),
+    )
+    crate = b.part("box", "basket")
+    crate_w = w * 0.52
+    cy = b.between(-0.06, 0.06)
+    b.put(
+        crate, b.paints.draw("cloth"), box((d * 0.85, crate_w, h * 0.30), (0.03, cy, 0.085 + h * 0.15), 0.015)
+    )
+    b.put(
+        b.subpart(crate, "label", "tag"),
+        b.paints.draw("plain"),
+        box((0.03, crate_w * 0.5, h * 0.14), (0.03 + d * 0.425, cy, 0.085 + h * 0.15), 0.008),
+    )
+
+
+def _plant(b: Builder) -> None:
+    clay, rim_paint = b.paints.draw("ceramic"), b.paints.draw("ceramic")
+    leaf, stem_paint, petal = (
+        b.paints.draw("plain", "green", "teal"),
+        b.paints.draw("wood", "brown"),
+        b.paints.draw("plain", "red", "pink", "yellow", "purple", "orange", "white", "blue"),
+    )
+    r, h = b.between(0.24, 0.30), b.between(0.30, 0.38)
+    pot = b.part("pot", "flowerpot")
+    b.put(pot, clay, lathe([(0, 0), (r * 0.72, 0), (r, h)]))
+    rim = b.subpart(pot, "rim", "edge")
+    b.put(
+        rim,
+        rim_paint,
+        lathe([(r, h - 0.10), (r + 0.05, h - 0.09), (r + 0.05, h), (r - 0.03, h), (r - 0.04, h - 0.05)]),
+    )
+    soil = b.subpart(pot, "soil", "earth")
+    b.put(
+        soil,
+        b.paints.draw("stone", "brown", "black"),
+        lathe([(r - 0.02, h - 0.04), (r * 0.5, h - 0.015), (0, h)]),
+    )
+    stem = b.part("stem", "trunk")
+    top = h + b.between(0.26, 0.34)
+    b.put(
+        stem,
+        stem_paint,
+        sweep([(0, 0, h - 0.05), (0.02, 0.02, (h + top) / 2), (0, 0, top + 0.05)], [0.06, 0.05, 0.05]),
+    )
+    b.put(
+        b.subpart(stem, "ring", "ribbon"),
+        b.paints.draw("cloth"),
+        lathe([(0.05, -0.065), (0.095, -0.05), (0.095, 0.05), (0.05, 0.065)]).moved(0.01, 0.01, h + 0.11),
+    )
+    crown = b.part("crown", "leaves", "foliage")
+    size = b.between(0.26, 0.31)
+    b.put(crown, leaf, ellipsoid((size, size, size * 0.92), (0, 0, top + size * 0.7)))
+    for i in range(5):
+        a = 2 * np.pi * i / 5 + b.between(0, 0.8)
+        b.put(
+            crown,
+            leaf,
+            sphere(
+                size * 0.52,
+                (size * 0.72 * np.cos(a), size * 0.72 * np.sin(a), top + size * b.between(0.35, 0.75)),
+            ),
+        )
+    for i in range(5):
+        a, up = 2 * np.pi * i / 5 + b.between(0, 0.5), b.between(0.15, 1.0)
+        flat = size * 1.1 * np.cos(up)
+        flower = b.subpart(crown, "flower", "blossom")
+        place = (flat * np.cos(a), flat * np.sin(a), top + size * 0.75 + size * np.sin(up) * 0.95)
+        b.put(flower, petal, sphere(0.085, place, 16))
+
+
+def _clock(b: Builder) -> None:
+    case_paint, face_paint = (
+        b.paints.draw("plastic"),
+        b.paints.draw("plain", "white", "beige", "yellow", "pink"),
+    )
+    dark, accent, metal = (
+        b.paints.draw("plastic", "black", "blue", "red", "purple"),
+        b.paints.draw("plastic"),
+        b.paints.draw("metal"),
+    )
+    r, depth = b.between(0.36, 0.42), b.between(0.22, 0.28)
+    z = r + 0.13
+    case = b.part("case", "body", "housing")
+    b.put(case, case_paint, cylinder(r, -depth / 2, depth / 2 - 0.02, 36, 0.03).turned("y", 90).moved(z=z))
+    frame = b.subpart(case, "frame", "ring")
+    ring = lathe(
+        [(r + 0.01, -0.01), (r + 0.03, 0.0), (r + 0.03, 0.06), (r - 0.07, 0.07), (r - 0.08, 0.0)], 36
+    )
+    b.put(frame, accent, ring.turned("y", 90).moved(depth / 2 - 0.03, 0, z))
+    feet = b.subpart(case, "feet", "stand")
+    for side in (-1, 1):
+        b.put(
+            feet,
+            metal,
+            sweep([(0, side * r * 0.55, z - r * 0.72), (0, side * r * 0.72, 0.05)], [0.06, 0.085]),
+        )
+    key = b.subpart(case, "key", "winder")
+    b.put(
+        key,
+        metal,
+        box((0.10, 0.24, 0.11), (-depth / 2 - 0.07, 0, z), 0.03),
+        cylinder(0.05, 0, 0.06).turned("y", -90).moved(-depth / 2, 0, z),
+    )
+    face = b.part("face", "dial")
+    x = depth / 2 - 0.015
+    b.put(face, face_paint, cylinder(r - 0.07, 0, 0.03, 36).turned("y", 90).moved(x - 0.02, 0, z))
+    marks = b.subpart(face, "hour marks", "numbers")
+    for i in range(4):
+        b.put(marks, dark, box((0.03, 0.075, 0.13), (x + 0.015, 0, r - 0.16)).turned("x", 90 * i).moved(z=z))
+    hands = b.subpart(face, "hands", "pointers")
+    for angle, length, width in ((b.between(0, 360), 0.56, 0.07), (b.between(0, 360), 0.36, 0.09)):
+        b.put(
+            hands,
+            accent,
+            box((0.03, width, r * length), (x + 0.045, 0, r * length / 2 - 0.03), 0.01)
+            .turned("x", angle)
+            .moved(z=z),
+        )
+    b.put(hands, accent, cylinder(0.07, 0, 0.05, 16, 0.01).turned("y", 90).moved(x + 0.02, 0, z))
+    for side in (-1, 1):
+        bell = b.part("bell", "alarm bell")
+        place = (0, side * r * 0.62, z + r * 0.86)
+        dome = lathe([(0, 0), (0.19, 0), (0.175, 0.09), (0.10, 0.16), (0, 0.18)]).turned("x", -side * 32)
+        b.put(bell, metal, dome.moved(*place))
+        top = np.array(place) + np.array([0, side * np.sin(np.radians(32)), np.cos(np.radians(32))]) * 0.19
+        b.put(b.subpart(bell, "knob", "button"), dark, sphere(0.062, tuple(top)))
+
+
+MAKERS: dict[str, Maker] = {
+    "chair": Maker(_chair, ("dining chair", "side chair")),
+    "cabinet": Maker(_cabinet, ("cupboard", "sideboard")),
+    "lamp": Maker(_lamp, ("table lamp", "light")),
+    "shelf": Maker(_shelf, ("bookshelf", "bookcase")),
+    "plant": Maker(_plant, ("potted plant", "flower plant")),
+    "clock": Maker(_clock, ("alarm clock", "timepiece")),
+}
+"""Classes that this file draws."""

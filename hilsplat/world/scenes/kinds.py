@@ -1,0 +1,67 @@
+"""The kinds of scene that the synthetic world knows: how each is built and seen."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from hilsplat.base.errors import SceneError
+from hilsplat.scene.cameras import Camera, Cameras
+from hilsplat.world.scenes import tabletop
+from hilsplat.world.scenes.scene import WorldScene
+
+
+class SceneKind(NamedTuple):
+    """What a kind of scene is.
+
+    Attributes:
+        build: the scene of a seed with a number of objects.
+        cameras: views of a scene, (scene, views, image_px, arc_deg); neighbours are near enough for
+            structure from motion.
+        training_camera: a random camera for the small models, (scene, random, image_px).
+    """
+
+    build: Callable[[int, int], WorldScene]
+    cameras: Callable[[WorldScene, int, int, float | int], Cameras]
+    training_camera: Callable[[WorldScene, np.random.Generator, int], Camera]
+
+
+KINDS: dict[str, SceneKind] = {
+    "tabletop": SceneKind(tabletop.build_tabletop, tabletop.ring_cameras, tabletop.training_camera),
+}
+"""By the word that names the kind in the scene sheet."""
+
+
+def build_scene(kind: str, seed: int, objects: int) -> WorldScene:
+    """Build a scene.
+
+    Args:
+        kind: one of `KINDS`.
+        seed: not negative; same seed and number of objects, same scene.
+        objects: how many to place.
+
+    Raises:
+        SceneError: the kind is unknown, or a number is out of range.
+    """
+    if kind not in KINDS:
+        raise SceneError(
+            f"unknown kind of synthetic scene {kind!r}",
+            expected=f"one of: {', '.join(KINDS)}",
+            fix="name a known kind in the scene sheet, as in world:tabletop:201",
+        )
+    if seed < 0 or objects < 1:
+        raise SceneError(
+            "a synthetic scene needs a seed of at least 0 and at least one object",
+            found=f"seed {seed}, {objects} objects",
+        )
+    return KINDS[kind].build(seed, objects)
+
+
+def scene_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int) -> Cameras:
+    """The views of a scene that its stage renders."""
+    return KINDS[scene.kind].cameras(scene, views, image_px, arc_deg)
+
+
+def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int) -> Camera:
+    """A random view of a training scene."""
+    return KINDS[scene.kind].training_camera(scene, rng, image_px)

@@ -1,0 +1,197 @@
+"""A scene of the synthetic world: triangles, each of which knows what it belongs to."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Float32, Int32
+
+from hilsplat.base.levels import NONE
+from hilsplat.datasets.hierarchy import AnnotatedNode
+from hilsplat.world.objects.builder import ObjectModel
+from hilsplat.world.paints import Paint
+from hilsplat.world.shapes import Mesh, rotation_about
+
+
+@dataclass(frozen=True)
+class Style:
+    """Light and colour of a rendering.
+
+    Attributes:
+        light_position: centre of the round area light, scene units.
+        light_radius: its radius, scene units.
+        light_colour: linear RGB of its light on a surface that faces it.
+        sky_colour: linear RGB of the light from above.
+        ground_colour: linear RGB of the light from below.
+        exposure: factor on everything.
+    """
+
+    light_position: tuple[float, float, float] = (1.3, 1.0, 3.6)
+    light_radius: float = 0.45
+    light_colour: tuple[float, float, float] = (1.0, 0.96, 0.88)
+    sky_colour: tuple[float, float, float] = (0.42, 0.46, 0.52)
+    ground_colour: tuple[float, float, float] = (0.24, 0.21, 0.18)
+    exposure: float = 1.15
+
+    @staticmethod
+    def draw(rng: np.random.Generator) -> "Style":
+        """A random style."""
+        azimuth, away = rng.uniform(0, 2 * np.pi), rng.uniform(0.8, 2.2)
+        warm = rng.uniform(-1, 1)
+        light = np.array([1.0 + 0.06 * warm, 0.97, 0.92 - 0.12 * warm]) * rng.uniform(0.85, 1.15)
+        sky = np.array([0.44 - 0.05 * warm, 0.46, 0.50 + 0.05 * warm]) * rng.uniform(0.8, 1.15)
+        return Style(
+            (float(away * np.cos(azimuth)), float(away * np.sin(azimuth)), float(rng.uniform(3.2, 4.2))),
+            float(rng.uniform(0.3, 0.6)),
+            tuple(light.tolist()),
+            tuple(sky.tolist()),
+            tuple((sky * np.array([0.58, 0.5, 0.42])).tolist()),
+            float(rng.uniform(1.0, 1.3)),
+        )
+
+
+@dataclass(frozen=True)
+class PlacedObject:
+    """Where an object stands.
+
+    Attributes:
+        name: its class.
+        node: id of its whole among the nodes of the scene.
+        centre_xy: middle of its footprint, scene units.
+        footprint: radius of the circle that holds it from above, scene units.
+        height: scene units.
+        yaw_deg: turn about the vertical axis; its front faces +x at 0.
+        base_z: height of what it stands on, scene units.
+    """
+
+    name: str
+    node: int
+    centre_xy: tuple[float, float]
+    footprint: float
+    height: float
+    yaw_deg: float
+    base_z: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class WorldScene:
+    """A scene as triangles, each of which knows what it belongs to. z is up.
+
+    Attributes:
+        kind: what sort of scene.
+        seed: everything random in it follows from this and from the number of objects.
+        asked: number of objects asked for.
+        placed: the objects that found a place.
+        triangles: corner positions, scene units.
+        normals: shading normals at the corners.
+        coords: object coordinates of the corners, scene units; solid textures live in them.
+        node_ids: nodes that each triangle belongs to (whole, part, subpart; -1 none).
+        material_ids: row of `materials` of each triangle.
+        materials: numbers for the shader, `Paint.row`.
+        nodes: all nodes by id. Those of the surroundings (table, floor, wall) are wholes without parts.
+        background: ids of the surroundings. They are labelled but never scored: large easy regions
+            would lift every mean.
+        style: light of this scene.
+    """
+
+    kind: str
+    seed: int
+    asked: int
+    placed: tuple[PlacedObject, ...]
+    triangles: Float32[np.ndarray, "F 3 3"]
+    normals: Float32[np.ndarray, "F 3 3"]
+    coords: Float32[np.ndarray, "F 3 3"]
+    node_ids: Int32[np.ndarray, "F 3"]
+    material_ids: Int32[np.ndarray, " F"]
+    materials: Float32[np.ndarray, "M 14"]
+    nodes: tuple[AnnotatedNode, ...]
+    background: frozenset[int]
+    style: Style
+
+    @cached_property
+    def embree(self) -> object:
+        """Ray-casting structure, built on first use."""
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        scene = EmbreeScene()
+        TriangleMesh(scene, self.triangles)
+        return scene
+
+
+class Assembly:
+    """Collects triangles, materials and nodes of a scene while it is built."""
+
+    def __init__(self) -> None:
+        self.triangles: list[np.ndarray] = []
+        self.normals: list[np.ndarray] = []
+        self.coords: list[np.ndarray] = []
+        self.node_ids: list[np.ndarray] = []
+        self.material_ids: list[np.ndarray] = []
+        self.materials: list[np.ndarray] = []
+        self.nodes: list[AnnotatedNode] = []
+
+    def add_object(
+        self, model: ObjectModel, scale: float, xy: np.ndarray, yaw_deg: float, base_z: float = 0.0
+    ) -> int:
+        """Add an object, scaled, turned, then moved; returns the id of its whole."""
+        first, materials = len(self.nodes), sum(len(rows) for rows in self.materials)
+        for row, node in enumerate(model.nodes):
+            parent = NONE if node.parent == NONE else first + node.parent
+            self.nodes.append(AnnotatedNode(first + row, node.level, parent, node.text, node.synonyms))
+        rotation = rotation_about("z", yaw_deg)
+        local = model.triangles * scale
+        self.coords.append(local)
+        self.triangles.append(local @ rotation.T + np.array([xy[0], xy[1], base_z]))
+        self.normals.append(model.normals @ rotation.T)
+        self.node_ids.append(np.where(model.node_ids == NONE, NONE, model.node_ids + first))
+        self.material_ids.append(model.material_ids + materials)
+        self.materials.append(model.materials)
+        return first
+
+    def add_surroundings(self, text: str, synonyms: tuple[str, ...], pieces: list[tuple[Mesh, Paint]]) -> int:
+        """Add a whole without parts, such as the floor; returns its node id."""
+        node = len(self.nodes)
+        self.nodes.append(AnnotatedNode(node, 1, NONE, text, synonyms))
+        for mesh, paint in pieces:
+            self.coords.append(mesh.triangles)
+            self.triangles.append(mesh.triangles)
+            self.normals.append(mesh.normals)
+            self.node_ids.append(np.tile(np.int32([node, NONE, NONE]), (len(mesh), 1)))
+            self.material_ids.append(np.full(len(mesh), sum(len(rows) for rows in self.materials), np.int32))
+            self.materials.append(paint.row()[None])
+        return node
+
+    def finished(
+        self,
+        kind: str,
+        seed: int,
+        asked: int,
+        placed: Sequence[PlacedObject],
+        background: Collection[int],
+        style: Style,
+    ) -> WorldScene:
+        """The scene with everything added so far."""
+        return WorldScene(
+            kind,
+            seed,
+            asked,
+            tuple(placed),
+            np.concatenate(self.triangles).astype(np.float32),
+            np.concatenate(self.normals).astype(np.float32),
+            np.concatenate(self.coords).astype(np.float32),
+            np.concatenate(self.node_ids).astype(np.int32),
+            np.concatenate(self.material_ids).astype(np.int32),
+            np.concatenate(self.materials).astype(np.float32),
+            tuple(self.nodes),
+            frozenset(background),
+            style,
+        )
+
+
+def footprint_of(triangles: Float[np.ndarray, "F 3 3"]) -> tuple[Float[np.ndarray, " 2"], float]:
+    """Centre and radius of a circle in the x-y plane that holds the triangles, seen from above."""
+    points = triangles.reshape(-1, 3)[:, :2]
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    return centre, float(np.linalg.norm(points - centre, axis=1).max())

@@ -1,0 +1,170 @@
+"""Tabletop scenes: objects on a round table in a room (stand-ins for LERF, 3D-OVS, Hi-LERF, Hi-3DOVS)."""
+
+import logging
+
+import numpy as np
+from jaxtyping import Float
+
+from hilsplat.scene.cameras import Camera, Cameras
+from hilsplat.world.objects.catalogue import TABLETOP, build_object
+from hilsplat.world.paints import PaintBox
+from hilsplat.world.scenes.scene import Assembly, PlacedObject, Style, WorldScene, footprint_of
+from hilsplat.world.shapes import box, cylinder, rotation_about
+from hilsplat.world.views import looking_at, numbered_cameras, on_sphere, pinhole
+
+logger = logging.getLogger(__name__)
+
+TABLE_RADIUS = 0.9
+ROOM_HALF = 3.0
+FLOOR_Z = -0.75
+WALL_HEIGHT = 3.4
+COVERED_SHARE = 0.50
+"""Share of the table top that the objects' footprints would cover, were all of them placed."""
+MAX_FOOTPRINT = 0.36
+MAX_HEIGHT_TO_FOOTPRINT = 2.7
+GAP = 0.015
+ROOM_PALE = 0.5
+"""Walls and floor are mixed with this share of grey, so that the things stand out."""
+FOV_DEG = 50.0
+ELEVATIONS_DEG = (24.0, 46.0)
+DISTANCE = 2.25 * TABLE_RADIUS
+LOOK_AT_Z = 0.16
+TRIES = 150
+LAYOUTS = 25
+"""Layouts tried before an object is left out; the first that holds all is taken, else the fullest."""
+
+
+def build_tabletop(seed: int, objects: int) -> WorldScene:
+    """Objects on a table whose top is z = 0. The more are asked for, the smaller each is.
+
+    Objects are of different classes while there are enough classes. Each is put at a random place
+    where its footprint meets no other; one that finds no place is left out.
+
+    Args:
+        seed: not negative; same seed and number of objects, same scene.
+        objects: how many to place.
+    """
+    rng = np.random.default_rng([seed, 1])
+    assembly = Assembly()
+    order = np.concatenate([rng.permutation(len(TABLETOP)) for _ in range(1 + objects // len(TABLETOP))])
+    typical = min(MAX_FOOTPRINT, TABLE_RADIUS * float(np.sqrt(COVERED_SHARE / objects)))
+    drawn = []
+    for i in range(objects):
+        name = TABLETOP[order[i]]
+        model = build_object(name, np.random.default_rng([seed, 2, i]))
+        centre, radius = footprint_of(model.triangles)
+        height = float(model.triangles[..., 2].max())
+        size = typical * float(rng.uniform(0.92, 1.08))
+        scale = min(size / radius, MAX_HEIGHT_TO_FOOTPRINT * size / height)
+        drawn.append((name, model, centre * scale, radius * scale, height * scale, scale))
+    drawn.sort(key=lambda entry: -entry[3])
+    spots = _layout(rng, [entry[3] for entry in drawn])
+    placed: list[PlacedObject] = []
+    for (name, model, centre, radius, height, scale), spot in zip(drawn, spots, strict=True):
+        if spot is None:
+            logger.warning("scene tabletop:%d: no place left for the %s", seed, name)
+            continue
+        yaw = float(rng.uniform(-110, 110))
+        xy = spot - rotation_about("z", yaw)[:2, :2] @ centre
+        node = assembly.add_object(model, scale, xy, yaw)
+        placed.append(PlacedObject(name, node, (float(spot[0]), float(spot[1])), radius, height, yaw))
+    logger.info("scene tabletop:%d: %d of %d objects placed", seed, len(placed), objects)
+    background = _add_room(assembly, np.random.default_rng([seed, 3]))
+    style = Style.draw(np.random.default_rng([seed, 4]))
+    return assembly.finished("tabletop", seed, objects, placed, background, style)
+
+
+def _layout(rng: np.random.Generator, radii: list[float]) -> list[Float[np.ndarray, " 2"] | None]:
+    """Random places on the table for footprints, given largest first; None for those left out.
+
+    Each is drawn until it meets no earlier one, at most `TRIES` times; at most `LAYOUTS` layouts.
+    """
+    best: list[np.ndarray | None] = []
+    most = -1
+    for _ in range(LAYOUTS):
+        spots: list[np.ndarray | None] = []
+        taken: list[tuple[np.ndarray, float]] = []
+        for radius in radii:
+            reach = TABLE_RADIUS - 0.6 * radius  # objects may overhang the edge a little, as real ones do
+            spots.append(None)
+            for _ in range(TRIES):
+                angle, away = rng.uniform(0, 2 * np.pi), reach * np.sqrt(rng.uniform())
+                spot = np.array([away * np.cos(angle), away * np.sin(angle)])
+                if all(np.hypot(*(spot - other)) >= radius + size + GAP for other, size in taken):
+                    taken.append((spot, radius))
+                    spots[-1] = spot
+                    break
+        if len(taken) > most:
+            best, most = spots, len(taken)
+        if most == len(radii):
+            break
+    return best
+
+
+def _add_room(assembly: Assembly, rng: np.random.Generator) -> list[int]:
+    """Table, floor and walls; their textures are rich, for structure from motion."""
+    paints = PaintBox(rng)
+    top = paints.draw(str(rng.choice(["wood", "cloth", "stone", "collage"])), scale=0.6).paled(0.25)
+    leg = paints.draw("wood")
+    top_radius = TABLE_RADIUS * 1.12
+    table = [
+        (cylinder(top_radius, -0.07, 0.0, 64, bevel=0.012), top),
+        (cylinder(0.12, FLOOR_Z, -0.07), leg),
+        (cylinder(0.45, FLOOR_Z, FLOOR_Z + 0.06), leg),
+    ]
+    floor = paints.draw(str(rng.choice(["wood", "collage", "stone", "brick"])), scale=0.35).paled(ROOM_PALE)
+    half = ROOM_HALF
+    nodes = [assembly.add_surroundings("table", ("round table", f"{top.colour} table", "table top"), table)]
+    ground = box((2 * half, 2 * half, 0.1), (0, 0, FLOOR_Z - 0.05))
+    nodes.append(assembly.add_surroundings("floor", ("ground", f"{floor.colour} floor"), [(ground, floor)]))
+    walls = []
+    for turn in range(4):
+        group = str(rng.choice(["brick", "collage", "stone", "plain", "cloth"]))
+        paint = paints.draw(group, scale=0.35).paled(ROOM_PALE)
+        wall = box((0.1, 2 * half + 0.2, WALL_HEIGHT), (half + 0.05, 0, FLOOR_Z + WALL_HEIGHT / 2))
+        walls.append((wall.turned("z", 90 * turn), paint))
+    nodes.append(assembly.add_surroundings("wall", ("walls", "room wall"), walls))
+    return nodes
+
+
+def ring_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int = 360.0) -> Cameras:
+    """Cameras around the table at two alternating elevations, slightly jittered.
+
+    Neighbours should be at most 9 degrees apart, or structure from motion fails (measured).
+
+    Args:
+        scene: its seed is that of the jitter.
+        views: number of cameras, named 000.png, 001.png, ...
+        image_px: height and width.
+        arc_deg: azimuth covered, centred on +x, where the objects' fronts tend to face; a full ring
+            does not repeat its first azimuth.
+    """
+    rng = np.random.default_rng([scene.seed, 5])
+    share = np.arange(views) / (views if arc_deg >= 360 else max(1, views - 1))
+    target = np.array([0.0, 0.0, LOOK_AT_Z])
+    transforms = []
+    for i in range(views):
+        azimuth = arc_deg * (share[i] - 0.5) + rng.uniform(-1, 1)
+        elevation = ELEVATIONS_DEG[i % 2] + rng.uniform(-1.5, 1.5)
+        centre = target + on_sphere(azimuth, elevation, DISTANCE * rng.uniform(0.97, 1.03))
+        transforms.append(looking_at(centre, target + rng.uniform(-0.03, 0.03, 3)))
+    return numbered_cameras(transforms, pinhole(image_px, FOV_DEG), image_px)
+
+
+def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int = 256) -> Camera:
+    """A random camera for training: like those of `ring_cameras`, and closer ones on one object.
+
+    Half of them see the whole table, half look at an object from nearer by.
+    """
+    azimuth, elevation = rng.uniform(0, 360), rng.uniform(18, 55)
+    if scene.placed and rng.random() < 0.5:
+        thing = scene.placed[int(rng.integers(len(scene.placed)))]
+        target = np.array([*thing.centre_xy, thing.height * 0.45]) + rng.uniform(-0.08, 0.08, 3)
+        distance = DISTANCE * rng.uniform(0.5, 0.85)
+    else:
+        target = np.array([0.0, 0.0, LOOK_AT_Z]) + rng.uniform(-0.15, 0.15, 3) * np.array([1, 1, 0.5])
+        distance = DISTANCE * rng.uniform(0.85, 1.12)
+    centre = target + on_sphere(azimuth, elevation, distance)
+    return Camera(
+        "random.png", looking_at(centre, target), pinhole(image_px, rng.uniform(46, 54)), (image_px, image_px)
+    )
