@@ -35,7 +35,7 @@ from hilsplat.base.code_hash import code_hash
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import stage_log, track
-from hilsplat.language.quadratic import Gram, StackedWeights, choose_quadratic
+from hilsplat.language.quadratic import Gram, QuadraticBuilder, StackedWeights
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ContributionsSettings
@@ -157,12 +157,6 @@ def labelled_rows(weights: sp.csr_matrix, labels: Int32[np.ndarray, "P 3"]) -> S
     return StackedWeights(weights[rows], valid[rows])
 
 
-def stack_weights(parts: list[StackedWeights]) -> StackedWeights:
-    """One after the other."""
-    matrix = sp.vstack([part.weights for part in parts], format="csr")
-    return StackedWeights(matrix, np.concatenate([part.valid for part in parts]))
-
-
 def run_contributions(
     scene_folder: Path,
     gaussians_ply: Path,
@@ -188,7 +182,7 @@ def run_contributions(
     store = ViewCache(Path(cache) / "contributions")
     code = code_hash("hilsplat.language.contributions")
     parts: list[dict[str, np.ndarray]] = []
-    stacked: list[StackedWeights] = []
+    builder = QuadraticBuilder(len(gaussians), settings.keep, threads)
     rows: dict[str, list[np.ndarray]] = {"view": [], "mask": [], "level": [], "area_px": []}
     read_index(masks_folder)
     with stage_log("contributions", scene.name) as counts:
@@ -221,7 +215,7 @@ def run_contributions(
                     lambda view=view, weights=weights, masks=masks: view_contributions(view, weights, masks),
                 )
             )
-            stacked.append(labelled_rows(weights, label_maps(masks)))
+            builder.add(labelled_rows(weights, label_maps(masks)))
             rows["view"].append(np.full(len(masks), number, np.int32))
             rows["mask"].append(np.arange(len(masks), dtype=np.int32))
             rows["level"].append(masks.level)
@@ -232,9 +226,7 @@ def run_contributions(
                 f"no train view of {scene.name} has a mask",
                 fix="loosen masks.predicted_iou_min or masks.stability_min, then run the masks stage again",
             )
-        everything = stack_weights(stacked)
-        stacked.clear()
-        quadratic = choose_quadratic(everything, settings.keep, threads)
+        quadratic = builder.finish()
         with atomic_folder(out) as folder:
             for name in MATRICES:
                 _save_stacked(folder / f"{name}.npz", name, parts)
@@ -256,7 +248,7 @@ def run_contributions(
                 "masks": num_masks,
                 "kept": kept,
                 "nonzeros": quadratic.nonzeros,
-                "nonzeros of W": everything.nonzeros,
+                "nonzeros of W": builder.weights_nonzeros,
                 "from_cache": store.hits,
             }
             write_index(
@@ -270,7 +262,7 @@ def run_contributions(
                 quadratic=kept,
                 nonzeros={
                     **{name: int(sum(len(part[f"{name}_data"]) for part in parts)) for name in MATRICES},
-                    "W": everything.nonzeros,
+                    "W": builder.weights_nonzeros,
                     kept: quadratic.nonzeros,
                 },
             )

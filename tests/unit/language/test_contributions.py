@@ -9,17 +9,23 @@ import scipy.sparse as sp
 from hilsplat.base.artifacts import sha256_of_path
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
+from hilsplat.language import quadratic as quadratic_module
 from hilsplat.language.contributions import (
     label_maps,
     labelled_rows,
     normalised_weights,
     random_half,
     run_contributions,
-    stack_weights,
     view_contributions,
 )
 from hilsplat.language.mask_rows import Contributions, mask_embeddings
-from hilsplat.language.quadratic import build_gram, choose_quadratic, level_mass, load_quadratic
+from hilsplat.language.quadratic import (
+    GramBuilder,
+    QuadraticBuilder,
+    level_mass,
+    load_quadratic,
+    stack_weights,
+)
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ContributionsSettings
 from tests.unit.language.two_boxes_world import HEIGHT, REGIONS, WIDTH, two_boxes_weights
@@ -87,7 +93,7 @@ def test_gram_and_weights_give_the_quadratic_form_of_every_level():
             valid = labels[:, index] >= 0
             dense[index] += full[valid].T @ full[valid]
     everything = stack_weights(stacked)
-    gram = build_gram(everything, None, threads=1)
+    gram = built_gram(stacked)
     features = np.random.default_rng(5).normal(size=(40, 3, 4)).astype(np.float32)
     expected = np.einsum("lij,jld->ild", dense, features)
     assert gram.product(features) == pytest.approx(expected, abs=1e-5)
@@ -99,13 +105,43 @@ def test_gram_and_weights_give_the_quadratic_form_of_every_level():
     assert level_mass(gram) == pytest.approx(dense.sum(axis=2).T, abs=1e-5)
 
 
+def built_gram(parts, threads=1):
+    builder = GramBuilder(parts[0].num_gaussians, threads)
+    for part in parts:
+        builder.add(part)
+    return builder.finish()
+
+
+def chosen_quadratic(part, keep):
+    builder = QuadraticBuilder(part.num_gaussians, keep, threads=1)
+    builder.add(part)
+    return builder.finish()
+
+
 def test_gram_does_not_depend_on_threads():
     raw, masks = random_view(0)
     weights, _ = normalised_weights(raw)
     part = labelled_rows(weights, label_maps(masks))
-    one, two = build_gram(part, None, threads=1), build_gram(part, None, threads=2)
+    one, two = built_gram([part], threads=1), built_gram([part], threads=2)
     assert one.values.tobytes() == two.values.tobytes()
     assert one.indices.tobytes() == two.indices.tobytes()
+
+
+def test_gram_does_not_depend_on_how_the_pixels_are_parted(monkeypatch):
+    parts = []
+    for seed in range(4):
+        raw, masks = random_view(seed)
+        weights, _ = normalised_weights(raw)
+        parts.append(labelled_rows(weights, label_maps(masks)))
+    one, four = built_gram([stack_weights(parts)]), built_gram(parts)
+    for name in ("indptr", "indices", "values"):
+        assert getattr(one, name).tobytes() == getattr(four, name).tobytes()
+    # too many weights to hold: G, whatever its size
+    monkeypatch.setattr(quadratic_module, "MAX_WEIGHTS", parts[0].nonzeros)
+    builder = QuadraticBuilder(40, "auto", threads=1)
+    for part in parts:
+        builder.add(part)
+    assert builder.finish().values.tobytes() == one.values.tobytes()
 
 
 def test_the_smaller_quadratic_is_kept_and_read_back_equal(tmp_path):
@@ -114,14 +150,14 @@ def test_the_smaller_quadratic_is_kept_and_read_back_equal(tmp_path):
     part = labelled_rows(weights, label_maps(masks))
     features = np.random.default_rng(5).normal(size=(40, 3, 4)).astype(np.float32)
     for keep in ("gram", "weights"):
-        kept = choose_quadratic(part, keep, threads=1)
+        kept = chosen_quadratic(part, keep)
         folder = tmp_path / keep
         kept.save(folder / ("G.npz" if keep == "gram" else "W.npz"))
         again = load_quadratic(folder)
         assert type(again) is type(kept)
         assert np.array_equal(again.product(features), kept.product(features))
-    gram = build_gram(part, None, threads=1)
-    chosen = choose_quadratic(part, "auto", threads=1)
+    gram = built_gram([part])
+    chosen = chosen_quadratic(part, "auto")
     assert chosen.nonzeros == min(gram.nonzeros, part.nonzeros)
 
 
