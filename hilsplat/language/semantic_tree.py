@@ -6,15 +6,13 @@ their Gaussians, a coarser node that holds most of a finer one becomes its paren
 gets the average of its masks' full CLIP vectors. Queries are answered by ranking nodes.
 """
 
-import inspect
 import logging
 from dataclasses import dataclass
 from pathlib import Path
 
-import numba
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Bool, Float, Float32, Int32, Int64, UInt8
+from jaxtyping import Float, Float32, Int32, Int64, UInt8
 
 from hilsplat.base.artifacts import (
     INDEX,
@@ -29,6 +27,7 @@ from hilsplat.base.artifacts import (
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log
+from hilsplat.language.linkage import mask_evidence, pooled_linkage
 from hilsplat.language.mask_rows import Contributions, mask_embeddings
 from hilsplat.settings import SemanticTreeSettings
 
@@ -100,120 +99,6 @@ class SemanticTree:
             view_names=tuple(index["views"]),
             gaussians_sha256=index["gaussians_sha256"],
         )
-
-
-def mask_evidence(
-    shares: sp.csr_matrix,
-    importance: Float[np.ndarray, " N"],
-    visible: Bool[np.ndarray, "V N"],
-    view: Int32[np.ndarray, " M"],
-    min_covisible: float,
-    overlap: str,
-) -> tuple[Float[np.ndarray, "M M"], Float[np.ndarray, "M M"]]:
-    """Soft intersection and union of every two masks of one level, on the Gaussians both views see.
-
-    With s the share of a Gaussian's visible weight that lies in a mask and w its importance, the
-    intersection of a and b is sum w s_a s_b, the size of a as seen from the view of b is the sum of
-    w s_a^2 (Tanimoto) or w s_a (soft) over Gaussians visible there. For shares of 0 and 1 the two
-    agree. A fitted Gaussian reaches across borders and has shares between: there soft sizes shrink
-    the IoU of one region with itself (shares of 0.3 give 0.18), Tanimoto keeps it at 1.
-
-    Two masks of one view are different things: they are evidence against a link (intersection 0,
-    union both full sizes). Masks that see less than `min_covisible` of each other, both ways, are no
-    evidence at all (0 and 0).
-
-    Args:
-        shares: s, one row per mask; zero where the Gaussian is not visible in the mask's view.
-        importance: w, such as the mean visible mass.
-        visible: which Gaussians each view sees.
-        view: view of each mask.
-        min_covisible: share below which a pair is dropped.
-        overlap: "tanimoto" or "soft".
-    """
-    weighted = (shares @ sp.diags(importance)).tocsr()
-    intersection = (weighted @ shares.T).toarray()
-    sizes = weighted.multiply(shares).tocsr() if overlap == "tanimoto" else weighted
-    seen_from = np.asarray(sizes @ visible.T.astype(np.float64))  # [mask, view]
-    size = seen_from[np.arange(len(view)), view]
-    seen_by_other = seen_from[:, view]  # [a, b]: size of a in the view of b
-    union = seen_by_other + seen_by_other.T - intersection
-    covisible = seen_by_other / np.maximum(size, 1e-12)[:, None]
-    ignored = np.maximum(covisible, covisible.T) < min_covisible
-    intersection[ignored] = union[ignored] = 0.0
-    same_view = view[:, None] == view[None]
-    intersection[same_view] = 0.0
-    union[same_view] = (size[:, None] + size[None])[same_view]
-    np.fill_diagonal(union, 0.0)
-    return intersection, union
-
-
-def pooled_linkage(
-    intersection: Float[np.ndarray, "M M"], union: Float[np.ndarray, "M M"], threshold: float
-) -> tuple[Int64[np.ndarray, " M"], Float[np.ndarray, " K"]]:
-    """Join clusters while the best pair's pooled IoU is at least the threshold.
-
-    The IoU of two clusters is the sum of intersections over the sum of unions of all their pairs of
-    masks. Pooling is reducible (joining never creates a better pair), so one nearest neighbour per
-    cluster is kept. Of equally good pairs the one with the lowest rows is joined.
-
-    Returns:
-        cluster of each mask, numbered by first appearance, and each cluster's pooled IoU over its
-        own pairs (0 for a single mask).
-    """
-    inter, total = intersection.astype(np.float64).copy(), union.astype(np.float64).copy()
-    within = np.zeros((2, len(inter)))
-    root = np.arange(len(inter))
-    _link(inter, total, float(threshold), root, within)
-    # A root is the lowest row of its cluster, so sorting roots numbers clusters by first appearance.
-    tops, cluster = np.unique(root, return_inverse=True)
-    quality = within[0, tops] / np.where(within[1, tops] > 0, within[1, tops], 1.0)
-    return cluster.astype(np.int64), quality
-
-
-def _link_loop(inter, total, threshold, root, within):
-    """Merge in place; `root` ends as the lowest row of each mask's cluster."""
-    num = len(root)
-    alive = np.ones(num, np.bool_)
-    best = np.full(num, -1, np.int64)
-    score = np.full(num, -1.0)
-    stale = np.ones(num, np.bool_)
-    while True:
-        for i in range(num):
-            if alive[i] and stale[i]:
-                best[i], score[i] = -1, -1.0
-                for j in range(num):
-                    if alive[j] and j != i and total[i, j] > 0.0 and inter[i, j] / total[i, j] > score[i]:
-                        best[i], score[i] = j, inter[i, j] / total[i, j]
-                stale[i] = False
-        top, value = -1, threshold
-        for i in range(num):
-            if alive[i] and best[i] >= 0 and (score[i] > value or (top < 0 and score[i] >= value)):
-                top, value = i, score[i]
-        if top < 0:
-            break
-        a, b = min(top, best[top]), max(top, best[top])
-        within[0, a] += within[0, b] + inter[a, b]
-        within[1, a] += within[1, b] + total[a, b]
-        alive[b] = False
-        for c in range(num):
-            if root[c] == b:
-                root[c] = a
-            if alive[c] and c != a:
-                inter[a, c] += inter[b, c]
-                inter[c, a] = inter[a, c]
-                total[a, c] += total[b, c]
-                total[c, a] = total[a, c]
-                # A pair that was no evidence may become one, so compare with the merged cluster too.
-                if best[c] == a or best[c] == b:
-                    stale[c] = True
-                elif total[a, c] > 0.0:
-                    merged = inter[a, c] / total[a, c]
-                    if merged > score[c] or (merged == score[c] and a < best[c]):
-                        best[c], score[c] = a, merged
-        stale[a] = True
-
-
-_link = numba.njit(cache=True, nogil=True)(inspect.unwrap(_link_loop))
 
 
 def gaussian_nodes(
@@ -345,7 +230,7 @@ def build_tree(
         evidence = mask_evidence(
             shares_in_view[rows], importance, visible, view, settings.min_covisible, settings.overlap
         )
-        cluster, cluster_quality = pooled_linkage(*evidence, settings.link_threshold)
+        cluster, cluster_quality = pooled_linkage(evidence, settings.link_threshold)
         seen = [len(np.unique(view[cluster == c])) for c in range(int(cluster.max(initial=-1)) + 1)]
         large = np.flatnonzero(np.array(seen, dtype=np.int64) >= settings.min_views)
         local = np.full(len(seen) + 1, NONE, np.int64)

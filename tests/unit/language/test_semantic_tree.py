@@ -1,4 +1,4 @@
-"""Linking masks, and the tree of a world whose nodes are known."""
+"""Nodes of linked masks, and the tree of a world whose nodes are known."""
 
 import numpy as np
 import pytest
@@ -10,97 +10,11 @@ from hilsplat.base.levels import Level
 from hilsplat.language.semantic_tree import (
     SemanticTree,
     gaussian_nodes,
-    mask_evidence,
     node_parents,
-    pooled_linkage,
     run_semantic_tree,
 )
 from hilsplat.settings import SemanticTreeSettings
 from tests.unit.language.two_boxes_world import HEIGHT, NUM_GAUSSIANS, REGIONS, WIDTH, region_mask
-
-
-def test_evidence_counts_only_gaussians_both_views_see():
-    # three Gaussians; view 0 sees 0 and 1, view 1 sees 1 and 2
-    visible = np.array([[True, True, False], [False, True, True]])
-    shares = sp.csr_matrix(np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 0.5]]))
-    intersection, union = mask_evidence(
-        shares, np.ones(3), visible, np.array([0, 1], np.int32), 0.2, "tanimoto"
-    )
-    # on Gaussian 1 both agree fully: intersection 1, union 1 + 1 - 1
-    assert intersection[0, 1] == pytest.approx(1)
-    assert union[0, 1] == pytest.approx(1)
-
-
-@pytest.mark.parametrize(("overlap", "iou"), [("tanimoto", 1.0), ("soft", 0.09 / 0.51)])
-def test_a_blurred_region_agrees_with_itself_only_by_tanimoto(overlap, iou):
-    visible, shares = np.ones((2, 1), bool), sp.csr_matrix(np.array([[0.3], [0.3]]))
-    view = np.array([0, 1], np.int32)
-    intersection, union = mask_evidence(shares, np.ones(1), visible, view, 0.2, overlap)
-    assert intersection[0, 1] / union[0, 1] == pytest.approx(iou)
-
-
-def test_masks_of_one_view_are_evidence_against_a_link():
-    visible = np.ones((1, 2), bool)
-    shares = sp.csr_matrix(np.array([[1.0, 0.0], [1.0, 1.0]]))
-    intersection, union = mask_evidence(shares, np.ones(2), visible, np.zeros(2, np.int32), 0.2, "tanimoto")
-    assert intersection[0, 1] == 0
-    assert union[0, 1] == pytest.approx(3)  # sizes 1 and 2
-
-
-def test_masks_that_hardly_see_each_other_are_no_evidence():
-    visible = np.ones((2, 11), bool)
-    visible[0, 5:], visible[1, :4] = False, False  # common: Gaussian 4 alone
-    shares = sp.csr_matrix(np.where(visible, 1.0, 0.0))
-    view = np.array([0, 1], np.int32)
-    assert mask_evidence(shares, np.ones(11), visible, view, 0.1, "soft")[1][0, 1] == pytest.approx(1)
-    assert mask_evidence(shares, np.ones(11), visible, view, 0.25, "soft")[1][0, 1] == 0
-
-
-def test_linkage_pools_intersections_over_unions():
-    # 0 and 1 agree by 0.8; together they agree with 2 by (3 + 0) / (10 + 5) = 0.2
-    intersection = np.array([[0, 8, 3], [8, 0, 0], [3, 0, 0]], float)
-    union = np.array([[0, 10, 10], [10, 0, 5], [10, 5, 0]], float)
-    cluster, quality = pooled_linkage(intersection, union, 0.21)
-    assert cluster.tolist() == [0, 0, 1]
-    assert quality.tolist() == pytest.approx([0.8, 0.0])
-    cluster, quality = pooled_linkage(intersection, union, 0.19)
-    assert cluster.tolist() == [0, 0, 0]
-    assert quality.tolist() == pytest.approx([11 / 25])
-
-
-def test_linkage_of_equal_pairs_takes_the_lowest_rows():
-    # 0-1 and 1-2 are equally good; joining 0-1 leaves 2 at 1 / 4 with the pair
-    intersection = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], float)
-    union = np.array([[0, 2, 2], [2, 0, 2], [2, 2, 0]], float)
-    assert pooled_linkage(intersection, union, 0.3)[0].tolist() == [0, 0, 1]
-
-
-def brute_linkage(intersection, union, threshold):
-    clusters = [[row] for row in range(len(intersection))]
-    while True:
-        best, pair = -1.0, None
-        for a in range(len(clusters)):
-            for b in range(a + 1, len(clusters)):
-                grid = np.ix_(clusters[a], clusters[b])
-                if union[grid].sum() > 0:
-                    value = intersection[grid].sum() / union[grid].sum()
-                    if value > best + 1e-12:
-                        best, pair = value, (a, b)
-        if pair is None or best < threshold:
-            return sorted(sorted(cluster) for cluster in clusters)
-        clusters[pair[0]] += clusters.pop(pair[1])
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_linkage_equals_a_search_over_all_pairs(seed):
-    rng = np.random.default_rng(seed)
-    union = rng.uniform(1, 2, (14, 14)) * (rng.random((14, 14)) < 0.7)
-    union = np.triu(union, 1) + np.triu(union, 1).T
-    intersection = np.triu(union * rng.random((14, 14)) ** 2, 1)
-    intersection = intersection + intersection.T
-    cluster, _ = pooled_linkage(intersection, union, 0.3)
-    found = sorted(sorted(np.flatnonzero(cluster == c).tolist()) for c in range(cluster.max() + 1))
-    assert found == brute_linkage(intersection, union, 0.3)
 
 
 def test_gaussians_join_the_node_with_the_largest_share():
