@@ -12,7 +12,9 @@ from torch import Tensor
 from hilsplat.base.errors import HilsplatError
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.rasterise import cpu, cuda
 from hilsplat.splat.rasterise.cpu import (
+    Drawn,
     Parameters,
     Projected,
     blend_forward,
@@ -20,6 +22,7 @@ from hilsplat.splat.rasterise.cpu import (
     project_gaussians,
     sparse_weights,
 )
+from hilsplat.splat.rasterise.device import Device
 
 CHANNELS_PER_PASS = 32
 """Feature channels blended in one pass; more would leave the first-level cache."""
@@ -66,31 +69,35 @@ def _checked_degree(gaussians: Gaussians, sh_degree: int | None) -> int:
 
 
 class _Render(torch.autograd.Function):
-    """Premultiplied RGB + feature channels and alpha, with the CPU backend's own gradients."""
+    """Premultiplied RGB + feature channels, alpha and blended depth, with the CPU backend's own gradients."""
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Any:
-        *tensors, features, camera, degree, threads = arguments
+        *tensors, features, camera, degree, depth, threads = arguments
         parameters = Parameters(*(_to_array(tensor) for tensor in tensors))
         view = project_gaussians(parameters, camera, degree, threads)
         channels = view.colours
         if features is not None:
             channels = np.concatenate([channels, _to_array(features)], axis=1)
         image, alpha = blend_forward(view, channels, threads)
-        ctx.replay = (parameters, view, channels, image, alpha, threads, features is not None)
-        ctx.dtypes = [tensor.dtype for tensor in tensors]
-        depths = torch.from_numpy(view.geometry[:, 6])
-        ctx.mark_non_differentiable(depths)
-        return torch.from_numpy(image), torch.from_numpy(alpha), depths
+        ctx.replay = (parameters, view, channels, image, alpha, threads)
+        ctx.inputs = [(tensor.device, tensor.dtype) for tensor in tensors]
+        ctx.features = (features.device, features.dtype) if features is not None else None
+        summed = torch.empty(0)
+        if depth:
+            summed = torch.from_numpy(blend_forward(view, view.geometry[:, 6:7].copy(), threads)[0][..., 0])
+        ctx.mark_non_differentiable(summed)
+        return torch.from_numpy(image), torch.from_numpy(alpha), summed
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
-        parameters, view, channels, image, alpha, threads, has_features = ctx.replay
+        parameters, view, channels, image, alpha, threads = ctx.replay
         grad_image, grad_alpha = (_to_array(grad) for grad in grads[:2])
         g = blend_gradients(parameters, view, channels, image, alpha, grad_image, grad_alpha, threads)
         arrays = (g.means, g.log_scales, g.quats, g.opacity_logits, g.sh)
-        out = [torch.from_numpy(a).to(dtype) for a, dtype in zip(arrays, ctx.dtypes, strict=True)]
-        return *out, torch.from_numpy(g.features) if has_features else None, None, None, None
+        out = [torch.from_numpy(a).to(*place) for a, place in zip(arrays, ctx.inputs, strict=True)]
+        by_features = torch.from_numpy(g.features).to(*ctx.features) if ctx.features else None
+        return *out, by_features, None, None, None, None
 
 
 def render(
@@ -102,38 +109,71 @@ def render(
     sh_degree: int | None = None,
     threads: int = 1,
     depth: bool = False,
+    device: Device = "cpu",
 ) -> Rendering:
     """Render a view; differentiable in all parameters of the Gaussians and in `features`.
 
-    Conventions of gsplat: pixel centres at +0.5, 0.3 px^2 low-pass, alpha cut at 1/255 and clipped
-    at 0.999, blending stops before transmittance falls to 1e-4, near plane 0.01. Gaussians behind
-    the camera contribute nothing and get zero gradient; without any Gaussian the background shows.
+    The conventions are gsplat's, on both devices:
+
+    - the centre of the top-left pixel is (0.5, 0.5);
+    - a Gaussian is projected by the perspective Jacobian at its centre, with the ray clamped to 30 %
+      beyond the image, and 0.3 px^2 are added to its variance (`eps2d`), whatever its size;
+    - Gaussians nearer than depth 0.01 are not drawn; no Gaussian is too small (`radius_clip` 0);
+    - alpha below 1/255 is not drawn, alpha above 0.999 is cut there;
+    - blending goes front to back by the depth of the centres and stops before the Gaussian that
+      would leave less than 1e-4 of the light;
+    - colour is max(0, 0.5 + spherical harmonics) in the direction from the camera to the centre;
+    - features are premultiplied by alpha, and the background reaches colour alone.
+
+    So one round Gaussian of scale s and opacity o on the optical axis at depth z has, r px from the
+    principal point, under a camera of focal length f px,
+
+        alpha = o exp(-r^2 / (2 ((f s / z)^2 + 0.3))), where that is at least 1/255.
+
+    Gaussians behind the camera get zero gradient; without any Gaussian the background shows.
     Gradients are first-order only and do not reach the camera.
 
     Args:
-        features: further channels to blend; they are not affected by the background.
+        features: further channels to blend in the same pass; any number.
         sh_degree: degree of the spherical harmonics to use; all of them by default.
         threads: CPU threads; the result is the same bytes for any number.
         depth: also return the average depth.
+        device: backend; see `device.choose_device`.
+
+    Returns:
+        Images where `gaussians` are.
 
     Raises:
-        HilsplatError: parameters that are not finite, or zero quaternions.
+        HilsplatError: parameters that are not finite, zero quaternions, or features of other rows.
     """
     degree = _checked_degree(gaussians, sh_degree)
     g = gaussians
-    image, alpha, depths = _Render.apply(
-        g.means, g.log_scales, g.quats, g.opacity_logits, g.sh, features, camera, degree, threads
-    )
-    behind = torch.tensor(background, dtype=image.dtype)
+    if features is not None:
+        _check_rows(features, g)
+    if device == "cuda":
+        image, alpha, summed = cuda.render_channels(g, camera, degree, features, depth)
+    else:
+        image, alpha, summed = _Render.apply(
+            g.means, g.log_scales, g.quats, g.opacity_logits, g.sh, features, camera, degree, depth, threads
+        )
+    behind = torch.tensor(background, dtype=image.dtype, device=image.device)
     color = image[..., :3] + (1.0 - alpha)[..., None] * behind
     depth_map = None
     if depth:
-        with torch.no_grad():
-            summed, covered = render_features(gaussians, camera, depths[:, None], threads=threads)
-            depth_map = torch.from_numpy(
-                np.divide(summed[..., 0], covered, out=np.zeros_like(covered), where=covered > 0)
-            )
+        covered = alpha.detach()
+        depth_map = torch.where(covered > 0, summed / covered, torch.zeros_like(covered))
     return Rendering(color, alpha, image[..., 3:] if features is not None else None, depth_map)
+
+
+def draw(parameters: Parameters, camera: Camera, degree: int, *, threads: int, device: Device) -> Drawn:
+    """One view of a fit, on plain arrays: image, alpha, and the gradients on demand.
+
+    Raises:
+        HilsplatError: parameters that are not finite, or quaternions of length zero.
+    """
+    if device == "cuda":
+        return cuda.draw(parameters, camera, degree)
+    return cpu.draw(parameters, camera, degree, threads)
 
 
 def render_features(
@@ -142,6 +182,7 @@ def render_features(
     features: Float[np.ndarray, "N D"] | Float[Tensor, "N D"],
     *,
     threads: int = 1,
+    device: Device = "cpu",
 ) -> tuple[Float[np.ndarray, "H W D"], Float[np.ndarray, "H W"]]:
     """Blend any number of feature channels into a view, without gradients.
 
@@ -151,23 +192,23 @@ def render_features(
     Raises:
         HilsplatError: rows of `features` do not fit, or parameters cannot be drawn.
     """
+    _check_rows(features, gaussians)
     values = _to_array(features)
-    if len(values) != len(gaussians):
-        raise HilsplatError(
-            "features do not fit the Gaussians",
-            expected=f"{len(gaussians)} rows",
-            found=f"{len(values)} rows",
-        )
+    if device == "cuda":
+        return cuda.blend_features(gaussians, camera, values)
     view = _project(gaussians, camera, threads)
+    if values.shape[1] <= CHANNELS_PER_PASS:
+        return blend_forward(view, values, threads)
     out = np.empty((*camera.size_hw, values.shape[1]), np.float32)
-    _, alpha = blend_forward(view, np.empty((len(values), 0), np.float32), threads)
     for begin in range(0, values.shape[1], CHANNELS_PER_PASS):
         some = np.ascontiguousarray(values[:, begin : begin + CHANNELS_PER_PASS])
-        out[..., begin : begin + CHANNELS_PER_PASS], _ = blend_forward(view, some, threads)
+        out[..., begin : begin + CHANNELS_PER_PASS], alpha = blend_forward(view, some, threads)
     return out, alpha
 
 
-def pixel_weights(gaussians: Gaussians, camera: Camera, *, min_weight: float, threads: int = 1) -> csr_matrix:
+def pixel_weights(
+    gaussians: Gaussians, camera: Camera, *, min_weight: float, threads: int = 1, device: Device = "cpu"
+) -> csr_matrix:
     """Blending weight alpha_i T_i of each Gaussian at each pixel, as a sparse matrix.
 
     Args:
@@ -177,6 +218,8 @@ def pixel_weights(gaussians: Gaussians, camera: Camera, *, min_weight: float, th
         float32 matrix (H W, N), rows row-major pixels, columns sorted. With min_weight 0 the rows
         sum to the alpha of the view.
     """
+    if device == "cuda":
+        return cuda.pixel_weights(gaussians, camera, min_weight)
     view = _project(gaussians, camera, threads)
     row_start, columns, weights = sparse_weights(view, min_weight, threads)
     if row_start[-1] < np.iinfo(np.int32).max:
@@ -185,6 +228,15 @@ def pixel_weights(gaussians: Gaussians, camera: Camera, *, min_weight: float, th
     matrix = csr_matrix((weights, columns, row_start), shape=shape, copy=False)
     matrix.has_sorted_indices = True
     return matrix
+
+
+def _check_rows(features: Tensor | np.ndarray, gaussians: Gaussians) -> None:
+    if len(features) != len(gaussians):
+        raise HilsplatError(
+            "features do not fit the Gaussians",
+            expected=f"{len(gaussians)} rows",
+            found=f"{len(features)} rows",
+        )
 
 
 def _project(gaussians: Gaussians, camera: Camera, threads: int) -> Projected:

@@ -5,37 +5,54 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Int32, Int64
-from numba import njit
+
+from hilsplat.splat.rasterise.compiling import kernel
 
 TILE = 16
 """Side of a tile, px."""
+MAX_ENTRIES = 2**21
+"""Entries of tile lists that are held at a time: 8 MiB, and 72 MiB of gradients for 3 channels."""
 
 
 @dataclass(frozen=True)
-class TileLists:
-    """Pairs of (tile, Gaussian), in two orders.
+class Tiles:
+    """What the tile lists of a view are made from.
+
+    Tile t of row y and column x has index y * tiles_x + x. Its list holds the Gaussians whose box
+    touches it, front to back; it has tile_start[t + 1] - tile_start[t] entries.
 
     Attributes:
-        tile_start: entries of tile t are tile_start[t] .. tile_start[t + 1], front to back.
-        gaussian: the Gaussian of an entry.
-        pair: the gradient slot of an entry; slots are grouped by Gaussian.
-        pair_start: slots of Gaussian i are pair_start[i] .. pair_start[i + 1].
+        tiles_x: tiles per row.
+        order: rows of the Gaussians that are drawn, front to back; equal depths in row order.
+        tile_start: entries of the tiles before.
     """
 
+    tiles_x: int
+    order: Int32[np.ndarray, " M"]
     tile_start: Int64[np.ndarray, " num_tiles_plus_1"]
-    gaussian: Int32[np.ndarray, " P"]
-    pair: Int64[np.ndarray, " P"]
-    pair_start: Int64[np.ndarray, " N_plus_1"]
+
+    @property
+    def num_entries(self) -> int:
+        """Entries of all lists together."""
+        return int(self.tile_start[-1])
+
+    def bands(self, max_entries: int = MAX_ENTRIES) -> list[tuple[int, int]]:
+        """Ranges of tiles that cover all tiles, each with at most `max_entries` entries or one tile."""
+        start, out, begin = self.tile_start, [], 0
+        while begin < len(start) - 1:
+            end = int(np.searchsorted(start, start[begin] + max_entries, side="right")) - 1
+            end = min(max(end, begin + 1), len(start) - 1)
+            out.append((begin, end))
+            begin = end
+        return out
 
 
-@njit(nogil=True, cache=True)
+@kernel
 @no_type_check
-def _depth_order(keys):
+def _depth_order(rows, keys):
     """Rows in order of ascending uint32 keys: least-significant-digit radix sort, 3 x 11 bits, stable."""
-    n = len(keys)
-    order, other = np.empty(n, np.int32), np.empty(n, np.int32)
-    for i in range(n):
-        order[i] = i
+    n = len(rows)
+    other_rows, other_keys = np.empty_like(rows), np.empty_like(keys)
     count = np.empty(2048, np.int64)
     for shift in range(0, 33, 11):
         count[:] = 0
@@ -47,67 +64,67 @@ def _depth_order(keys):
             count[digit] = total
             total += here
         for i in range(n):
-            row = order[i]
-            digit = (keys[row] >> shift) & 2047
-            other[count[digit]] = row
+            digit = (keys[i] >> shift) & 2047
+            other_rows[count[digit]] = rows[i]
+            other_keys[count[digit]] = keys[i]
             count[digit] += 1
-        order, other = other, order
-    return order
+        rows, other_rows = other_rows, rows
+        keys, other_keys = other_keys, keys
+    return rows
 
 
-@njit(nogil=True, cache=True)
+@kernel
 @no_type_check
-def _bin(box, keys, tiles_x, tiles_y):
-    n = len(box)
-    pair_start = np.zeros(n + 1, np.int64)
+def _count(box, keys, tiles_x, tiles_y):
+    """Depth order of what is drawn, and where each tile's list begins (summed from corners of boxes)."""
+    corners = np.zeros((tiles_y + 1, tiles_x + 1), np.int64)
+    rows, drawn_keys = np.empty(len(box), np.int32), np.empty(len(box), np.uint32)
+    drawn = 0
+    for i in range(len(box)):
+        if box[i, 1] >= box[i, 0]:
+            x0, x1 = box[i, 0] // TILE, box[i, 1] // TILE + 1
+            y0, y1 = box[i, 2] // TILE, box[i, 3] // TILE + 1
+            corners[y0, x0] += 1
+            corners[y0, x1] -= 1
+            corners[y1, x0] -= 1
+            corners[y1, x1] += 1
+            rows[drawn], drawn_keys[drawn] = i, keys[i]
+            drawn += 1
     tile_start = np.zeros(tiles_x * tiles_y + 1, np.int64)
-    visible = 0
-    for i in range(n):
-        if box[i, 1] >= box[i, 0]:
-            x0, x1 = box[i, 0] // TILE, box[i, 1] // TILE
-            y0, y1 = box[i, 2] // TILE, box[i, 3] // TILE
-            pair_start[i + 1] = (x1 - x0 + 1) * (y1 - y0 + 1)
-            visible += 1
-            for y in range(y0, y1 + 1):
-                for x in range(x0, x1 + 1):
-                    tile_start[y * tiles_x + x + 1] += 1
-    for i in range(n):
-        pair_start[i + 1] += pair_start[i]
-    for tile in range(tiles_x * tiles_y):
-        tile_start[tile + 1] += tile_start[tile]
-    rows, visible_keys = np.empty(visible, np.int32), np.empty(visible, np.uint32)
-    at = 0
-    for i in range(n):
-        if box[i, 1] >= box[i, 0]:
-            rows[at] = i
-            visible_keys[at] = keys[i]
-            at += 1
-    order = _depth_order(visible_keys)
-    gaussian = np.empty(pair_start[n], np.int32)
-    pair = np.empty(pair_start[n], np.int64)
-    cursor = tile_start[:-1].copy()
-    for k in range(visible):
-        i = rows[order[k]]
-        slot = pair_start[i]
-        for y in range(box[i, 2] // TILE, box[i, 3] // TILE + 1):
-            for x in range(box[i, 0] // TILE, box[i, 1] // TILE + 1):
-                tile = y * tiles_x + x
-                gaussian[cursor[tile]] = i
-                pair[cursor[tile]] = slot
-                cursor[tile] += 1
-                slot += 1
-    return tile_start, gaussian, pair, pair_start
+    above = np.zeros(tiles_x, np.int64)
+    for y in range(tiles_y):
+        along = 0
+        for x in range(tiles_x):
+            along += corners[y, x]
+            above[x] += along
+            tile_start[y * tiles_x + x + 1] = tile_start[y * tiles_x + x] + above[x]
+    return _depth_order(rows[:drawn], drawn_keys[:drawn]), tile_start
 
 
-def bin_gaussians(box: Int32[np.ndarray, "N 4"], depths: np.ndarray, size_hw: tuple[int, int]) -> TileLists:
-    """Sort the visible Gaussians by depth and list them per tile (row-major tiles).
+@kernel
+@no_type_check
+def fill_lists(begin, end, base, tiles_x, order, tile_start, box, gaussian):
+    """Write the lists of tiles begin..end; entry e goes to gaussian[e - base]."""
+    cursor = tile_start[begin:end] - base
+    for k in range(len(order)):
+        i = order[k]
+        x0, x1 = box[i, 0] // TILE, box[i, 1] // TILE + 1
+        y0, y1 = max(box[i, 2] // TILE, begin // tiles_x), box[i, 3] // TILE + 1
+        for y in range(y0, min(y1, (end - 1) // tiles_x + 1)):
+            for tile in range(max(y * tiles_x + x0, begin), min(y * tiles_x + x1, end)):
+                gaussian[cursor[tile - begin]] = i
+                cursor[tile - begin] += 1
+
+
+def bin_gaussians(box: Int32[np.ndarray, "N 4"], depths: np.ndarray, size_hw: tuple[int, int]) -> Tiles:
+    """Sort the drawn Gaussians by depth and count them per tile.
 
     Args:
         box: first and last pixel column, first and last pixel row; last < first is not drawn.
-        depths: positive float32 depths; Gaussians of equal depth stay in row order.
+        depths: positive float32 depths.
         size_hw: image size, px.
     """
     tiles_y, tiles_x = ((side + TILE - 1) // TILE for side in size_hw)
     # The bits of positive floats order as the floats do.
     keys = np.ascontiguousarray(depths, dtype=np.float32).view(np.uint32)
-    return TileLists(*_bin(box, keys, tiles_x, tiles_y))
+    return Tiles(tiles_x, *_count(box, keys, tiles_x, tiles_y))

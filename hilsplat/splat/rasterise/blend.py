@@ -5,18 +5,22 @@ the blocks that its box touches. Lanes outside the image begin with no transmitt
 
 The backward pass runs front to back and replays the forward pass, so its transmittance is exactly
 the forward's. Per pixel it carries one number, R = sum over channels of (what is still to come) x
-(gradient); then dL/dalpha = T (colour . gradient) - R / (1 - alpha). Each (tile, Gaussian) has its
-own slot for the sums, so the result does not depend on how tiles are spread over threads.
+(gradient); then dL/dalpha = T (colour . gradient) - R / (1 - alpha). Each entry of a tile's list has
+its own slot for the sums, so the result does not depend on how tiles are spread over threads.
 
 Alpha is one more channel, of colour 1: the image's alpha is the sum of the weights.
+
+Arguments that the kernels share: tiles begin..end of a row-major grid with `tiles_x` per row; the
+list of tile t is gaussian[tile_start[t] - base] .. gaussian[tile_start[t + 1] - base]; geometry and
+box as `project` fills them.
 """
 
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
 from hilsplat.splat.rasterise.binning import TILE
+from hilsplat.splat.rasterise.compiling import kernel
 from hilsplat.splat.rasterise.lanes import (
     any_ge,
     exp2_negative,
@@ -42,7 +46,7 @@ CHECK_EVERY = 8
 _CUT = np.float32(np.log2(MIN_ALPHA))
 _TOP = np.float32(MAX_ALPHA)
 _STOP = np.float32(MIN_TRANSMITTANCE)
-_ZERO = np.float32(0.0)
+_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _X = np.tile(np.arange(4, dtype=np.float32) + np.float32(0.5), 4)
 _Y = np.repeat(np.arange(4, dtype=np.float32) + np.float32(0.5), 4)
 BLOCKS = 16
@@ -50,7 +54,7 @@ LANES = 16
 PIXELS = BLOCKS * LANES
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline="always")
 @no_type_check
 def _start_tile(tile, tiles_x, height, width, transmittance, alive):
     """Full transmittance in the pixels inside the image; returns the tile's corner."""
@@ -58,15 +62,21 @@ def _start_tile(tile, tiles_x, height, width, transmittance, alive):
     for block in range(BLOCKS):
         alive[block] = False
         for lane in range(LANES):
-            x = x0 + (block % 4) * 4 + lane % 4
-            y = y0 + (block // 4) * 4 + lane // 4
+            x, y = _pixel(x0, y0, block, lane)
             inside = x < width and y < height
             transmittance[block * LANES + lane] = 1.0 if inside else 0.0
             alive[block] = alive[block] or inside
     return x0, y0
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline="always")
+@no_type_check
+def _pixel(x0, y0, block, lane):
+    """Column and row of a lane's pixel."""
+    return x0 + (block % 4) * 4 + lane % 4, y0 + (block // 4) * 4 + lane // 4
+
+
+@kernel(inline="always")
 @no_type_check
 def _any_alive(transmittance, alive):
     """Mark finished blocks; returns whether any block is unfinished."""
@@ -78,16 +88,57 @@ def _any_alive(transmittance, alive):
     return some
 
 
-@njit(nogil=True, cache=True)
+@kernel(inline="always")
 @no_type_check
-def blend(begin, end, tiles_x, tile_start, gaussian, geometry, box, colours, image, alpha):
-    """Blend tiles begin..end: image (H, W, C) gets the premultiplied channels, alpha (H, W) the coverage."""
+def _blocks(box, i, x0, y0):
+    """First and last block row, first and last block column of the tile that a Gaussian's box touches."""
+    return (
+        max(box[i, 2] - y0, 0) >> 2,
+        min(box[i, 3] - y0, TILE - 1) >> 2,
+        max(box[i, 0] - x0, 0) >> 2,
+        min(box[i, 1] - x0, TILE - 1) >> 2,
+    )
+
+
+@kernel(inline="always")
+@no_type_check
+def _place(geometry, i, x0, y0):
+    """Mean of a Gaussian from the tile's corner, and a, b, c, log2 of the peak alpha in all lanes."""
+    mean_x = np.float32(geometry[i, 0] - np.float32(x0))
+    mean_y = np.float32(geometry[i, 1] - np.float32(y0))
+    a, b, c = lanes(geometry[i, 2]), lanes(geometry[i, 3]), lanes(geometry[i, 4])
+    return mean_x, mean_y, a, b, c, lanes(geometry[i, 5])
+
+
+@kernel(inline="always")
+@no_type_check
+def _to_mean(mean, at, centres):
+    """Distances of a block's pixel centres to the mean along an axis; `at` counts blocks."""
+    return lanes(np.float32(mean - np.float32(4 * at))) - centres
+
+
+@kernel(inline="always")
+@no_type_check
+def _shine(exponent, transmittance, block):
+    """Blend a Gaussian into a block: take its light; returns alpha uncut, alpha and the weight."""
+    uncut = exp2_negative(exponent)
+    alpha = keep_ge(exponent, lanes(_CUT), smaller(uncut, lanes(_TOP)))
+    light = load(transmittance, block * LANES)
+    weight = light * alpha
+    left = light - weight
+    store(transmittance, block * LANES, keep_gt(left, lanes(_STOP), left))
+    return uncut, alpha, keep_gt(left, lanes(_STOP), weight)
+
+
+@kernel
+@no_type_check
+def blend(begin, end, base, tiles_x, tile_start, gaussian, geometry, box, colours, image, alpha):
+    """Blend tiles: image (H, W, C) gets the premultiplied channels, alpha (H, W) the coverage."""
     height, width, channels = image.shape
     transmittance = np.empty(PIXELS, np.float32)
     sums = np.empty(PIXELS * (channels + 1), np.float32)
     alive = np.empty(BLOCKS, np.bool_)
     px, py = load(_X, 0), load(_Y, 0)
-    cut, top, stop = lanes(_CUT), lanes(_TOP), lanes(_STOP)
     stride = LANES * (channels + 1)
     for tile in range(begin, end):
         x0, y0 = _start_tile(tile, tiles_x, height, width, transmittance, alive)
@@ -95,31 +146,21 @@ def blend(begin, end, tiles_x, tile_start, gaussian, geometry, box, colours, ima
         for entry in range(tile_start[tile], tile_start[tile + 1]):
             if (entry - tile_start[tile]) % CHECK_EVERY == 0 and not _any_alive(transmittance, alive):
                 break
-            i = gaussian[entry]
-            mean_x = np.float32(geometry[i, 0] - np.float32(x0))
-            mean_y = np.float32(geometry[i, 1] - np.float32(y0))
-            a, b, c = lanes(geometry[i, 2]), lanes(geometry[i, 3]), lanes(geometry[i, 4])
-            peak = lanes(geometry[i, 5])
-            column0, column1 = max(box[i, 0] - x0, 0) >> 2, min(box[i, 1] - x0, TILE - 1) >> 2
-            row0, row1 = max(box[i, 2] - y0, 0) >> 2, min(box[i, 3] - y0, TILE - 1) >> 2
+            i = gaussian[entry - base]
+            row0, row1, column0, column1 = _blocks(box, i, x0, y0)
+            mean_x, mean_y, a, b, c, top = _place(geometry, i, x0, y0)
             for row in range(row0, row1 + 1):
-                dy = lanes(np.float32(mean_y - np.float32(4 * row))) - py
-                row_peak = peak - c * dy * dy
-                row_slope = b * dy
+                dy = _to_mean(mean_y, row, py)
+                peak, slope = top - c * dy * dy, b * dy
                 for column in range(column0, column1 + 1):
                     block = row * 4 + column
                     if not alive[block]:
                         continue
-                    dx = lanes(np.float32(mean_x - np.float32(4 * column))) - px
-                    exponent = row_peak - dx * (a * dx + row_slope)
-                    if not any_ge(exponent, cut):
+                    dx = _to_mean(mean_x, column, px)
+                    exponent = peak - dx * (a * dx + slope)
+                    if not any_ge(exponent, lanes(_CUT)):
                         continue
-                    here = keep_ge(exponent, cut, smaller(exp2_negative(exponent), top))
-                    light = load(transmittance, block * LANES)
-                    weight = light * here
-                    left = light - weight
-                    weight = keep_gt(left, stop, weight)
-                    store(transmittance, block * LANES, keep_gt(left, stop, left))
+                    _, _, weight = _shine(exponent, transmittance, block)
                     at = block * stride
                     store(sums, at, load(sums, at) + weight)
                     for channel in range(channels):
@@ -127,8 +168,7 @@ def blend(begin, end, tiles_x, tile_start, gaussian, geometry, box, colours, ima
                         store(sums, at, load(sums, at) + weight * lanes(colours[i, channel]))
         for block in range(BLOCKS):
             for lane in range(LANES):
-                x = x0 + (block % 4) * 4 + lane % 4
-                y = y0 + (block // 4) * 4 + lane // 4
+                x, y = _pixel(x0, y0, block, lane)
                 if x < width and y < height:
                     at = block * stride + lane
                     alpha[y, x] = sums[at]
@@ -136,15 +176,37 @@ def blend(begin, end, tiles_x, tile_start, gaussian, geometry, box, colours, ima
                         image[y, x, channel] = sums[at + LANES * (channel + 1)]
 
 
-@njit(nogil=True, cache=True)
+@kernel(inline="always")
+@no_type_check
+def _load_gradients(x0, y0, stride, image, alpha, grad_image, grad_alpha, grads, to_come):
+    """Gradients of a tile's pixels by block and channel, and R before the first Gaussian."""
+    height, width, channels = image.shape
+    for block in range(BLOCKS):
+        for lane in range(LANES):
+            x, y = _pixel(x0, y0, block, lane)
+            at = block * stride + lane
+            total = _ZERO
+            if x < width and y < height:
+                grads[at] = grad_alpha[y, x]
+                total = alpha[y, x] * grad_alpha[y, x]
+                for channel in range(channels):
+                    grads[at + LANES * (channel + 1)] = grad_image[y, x, channel]
+                    total += image[y, x, channel] * grad_image[y, x, channel]
+            else:
+                for channel in range(channels + 1):
+                    grads[at + LANES * channel] = 0.0
+            to_come[block * LANES + lane] = total
+
+
+@kernel
 @no_type_check
 def blend_backward(
     begin,
     end,
+    base,
     tiles_x,
     tile_start,
     gaussian,
-    pair,
     geometry,
     box,
     colours,
@@ -154,10 +216,10 @@ def blend_backward(
     grad_alpha,
     slots,
 ):
-    """Gradient of `blend` for tiles begin..end, into one slot per (tile, Gaussian).
+    """Gradient of `blend`, into one slot per entry of the lists: slots[entry - base].
 
-    A slot holds the moments of v = alpha dL/dalpha (see MOMENTS), then dL/dcolour per channel.
-    Slots come in as zeros; those behind finished pixels stay so.
+    A slot holds the moments of v = alpha dL/dalpha (see MOMENTS), then dL/dcolour per channel; those
+    of entries behind finished pixels are zeros.
     """
     height, width, channels = image.shape
     transmittance = np.empty(PIXELS, np.float32)
@@ -166,77 +228,50 @@ def blend_backward(
     colour_sums = np.empty(LANES * channels, np.float32)
     alive = np.empty(BLOCKS, np.bool_)
     px, py = load(_X, 0), load(_Y, 0)
-    zero, one = lanes(_ZERO), lanes(np.float32(1.0))
-    cut, top, stop = lanes(_CUT), lanes(_TOP), lanes(_STOP)
+    zero = lanes(_ZERO)
     stride = LANES * (channels + 1)
     for tile in range(begin, end):
         x0, y0 = _start_tile(tile, tiles_x, height, width, transmittance, alive)
-        for block in range(BLOCKS):
-            for lane in range(LANES):
-                x = x0 + (block % 4) * 4 + lane % 4
-                y = y0 + (block // 4) * 4 + lane // 4
-                at = block * stride + lane
-                total = _ZERO
-                if x < width and y < height:
-                    grads[at] = grad_alpha[y, x]
-                    total = alpha[y, x] * grad_alpha[y, x]
-                    for channel in range(channels):
-                        grads[at + LANES * (channel + 1)] = grad_image[y, x, channel]
-                        total += image[y, x, channel] * grad_image[y, x, channel]
-                else:
-                    for channel in range(channels + 1):
-                        grads[at + LANES * channel] = 0.0
-                to_come[block * LANES + lane] = total
+        _load_gradients(x0, y0, stride, image, alpha, grad_image, grad_alpha, grads, to_come)
+        finished = False
         for entry in range(tile_start[tile], tile_start[tile + 1]):
-            if (entry - tile_start[tile]) % CHECK_EVERY == 0 and not _any_alive(transmittance, alive):
-                break
-            i = gaussian[entry]
-            mean_x = np.float32(geometry[i, 0] - np.float32(x0))
-            mean_y = np.float32(geometry[i, 1] - np.float32(y0))
-            a, b, c = lanes(geometry[i, 2]), lanes(geometry[i, 3]), lanes(geometry[i, 4])
-            peak = lanes(geometry[i, 5])
-            column0, column1 = max(box[i, 0] - x0, 0) >> 2, min(box[i, 1] - x0, TILE - 1) >> 2
-            row0, row1 = max(box[i, 2] - y0, 0) >> 2, min(box[i, 3] - y0, TILE - 1) >> 2
+            slot = entry - base
+            if not finished and (entry - tile_start[tile]) % CHECK_EVERY == 0:
+                finished = not _any_alive(transmittance, alive)
+            if finished:
+                slots[slot, :] = 0.0
+                continue
+            i = gaussian[slot]
+            row0, row1, column0, column1 = _blocks(box, i, x0, y0)
+            mean_x, mean_y, a, b, c, top = _place(geometry, i, x0, y0)
             s, sx, sy, sxx, sxy, syy = zero, zero, zero, zero, zero, zero
             red, green, blue = zero, zero, zero
             if channels != 3:
                 colour_sums[:] = 0.0
-            hit = False
             for row in range(row0, row1 + 1):
-                dy = lanes(np.float32(mean_y - np.float32(4 * row))) - py
-                row_peak = peak - c * dy * dy
-                row_slope = b * dy
+                dy = _to_mean(mean_y, row, py)
+                peak, slope = top - c * dy * dy, b * dy
                 for column in range(column0, column1 + 1):
                     block = row * 4 + column
                     if not alive[block]:
                         continue
-                    dx = lanes(np.float32(mean_x - np.float32(4 * column))) - px
-                    exponent = row_peak - dx * (a * dx + row_slope)
-                    if not any_ge(exponent, cut):
+                    dx = _to_mean(mean_x, column, px)
+                    exponent = peak - dx * (a * dx + slope)
+                    if not any_ge(exponent, lanes(_CUT)):
                         continue
-                    hit = True
-                    full = exp2_negative(exponent)
-                    here = keep_ge(exponent, cut, smaller(full, top))
-                    light = load(transmittance, block * LANES)
-                    weight = light * here
-                    left = light - weight
-                    weight = keep_gt(left, stop, weight)
-                    store(transmittance, block * LANES, keep_gt(left, stop, left))
+                    uncut, here, weight = _shine(exponent, transmittance, block)
                     at = block * stride
-                    if channels == 3:
-                        grad_red = load(grads, at + LANES)
-                        grad_green = load(grads, at + 2 * LANES)
-                        grad_blue = load(grads, at + 3 * LANES)
-                        red = red + weight * grad_red
-                        green = green + weight * grad_green
-                        blue = blue + weight * grad_blue
-                        shade = load(grads, at) + (
-                            grad_red * lanes(colours[i, 0])
-                            + grad_green * lanes(colours[i, 1])
-                            + grad_blue * lanes(colours[i, 2])
-                        )
+                    shade = load(grads, at)
+                    if channels == 3:  # colour sums in registers: a fifth faster
+                        by_red = load(grads, at + LANES)
+                        by_green = load(grads, at + 2 * LANES)
+                        by_blue = load(grads, at + 3 * LANES)
+                        red = red + weight * by_red
+                        green = green + weight * by_green
+                        blue = blue + weight * by_blue
+                        shade = shade + by_red * lanes(colours[i, 0])
+                        shade = shade + by_green * lanes(colours[i, 1]) + by_blue * lanes(colours[i, 2])
                     else:
-                        shade = load(grads, at)
                         for channel in range(channels):
                             grad = load(grads, at + LANES * (channel + 1))
                             shade = shade + grad * lanes(colours[i, channel])
@@ -245,8 +280,8 @@ def blend_backward(
                     seen = weight * shade
                     rest = load(to_come, block * LANES) - seen
                     store(to_come, block * LANES, rest)
-                    v = seen - rest * here * reciprocal(one - here)
-                    v = keep_lt(full, top, keep_gt(weight, zero, v))
+                    v = seen - rest * here * reciprocal(lanes(_ONE) - here)
+                    v = keep_lt(uncut, lanes(_TOP), keep_gt(weight, zero, v))
                     vx, vy = v * dx, v * dy
                     s = s + v
                     sx = sx + vx
@@ -254,29 +289,33 @@ def blend_backward(
                     sxx = sxx + vx * dx
                     sxy = sxy + vx * dy
                     syy = syy + vy * dy
-            if hit:
-                slot = pair[entry]
-                slots[slot, 0] = lane_sum(s)
-                slots[slot, 1] = lane_sum(sx)
-                slots[slot, 2] = lane_sum(sy)
-                slots[slot, 3] = lane_sum(sxx)
-                slots[slot, 4] = lane_sum(sxy)
-                slots[slot, 5] = lane_sum(syy)
-                if channels == 3:
-                    slots[slot, MOMENTS] = lane_sum(red)
-                    slots[slot, MOMENTS + 1] = lane_sum(green)
-                    slots[slot, MOMENTS + 2] = lane_sum(blue)
-                else:
-                    for channel in range(channels):
-                        slots[slot, MOMENTS + channel] = lane_sum(load(colour_sums, LANES * channel))
+            slots[slot, 0], slots[slot, 1], slots[slot, 2] = lane_sum(s), lane_sum(sx), lane_sum(sy)
+            slots[slot, 3], slots[slot, 4], slots[slot, 5] = lane_sum(sxx), lane_sum(sxy), lane_sum(syy)
+            if channels == 3:
+                store(colour_sums, 0, red)
+                store(colour_sums, LANES, green)
+                store(colour_sums, 2 * LANES, blue)
+            for channel in range(channels):
+                slots[slot, MOMENTS + channel] = lane_sum(load(colour_sums, LANES * channel))
 
 
-@njit(nogil=True, cache=True)
+@kernel
+@no_type_check
+def add_slots(begin, end, gaussian, slots, sums):
+    """Add the slots of Gaussians begin..end to their sums, in the order of the entries."""
+    for entry in range(len(gaussian)):
+        i = gaussian[entry]
+        if begin <= i < end:
+            for k in range(slots.shape[1]):
+                sums[i, k] += slots[entry, k]
+
+
+@kernel
 @no_type_check
 def blend_weights(
-    begin, end, tiles_x, size_hw, tile_start, gaussian, geometry, box, least, cursor, columns, weights
+    begin, end, base, tiles_x, size_hw, tile_start, gaussian, geometry, box, least, cursor, columns, weights
 ):
-    """Weights of tiles begin..end as sparse rows, one row per pixel (row-major).
+    """Weights of tiles as sparse rows, one row per pixel (row-major).
 
     Called twice. With empty `columns` it counts: cursor[pixel] grows by one per weight >= least.
     Then, with cursor at the beginning of each row, it fills columns and weights front to back.
@@ -287,44 +326,32 @@ def blend_weights(
     buffer = np.empty(LANES, np.float32)
     alive = np.empty(BLOCKS, np.bool_)
     px, py = load(_X, 0), load(_Y, 0)
-    cut, top, stop = lanes(_CUT), lanes(_TOP), lanes(_STOP)
     for tile in range(begin, end):
         x0, y0 = _start_tile(tile, tiles_x, height, width, transmittance, alive)
         for entry in range(tile_start[tile], tile_start[tile + 1]):
             if (entry - tile_start[tile]) % CHECK_EVERY == 0 and not _any_alive(transmittance, alive):
                 break
-            i = gaussian[entry]
-            mean_x = np.float32(geometry[i, 0] - np.float32(x0))
-            mean_y = np.float32(geometry[i, 1] - np.float32(y0))
-            a, b, c = lanes(geometry[i, 2]), lanes(geometry[i, 3]), lanes(geometry[i, 4])
-            peak = lanes(geometry[i, 5])
-            column0, column1 = max(box[i, 0] - x0, 0) >> 2, min(box[i, 1] - x0, TILE - 1) >> 2
-            row0, row1 = max(box[i, 2] - y0, 0) >> 2, min(box[i, 3] - y0, TILE - 1) >> 2
+            i = gaussian[entry - base]
+            row0, row1, column0, column1 = _blocks(box, i, x0, y0)
+            mean_x, mean_y, a, b, c, top = _place(geometry, i, x0, y0)
             for row in range(row0, row1 + 1):
-                dy = lanes(np.float32(mean_y - np.float32(4 * row))) - py
-                row_peak = peak - c * dy * dy
-                row_slope = b * dy
+                dy = _to_mean(mean_y, row, py)
+                peak, slope = top - c * dy * dy, b * dy
                 for column in range(column0, column1 + 1):
                     block = row * 4 + column
                     if not alive[block]:
                         continue
-                    dx = lanes(np.float32(mean_x - np.float32(4 * column))) - px
-                    exponent = row_peak - dx * (a * dx + row_slope)
-                    if not any_ge(exponent, cut):
+                    dx = _to_mean(mean_x, column, px)
+                    exponent = peak - dx * (a * dx + slope)
+                    if not any_ge(exponent, lanes(_CUT)):
                         continue
-                    here = keep_ge(exponent, cut, smaller(exp2_negative(exponent), top))
-                    light = load(transmittance, block * LANES)
-                    weight = light * here
-                    left = light - weight
-                    weight = keep_gt(left, stop, weight)
-                    store(transmittance, block * LANES, keep_gt(left, stop, left))
+                    _, _, weight = _shine(exponent, transmittance, block)
                     if not any_ge(weight, lanes(least)):
                         continue
                     store(buffer, 0, weight)
                     for lane in range(LANES):
                         if buffer[lane] > _ZERO and buffer[lane] >= least:
-                            x = x0 + column * 4 + lane % 4
-                            y = y0 + row * 4 + lane // 4
+                            x, y = _pixel(x0, y0, block, lane)
                             at = cursor[y * width + x]
                             cursor[y * width + x] = at + 1
                             if not count_only:
@@ -332,7 +359,7 @@ def blend_weights(
                                 weights[at] = buffer[lane]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 @no_type_check
 def sort_rows(begin, end, row_start, columns, weights):
     """Sort the entries of sparse rows begin..end by column (insertion sort; rows are short)."""

@@ -4,20 +4,24 @@ Threads take ranges of Gaussians or tiles; nothing is summed across threads, so 
 same bytes for any number of them.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32
+from jaxtyping import Bool, Float32, Float64, Int32
 
 from hilsplat.base.errors import HilsplatError
 from hilsplat.scene.cameras import Camera
-from hilsplat.splat.rasterise.binning import TILE, TileLists, bin_gaussians
-from hilsplat.splat.rasterise.blend import blend, blend_backward, blend_weights, sort_rows
+from hilsplat.splat.rasterise.binning import Tiles, bin_gaussians, fill_lists
+from hilsplat.splat.rasterise.blend import add_slots, blend, blend_backward, blend_weights, sort_rows
 from hilsplat.splat.rasterise.project import GEOMETRY, MOMENTS, pack_camera, project, project_backward
+
+RANGES_PER_THREAD = 4
+"""Ranges that work is cut into for each thread, so that threads end together."""
 
 
 @cache
@@ -25,12 +29,17 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="rasterise")
 
 
+def over_edges(work: Callable[[int, int], Any], edges: list[int], threads: int) -> list[Any]:
+    """Call `work(begin, end)` for all neighbours in `edges`, on threads; results in order."""
+    if threads <= 1:
+        return [work(begin, end) for begin, end in pairwise(edges)]
+    return list(_pool(threads).map(work, edges[:-1], edges[1:]))
+
+
 def over_ranges(work: Callable[[int, int], Any], count: int, threads: int) -> list[Any]:
     """Call `work(begin, end)` over ranges that cover 0..count, on threads; results in range order."""
-    if threads <= 1 or count <= 1:
-        return [work(0, count)]
-    edges = np.linspace(0, count, min(count, 4 * threads) + 1).astype(int).tolist()
-    return list(_pool(threads).map(work, edges[:-1], edges[1:]))
+    pieces = min(count, RANGES_PER_THREAD * threads) if threads > 1 and count > 1 else 1
+    return over_edges(work, np.linspace(0, count, pieces + 1).astype(int).tolist(), threads)
 
 
 @dataclass(frozen=True)
@@ -55,7 +64,8 @@ class Projected:
         geometry: see `project.GEOMETRY`.
         box: pixel box of each Gaussian; last < first where it is not drawn.
         colours: RGB in this view.
-        tiles: tile lists.
+        tiles: depth order and sizes of the tile lists; `tile_lists` fills them band by band.
+        only_band: the filled lists, where one band holds them all and was filled already.
     """
 
     camera: Float64[np.ndarray, " 25"]
@@ -64,17 +74,8 @@ class Projected:
     geometry: Float32[np.ndarray, "N 8"]
     box: Int32[np.ndarray, "N 4"]
     colours: Float32[np.ndarray, "N 3"]
-    tiles: TileLists
-
-    @property
-    def tiles_x(self) -> int:
-        """Tiles per row."""
-        return (self.size_hw[1] + TILE - 1) // TILE
-
-    @property
-    def num_tiles(self) -> int:
-        """Tiles of the view."""
-        return self.tiles_x * ((self.size_hw[0] + TILE - 1) // TILE)
+    tiles: Tiles
+    only_band: list["Band"] = field(default_factory=list, repr=False)
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,33 @@ class Gradients:
     sh: Float32[np.ndarray, "N K 3"]
     features: Float32[np.ndarray, "N D"]
     means_px: Float32[np.ndarray, "N 2"]
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """One view of a fit, drawn by either backend.
+
+    Attributes:
+        image: premultiplied RGB, without background.
+        alpha: coverage.
+        drawn: whether a Gaussian reaches a pixel of the view.
+        gradients: of the parameters, from those of image and alpha.
+    """
+
+    image: Float32[np.ndarray, "H W 3"]
+    alpha: Float32[np.ndarray, "H W"]
+    drawn: Bool[np.ndarray, " N"]
+    gradients: Callable[[np.ndarray, np.ndarray], Gradients]
+
+
+def refuse_broken(broken: int, total: int) -> None:
+    """Raise where parameters are not finite or quaternions have length zero."""
+    if broken:
+        raise HilsplatError(
+            f"{broken} of {total} Gaussians cannot be drawn: not finite, or a zero quaternion",
+            expected="finite means, log_scales, quats, opacity_logits and sh",
+            fix="drop these Gaussians, or run the gaussians stage again",
+        )
 
 
 def project_gaussians(parameters: Parameters, camera: Camera, degree: int, threads: int) -> Projected:
@@ -119,15 +147,52 @@ def project_gaussians(parameters: Parameters, camera: Camera, degree: int, threa
             colours,
         )
 
-    broken = sum(over_ranges(work, n, threads))
-    if broken:
-        raise HilsplatError(
-            f"{broken} of {n} Gaussians cannot be drawn: not finite, or a zero quaternion",
-            expected="finite means, log_scales, quats, opacity_logits and sh",
-            fix="drop these Gaussians, or run the gaussians stage again",
-        )
+    refuse_broken(sum(over_ranges(work, n, threads)), n)
     tiles = bin_gaussians(box, geometry[:, 6], camera.size_hw)
     return Projected(row, tuple(camera.size_hw), degree, geometry, box, colours, tiles)
+
+
+@dataclass(frozen=True)
+class Band:
+    """The filled lists of tiles begin..end: entry e is gaussian[e - base]."""
+
+    begin: int
+    end: int
+    base: int
+    gaussian: Int32[np.ndarray, " E"]
+
+    def over_tiles(self, work: Callable[[int, int], Any], threads: int) -> None:
+        """Call `work(begin, end)` over ranges that cover the band's tiles, on threads."""
+        over_ranges(
+            lambda begin, end: work(self.begin + begin, self.begin + end), self.end - self.begin, threads
+        )
+
+
+def tile_lists(view: Projected, threads: int) -> Iterator[Band]:
+    """Fill the tile lists, a band of tiles at a time so that memory stays bounded.
+
+    Where one band holds all tiles it is kept for the next pass over the view.
+    """
+    if view.only_band:
+        yield view.only_band[0]
+        return
+    t = view.tiles
+    bands = t.bands()
+    for begin, end in bands:
+        base = int(t.tile_start[begin])
+        gaussian = np.empty(int(t.tile_start[end]) - base, np.int32)
+
+        def fill(first: int, last: int, base: int = base, gaussian: np.ndarray = gaussian) -> None:
+            fill_lists(first, last, base, t.tiles_x, t.order, t.tile_start, view.box, gaussian)
+
+        # every range reads the whole depth order: one per thread, with as many entries each
+        shares = base + np.linspace(0, len(gaussian), max(threads, 1) + 1)
+        edges = np.searchsorted(t.tile_start, shares[1:-1]).clip(begin, end).tolist()
+        over_edges(fill, [begin, *edges, end], threads)
+        band = Band(begin, end, base, gaussian)
+        if len(bands) == 1:
+            view.only_band.append(band)
+        yield band
 
 
 def blend_forward(
@@ -136,23 +201,13 @@ def blend_forward(
     """Blend per-Gaussian channels: premultiplied image and alpha."""
     image = np.empty((*view.size_hw, channels.shape[1]), np.float32)
     alpha = np.empty(view.size_hw, np.float32)
-    t = view.tiles
-    over_ranges(
-        lambda begin, end: blend(
-            begin,
-            end,
-            view.tiles_x,
-            t.tile_start,
-            t.gaussian,
-            view.geometry,
-            view.box,
-            channels,
-            image,
-            alpha,
-        ),
-        view.num_tiles,
-        threads,
-    )
+    t, geometry, box = view.tiles, view.geometry, view.box
+    for band in tile_lists(view, threads):
+        lists = (band.base, t.tiles_x, t.tile_start, band.gaussian)
+        band.over_tiles(
+            lambda begin, end, lists=lists: blend(begin, end, *lists, geometry, box, channels, image, alpha),
+            threads,
+        )
     return image, alpha
 
 
@@ -172,64 +227,48 @@ def blend_gradients(
         channels: what was blended: the view's colours in the first 3 columns, then features.
         image, alpha: what `blend_forward` returned.
     """
-    t, n = view.tiles, len(parameters.means)
-    slots = np.zeros((len(t.gaussian), MOMENTS + channels.shape[1]), np.float32)
+    t, p, n = view.tiles, parameters, len(parameters.means)
+    columns = MOMENTS + channels.shape[1]
+    sums = np.zeros((n, columns))
+    blended = (view.geometry, view.box, channels, image, alpha, grad_image, grad_alpha)
+    for band in tile_lists(view, threads):
+        slots = np.empty((len(band.gaussian), columns), np.float32)
+        lists = (band.base, t.tiles_x, t.tile_start, band.gaussian)
+        band.over_tiles(
+            lambda begin, end, lists=lists, slots=slots: blend_backward(begin, end, *lists, *blended, slots),
+            threads,
+        )
+        # every range reads all entries, so there is one per thread
+        over_edges(
+            lambda begin, end, lists=lists, slots=slots: add_slots(begin, end, lists[-1], slots, sums),
+            np.linspace(0, n, max(threads, 1) + 1).astype(int).tolist(),
+            threads,
+        )
+    # np.zeros leaves the zeroing to the threads that first write there; np.zeros_like would do it here
+    fields = (p.means, p.log_scales, p.quats, p.opacity_logits, p.sh)
+    zeros = [np.zeros(values.shape, np.float32) for values in fields]
+    out = Gradients(*zeros, sums[:, MOMENTS + 3 :].astype(np.float32), np.zeros((n, 2), np.float32))
+    known = (p.means, p.log_scales, p.quats, p.sh, view.degree, view.camera, view.geometry, view.box)
+    outputs = (out.means, out.log_scales, out.quats, out.opacity_logits, out.sh, out.means_px)
     over_ranges(
-        lambda begin, end: blend_backward(
-            begin,
-            end,
-            view.tiles_x,
-            t.tile_start,
-            t.gaussian,
-            t.pair,
-            view.geometry,
-            view.box,
-            channels,
-            image,
-            alpha,
-            grad_image,
-            grad_alpha,
-            slots,
-        ),
-        view.num_tiles,
-        threads,
-    )
-    p = parameters
-    out = Gradients(
-        np.zeros_like(p.means),
-        np.zeros_like(p.log_scales),
-        np.zeros_like(p.quats),
-        np.zeros_like(p.opacity_logits),
-        np.zeros_like(p.sh),
-        np.zeros((n, channels.shape[1] - 3), np.float32),
-        np.zeros((n, 2), np.float32),
-    )
-    over_ranges(
-        lambda begin, end: project_backward(
-            begin,
-            end,
-            p.means,
-            p.log_scales,
-            p.quats,
-            p.sh,
-            view.degree,
-            view.camera,
-            view.geometry,
-            view.colours,
-            t.pair_start,
-            slots,
-            out.means,
-            out.log_scales,
-            out.quats,
-            out.opacity_logits,
-            out.sh,
-            out.features,
-            out.means_px,
-        ),
-        n,
-        threads,
+        lambda begin, end: project_backward(begin, end, *known, view.colours, sums, *outputs), n, threads
     )
     return out
+
+
+def draw(parameters: Parameters, camera: Camera, degree: int, threads: int) -> Drawn:
+    """One view of a fit: image, alpha, and the gradients on demand.
+
+    Raises:
+        HilsplatError: parameters that are not finite, or quaternions of length zero.
+    """
+    view = project_gaussians(parameters, camera, degree, threads)
+    image, alpha = blend_forward(view, view.colours, threads)
+
+    def gradients(grad_image: np.ndarray, grad_alpha: np.ndarray) -> Gradients:
+        return blend_gradients(parameters, view, view.colours, image, alpha, grad_image, grad_alpha, threads)
+
+    return Drawn(image, alpha, view.box[:, 1] >= view.box[:, 0], gradients)
 
 
 def sparse_weights(
@@ -244,24 +283,15 @@ def sparse_weights(
     count = np.zeros(pixels, np.int64)
 
     def walk(cursor: np.ndarray, columns: np.ndarray, weights: np.ndarray) -> None:
-        over_ranges(
-            lambda begin, end: blend_weights(
-                begin,
-                end,
-                view.tiles_x,
-                view.size_hw,
-                t.tile_start,
-                t.gaussian,
-                view.geometry,
-                view.box,
-                np.float32(min_weight),
-                cursor,
-                columns,
-                weights,
-            ),
-            view.num_tiles,
-            threads,
-        )
+        rows = (np.float32(min_weight), cursor, columns, weights)
+        for band in tile_lists(view, threads):
+            lists = (view.size_hw, t.tile_start, band.gaussian, view.geometry, view.box)
+            band.over_tiles(
+                lambda begin, end, base=band.base, lists=lists: blend_weights(
+                    begin, end, base, t.tiles_x, *lists, *rows
+                ),
+                threads,
+            )
 
     walk(count, np.empty(0, np.int32), np.empty(0, np.float32))
     row_start = np.concatenate([[0], np.cumsum(count)])

@@ -14,9 +14,9 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
 
 from hilsplat.scene.cameras import Camera
+from hilsplat.splat.rasterise.compiling import kernel
 
 NEAR = 0.01
 """Gaussians with a smaller depth are not drawn, scene units (gsplat: 0.01)."""
@@ -29,7 +29,7 @@ LOG2_E = 1.4426950408889634
 GEOMETRY = 8
 """Columns of a projected Gaussian: mean x, mean y, a, b, c, log2 of the peak alpha, depth, spare."""
 MOMENTS = 6
-"""Leading columns of a gradient slot: v, v dx, v dy, v dx^2, v dx dy, v dy^2 with v = alpha dL/dalpha."""
+"""Leading columns of gradient slots and sums: v, v dx, v dy, v dx^2, v dx dy, v dy^2; v = alpha dL/dalpha."""
 
 _C0 = 0.28209479177387814
 _C1 = 0.4886025119029199
@@ -64,7 +64,7 @@ def pack_camera(camera: Camera) -> Float[np.ndarray, " 25"]:
     return np.array((*row, *camera.centre, *limits, height, width), dtype=np.float64)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline="always")
 @no_type_check
 def _sh_basis(x, y, z, degree, basis):
     """Real spherical harmonics up to `degree` (at most 3) of a unit direction, 3DGS order and signs."""
@@ -90,7 +90,7 @@ def _sh_basis(x, y, z, degree, basis):
             basis[15] = -_C30 * x * (xx - 3.0 * yy)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline="always")
 @no_type_check
 def _sh_slope(x, y, z, degree, slope):
     """Derivatives of `_sh_basis` by x, y, z (taken as independent): slope[k] = (d/dx, d/dy, d/dz)."""
@@ -119,7 +119,7 @@ def _sh_slope(x, y, z, degree, slope):
         slope[15, 0], slope[15, 1] = -_C30 * (3.0 * xx - 3.0 * yy), 6.0 * _C30 * x * y
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline="always")
 @no_type_check
 def _cam_from_gaussian(camera, quats, scales, i, axes, factor):
     """Rotation of Gaussian i into the camera (axes) and the same with columns scaled (factor)."""
@@ -139,7 +139,7 @@ def _cam_from_gaussian(camera, quats, scales, i, axes, factor):
     return w, x, y, z, norm
 
 
-@njit(nogil=True, cache=True)
+@kernel
 @no_type_check
 def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, camera, geometry, box, colours):
     """Project Gaussians begin..end into a view.
@@ -225,7 +225,7 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
     return broken
 
 
-@njit(nogil=True, cache=True)
+@kernel
 @no_type_check
 def project_backward(
     begin,
@@ -237,20 +237,18 @@ def project_backward(
     degree,
     camera,
     geometry,
+    box,
     colours,
-    pair_start,
-    slots,
+    sums,
     grad_means,
     grad_log_scales,
     grad_quats,
     grad_opacity_logits,
     grad_sh,
-    grad_features,
     grad_means_px,
 ):
-    """Gradients of Gaussians begin..end from their slots, one per (tile, Gaussian).
+    """Gradients of Gaussians begin..end from their moments and dL/dcolours (rows of `sums`).
 
-    Slots of a Gaussian are consecutive and added in that order, so sums do not depend on threads.
     The outputs come in as zeros. `grad_means_px` is dL/d(projected mean), per pixel.
     """
     fx, fy = camera[12], camera[13]
@@ -258,29 +256,21 @@ def project_backward(
     scales, basis, slope = np.empty(3), np.empty(16), np.empty((16, 3))
     rotation_grad, jacobian = np.empty((3, 3)), np.empty((2, 3))
     bases = (degree + 1) * (degree + 1)
-    channels = slots.shape[1] - MOMENTS
-    sums = np.empty(slots.shape[1])
     for i in range(begin, end):
-        if pair_start[i + 1] == pair_start[i]:
+        if box[i, 1] < box[i, 0]:
             continue
-        sums[:] = 0.0
-        for pair in range(pair_start[i], pair_start[i + 1]):
-            for k in range(MOMENTS + channels):
-                sums[k] += slots[pair, k]
-        for k in range(3, channels):
-            grad_features[i, k - 3] = sums[MOMENTS + k]
 
         # log alpha = ln opacity - (A dx^2 + 2 B dx dy + C dy^2) / 2, conic (A, B, C) = inverse covariance
         conic_a = 2.0 / LOG2_E * geometry[i, 2]
         conic_b = geometry[i, 3] / LOG2_E
         conic_c = 2.0 / LOG2_E * geometry[i, 4]
         opacity = 2.0 ** float(geometry[i, 5])
-        grad_opacity_logits[i] = sums[0] * (1.0 - opacity)
-        gpx = -(conic_a * sums[1] + conic_b * sums[2])
-        gpy = -(conic_b * sums[1] + conic_c * sums[2])
+        grad_opacity_logits[i] = sums[i, 0] * (1.0 - opacity)
+        gpx = -(conic_a * sums[i, 1] + conic_b * sums[i, 2])
+        gpy = -(conic_b * sums[i, 1] + conic_c * sums[i, 2])
         grad_means_px[i, 0], grad_means_px[i, 1] = gpx, gpy
         # dL/d conic as a symmetric matrix (p, q; q, r); dL/d cov = -conic (p, q; q, r) conic
-        p, q, r = -0.5 * sums[3], -0.5 * sums[4], -0.5 * sums[5]
+        p, q, r = -0.5 * sums[i, 3], -0.5 * sums[i, 4], -0.5 * sums[i, 5]
         m00, m01 = conic_a * p + conic_b * q, conic_a * q + conic_b * r
         m10, m11 = conic_b * p + conic_c * q, conic_b * q + conic_c * r
         cov_xx = -(m00 * conic_a + m01 * conic_b)
@@ -372,9 +362,9 @@ def project_backward(
         inverse = 1.0 / math.sqrt(vx * vx + vy * vy + vz * vz)
         vx, vy, vz = vx * inverse, vy * inverse, vz * inverse
         _sh_basis(vx, vy, vz, degree, basis)
-        red = sums[MOMENTS] if colours[i, 0] > 0.0 else 0.0
-        green = sums[MOMENTS + 1] if colours[i, 1] > 0.0 else 0.0
-        blue = sums[MOMENTS + 2] if colours[i, 2] > 0.0 else 0.0
+        red = sums[i, MOMENTS] if colours[i, 0] > 0.0 else 0.0
+        green = sums[i, MOMENTS + 1] if colours[i, 1] > 0.0 else 0.0
+        blue = sums[i, MOMENTS + 2] if colours[i, 2] > 0.0 else 0.0
         for k in range(bases):
             grad_sh[i, k, 0] = basis[k] * red
             grad_sh[i, k, 1] = basis[k] * green

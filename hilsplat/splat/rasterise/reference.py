@@ -1,6 +1,7 @@
 """Slow, obvious rendering in float64 torch: what the fast backends are tested against.
 
-Every Gaussian is evaluated at every pixel, gradients are torch's own. Used by tests only.
+Every Gaussian is evaluated at every pixel, gradients are torch's own. Used by tests only, and shares
+no code with the backends: the constants stand here again.
 """
 
 import torch
@@ -46,18 +47,8 @@ def render_reference(
     gaussians: Gaussians, camera: Camera, sh_degree: int, features: Float[Tensor, "N D"] | None = None
 ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"], Float[Tensor, "N H W"]]:
     """Premultiplied RGB (+ features), alpha, and the blending weights, in float64."""
-    g = Gaussians(
-        *(
-            values.double()
-            for values in (
-                gaussians.means,
-                gaussians.log_scales,
-                gaussians.quats,
-                gaussians.opacity_logits,
-                gaussians.sh,
-            )
-        )
-    )
+    fields = ("means", "log_scales", "quats", "opacity_logits", "sh")
+    g = Gaussians(*(getattr(gaussians, name).double() for name in fields))
     height, width = camera.size_hw
     cam_from_world, K = torch.from_numpy(camera.cam_from_world), torch.from_numpy(camera.K)
     cam = g.means @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]

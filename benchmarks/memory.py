@@ -1,0 +1,58 @@
+"""Peak memory of one forward and one backward pass, in a process of its own (Linux).
+
+    python -m benchmarks.memory 1000000 2160 3840 3     # Gaussians, height, width, channels
+
+prints what forward, and forward and backward, take at their peak beyond the scene itself, MiB. What
+counts are the image and alpha, all gradients, and everything in between; not the gradients of the
+image that are handed in.
+"""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+
+def peaks_mib(num_gaussians: int, size_hw: tuple[int, int], channels: int) -> tuple[float, float]:
+    """Peak of forward, and of forward and backward, measured in a fresh process."""
+    numbers = [str(number) for number in (num_gaussians, *size_hw, channels)]
+    command = [sys.executable, "-m", "benchmarks.memory", *numbers]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    return float(printed[-2]), float(printed[-1])
+
+
+def _measure(num_gaussians: int, size_hw: tuple[int, int], channels: int) -> tuple[float, float]:
+    from benchmarks.scenes import random_scene
+    from hilsplat.splat.rasterise.api import to_parameters
+    from hilsplat.splat.rasterise.cpu import blend_forward, blend_gradients, project_gaussians
+
+    def passes(num: int, size_hw: tuple[int, int]) -> tuple[float, float]:
+        gaussians, camera = random_scene(num, size_hw)
+        parameters = to_parameters(gaussians)
+        features = np.ones((num, channels - 3), np.float32)
+        grad = np.ones((*size_hw, channels), np.float32), np.ones(size_hw, np.float32)
+        # a first peak that is forgotten: the process begins with what it holds now
+        Path("/proc/self/clear_refs").write_text("5")
+        before = _status_mib("VmRSS")
+        view = project_gaussians(parameters, camera, 3, 1)
+        values = np.concatenate([view.colours, features], axis=1) if channels > 3 else view.colours
+        image, alpha = blend_forward(view, values, 1)
+        forward = _status_mib("VmHWM") - before
+        blend_gradients(parameters, view, values, image, alpha, *grad, 1)
+        return forward, _status_mib("VmHWM") - before
+
+    passes(1000, (32, 32))  # loads the kernels
+    return passes(num_gaussians, size_hw)
+
+
+def _status_mib(name: str) -> float:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(f"{name}:"):
+            return int(line.split()[1]) / 1024
+    raise LookupError(f"/proc/self/status has no {name}")
+
+
+if __name__ == "__main__":
+    number, height, width, depth = (int(word) for word in sys.argv[1:])
+    print(*(f"{peak:.0f}" for peak in _measure(number, (height, width), depth)))

@@ -1,0 +1,49 @@
+"""Which backend draws: the CPU's own, or gsplat on CUDA."""
+
+import logging
+from functools import cache
+from typing import Literal
+
+import torch
+
+from hilsplat.base.errors import DeviceError
+
+logger = logging.getLogger(__name__)
+
+Device = Literal["cpu", "cuda"]
+DEVICES: tuple[Device, ...] = ("cpu", "cuda")
+
+
+@cache
+def cuda_problem() -> str | None:
+    """Why the CUDA backend cannot be used here; None where it can."""
+    if not torch.cuda.is_available():
+        return f"torch {torch.__version__} finds no CUDA device"
+    try:
+        import gsplat  # noqa: F401
+    except ImportError as error:
+        return f"gsplat cannot be imported: {error}"
+    return None
+
+
+@cache
+def choose_device(wanted: Literal["auto", "cpu", "cuda"]) -> Device:
+    """The backend for a stage, told in the log the first time.
+
+    Args:
+        wanted: `auto` takes CUDA where torch finds a device and gsplat can be imported.
+
+    Raises:
+        DeviceError: `cuda` was asked for and cannot be used. There is no falling back.
+    """
+    problem = cuda_problem()
+    if wanted == "cuda" and problem:
+        raise DeviceError(
+            "device: cuda was asked for and cannot be used",
+            expected="a CUDA build of torch that finds a device, and gsplat",
+            found=problem,
+            fix="pip install 'hilsplat[gpu]' on a machine with a CUDA device, or set device: auto or cpu",
+        )
+    device: Device = "cuda" if wanted != "cpu" and not problem else "cpu"
+    logger.info("rasterising on %s (device: %s%s)", device, wanted, f"; {problem}" if problem else "")
+    return device

@@ -1,0 +1,132 @@
+"""What the CPU backend promises beyond the numbers: threads, bands of tiles, the notice, the device."""
+
+import logging
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from hilsplat.base.errors import DeviceError
+from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.rasterise import binning, compiling
+from hilsplat.splat.rasterise.api import pixel_weights, render
+from hilsplat.splat.rasterise.binning import bin_gaussians, fill_lists
+from hilsplat.splat.rasterise.device import choose_device, cuda_problem
+from tests.unit.splat.rasterise_scenes import camera, leaves, random_gaussians
+
+
+def everything(threads: int) -> list[torch.Tensor]:
+    """Images, gradients and weights of one scene."""
+    base, view = random_gaussians(300, seed=5), camera(70, 90)
+    parameters = leaves(base)
+    features = torch.linspace(-1, 1, 1800).reshape(300, 6).requires_grad_()
+    out = render(Gaussians(*parameters), view, features=features, threads=threads, depth=True)
+    (out.color.square().sum() + out.features.square().sum() + out.alpha.sum()).backward()
+    matrix = pixel_weights(base, view, min_weight=1e-3, threads=threads)
+    sparse = [torch.from_numpy(values) for values in (matrix.data, matrix.indices, matrix.indptr)]
+    images = [out.color.detach(), out.features.detach(), out.alpha.detach(), out.depth]
+    return [*images, *(leaf.grad for leaf in [*parameters, features]), *sparse]
+
+
+@pytest.mark.parametrize("threads", [2, 3, 7])
+def test_any_number_of_threads_gives_the_same_bytes(threads):
+    for one, several in zip(everything(1), everything(threads), strict=True):
+        assert torch.equal(one, several)
+
+
+@pytest.mark.parametrize("max_entries", [1, 50, 1000])
+def test_bands_of_tiles_give_the_same_bytes(monkeypatch, max_entries):
+    whole = everything(1)
+    bands = binning.Tiles.bands
+    monkeypatch.setattr(binning.Tiles, "bands", lambda tiles: bands(tiles, max_entries))
+    for one, in_bands in zip(whole, everything(2), strict=True):
+        assert torch.equal(one, in_bands)
+
+
+def test_bands_cover_all_tiles_and_hold_no_more_than_asked():
+    tiles = binning.Tiles(2, np.empty(0, np.int32), np.array([0, 3, 3, 10, 12, 13]))
+    # tile 2 alone has 7 entries, more than asked for, and stands alone
+    assert tiles.bands(5) == [(0, 2), (2, 3), (3, 5)]
+    assert tiles.bands() == [(0, 5)]
+
+
+def test_tiles_list_the_boxes_that_touch_them_front_to_back():
+    rng = np.random.default_rng(0)
+    low, high = (np.sort(rng.integers(0, side, (2, 50)), axis=0) for side in (50, 35))
+    box = np.stack([low[0], low[1], high[0], high[1]], axis=1).astype(np.int32)
+    box[::7, 1] = -1  # not drawn
+    depths = rng.uniform(1, 2, 50).astype(np.float32)
+    depths[10:20] = depths[10]  # equal depths stay in the order of the rows
+    tiles = bin_gaussians(box, depths, (35, 50))
+    order = np.argsort(depths, kind="stable")
+    gaussian = np.empty(tiles.num_entries, np.int32)
+    for begin, end in ((0, 5), (5, 6), (6, 12)):  # in pieces: as threads and bands fill them
+        fill_lists(begin, end, 0, tiles.tiles_x, tiles.order, tiles.tile_start, box, gaussian)
+    for tile in range(4 * 3):
+        x, y = tile % 4 * 16, tile // 4 * 16
+        touches = (box[:, 0] < x + 16) & (box[:, 1] >= x) & (box[:, 2] < y + 16) & (box[:, 3] >= y)
+        expected = [i for i in order if touches[i] and box[i, 1] >= box[i, 0]]
+        assert gaussian[tiles.tile_start[tile] : tiles.tile_start[tile + 1]].tolist() == expected
+
+
+# ---- compiling ------------------------------------------------------------------------------------
+
+FILL_ONE_LIST = """
+import logging, sys
+logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(message)s")
+import numpy as np
+from hilsplat.splat.rasterise.binning import fill_lists
+one = np.zeros(1, np.int32)
+fill_lists(0, 1, 0, 1, one, np.array([0, 1]), np.zeros((1, 4), np.int32), one.copy())
+"""
+
+
+def test_compiling_is_announced_once_and_only_when_it_happens(tmp_path):
+    def log() -> str:
+        environment = {"NUMBA_CACHE_DIR": str(tmp_path), "PATH": ""}
+        command = [sys.executable, "-c", FILL_ONE_LIST]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+
+    assert log().count("compiling kernels, once") == 1
+    assert "compiling" not in log()
+
+
+def test_an_edited_module_makes_the_kernels_of_all_modules_stale(monkeypatch):
+    def double(x):
+        return 2 * x
+
+    stamps = []
+    for digest in ("one state of the sources", "another"):
+        monkeypatch.setattr(compiling, "_DIGEST", digest)
+        stamps.append(compiling.kernel(double)._cache._cache_file._source_stamp)
+    assert stamps[0] != stamps[1]
+
+
+# ---- device ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def no_cuda(monkeypatch):
+    """A machine without CUDA, whatever this one has."""
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    for cached in (cuda_problem, choose_device):
+        cached.cache_clear()
+    yield
+    for cached in (cuda_problem, choose_device):
+        cached.cache_clear()
+
+
+@pytest.mark.usefixtures("no_cuda")
+def test_auto_takes_the_cpu_without_cuda_and_says_so_once(caplog):
+    with caplog.at_level(logging.INFO):
+        assert choose_device("auto") == choose_device("auto") == "cpu"
+    assert caplog.text.count("rasterising on cpu (device: auto") == 1
+    assert "finds no CUDA device" in caplog.text
+
+
+@pytest.mark.usefixtures("no_cuda")
+def test_cuda_is_never_replaced_by_the_cpu():
+    with pytest.raises(DeviceError, match=r"device: cuda was asked for(?s:.*)finds no CUDA device(?s:.*)gpu"):
+        choose_device("cuda")
