@@ -1,9 +1,11 @@
-# Base 3D Gaussian Splatting.
+# Base 3D Gaussian Splatting: a fit, or somebody's Gaussians (column gaussians of the scene sheet).
 rule gaussians:
     input:
         scene="results/{dataset}/{scene}/scene",
+        brought=brought_gaussians_of,
     output:
         ply="results/{dataset}/{scene}/gaussians.ply",
+        coordinates="results/{dataset}/{scene}/gaussians.json",
         report=directory("results/{dataset}/{scene}/gaussians"),
     log:
         "results/{dataset}/{scene}/logs/gaussians.log",
@@ -16,9 +18,11 @@ rule gaussians:
         mem_mb=3000,
     params:
         settings=settings_of("gaussians"),
+        brought=brought_option_of,
         seed=RUN.seed,
         cache="results/.cache",
         code=code("gaussians"),
     shell:
         "hilsplat gaussians --scene {input.scene} --settings {params.settings:q} --seed {params.seed}"
-        " --threads {threads} --cache {params.cache} --report {output.report} --out {output.ply} --log {log}"
+        " {params.brought} --threads {threads} --cache {params.cache} --report {output.report}"
+        " --out {output.ply} --log {log}"

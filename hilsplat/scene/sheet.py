@@ -1,11 +1,10 @@
-"""The scene sheet (config/scenes.tsv): which scenes there are, and adding one's own photographs.
+"""The scene sheet (config/scenes.tsv): which scenes there are.
 
 The workflow imports this module at start-up, so nothing heavy is imported at its top.
 """
 
-import hashlib
 import re
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,9 @@ from hilsplat.base.errors import SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, list_images
 
 COLUMNS = ("dataset", "scene", "group", "source", "unit")
+OPTIONAL_COLUMNS = ("gaussians",)
+NOTHING = ("", "-")
+"""Cells of an optional column that say nothing."""
 GROUPS = ("benchmark", "development", "ci", "photos", "lerf")
 UNITS = ("metre", "arbitrary")
 PHOTOS = "photos"
@@ -30,10 +32,6 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 DATA_PREFIX = "data:"
 """Begins a source that lies below the folder of real data sets (`data_root`)."""
 WORLD_SOURCE = re.compile(r"world:([a-z][a-z0-9_-]*):([0-9]{1,9})")
-OTHER_PHOTO_SUFFIXES = frozenset(
-    {".heic", ".heif", ".avif", ".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".gif"}
-)
-"""Photographs that we do not read; a folder of them deserves a better answer than "no images"."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +45,8 @@ class SceneRow:
         source: `world:<kind>:<seed>`, `data:<folder below data_root>`, or a folder.
         unit: unit of the source's lengths, "metre" or "arbitrary".
         folder: the source folder, resolved; None for a world, and for `data:` without a data root.
+        gaussians: somebody's 3DGS PLY in the source's coordinates, which takes the place of a fit;
+            None where the Gaussians are fitted, and for `data:` without a data root.
     """
 
     dataset: str
@@ -55,6 +55,7 @@ class SceneRow:
     source: str
     unit: str
     folder: Path | None
+    gaussians: Path | None = None
 
     @property
     def name(self) -> str:
@@ -108,6 +109,8 @@ def read_sheet(
 ) -> list[SceneRow]:
     """Read and check the scene sheet: tab-separated, one header line, `#` begins a comment line.
 
+    The column `gaussians` may be left out; an empty cell or "-" in it has the Gaussians fitted.
+
     Args:
         path: the sheet; relative sources start from its project root.
         checked_groups: groups whose source folders must exist and hold images; None for all. A
@@ -119,7 +122,7 @@ def read_sheet(
         SceneError: naming sheet, line, column and the way out.
     """
     path = Path(path)
-    lines = _content_lines(path)
+    lines = content_lines(path)
     if not lines:
         raise SceneError(f"scene sheet {path} is empty", fix=f"begin it with the line: {_joined(COLUMNS)}")
     header_line, header_text = lines[0]
@@ -149,7 +152,7 @@ def read_sheet(
     return rows
 
 
-def _content_lines(path: Path) -> list[tuple[int, str]]:
+def content_lines(path: Path) -> list[tuple[int, str]]:
     """Numbered lines of the sheet without comments and empty ones."""
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -175,7 +178,7 @@ def _joined(columns: tuple[str, ...] | list[str]) -> str:
 def _check_header(path: Path, line: int, header: list[str]) -> None:
     """Refuse missing, unknown or repeated columns."""
     missing = [column for column in COLUMNS if column not in header]
-    unknown = [column for column in header if column not in COLUMNS]
+    unknown = [column for column in header if column not in (*COLUMNS, *OPTIONAL_COLUMNS)]
     repeated = [column for column, count in Counter(header).items() if count > 1]
     if missing or unknown or repeated:
         problems = [
@@ -185,7 +188,7 @@ def _check_header(path: Path, line: int, header: list[str]) -> None:
         ]
         raise SceneError(
             f"{path}, line {line}: the header cannot be used",
-            expected=f"the columns {_joined(COLUMNS)}, separated by tabs",
+            expected=f"the columns {_joined(COLUMNS)}, separated by tabs; also {_joined(OPTIONAL_COLUMNS)}",
             found="; ".join(problems),
             fix="correct the header line; blanks or commas do not separate columns",
         )
@@ -212,6 +215,7 @@ def _row(
             )
     source = cells["source"]
     where = f"{path}, line {line}, column source"
+    is_checked = checked_groups is None or cells["group"] in checked_groups
     if not source:
         raise SceneError(f"{where}: it is empty", fix="give world:<kind>:<seed>, or a folder of images")
     if source.startswith("world:"):
@@ -222,18 +226,51 @@ def _row(
                 fix="correct the source",
             )
         folder = None
-    elif source.startswith(DATA_PREFIX) and not data_root:
-        folder = None
     else:
-        start = (
-            project_root(path) / Path(data_root).expanduser()
-            if source.startswith(DATA_PREFIX)
-            else project_root(path)
-        )
-        folder = (start / Path(source.removeprefix(DATA_PREFIX)).expanduser()).resolve()
-        if checked_groups is None or cells["group"] in checked_groups:
+        folder = _resolved(path, source, data_root)
+        if folder is not None and is_checked:
             _check_source(where, folder)
-    return SceneRow(cells["dataset"], cells["scene"], cells["group"], source, cells["unit"], folder)
+    gaussians = None
+    if (cell := cells.get("gaussians", "")) not in NOTHING:
+        gaussians = _resolved(path, cell, data_root)
+        where = f"{path}, line {line}, column gaussians"
+        if gaussians is None and folder is not None and is_checked:
+            raise SceneError(
+                f"{where}: {cell!r} lies below data_root, which is not set",
+                fix="set data_root, or give a path that starts from the project folder",
+            )
+        if gaussians is not None and is_checked:
+            _check_gaussians(where, gaussians)
+    return SceneRow(
+        cells["dataset"], cells["scene"], cells["group"], source, cells["unit"], folder, gaussians
+    )
+
+
+def _resolved(sheet: Path, place: str, data_root: str) -> Path | None:
+    """A path of the sheet, from the project root or, with `data:`, the data root; None without that."""
+    start = project_root(sheet)
+    if place.startswith(DATA_PREFIX):
+        if not data_root:
+            return None
+        start = start / Path(data_root).expanduser()
+    return (start / Path(place.removeprefix(DATA_PREFIX)).expanduser()).resolve()
+
+
+def _check_gaussians(where: str, ply: Path) -> None:
+    """Refuse a path that is no PLY file."""
+    if not ply.is_file():
+        problem = "is a folder" if ply.exists() else "is missing"
+    else:
+        with ply.open("rb") as stream:
+            head = stream.read(4)
+        if head in (b"ply\n", b"ply\r"):
+            return
+        problem = f"is no PLY: it begins with {head!r}"
+    raise SceneError(
+        f"{where}: file {ply} {problem}",
+        expected="a 3DGS PLY; relative paths start from the project folder",
+        fix='correct the path, or write "-" to have the Gaussians fitted',
+    )
 
 
 def _check_source(where: str, folder: Path) -> None:
@@ -260,180 +297,3 @@ def _what_else(folder: Path) -> str:
         return ", ".join(f"{count} files {kind}" for kind, count in sorted(kinds.items()))
     below = sorted(sub.name for sub in folder.iterdir() if sub.is_dir() and list_images(sub))
     return f"folders with images below it: {', '.join(below[:5])}" if below else "nothing"
-
-
-@dataclass(frozen=True)
-class PhotoReport:
-    """What a folder of photographs holds.
-
-    Attributes:
-        folder: where the photographs are.
-        sizes: number of readable photographs per upright size (height, width), px.
-        unreadable: (file name, reason) of each image that cannot be read.
-        num_rotated: photographs that an EXIF flag turns upright.
-        duplicates: groups of file names with identical bytes.
-        passed_over: number of files per suffix that look like photographs but are not read.
-    """
-
-    folder: Path
-    sizes: dict[tuple[int, int], int]
-    unreadable: tuple[tuple[str, str], ...]
-    num_rotated: int
-    duplicates: tuple[tuple[str, ...], ...]
-    passed_over: dict[str, int]
-
-    @property
-    def num_readable(self) -> int:
-        """Photographs that can be read, identical copies included."""
-        return sum(self.sizes.values())
-
-    @property
-    def num_distinct(self) -> int:
-        """Photographs that can be read, identical copies counted once."""
-        return self.num_readable - sum(len(names) - 1 for names in self.duplicates)
-
-    def __str__(self) -> str:
-        lines = [f"{self.num_readable} photographs in {self.folder}"]
-        for (height, width), count in sorted(self.sizes.items(), key=lambda item: (-item[1], item[0])):
-            lines.append(f"  {count:>5}  of {width} x {height} px (width x height)")
-        if self.num_rotated:
-            lines.append(f"  {self.num_rotated:>5}  turned upright by their EXIF flag")
-        for names in self.duplicates:
-            lines.append(f"  {len(names):>5}  are the same file: {', '.join(names)}")
-        for suffix, count in sorted(self.passed_over.items()):
-            lines.append(f"  {count:>5}  {suffix} passed over: convert them to JPEG or PNG to use them")
-        if self.unreadable:
-            lines.append(f"  {len(self.unreadable):>5}  cannot be read:")
-            lines += [f"           {name}: {reason}" for name, reason in self.unreadable]
-        return "\n".join(lines)
-
-
-def inspect_photos(folder: Path) -> PhotoReport:
-    """Read every photograph of a folder (or of its `images/`) in full and report what is there.
-
-    Raises:
-        SceneError: there is no such folder, or two photographs differ only in their suffix.
-    """
-    from PIL import Image, ImageOps
-
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise SceneError(
-            f"photo folder {folder} {'is a file' if folder.exists() else 'is missing'}",
-            fix="give the folder that holds the photographs",
-        )
-    where = photo_folder(folder)
-    sizes: Counter[tuple[int, int]] = Counter()
-    unreadable: list[tuple[str, str]] = []
-    by_digest: dict[str, list[str]] = defaultdict(list)
-    by_stem: dict[str, list[str]] = defaultdict(list)
-    num_rotated = 0
-    for path in list_images(where):
-        if path.stat().st_size == 0:
-            unreadable.append((path.name, "the file is empty"))
-            continue
-        try:
-            with Image.open(path) as image:
-                image.load()
-                turned = image.getexif().get(0x0112, 1) not in (0, 1)
-                width, height = ImageOps.exif_transpose(image).size
-        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-            reason = str(error).replace(str(path), path.name)
-            unreadable.append((path.name, f"{reason} ({path.stat().st_size} bytes)"))
-            continue
-        sizes[height, width] += 1
-        num_rotated += turned
-        with path.open("rb") as stream:
-            by_digest[hashlib.file_digest(stream, "sha256").hexdigest()].append(path.name)
-        by_stem[path.stem].append(path.name)
-    for names in by_stem.values():
-        if len(names) > 1:
-            raise SceneError(
-                f"{len(names)} photographs in {where} would become the same view",
-                found=", ".join(names),
-                fix="rename or remove all but one: views are named after the file without its suffix",
-            )
-    passed_over = Counter(
-        path.suffix.lower()
-        for path in where.iterdir()
-        if path.is_file() and path.suffix.lower() in OTHER_PHOTO_SUFFIXES
-    )
-    return PhotoReport(
-        folder=where,
-        sizes=dict(sizes),
-        unreadable=tuple(unreadable),
-        num_rotated=num_rotated,
-        duplicates=tuple(tuple(names) for names in by_digest.values() if len(names) > 1),
-        passed_over=dict(passed_over),
-    )
-
-
-def add_scene(sheet: Path, name: str, photos: Path, unit: str = "arbitrary") -> PhotoReport:
-    """Append one's own photographs to the sheet as scene `photos/<name>`; an absent sheet is begun.
-
-    The folder stays where it is: the sheet points at it, relative to the project where it lies
-    inside.
-
-    Args:
-        sheet: the scene sheet.
-        name: name of the new scene.
-        photos: folder of photographs.
-        unit: unit of lengths where the folder brings metric poses.
-
-    Raises:
-        SceneError: the name cannot be used or is taken, photographs cannot be read, or there are
-            fewer than three different ones and no known poses. The sheet is unchanged then.
-    """
-    from hilsplat.base.artifacts import write_text
-
-    sheet, photos = Path(sheet), Path(photos).expanduser().resolve()
-    if problem := name_problem(name):
-        raise SceneError(
-            f"{name!r} cannot be the name of a scene",
-            expected=NAME_RULE,
-            found=problem,
-            fix="choose another name, such as my-desk_2",
-        )
-    if unit not in UNITS:
-        raise SceneError(f"unit {unit!r} is unknown", expected=f"one of {', '.join(UNITS)}")
-    rows = read_sheet(sheet, checked_groups=()) if sheet.exists() else []
-    taken = {row.name.casefold(): row for row in rows}
-    if (row := taken.get(f"{PHOTOS}/{name}".casefold())) is not None:
-        raise SceneError(
-            f"scene {row.name} is already in {sheet}",
-            found=f"source {row.source}",
-            fix="choose another name, or remove its line from the sheet first",
-        )
-    report = inspect_photos(photos)
-    if report.unreadable:
-        raise SceneError(
-            f"{len(report.unreadable)} photographs in {report.folder} cannot be read",
-            found="; ".join(f"{file}: {reason}" for file, reason in report.unreadable),
-            fix="remove them from the folder or replace them by whole copies, then try again",
-        )
-    if report.num_distinct < MIN_PHOTOS and not has_known_poses(photos):
-        found = [f"{report.num_distinct} different ones that can be read"]
-        found += [
-            f"{count} {suffix} files passed over" for suffix, count in sorted(report.passed_over.items())
-        ]
-        raise SceneError(
-            f"{report.folder} has too few photographs",
-            expected=f"at least {MIN_PHOTOS} (20 or more are better)",
-            found="; ".join(found),
-            fix="add photographs (JPEG or PNG) of the same scene",
-        )
-    root = project_root(sheet)
-    source = photos.relative_to(root).as_posix() if photos.is_relative_to(root) else str(photos)
-    if not source.isprintable() or source.startswith("world:"):
-        raise SceneError(f"the path {source!r} cannot stand in the scene sheet", fix="rename the folder")
-    values = {"dataset": PHOTOS, "scene": name, "group": PHOTOS, "source": source, "unit": unit}
-    if sheet.exists():
-        text = sheet.read_text(encoding="utf-8-sig")
-        header = [cell.strip() for cell in _content_lines(sheet)[0][1].split("\t")]
-        if not text.endswith("\n"):
-            text += "\n"
-    else:
-        header = list(COLUMNS)
-        text = "\t".join(header) + "\n"
-    write_text(sheet, text + "\t".join(values[column] for column in header) + "\n")
-    return report

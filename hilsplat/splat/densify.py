@@ -12,6 +12,7 @@ from jaxtyping import Float32, Float64, Int32
 
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.optimise import FIELDS, Adam
+from hilsplat.splat.rotations import rotate
 
 SMALL = 0.01
 """Largest axis, in units of the extent, up to which a Gaussian is cloned; larger ones are split (3DGS)."""
@@ -84,10 +85,7 @@ def _offsets(
     local = generator.normal(size=log_scales.shape) * np.exp(log_scales.astype(np.float64))
     q = quats.astype(np.float64)
     q /= np.linalg.norm(q, axis=1, keepdims=True)
-    # rotate by the quaternion: v + 2 w (u x v) + 2 u x (u x v)
-    u = q[:, 1:]
-    turned = np.cross(u, local)
-    return (local + 2 * (q[:, :1] * turned + np.cross(u, turned))).astype(np.float32)
+    return rotate(q, local).astype(np.float32)
 
 
 def prune(adam: Adam, settings: GaussiansSettings, extent: float) -> None:

@@ -4,19 +4,28 @@ from dataclasses import dataclass
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
+from hilsplat.settings import GaussiansSettings
+from hilsplat.splat.rasterise.compiling import kernel
 from hilsplat.splat.rasterise.cpu import Gradients, Parameters, over_ranges
 
 FIELDS = ("means", "log_scales", "quats", "opacity_logits", "sh")
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15  # 3DGS
 
-MEANS_RATE = (1.6e-4, 1.6e-6)  # first and last step, in units of the scene's extent; 3DGS
-SCALES_RATE, QUATS_RATE, OPACITY_RATE = 5e-3, 1e-3, 0.05  # 3DGS
+OPACITY_RATE = 0.05  # 3DGS
 SH_RATE, SH_REST_RATE = 2.5e-3, 2.5e-3 / 20  # constant term, other terms; 3DGS
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+def means_rate(settings: GaussiansSettings, progress: float) -> float:
+    """Step size of the means in units of the cameras' extent: falls exponentially from first to last.
+
+    Args:
+        progress: share of the iterations done, in [0, 1].
+    """
+    return settings.means_rate ** (1 - progress) * settings.means_rate_last**progress
+
+
+@kernel(error_model="numpy")
 @no_type_check
 def _adam_rows(
     begin, end, values, gradients, first, second, rate, rate_rest, columns, head, root, one_minus1
@@ -70,19 +79,20 @@ class Adam:
         """The current values, as the rasteriser takes them (shared memory)."""
         return Parameters(**self.parameters)
 
-    def step(self, gradients: Gradients, progress: float, extent: float, threads: int) -> None:
+    def step(
+        self, gradients: Gradients, settings: GaussiansSettings, rate_of_means: float, threads: int
+    ) -> None:
         """One step.
 
         Args:
-            progress: share of the iterations done, in [0, 1]; the means' step falls exponentially with it.
-            extent: radius of the cameras, scene units.
+            settings: step sizes of scales and quaternions.
+            rate_of_means: step size of the means, scene units.
         """
         self.steps += 1
-        means_rate = extent * MEANS_RATE[0] ** (1 - progress) * MEANS_RATE[1] ** progress
         rates = {
-            "means": (means_rate, means_rate),
-            "log_scales": (SCALES_RATE, SCALES_RATE),
-            "quats": (QUATS_RATE, QUATS_RATE),
+            "means": (rate_of_means, rate_of_means),
+            "log_scales": (settings.scales_rate, settings.scales_rate),
+            "quats": (settings.quats_rate, settings.quats_rate),
             "opacity_logits": (OPACITY_RATE, OPACITY_RATE),
             "sh": (SH_RATE, SH_REST_RATE),
         }

@@ -47,8 +47,14 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
         PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(temporary)
 
 
-def load_ply(path: Path) -> Gaussians:
+def load_ply(path: Path, fix: str = "delete it and run the gaussians stage again") -> Gaussians:
     """Read a 3DGS PLY, of this package or another; the number of f_rest columns gives the degree.
+
+    Binary or ASCII, properties in any order and of any number type; properties that 3DGS does not
+    know (colours, labels) and normals are passed over, present or not.
+
+    Args:
+        fix: what a person can do about a file that cannot be used.
 
     Raises:
         ArtifactError: the file is missing, damaged, no 3DGS PLY or holds numbers that are not finite.
@@ -59,10 +65,10 @@ def load_ply(path: Path) -> Gaussians:
     except FileNotFoundError as error:
         raise ArtifactError(f"{path} is missing", fix="run the gaussians stage") from error
     except (PlyParseError, KeyError, ValueError, EOFError) as error:
-        raise ArtifactError(
-            f"{path} is no readable PLY: {error}", fix="delete it and run the gaussians stage again"
-        ) from error
+        raise ArtifactError(f"{path} is no readable PLY: {error}", fix=fix) from error
     found = {prop.name for prop in vertex.properties}
+    if "packed_position" in found:
+        raise ArtifactError(f"{path} is a compressed PLY", expected="a plain 3DGS PLY", fix=fix)
     num_rest = sum(name.startswith("f_rest_") for name in found)
     num_bases = num_rest // 3 + 1
     missing = [name for name in _names(num_bases) if name not in found and name not in ("nx", "ny", "nz")]
@@ -71,6 +77,7 @@ def load_ply(path: Path) -> Gaussians:
             f"{path} is no 3DGS PLY",
             expected="x y z, f_dc_0..2, 0, 9, 24 or 45 f_rest_*, opacity, scale_0..2, rot_0..3",
             found=f"{num_rest} f_rest columns" + (f"; without {', '.join(missing[:5])}" if missing else ""),
+            fix=fix,
         )
 
     def columns(*names: str) -> torch.Tensor:
@@ -93,6 +100,6 @@ def load_ply(path: Path) -> Gaussians:
     if not finite.all():
         raise ArtifactError(
             f"{path}: {int((~finite).sum())} of {len(gaussians)} Gaussians hold a number that is not finite",
-            fix="delete it and run the gaussians stage again",
+            fix=fix,
         )
     return gaussians

@@ -5,7 +5,8 @@ import pytest
 from PIL import Image
 
 from hilsplat.base.errors import SceneError
-from hilsplat.scene.sheet import add_scene, inspect_photos, read_sheet
+from hilsplat.scene.photos import add_scene, inspect_photos
+from hilsplat.scene.sheet import read_sheet
 
 HEADER = "dataset\tscene\tgroup\tsource\tunit\n"
 
@@ -168,3 +169,56 @@ def test_data_sources_lie_below_the_data_root(tmp_path):
 def test_a_group_that_is_not_run_is_not_checked(tmp_path):
     row = ("photos", "lost", "photos", "nowhere", "arbitrary")
     assert len(read_sheet(write_sheet(tmp_path, row), checked_groups=("ci",))) == 1
+
+
+WITH_GAUSSIANS = HEADER.replace("\n", "\tgaussians\n")
+
+
+def test_a_ply_of_somebody_is_found_from_the_project_folder(tmp_path):
+    write_photos(tmp_path / "desk", 3)
+    (tmp_path / "theirs.ply").write_bytes(b"ply\nformat ...")
+    rows = [
+        ("photos", "desk", "photos", "desk", "arbitrary", "theirs.ply"),
+        ("photos", "fitted", "photos", "desk", "arbitrary", "-"),
+        ("photos", "too", "photos", "desk", "arbitrary", ""),
+    ]
+    brought, fitted, too = read_sheet(write_sheet(tmp_path, *rows, header=WITH_GAUSSIANS))
+    assert brought.gaussians == tmp_path / "theirs.ply"
+    assert fitted.gaussians is None
+    assert too.gaussians is None
+
+
+@pytest.mark.parametrize(
+    ("cell", "problem"),
+    [
+        ("gone.ply", "is missing"),
+        ("desk", "is a folder"),
+        ("notes.txt", "is no PLY: it begins with b'hell'"),
+        ("data:theirs.ply", "data_root, which is not set"),
+    ],
+)
+def test_a_ply_that_cannot_be_read_stops_its_group_only(tmp_path, cell, problem):
+    write_photos(tmp_path / "desk", 3)
+    (tmp_path / "notes.txt").write_text("hello")
+    row = ("photos", "desk", "photos", "desk", "arbitrary", cell)
+    sheet = write_sheet(tmp_path, row, header=WITH_GAUSSIANS)
+    with pytest.raises(SceneError, match=rf"line 2, column gaussians: (.|\n)*{problem}"):
+        read_sheet(sheet)
+    read_sheet(sheet, checked_groups=("ci",))
+
+
+def test_a_ply_below_the_data_root_is_found(tmp_path):
+    write_photos(tmp_path / "data" / "desk", 3)
+    (tmp_path / "data" / "theirs.ply").write_bytes(b"ply\n")
+    row = ("lerf", "desk", "lerf", "data:desk", "arbitrary", "data:theirs.ply")
+    sheet = write_sheet(tmp_path, row, header=WITH_GAUSSIANS)
+    assert read_sheet(sheet, data_root="data")[0].gaussians == tmp_path / "data" / "theirs.ply"
+    assert read_sheet(sheet)[0].gaussians is None  # nor has the scene a folder: it is skipped
+
+
+def test_a_new_scene_in_a_sheet_with_that_column_is_fitted(tmp_path):
+    write_photos(tmp_path / "desk", 3)
+    sheet = write_sheet(tmp_path, header=WITH_GAUSSIANS)
+    add_scene(sheet, "desk", tmp_path / "desk")
+    assert sheet.read_text().splitlines()[1] == "photos\tdesk\tphotos\tdesk\tarbitrary\t-"
+    assert read_sheet(sheet)[0].gaussians is None

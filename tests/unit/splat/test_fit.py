@@ -5,80 +5,29 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from hilsplat.base.artifacts import read_index
+from hilsplat.base.artifacts import read_index, read_json
 from hilsplat.base.errors import SceneError
-from hilsplat.base.images import write_png
-from hilsplat.scene.cameras import Cameras
-from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat import fit
 from hilsplat.splat.densify import ScreenGradients, densify, prune, reset_opacities
-from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.optimise import Adam
-from hilsplat.splat.photometric import psnr
+from hilsplat.splat.initial import RANDOM_POINTS, first_gaussians
+from hilsplat.splat.optimise import Adam, means_rate
 from hilsplat.splat.ply import load_ply
-from hilsplat.splat.rasterise.api import render
 from hilsplat.splat.rasterise.cpu import Gradients
+from hilsplat.splat.state import FitState
+from tests.unit.splat.three_gaussians_world import mean_psnr
 
 SETTINGS = GaussiansSettings(
     iterations=60, densify_every=10, checkpoint_every=25, sh_degree=1, max_gaussians=400
 )
 
 
-def ring(number: int, size: int) -> Cameras:
-    """Cameras on a circle of radius 3 that look at the origin."""
-    poses = []
-    for angle in np.linspace(0, 2 * np.pi, number, endpoint=False):
-        centre = 3 * np.array([np.cos(angle), np.sin(angle), 0.4])
-        forward = -centre / np.linalg.norm(centre)
-        right = np.cross(forward, [0, 0, 1])
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-        pose[:3, 3] = -pose[:3, :3] @ centre
-        poses.append(pose)
-    K = np.array([[1.2 * size, 0, size / 2], [0, 1.2 * size, size / 2], [0, 0, 1.0]])
-    names = tuple(f"{view:03d}.png" for view in range(number))
-    return Cameras(names, np.stack(poses), np.tile(K, (number, 1, 1)), np.full((number, 2), size, np.int32))
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Scene:
-    """Three coloured Gaussians seen from nine views, two of them held out; eight points."""
-    folder = tmp_path_factory.mktemp("world") / "scene"
-    truth = Gaussians(
-        torch.tensor([[0.4, 0, 0], [-0.4, 0.2, 0.1], [0, -0.4, 0.3]]),
-        torch.tensor([[0.3, 0.2, 0.2], [0.15, 0.3, 0.2], [0.2, 0.2, 0.35]]).log(),
-        torch.tensor([[1.0, 0.2, 0, 0], [1, 0, 0.3, 0], [1, 0, 0, 0]]),
-        torch.tensor([3.0, 3.0, 3.0]),
-        torch.tensor([[[1.5, -1, -1]], [[-1, 1.5, -1]], [[-1, -1, 1.5]]]),
-    )
-    cameras = ring(9, 48)
-    for name in cameras.names:
-        color = render(truth, cameras[name]).color.clamp(0, 1).numpy()
-        write_png(folder / "images" / name, np.round(color * 255).astype(np.uint8))
-    points = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 3)).astype(np.float32)
-    split = {name: "test" if row % 4 == 3 else "train" for row, name in enumerate(cameras.names)}
-    made = Scene(
-        folder, "toy/three", "arbitrary", cameras, split, points, np.full((8, 3), 128, np.uint8), np.eye(4)
-    )
-    made.save()
-    return made
-
-
-def mean_psnr(scene: Scene, gaussians: Gaussians) -> float:
-    values = []
-    for name in scene.views("test"):
-        shown = render(gaussians, scene.cameras[name]).color.clamp(0, 1).numpy()
-        values.append(psnr(shown, scene.image(name).astype(np.float32) / 255))
-    return float(np.mean(values))
-
-
-def test_fit_improves_held_out_views(scene):
-    first, _ = fit.fit_gaussians(scene, SETTINGS.model_copy(update={"iterations": 1}), seed=0)
-    last, curve = fit.fit_gaussians(scene, SETTINGS.model_copy(update={"iterations": 200}), seed=0)
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_fit_improves_held_out_views(scene, strategy):
+    settings = SETTINGS.model_copy(update={"strategy": strategy})
+    first, _ = fit.fit_gaussians(scene, settings.model_copy(update={"iterations": 1}), seed=0)
+    last, curve = fit.fit_gaussians(scene, settings.model_copy(update={"iterations": 200}), seed=0)
     assert mean_psnr(scene, last) > mean_psnr(scene, first) + 5
     assert len(last) <= SETTINGS.max_gaussians
     assert curve[-1, 0] == 200
@@ -88,18 +37,22 @@ def outputs(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_stage_writes_the_same_bytes_on_any_threads_and_after_a_stop(scene, tmp_path, monkeypatch):
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_stage_writes_the_same_bytes_on_any_threads_and_after_a_stop(scene, tmp_path, monkeypatch, strategy):
+    monkeypatch.setenv("PATH", "")  # without ffmpeg, whatever this machine has
+    settings = SETTINGS.model_copy(update={"strategy": strategy, "background": "random"})
+
     def stage(name: str, threads: int) -> dict[str, bytes]:
         out = tmp_path / name
         fit.run_gaussians(
-            scene.folder, out / "g.ply", out / "report", tmp_path / "cache", SETTINGS, 3, threads
+            scene.folder, out / "g.ply", out / "report", tmp_path / "cache", settings, 3, threads
         )
         return outputs(out)
 
     undisturbed = stage("one", threads=1)
     assert undisturbed == stage("two", threads=2)
     assert set(undisturbed) == {
-        *("g.ply", "report.json", "curves.png", "test_views.png", "flyaround.png", "index.json")
+        *("g.ply", "g.json", "report.json", "curves.png", "test_views.png", "flyaround.png", "index.json")
     }
     assert not list((tmp_path / "cache").rglob("*.npz"))
 
@@ -126,13 +79,41 @@ def test_stage_writes_the_same_bytes_on_any_threads_and_after_a_stop(scene, tmp_
 
 
 def test_another_fits_checkpoint_is_not_used(scene, tmp_path):
-    adam = Adam.start(
-        fit.first_gaussians(scene, [scene.cameras["000.png"]], SETTINGS, np.random.default_rng(0))
-    )
-    state = fit.FitState(adam, ScreenGradients.start(len(adam)), np.random.default_rng(0))
+    adam = Adam.start(first_gaussians(scene, [scene.cameras["000.png"]], SETTINGS, np.random.default_rng(0)))
+    state = FitState(adam, ScreenGradients.start(len(adam)), np.random.default_rng(0))
     state.save(tmp_path / "c.npz", "this")
-    assert fit.FitState.load(tmp_path / "c.npz", "other") is None
-    assert len(fit.FitState.load(tmp_path / "c.npz", "this").adam) == len(adam)
+    assert FitState.load(tmp_path / "c.npz", "other") is None
+    assert len(FitState.load(tmp_path / "c.npz", "this").adam) == len(adam)
+
+
+def test_random_start_holds_as_many_points_as_asked_in_sight_of_cameras(scene):
+    cameras = [scene.cameras[name] for name in scene.views("train")]
+    settings = GaussiansSettings(initial="random")
+    first = first_gaussians(scene, cameras, settings, np.random.default_rng(0))
+    assert len(first["means"]) == RANDOM_POINTS
+    seen = np.zeros(RANDOM_POINTS, bool)
+    for camera in cameras:
+        at = first["means"] @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+        pixel = at[:, :2] / at[:, 2:] * np.diag(camera.K)[:2] + camera.K[:2, 2]
+        seen |= (at[:, 2] > 0) & (pixel > -1e-3).all(axis=1) & (pixel < 48 + 1e-3).all(axis=1)
+    assert seen.all()
+
+
+def test_rate_of_the_means_falls_exponentially():
+    settings = GaussiansSettings(means_rate=1e-2, means_rate_last=1e-4)
+    assert means_rate(settings, 0.0) == pytest.approx(1e-2)
+    assert means_rate(settings, 0.5) == pytest.approx(1e-3)
+    assert means_rate(settings, 1.0) == pytest.approx(1e-4)
+
+
+def test_coordinates_are_written_beside_the_ply(scene, tmp_path):
+    settings = SETTINGS.model_copy(update={"iterations": 2})
+    fit.run_gaussians(scene.folder, tmp_path / "g.ply", tmp_path / "report", tmp_path, settings, 3, 1)
+    content = read_json(tmp_path / "g.json")
+    assert content["source"] == "imported from sparse/0"
+    assert content["unit"] == "arbitrary"
+    assert content["scale"] == 1.0
+    assert content["origin"] == {"kind": "fitted", "strategy": "default", "iterations": 2, "seed": 3}
 
 
 def test_scene_without_training_views_is_refused(scene):
@@ -202,6 +183,7 @@ def test_first_adam_step_moves_by_the_rate_against_the_sign():
     gradients = Gradients(
         **ones, features=np.zeros((2, 0), np.float32), means_px=np.zeros((2, 2), np.float32)
     )
-    adam.step(gradients, progress=0.0, extent=2.0, threads=1)
+    adam.step(gradients, GaussiansSettings(scales_rate=0.01), rate_of_means=3.2e-4, threads=1)
     np.testing.assert_allclose(before["means"] - adam.parameters["means"], 3.2e-4, rtol=1e-3)
+    np.testing.assert_allclose(before["log_scales"] - adam.parameters["log_scales"], 0.01, rtol=1e-3)
     np.testing.assert_allclose(before["sh"] - adam.parameters["sh"], 2.5e-3, rtol=1e-3)

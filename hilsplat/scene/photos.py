@@ -1,0 +1,205 @@
+"""One's own photographs: what a folder holds, and adding it to the scene sheet."""
+
+import hashlib
+from collections import Counter, defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+from hilsplat.base.errors import SceneError
+from hilsplat.base.files import list_images
+from hilsplat.scene.sheet import (
+    COLUMNS,
+    MIN_PHOTOS,
+    NAME_RULE,
+    NOTHING,
+    PHOTOS,
+    UNITS,
+    content_lines,
+    has_known_poses,
+    name_problem,
+    photo_folder,
+    project_root,
+    read_sheet,
+)
+
+OTHER_PHOTO_SUFFIXES = frozenset(
+    {".heic", ".heif", ".avif", ".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".gif"}
+)
+"""Photographs that we do not read; a folder of them deserves a better answer than "no images"."""
+
+
+@dataclass(frozen=True)
+class PhotoReport:
+    """What a folder of photographs holds.
+
+    Attributes:
+        folder: where the photographs are.
+        sizes: number of readable photographs per upright size (height, width), px.
+        unreadable: (file name, reason) of each image that cannot be read.
+        num_rotated: photographs that an EXIF flag turns upright.
+        duplicates: groups of file names with identical bytes.
+        passed_over: number of files per suffix that look like photographs but are not read.
+    """
+
+    folder: Path
+    sizes: dict[tuple[int, int], int]
+    unreadable: tuple[tuple[str, str], ...]
+    num_rotated: int
+    duplicates: tuple[tuple[str, ...], ...]
+    passed_over: dict[str, int]
+
+    @property
+    def num_readable(self) -> int:
+        """Photographs that can be read, identical copies included."""
+        return sum(self.sizes.values())
+
+    @property
+    def num_distinct(self) -> int:
+        """Photographs that can be read, identical copies counted once."""
+        return self.num_readable - sum(len(names) - 1 for names in self.duplicates)
+
+    def __str__(self) -> str:
+        lines = [f"{self.num_readable} photographs in {self.folder}"]
+        for (height, width), count in sorted(self.sizes.items(), key=lambda item: (-item[1], item[0])):
+            lines.append(f"  {count:>5}  of {width} x {height} px (width x height)")
+        if self.num_rotated:
+            lines.append(f"  {self.num_rotated:>5}  turned upright by their EXIF flag")
+        for names in self.duplicates:
+            lines.append(f"  {len(names):>5}  are the same file: {', '.join(names)}")
+        for suffix, count in sorted(self.passed_over.items()):
+            lines.append(f"  {count:>5}  {suffix} passed over: convert them to JPEG or PNG to use them")
+        if self.unreadable:
+            lines.append(f"  {len(self.unreadable):>5}  cannot be read:")
+            lines += [f"           {name}: {reason}" for name, reason in self.unreadable]
+        return "\n".join(lines)
+
+
+def inspect_photos(folder: Path) -> PhotoReport:
+    """Read every photograph of a folder (or of its `images/`) in full and report what is there.
+
+    Raises:
+        SceneError: there is no such folder, or two photographs differ only in their suffix.
+    """
+    from PIL import Image, ImageOps
+
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise SceneError(
+            f"photo folder {folder} {'is a file' if folder.exists() else 'is missing'}",
+            fix="give the folder that holds the photographs",
+        )
+    where = photo_folder(folder)
+    sizes: Counter[tuple[int, int]] = Counter()
+    unreadable: list[tuple[str, str]] = []
+    by_digest: dict[str, list[str]] = defaultdict(list)
+    by_stem: dict[str, list[str]] = defaultdict(list)
+    num_rotated = 0
+    for path in list_images(where):
+        if path.stat().st_size == 0:
+            unreadable.append((path.name, "the file is empty"))
+            continue
+        try:
+            with Image.open(path) as image:
+                image.load()
+                turned = image.getexif().get(0x0112, 1) not in (0, 1)
+                width, height = ImageOps.exif_transpose(image).size
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+            reason = str(error).replace(str(path), path.name)
+            unreadable.append((path.name, f"{reason} ({path.stat().st_size} bytes)"))
+            continue
+        sizes[height, width] += 1
+        num_rotated += turned
+        with path.open("rb") as stream:
+            by_digest[hashlib.file_digest(stream, "sha256").hexdigest()].append(path.name)
+        by_stem[path.stem].append(path.name)
+    for names in by_stem.values():
+        if len(names) > 1:
+            raise SceneError(
+                f"{len(names)} photographs in {where} would become the same view",
+                found=", ".join(names),
+                fix="rename or remove all but one: views are named after the file without its suffix",
+            )
+    passed_over = Counter(
+        path.suffix.lower()
+        for path in where.iterdir()
+        if path.is_file() and path.suffix.lower() in OTHER_PHOTO_SUFFIXES
+    )
+    return PhotoReport(
+        folder=where,
+        sizes=dict(sizes),
+        unreadable=tuple(unreadable),
+        num_rotated=num_rotated,
+        duplicates=tuple(tuple(names) for names in by_digest.values() if len(names) > 1),
+        passed_over=dict(passed_over),
+    )
+
+
+def add_scene(sheet: Path, name: str, photos: Path, unit: str = "arbitrary") -> PhotoReport:
+    """Append one's own photographs to the sheet as scene `photos/<name>`; an absent sheet is begun.
+
+    The folder stays where it is: the sheet points at it, relative to the project where it lies
+    inside.
+
+    Args:
+        sheet: the scene sheet.
+        name: name of the new scene.
+        photos: folder of photographs.
+        unit: unit of lengths where the folder brings metric poses.
+
+    Raises:
+        SceneError: the name cannot be used or is taken, photographs cannot be read, or there are
+            fewer than three different ones and no known poses. The sheet is unchanged then.
+    """
+    from hilsplat.base.artifacts import write_text
+
+    sheet, photos = Path(sheet), Path(photos).expanduser().resolve()
+    if problem := name_problem(name):
+        raise SceneError(
+            f"{name!r} cannot be the name of a scene",
+            expected=NAME_RULE,
+            found=problem,
+            fix="choose another name, such as my-desk_2",
+        )
+    if unit not in UNITS:
+        raise SceneError(f"unit {unit!r} is unknown", expected=f"one of {', '.join(UNITS)}")
+    rows = read_sheet(sheet, checked_groups=()) if sheet.exists() else []
+    taken = {row.name.casefold(): row for row in rows}
+    if (row := taken.get(f"{PHOTOS}/{name}".casefold())) is not None:
+        raise SceneError(
+            f"scene {row.name} is already in {sheet}",
+            found=f"source {row.source}",
+            fix="choose another name, or remove its line from the sheet first",
+        )
+    report = inspect_photos(photos)
+    if report.unreadable:
+        raise SceneError(
+            f"{len(report.unreadable)} photographs in {report.folder} cannot be read",
+            found="; ".join(f"{file}: {reason}" for file, reason in report.unreadable),
+            fix="remove them from the folder or replace them by whole copies, then try again",
+        )
+    if report.num_distinct < MIN_PHOTOS and not has_known_poses(photos):
+        found = [f"{report.num_distinct} different ones that can be read"]
+        found += [
+            f"{count} {suffix} files passed over" for suffix, count in sorted(report.passed_over.items())
+        ]
+        raise SceneError(
+            f"{report.folder} has too few photographs",
+            expected=f"at least {MIN_PHOTOS} (20 or more are better)",
+            found="; ".join(found),
+            fix="add photographs (JPEG or PNG) of the same scene",
+        )
+    root = project_root(sheet)
+    source = photos.relative_to(root).as_posix() if photos.is_relative_to(root) else str(photos)
+    if not source.isprintable() or source.startswith("world:"):
+        raise SceneError(f"the path {source!r} cannot stand in the scene sheet", fix="rename the folder")
+    values = {"dataset": PHOTOS, "scene": name, "group": PHOTOS, "source": source, "unit": unit}
+    if sheet.exists():
+        text = sheet.read_text(encoding="utf-8-sig")
+        header = [cell.strip() for cell in content_lines(sheet)[0][1].split("\t")]
+        if not text.endswith("\n"):
+            text += "\n"
+    else:
+        header = list(COLUMNS)
+        text = "\t".join(header) + "\n"
+    write_text(sheet, text + "\t".join(values.get(column, NOTHING[1]) for column in header) + "\n")
+    return report

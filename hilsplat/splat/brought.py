@@ -1,0 +1,58 @@
+"""Somebody's Gaussians for a scene of ours: read, checked, and moved into the scene's coordinates."""
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from hilsplat.base.artifacts import sha256_of_file
+from hilsplat.base.errors import ArtifactError
+from hilsplat.scene.scene import Scene
+from hilsplat.splat.coordinates import read_source_from_scene
+from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.ply import load_ply
+from hilsplat.splat.similarity import move_gaussians
+
+logger = logging.getLogger(__name__)
+
+FIX = "export it again as an uncompressed 3DGS PLY, or correct column gaussians of the scene sheet"
+
+
+def bring_gaussians(ply: Path, scene: Scene) -> tuple[Gaussians, dict[str, Any]]:
+    """Read a 3DGS PLY that stands in the coordinates of the scene's source poses.
+
+    A PLY of this package stands in the coordinates of its scene instead; the JSON file beside it
+    leads back to the source's first.
+
+    Returns:
+        The Gaussians in the scene's coordinates, and their origin for the report.
+
+    Raises:
+        ArtifactError: the file cannot be used; the message names it and what is wrong.
+    """
+    ply = Path(ply)
+    gaussians = load_ply(ply, fix=FIX)
+    if len(gaussians) == 0:
+        raise ArtifactError(f"{ply} holds no Gaussian", fix=FIX)
+    lengths = torch.linalg.vector_norm(gaussians.quats, dim=1)
+    if (zero := int((lengths < 1e-12).sum())) > 0:
+        raise ArtifactError(
+            f"{ply}: {zero} of {len(gaussians)} Gaussians have no rotation: rot_0..3 are all zero", fix=FIX
+        )
+    source_from_ply = read_source_from_scene(ply)
+    moved = "in the coordinates of the scene's source"
+    transform = scene.scene_from_source
+    if source_from_ply is not None:
+        transform = transform @ source_from_ply
+        moved = "in the coordinates that the JSON file beside it describes"
+    logger.info("%s: %d Gaussians of %s, %s", scene.name, len(gaussians), ply, moved)
+    origin = {
+        "kind": "brought along",
+        "file": ply.name,  # where it lies is in the provenance
+        "sha256": sha256_of_file(ply),
+        "taken_as": moved,
+        "scene_from_ply": np.asarray(transform).tolist(),
+    }
+    return move_gaussians(gaussians, transform), origin

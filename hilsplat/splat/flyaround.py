@@ -1,0 +1,147 @@
+"""A smooth closed camera path around what the cameras saw, as a contact sheet and, with ffmpeg, a film."""
+
+import logging
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.distance import cdist
+
+from hilsplat.base.images import write_png
+from hilsplat.scene.cameras import Camera
+from hilsplat.splat.sheets import contact_sheet
+
+logger = logging.getLogger(__name__)
+
+FRAMES = 120
+FRAMES_PER_S = 24
+SHEET_FRAMES = 12
+MAX_STOPS = 80
+"""Cameras that the path is led through; of more, every n-th."""
+SMOOTHING = 1 / 40
+"""Width of the smoothing, as a share of the round: it takes the shake out of hand-held photographs."""
+TIMEOUT_S = 600
+
+
+def closed_path(cameras: list[Camera], frames: int) -> list[Camera]:
+    """Cameras along a closed tour of the given ones, evenly spaced and smoothed.
+
+    The tour visits the cameras in a short round (by position and viewing direction), is walked at
+    even speed, and position, viewing direction and up are smoothed along it. Lens and image size are
+    those of the first camera.
+
+    Args:
+        cameras: at least one; a single one is returned as often as asked.
+        frames: number of cameras to return; the one after the last is the first.
+    """
+    stops = cameras[:: -(-len(cameras) // MAX_STOPS)]
+    centres = np.stack([camera.centre for camera in stops])
+    ahead = np.stack([camera.cam_from_world[2, :3] for camera in stops])
+    down = np.stack([camera.cam_from_world[1, :3] for camera in stops])
+    spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()) or 1.0
+    order = short_round(cdist(*[np.concatenate([centres / spread, ahead], axis=1)] * 2))
+    poses = np.concatenate([centres, spread * ahead, spread * down], axis=1)[order]
+    # walked at even speed, far more finely than the frames, smoothed round the ring, then picked
+    steps = np.linalg.norm(np.diff(poses, axis=0, append=poses[:1]), axis=1) + 1e-9 * spread
+    at = np.concatenate([[0], np.cumsum(steps)])
+    fine = frames * 8
+    where = np.linspace(0, at[-1], fine, endpoint=False)
+    ring = np.concatenate([poses, poses[:1]])
+    walked = np.stack([np.interp(where, at, column) for column in ring.T], axis=1)
+    smooth = gaussian_filter1d(walked, SMOOTHING * fine, axis=0, mode="wrap")[::8]
+    return [_camera(row, cameras[0]) for row in smooth]
+
+
+def _camera(row: Float64[np.ndarray, " 9"], like: Camera) -> Camera:
+    """Camera from its centre, viewing direction and down direction, which need not be orthogonal."""
+    forward = row[3:6] / max(np.linalg.norm(row[3:6]), 1e-12)
+    down = row[6:] - forward * (row[6:] @ forward)
+    if np.linalg.norm(down) < 1e-9:  # opposite cameras that average to nothing: any upright will do
+        down = like.cam_from_world[1, :3] - forward * (like.cam_from_world[1, :3] @ forward)
+    down = down / max(np.linalg.norm(down), 1e-12)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([np.cross(down, forward), down, forward])
+    pose[:3, 3] = -pose[:3, :3] @ row[:3]
+    return Camera("flyaround", pose, like.K, like.size_hw)
+
+
+def short_round(distances: Float64[np.ndarray, "S S"]) -> list[int]:
+    """Order of a short closed tour: nearest neighbours first, then crossings undone (2-opt)."""
+    number = len(distances)
+    tour, left = [0], set(range(1, number))
+    while left:
+        nearest = min(sorted(left), key=lambda stop: distances[tour[-1], stop])
+        tour.append(nearest)
+        left.remove(nearest)
+    improved = number > 3
+    while improved:
+        improved = False
+        for i in range(number - 1):
+            for j in range(i + 2, number - (i == 0)):
+                a, b, c, d = tour[i], tour[i + 1], tour[j], tour[(j + 1) % number]
+                gain = distances[a, b] + distances[c, d] - distances[a, c] - distances[b, d]
+                if gain > 1e-9:
+                    tour[i + 1 : j + 1] = tour[i + 1 : j + 1][::-1]
+                    improved = True
+    return tour
+
+
+def write_flyaround(
+    folder: Path, cameras: list[Camera], picture: Callable[[Camera], UInt8[np.ndarray, "H W 3"]]
+) -> str:
+    """Write `flyaround.png` and, where ffmpeg is on PATH, `flyaround.mp4`.
+
+    Args:
+        cameras: training cameras, which the path is led through.
+        picture: renders a camera.
+
+    Returns:
+        One line for the report: what became of the film.
+    """
+    path = closed_path(cameras, FRAMES)
+    every = FRAMES // SHEET_FRAMES
+    program = shutil.which("ffmpeg")
+    if program is None:
+        frames = {number: picture(path[number]) for number in range(0, FRAMES, every)}
+        line = "no film: ffmpeg is not on PATH"
+    else:
+        frames = dict(enumerate(picture(camera) for camera in path))
+        line = _write_film(program, folder / "flyaround.mp4", [frames[number] for number in range(FRAMES)])
+    write_png(
+        folder / "flyaround.png",
+        contact_sheet([frames[number] for number in range(0, FRAMES, every)], columns=4),
+    )
+    return line
+
+
+def _write_film(program: str, path: Path, frames: list[UInt8[np.ndarray, "H W 3"]]) -> str:
+    """Encode frames as H.264 in yuv420p, which every player shows; the same frames, the same bytes."""
+    height, width = frames[0].shape[:2]
+    command = [
+        *(program, "-hide_banner", "-loglevel", "error", "-y", "-nostdin"),
+        *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(FRAMES_PER_S)),
+        *("-i", "pipe:0"),
+        *("-vf", "crop=trunc(iw/2)*2:trunc(ih/2)*2"),  # yuv420p needs even sides
+        *("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-threads", "1"),
+        *("-map_metadata", "-1", "-fflags", "+bitexact", "-flags:v", "+bitexact"),
+        *("-movflags", "+faststart", str(path)),
+    ]
+    try:
+        subprocess.run(
+            command,
+            input=b"".join(frame.tobytes() for frame in frames),
+            capture_output=True,
+            check=True,
+            timeout=TIMEOUT_S,
+        )
+    except (OSError, subprocess.SubprocessError) as error:
+        path.unlink(missing_ok=True)
+        reason = (getattr(error, "stderr", None) or b"").decode(errors="replace").strip().splitlines()
+        line = f"no film: ffmpeg failed: {reason[-1] if reason else error}"
+        logger.warning("%s", line)
+        return line
+    return f"flyaround.mp4: {len(frames)} frames at {FRAMES_PER_S} per second"

@@ -1,0 +1,83 @@
+"""The first Gaussians of a fit."""
+
+import logging
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from hilsplat.base.images import to_float
+from hilsplat.scene.cameras import Camera
+from hilsplat.scene.scene import Scene
+from hilsplat.settings import GaussiansSettings
+from hilsplat.splat.views import camera_extent
+
+logger = logging.getLogger(__name__)
+
+SH_0 = 0.28209479177387814
+FIRST_OPACITY = 0.1  # 3DGS
+MIN_POINTS = 200
+"""With fewer sparse points, random points that cameras see make up the difference."""
+ADDED_POINTS = 2_000
+"""Random points beside too few sparse ones."""
+RANDOM_POINTS = 10_000
+"""Random points where they are asked for."""
+
+
+def first_gaussians(
+    scene: Scene, cameras: list[Camera], settings: GaussiansSettings, generator: np.random.Generator
+) -> dict[str, np.ndarray]:
+    """Round Gaussians at the sparse points, as wide as the mean distance to their 3 nearest (3DGS).
+
+    With fewer than MIN_POINTS sparse points, random grey ones in front of random cameras are added;
+    with `settings.initial` "random" they take the place of all.
+    """
+    xyz, rgb = scene.points_xyz.astype(np.float64), to_float(scene.points_rgb)
+    finite = np.isfinite(xyz).all(axis=1)
+    xyz, rgb = xyz[finite], rgb[finite]
+    known, is_random = xyz, settings.initial == "random"
+    if is_random:
+        xyz, rgb = xyz[:0], rgb[:0]
+    if len(xyz) > settings.max_gaussians:
+        rows = np.sort(generator.choice(len(xyz), settings.max_gaussians, replace=False))
+        xyz, rgb = xyz[rows], rgb[rows]
+    if is_random or len(xyz) < MIN_POINTS:
+        if not is_random:
+            logger.warning("%s has %d sparse points; random points are added", scene.name, len(xyz))
+        number = min(RANDOM_POINTS if is_random else ADDED_POINTS, settings.max_gaussians - len(xyz))
+        more = _random_points(cameras, known, number, generator)
+        xyz, rgb = np.concatenate([xyz, more]), np.concatenate([rgb, np.full((number, 3), 0.5, np.float32)])
+    n = len(xyz)
+    distances = cKDTree(xyz).query(xyz, k=min(4, n))[0].reshape(n, -1)[:, 1:]
+    spacing = distances.mean(axis=1) if distances.shape[1] else np.full(n, 0.1)
+    # points on one spot would get no width; points far from all others would fill the view
+    extent = camera_extent(cameras)
+    spacing = np.clip(spacing, 1e-4 * extent, 0.1 * extent)
+    sh = np.zeros((n, (settings.sh_degree + 1) ** 2, 3), np.float32)
+    sh[:, 0] = (rgb - 0.5) / SH_0
+    return {
+        "means": xyz.astype(np.float32),
+        "log_scales": np.repeat(np.log(spacing)[:, None], 3, axis=1).astype(np.float32),
+        "quats": np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        "opacity_logits": np.full(n, np.log(FIRST_OPACITY / (1 - FIRST_OPACITY)), np.float32),
+        "sh": sh,
+    }
+
+
+def _random_points(
+    cameras: list[Camera], known: np.ndarray, number: int, generator: np.random.Generator
+) -> np.ndarray:
+    """Points seen by random cameras, at depths about the known points' or the cameras' spread."""
+    extent = camera_extent(cameras)
+    depths = []
+    for camera in cameras:
+        z = known @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
+        depths += z[z > 0].tolist()
+    near, far = np.quantile(depths, [0.05, 0.95]) if depths else (0.3 * extent, 2.0 * extent)
+    out = np.empty((number, 3))
+    for row in range(number):
+        camera = cameras[generator.integers(len(cameras))]
+        z = generator.uniform(near, far + 1e-6)
+        pixel = generator.uniform(size=2) * camera.size_hw[::-1]
+        ray = np.linalg.solve(camera.K, [pixel[0], pixel[1], 1.0])
+        out[row] = camera.cam_from_world[:3, :3].T @ (z * ray - camera.cam_from_world[:3, 3])
+    return out

@@ -1,0 +1,200 @@
+"""3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024): the other strategy.
+
+Nothing is cloned, split, pruned or reset. Gaussians that became transparent move onto opaque ones,
+the number grows by a fixed share up to the cap, noise lets transparent Gaussians explore, and two
+regularisers make the unneeded ones transparent and small.
+"""
+
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+from numba import njit
+from scipy.special import comb, expit, logit
+
+from hilsplat.settings import GaussiansSettings
+from hilsplat.splat.optimise import FIELDS, Adam
+from hilsplat.splat.rasterise.cpu import Gradients, over_ranges
+
+MAX_TOGETHER = 51
+"""So many Gaussians at most are taken to share one place (paper's code); more would change little."""
+MAX_OPACITY = 1 - 1e-6
+"""Opacity 1 has no logit."""
+NOISE_SHARPNESS = 100.0
+"""How fast noise falls with opacity (paper: k = 100): at opacity 0.1 it is down to e^-9.5."""
+LEAST_GATE = 1e-6
+"""Less noise than this share is none."""
+
+
+def shared_opacity(opacity: Float[np.ndarray, " N"], number: Int[np.ndarray, " N"]) -> np.ndarray:
+    """Opacity of each of `number` equal Gaussians on one spot that together cover like one of `opacity`.
+
+    1 - (1 - new)^number = old (paper, Eq. 9).
+    """
+    return -np.expm1(np.log1p(-np.minimum(opacity, MAX_OPACITY)) / number)
+
+
+def scale_factor(
+    opacity: Float[np.ndarray, " N"], shared: Float[np.ndarray, " N"], number: Int[np.ndarray, " N"]
+) -> Float[np.ndarray, " N"]:
+    """Factor on the scales of Gaussians that share a place, so that their profile keeps its integral.
+
+    n Gaussians of opacity o and deviation s cover 1 - (1 - o exp(-x^2 / 2s^2))^n along a line. Its
+    integral is sqrt(2 pi) s times the sum over k = 1..n of C(n, k) (-1)^(k-1) o^k / sqrt(k); one
+    Gaussian of opacity `opacity` and deviation 1 has sqrt(2 pi) opacity. (Paper, Eq. 9, whose double
+    sum is this one, because C(k-1, k-1) + ... + C(n-1, k-1) = C(n, k).)
+
+    Args:
+        opacity: of the one Gaussian before.
+        shared: `shared_opacity(opacity, number)`.
+        number: how many share the place, 1 to MAX_TOGETHER.
+    """
+    k = np.arange(1, MAX_TOGETHER + 1)
+    signs = np.where(k % 2 == 1, 1.0, -1.0) / np.sqrt(k)
+    binomials = comb(np.arange(MAX_TOGETHER + 1)[:, None], k) * signs  # row n: terms of the sum
+    total = (binomials[number] * shared[:, None] ** k).sum(axis=1)
+    return opacity / total
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+@no_type_check
+def noise_gate(opacity, dead_below):
+    """Share of the noise that a Gaussian gets: 1/2 at the opacity of the dead, 0 for the opaque (Eq. 8)."""
+    return 1.0 / (1.0 + np.exp(NOISE_SHARPNESS * (opacity - dead_below)))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+@no_type_check
+def _noise_rows(begin, end, means, log_scales, quats, logits, normal, dead_below, weight, extent):
+    """Noise for rows begin..end, in place: weight x gate x covariance x normal, in units of the extent."""
+    turn, local = np.empty((3, 3)), np.empty(3)
+    for row in range(begin, end):
+        gate = noise_gate(1.0 / (1.0 + np.exp(-np.float64(logits[row]))), dead_below)
+        if gate < LEAST_GATE:
+            continue
+        w, x = np.float64(quats[row, 0]), np.float64(quats[row, 1])
+        y, z = np.float64(quats[row, 2]), np.float64(quats[row, 3])
+        two = 2.0 / (w * w + x * x + y * y + z * z)
+        turn[0, 0] = 1 - two * (y * y + z * z)
+        turn[0, 1] = two * (x * y - w * z)
+        turn[0, 2] = two * (x * z + w * y)
+        turn[1, 0] = two * (x * y + w * z)
+        turn[1, 1] = 1 - two * (x * x + z * z)
+        turn[1, 2] = two * (y * z - w * x)
+        turn[2, 0] = two * (x * z - w * y)
+        turn[2, 1] = two * (y * z + w * x)
+        turn[2, 2] = 1 - two * (x * x + y * y)
+        for axis in range(3):
+            along = 0.0
+            for k in range(3):
+                along += turn[k, axis] * normal[row, k]
+            local[axis] = along * np.exp(2.0 * np.float64(log_scales[row, axis])) / (extent * extent)
+        square = local[0] ** 2 + local[1] ** 2 + local[2] ** 2  # turning does not change the length
+        # a Gaussian far wider than the scene would jump out of it
+        factor = extent * weight * gate / max(weight * gate * np.sqrt(square), 1.0)
+        for axis in range(3):
+            step = turn[axis, 0] * local[0] + turn[axis, 1] * local[1] + turn[axis, 2] * local[2]
+            means[row, axis] += factor * step
+
+
+def add_noise(
+    adam: Adam,
+    settings: GaussiansSettings,
+    rate_of_means: float,
+    extent: float,
+    generator: np.random.Generator,
+    threads: int = 1,
+) -> None:
+    """Move the means of transparent Gaussians at random, along their own axes (SGLD; paper, Eq. 8).
+
+    The step is noise weight x rate of the means x gate x covariance x normal numbers, and never longer
+    than the extent. The paper's lengths are those of scenes of extent 1; here the covariance is
+    measured in units of the extent, so that a scene in other units moves alike.
+
+    Args:
+        rate_of_means: step size of the means, in units of the extent.
+        extent: radius of the cameras, scene units.
+        threads: the result is the same bytes for any number.
+    """
+    p = adam.parameters
+    normal = generator.standard_normal(p["means"].shape, dtype=np.float32)
+    arrays = (p["means"], p["log_scales"], p["quats"], p["opacity_logits"], normal)
+    over_ranges(
+        lambda begin, end: _noise_rows(
+            begin, end, *arrays, settings.min_opacity, settings.mcmc_noise * rate_of_means, extent
+        ),
+        len(adam),
+        threads,
+    )
+
+
+def add_regularisers(adam: Adam, gradients: Gradients, settings: GaussiansSettings, extent: float) -> None:
+    """Add the gradients of opacity_weight x mean opacity + scale_weight x mean scale (paper, Eq. 10).
+
+    Scales count in units of the extent.
+    """
+    n = len(adam)
+    opacity = expit(adam.parameters["opacity_logits"])
+    by_logit, by_log_scale = gradients.opacity_logits, gradients.log_scales
+    by_logit += np.float32(settings.mcmc_opacity_weight / n) * opacity * (1 - opacity)
+    scales = np.exp(adam.parameters["log_scales"])
+    by_log_scale += np.float32(settings.mcmc_scale_weight / (3 * n * extent)) * scales
+
+
+def relocate_and_grow(adam: Adam, settings: GaussiansSettings, generator: np.random.Generator) -> None:
+    """Move the dead onto the living, then add Gaussians on the living up to the cap.
+
+    A place is drawn with a probability proportional to its opacity. Those that share it from then on
+    cover together what the one covered before.
+    """
+    dead = opacities(adam) <= settings.min_opacity
+    if dead.any() and not dead.all():
+        _relocate(adam, dead, settings, generator)
+    n = len(adam)
+    wanted = min(settings.max_gaussians, int(n * (1 + settings.mcmc_growth)))
+    if wanted > n:
+        source = _draw(opacities(adam), wanted - n, generator)
+        shared = _share(adam, source, settings)
+        adam.append({name: shared[name] for name in FIELDS})
+
+
+def opacities(adam: Adam) -> Float[np.ndarray, " N"]:
+    """Peak alphas."""
+    return expit(adam.parameters["opacity_logits"].astype(np.float64))
+
+
+def _relocate(
+    adam: Adam, dead: Bool[np.ndarray, " N"], settings: GaussiansSettings, generator: np.random.Generator
+) -> None:
+    """Move each dead Gaussian onto a living one."""
+    targets = np.flatnonzero(dead)
+    source = _draw(np.where(dead, 0.0, opacities(adam)), len(targets), generator)
+    shared = _share(adam, source, settings)
+    for name in FIELDS:
+        adam.parameters[name][targets] = shared[name]
+        adam.first[name][targets] = 0
+        adam.second[name][targets] = 0
+
+
+def _draw(weights: Float[np.ndarray, " N"], number: int, generator: np.random.Generator) -> np.ndarray:
+    """Rows drawn with replacement, with a probability proportional to their weights."""
+    edges = np.cumsum(weights)
+    return np.searchsorted(edges, generator.uniform(0, edges[-1], number), side="right")
+
+
+def _share(
+    adam: Adam, source: Int[np.ndarray, " M"], settings: GaussiansSettings
+) -> dict[str, Float32[np.ndarray, "M ..."]]:
+    """Give the drawn rows what is their part of the place; return the copies that join them there."""
+    p = adam.parameters
+    rows, drawn = np.unique(source, return_counts=True)
+    number = np.minimum(drawn + 1, MAX_TOGETHER)
+    old = np.minimum(expit(p["opacity_logits"][rows].astype(np.float64)), MAX_OPACITY)
+    new = shared_opacity(old, number)
+    p["log_scales"][rows] += np.log(scale_factor(old, new, number)).astype(np.float32)[:, None]
+    # not below the threshold of the dead: they would be moved again at once
+    p["opacity_logits"][rows] = logit(np.maximum(new, settings.min_opacity)).astype(np.float32)
+    for name in FIELDS:
+        adam.first[name][rows] = 0
+        adam.second[name][rows] = 0
+    return {name: p[name][source] for name in FIELDS}

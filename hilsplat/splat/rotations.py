@@ -1,0 +1,66 @@
+"""Turning vectors, quaternions and spherical harmonics."""
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.special import sph_harm_y
+
+
+def rotate(
+    quats: Float64[np.ndarray, "N 4"], vectors: Float64[np.ndarray, "N 3"]
+) -> Float64[np.ndarray, "N 3"]:
+    """Turn each vector by its unit quaternion (wxyz)."""
+    # v + 2 w (u x v) + 2 u x (u x v)
+    u = quats[:, 1:]
+    turned = np.cross(u, vectors)
+    return vectors + 2 * (quats[:, :1] * turned + np.cross(u, turned))
+
+
+def multiply(
+    left: Float64[np.ndarray, " 4"], right: Float64[np.ndarray, "N 4"]
+) -> Float64[np.ndarray, "N 4"]:
+    """Quaternion (wxyz) of: first turn by `right`, then by `left`."""
+    w, u = left[0], left[1:]
+    scalar = w * right[:, 0] - right[:, 1:] @ u
+    vector = w * right[:, 1:] + right[:, :1] * u + np.cross(u, right[:, 1:])
+    return np.concatenate([scalar[:, None], vector], axis=1)
+
+
+def sh_basis(directions: Float64[np.ndarray, "P 3"], degree: int) -> Float64[np.ndarray, "P K"]:
+    """Real spherical harmonics at unit directions, in the order and with the signs of 3DGS.
+
+    Within a band, orders run from -l to l; negative orders are the sines. 3DGS keeps the
+    Condon-Shortley sign (-1)^m, which real harmonics often drop.
+    """
+    x, y, z = directions.T
+    polar, azimuth = np.arccos(np.clip(z, -1, 1)), np.arctan2(y, x)
+    columns = []
+    for band in range(degree + 1):
+        for order in range(-band, band + 1):
+            value = sph_harm_y(band, abs(order), polar, azimuth)
+            if order == 0:
+                columns.append(value.real)
+            else:
+                columns.append(np.sqrt(2) * (value.imag if order < 0 else value.real))
+    return np.stack(columns, axis=1)
+
+
+def sh_rotation(rotation: Float64[np.ndarray, "3 3"], degree: int) -> Float64[np.ndarray, "K K"]:
+    """Matrix that turns spherical-harmonics coefficients: the colour seen along R d is that along d before.
+
+    The harmonics of one band turn among themselves, so the matrix has a block per band. Each is
+    solved from the harmonics at more directions than the band has members; it is exact but for
+    rounding, because a turned harmonic lies in the band.
+    """
+    # directions spread over the sphere along a spiral
+    number = 64
+    height = 1 - (2 * np.arange(number) + 1) / number
+    angle = np.arange(number) * np.pi * (3 - np.sqrt(5))
+    radius = np.sqrt(1 - height**2)
+    turned = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
+    before = sh_basis(turned @ rotation, degree)  # rows are R^T d
+    after = sh_basis(turned, degree)
+    out = np.zeros(((degree + 1) ** 2,) * 2)
+    for band in range(degree + 1):
+        block = slice(band**2, (band + 1) ** 2)
+        out[block, block] = np.linalg.lstsq(after[:, block], before[:, block], rcond=None)[0]
+    return out

@@ -1,0 +1,67 @@
+"""Gaussians moved by a similarity, so that every view of them looks the same."""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+
+from hilsplat.base.errors import HilsplatError
+from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.rotations import multiply, sh_rotation
+
+TOLERANCE = 1e-5
+"""How far from a rotation times a scale a matrix may be, relative to the scale."""
+
+
+def decompose(similarity: Float[np.ndarray, "4 4"]) -> tuple[float, Float64[np.ndarray, "3 3"], np.ndarray]:
+    """Scale, rotation and translation of x -> scale rotation x + translation.
+
+    Raises:
+        HilsplatError: the matrix mirrors, shears, projects or holds numbers that are not finite.
+    """
+    matrix = np.asarray(similarity, dtype=np.float64)
+    linear = matrix[:3, :3]
+    determinant = np.linalg.det(linear) if np.isfinite(matrix).all() else 0.0
+    scale = float(np.cbrt(determinant))
+    rotation = linear / scale if scale > 0 else np.zeros((3, 3))
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=TOLERANCE) or not np.allclose(
+        matrix[3], [0, 0, 0, 1]
+    ):
+        raise HilsplatError(
+            "a transform of coordinates is no similarity",
+            expected="a 4 x 4 matrix of scale times rotation, with a translation and the last row 0 0 0 1",
+            found=str(matrix.tolist()),
+        )
+    return scale, rotation, matrix[:3, 3]
+
+
+def move_gaussians(gaussians: Gaussians, similarity: Float[np.ndarray, "4 4"]) -> Gaussians:
+    """Gaussians in other coordinates: a camera moved along with them sees the same image.
+
+    Means are mapped, scales multiplied, quaternions turned, and spherical harmonics turned band by
+    band, because they are functions of the direction in the world. Opacities stay.
+
+    Args:
+        similarity: b_from_a, where the Gaussians are given in a.
+
+    Raises:
+        HilsplatError: `similarity` is none.
+    """
+    from scipy.spatial.transform import Rotation
+
+    scale, rotation, translation = decompose(similarity)
+    means = gaussians.means.detach().cpu().double().numpy()
+    quats = gaussians.quats.detach().cpu().double().numpy()
+    by_band = sh_rotation(rotation, gaussians.sh_degree)
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+    sh = np.einsum("kj,njc->nkc", by_band, gaussians.sh.detach().cpu().double().numpy())
+    return Gaussians(
+        means=_float32(scale * np.einsum("ij,nj->ni", rotation, means) + translation),
+        log_scales=_float32(gaussians.log_scales.detach().cpu().double().numpy() + np.log(scale)),
+        quats=_float32(multiply(np.array([w, x, y, z]), quats)),
+        opacity_logits=gaussians.opacity_logits.detach().cpu().clone(),
+        sh=_float32(sh),
+    )
+
+
+def _float32(values: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))

@@ -1,0 +1,84 @@
+"""The state of a fit, and its checkpoint."""
+
+import json
+import logging
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from hilsplat.base.artifacts import read_npz, write_npz
+from hilsplat.base.errors import ArtifactError
+from hilsplat.splat.densify import ScreenGradients
+from hilsplat.splat.optimise import FIELDS, Adam
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass
+class FitState:
+    """Everything that the next step depends on, so that a stopped fit goes on as if it had not stopped.
+
+    Attributes:
+        adam: parameters and moments.
+        gradients: screen gradients since the last densification.
+        generator: source of view order, splits and random backgrounds.
+        order: views still to come in this round, as indices.
+        step: steps done.
+        curve: rows of (step, loss, training PSNR in dB, number of Gaussians).
+    """
+
+    adam: Adam
+    gradients: ScreenGradients
+    generator: np.random.Generator
+    order: list[int] = field(default_factory=list)
+    step: int = 0
+    curve: list[tuple[float, float, float, float]] = field(default_factory=list)
+
+    def save(self, path: Path, key: str) -> None:
+        """Write a checkpoint."""
+        arrays = {
+            f"{table}_{name}": getattr(self.adam, table)[name]
+            for table in ("parameters", "first", "second")
+            for name in FIELDS
+        }
+        write_npz(
+            path,
+            key=np.array(key),
+            counts=np.array([self.step, self.adam.steps]),
+            order=np.array(self.order, dtype=np.int64),
+            generator=np.array(json.dumps(self.generator.bit_generator.state)),
+            gradient_total=self.gradients.total,
+            gradient_seen=self.gradients.seen,
+            curve=np.array(self.curve, dtype=np.float64).reshape(-1, 4),
+            **arrays,
+        )
+
+    @staticmethod
+    def load(path: Path, key: str) -> "FitState | None":
+        """Read a checkpoint of this very fit; None where there is none, or only another fit's."""
+        if not path.is_file():
+            return None
+        try:
+            arrays = read_npz(path)
+        except ArtifactError as error:
+            logger.warning("checkpoint is passed over, the fit starts anew: %s", error)
+            return None
+        if arrays["key"].item() != key:
+            logger.info("checkpoint %s belongs to other inputs; the fit starts anew", path)
+            return None
+        tables = [
+            {name: arrays[f"{table}_{name}"] for name in FIELDS}
+            for table in ("parameters", "first", "second")
+        ]
+        generator = np.random.default_rng()
+        generator.bit_generator.state = json.loads(arrays["generator"].item())
+        step, adam_steps = (int(count) for count in arrays["counts"])
+        return FitState(
+            Adam(*tables, steps=adam_steps),
+            ScreenGradients(arrays["gradient_total"], arrays["gradient_seen"]),
+            generator,
+            arrays["order"].tolist(),
+            step,
+            [tuple(row) for row in arrays["curve"].tolist()],
+        )

@@ -1,0 +1,172 @@
+"""Somebody's Gaussians take the place of a fit: as others write them, in the source's coordinates."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData, PlyElement
+from scipy.spatial.transform import Rotation
+
+from hilsplat.base.artifacts import read_json, write_json
+from hilsplat.base.errors import ArtifactError
+from hilsplat.scene.scene import Scene
+from hilsplat.settings import GaussiansSettings
+from hilsplat.splat.brought import bring_gaussians
+from hilsplat.splat.fit import run_gaussians
+from hilsplat.splat.ply import load_ply, save_ply
+from hilsplat.splat.similarity import move_gaussians
+from tests.unit.splat.three_gaussians_world import mean_psnr, three_gaussians, three_gaussians_scene
+
+FIELDS = ("means", "log_scales", "quats", "opacity_logits", "sh")
+
+
+@pytest.fixture(scope="module")
+def turned_scene(tmp_path_factory) -> Scene:
+    """The three Gaussians, whose source was turned, six times as large and elsewhere."""
+    transform = np.eye(4)
+    transform[:3, :3] = Rotation.from_rotvec([0.4, -0.9, 0.3]).as_matrix() / 6
+    transform[:3, 3] = (0.5, -1.0, 2.0)
+    return three_gaussians_scene(tmp_path_factory.mktemp("turned") / "scene", transform)
+
+
+@pytest.fixture
+def source_ply(turned_scene, tmp_path) -> Path:
+    """The true Gaussians in the source's coordinates."""
+    path = tmp_path / "theirs.ply"
+    save_ply(path, move_gaussians(three_gaussians(), np.linalg.inv(turned_scene.scene_from_source)))
+    return path
+
+
+def test_source_coordinates_become_the_scenes(turned_scene, source_ply):
+    brought, origin = bring_gaussians(source_ply, turned_scene)
+    truth = three_gaussians()
+    for name in ("means", "log_scales", "opacity_logits", "sh"):
+        np.testing.assert_allclose(getattr(brought, name), getattr(truth, name), atol=1e-5)
+    assert mean_psnr(turned_scene, brought) > 45
+    assert origin["kind"] == "brought along"
+    assert origin["taken_as"] == "in the coordinates of the scene's source"
+
+
+def test_the_stage_reports_on_brought_gaussians_without_a_fit(
+    turned_scene, source_ply, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("hilsplat.splat.fit.fit_gaussians", None)
+    out = tmp_path / "out"
+    run_gaussians(
+        turned_scene.folder,
+        out / "g.ply",
+        out / "report",
+        tmp_path / "cache",
+        GaussiansSettings(),
+        0,
+        1,
+        brought=source_ply,
+    )
+    report = read_json(out / "report" / "report.json")
+    assert report["origin"]["kind"] == "brought along"
+    assert report["origin"]["file"] == "theirs.ply"
+    assert report["split"] == "test"
+    assert report["psnr_db"] > 45
+    assert report["warnings"] == []
+    assert not (out / "report" / "curves.png").exists()
+    assert (out / "report" / "flyaround.png").is_file()
+    assert read_json(out / "g.json")["origin"]["kind"] == "brought along"
+    # the written PLY and its JSON lead back to where the brought one was
+    again = move_gaussians(load_ply(out / "g.ply"), np.array(read_json(out / "g.json")["source_from_scene"]))
+    np.testing.assert_allclose(again.means, load_ply(source_ply).means, atol=1e-4)
+
+
+def test_gaussians_elsewhere_are_told_of(turned_scene, tmp_path):
+    save_ply(tmp_path / "elsewhere.ply", three_gaussians())
+    out = tmp_path / "out"
+    settings = GaussiansSettings()
+    brought = tmp_path / "elsewhere.ply"
+    run_gaussians(turned_scene.folder, out / "g.ply", out / "r", tmp_path, settings, 0, 1, brought=brought)
+    assert "other coordinates" in read_json(out / "r" / "report.json")["warnings"][0]
+
+
+def test_a_ply_of_ours_comes_back_through_the_json_beside_it(turned_scene, source_ply, tmp_path):
+    out = tmp_path / "first"
+    settings = GaussiansSettings()
+    run_gaussians(turned_scene.folder, out / "g.ply", out / "r", tmp_path, settings, 0, 1, brought=source_ply)
+    again, origin = bring_gaussians(out / "g.ply", turned_scene)
+    np.testing.assert_allclose(again.means, three_gaussians().means, atol=1e-5)
+    assert "JSON" in origin["taken_as"]
+    shutil.copyfile(source_ply, out / "g.ply")
+    with pytest.raises(ArtifactError, match="belongs to another PLY"):
+        bring_gaussians(out / "g.ply", turned_scene)
+    write_json(out / "g.json", {"something": "else"})
+    again, origin = bring_gaussians(out / "g.ply", turned_scene)
+    assert "JSON" not in origin["taken_as"]
+
+
+def rewritten(source: Path, target: Path, change, *, text: bool = False) -> Path:
+    """A PLY with other columns: `change` gets a dict of columns and returns it."""
+    vertex = PlyData.read(source)["vertex"]
+    columns = change({prop.name: np.array(vertex[prop.name]) for prop in vertex.properties})
+    table = np.empty(vertex.count, [(name, values.dtype) for name, values in columns.items()])
+    for name, values in columns.items():
+        table[name] = values
+    PlyData([PlyElement.describe(table, "vertex")], text=text).write(target)
+    return target
+
+
+DIALECTS = {
+    "no normals (gsplat)": lambda c: {k: v for k, v in c.items() if k not in ("nx", "ny", "nz")},
+    "backwards": lambda c: dict(reversed(c.items())),
+    "doubles": lambda c: {k: v.astype(np.float64) for k, v in c.items()},
+    "bytes of colour (nerfstudio)": lambda c: {
+        **c,
+        **{name: np.full(len(c["x"]), 7, np.uint8) for name in ("red", "green", "blue", "label")},
+    },
+}
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "ascii"])
+@pytest.mark.parametrize("dialect", DIALECTS)
+@pytest.mark.parametrize("bases", [1, 4, 9, 16])
+def test_dialects_of_other_programs_are_read(tmp_path, dialect, bases, text):
+    generator = torch.Generator().manual_seed(bases)
+    gaussians = three_gaussians()
+    sh = torch.randn(3, bases, 3, generator=generator)
+    gaussians = type(gaussians)(*(getattr(gaussians, name) for name in FIELDS[:4]), sh)
+    save_ply(tmp_path / "plain.ply", gaussians)
+    path = rewritten(tmp_path / "plain.ply", tmp_path / "theirs.ply", DIALECTS[dialect], text=text)
+    again = load_ply(path)
+    for name in FIELDS:
+        # ASCII files print enough digits for float32 to come back, or nearly
+        np.testing.assert_allclose(getattr(again, name), getattr(gaussians, name), rtol=1e-6)
+
+
+def zero(columns: dict, name: str, value: float) -> dict:
+    columns[name][1] = value
+    return columns
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: {k: c[k] for k in ("x", "y", "z")}, "without f_dc_0, f_dc_1"),
+        (lambda c: {k: v for k, v in c.items() if k != "rot_3"}, "without rot_3"),
+        (lambda c: {**c, "f_rest_0": c["x"], "f_rest_1": c["x"]}, "2 f_rest columns"),
+        (lambda c: {**c, **{f"f_rest_{k}": c["x"] for k in range(72)}}, "72 f_rest columns"),
+        (lambda c: zero(c, "scale_1", -np.inf), "1 of 3 Gaussians hold a number that is not finite"),
+        (lambda c: zero(zero(zero(zero(c, "rot_0", 0), "rot_1", 0), "rot_2", 0), "rot_3", 0), "no rotation"),
+        (lambda c: {"packed_position": c["x"].astype(np.uint32)}, "compressed"),
+        (lambda c: {k: v[:0] for k, v in c.items()}, "holds no Gaussian"),
+    ],
+)
+def test_what_cannot_be_used_is_named(turned_scene, source_ply, tmp_path, change, message):
+    vertex = PlyData.read(source_ply)["vertex"]
+    columns = change({prop.name: np.array(vertex[prop.name]) for prop in vertex.properties})
+    table = np.empty(len(next(iter(columns.values()))), [(name, v.dtype) for name, v in columns.items()])
+    for name, values in columns.items():
+        table[name] = values
+    path = tmp_path / "broken.ply"
+    PlyData([PlyElement.describe(table, "vertex")]).write(path)
+    with pytest.raises(ArtifactError, match=message) as caught:
+        bring_gaussians(path, turned_scene)
+    assert "broken.ply" in str(caught.value)
+    assert "column gaussians" in str(caught.value)

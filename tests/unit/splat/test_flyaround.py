@@ -1,0 +1,129 @@
+"""The fly-around: a smooth closed path, a contact sheet always, a film where ffmpeg is there."""
+
+import os
+import stat
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hilsplat.scene.cameras import Camera
+from hilsplat.splat import flyaround
+from hilsplat.splat.flyaround import FRAMES, closed_path, short_round, write_flyaround
+from hilsplat.splat.sheets import contact_sheet
+from tests.unit.splat.three_gaussians_world import ring
+
+
+def shuffled_ring(number: int) -> list[Camera]:
+    cameras = ring(number, 48)
+    order = np.random.default_rng(3).permutation(number)
+    return [cameras[cameras.names[row]] for row in order]
+
+
+def test_path_of_a_ring_goes_once_round_whatever_the_order():
+    path = closed_path(shuffled_ring(24), 60)
+    centres = np.stack([camera.centre for camera in path])
+    radius = np.linalg.norm(centres[:, :2], axis=1)
+    assert 2.85 < radius.min() <= radius.max() < 3.0  # smoothing cuts the corners a little
+    np.testing.assert_allclose(centres[:, 2], 1.2, atol=1e-9)
+    angle = np.unwrap(np.arctan2(centres[:, 1], centres[:, 0]))
+    assert abs(abs(angle[-1] - angle[0]) - 2 * np.pi * 59 / 60) < 0.05
+    steps = np.linalg.norm(np.diff(centres, axis=0, append=centres[:1]), axis=1)
+    assert steps.max() < 1.1 * steps.min()  # closed, and at even speed
+    for camera in path:
+        rotation = camera.cam_from_world[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(rotation) == pytest.approx(1)
+        # it looks at the origin, upright
+        np.testing.assert_allclose(rotation[2], -camera.centre / np.linalg.norm(camera.centre), atol=0.02)
+        assert rotation[1, 2] < 0
+
+
+def test_hand_shake_is_smoothed():
+    steady = ring(40, 48)
+    generator = np.random.default_rng(0)
+    shaky = []
+    for name in steady.names:
+        pose = steady[name].cam_from_world.copy()
+        pose[:3, 3] += generator.normal(0, 0.1, 3)
+        shaky.append(Camera(name, pose, steady[name].K, (48, 48)))
+
+    def jerk(centres: np.ndarray) -> float:
+        return float(np.abs(np.diff(centres, 2, axis=0)).max())
+
+    walked = np.stack([camera.centre for camera in closed_path(shaky, 40)])
+    assert jerk(walked) < 0.4 * jerk(np.stack([camera.centre for camera in shaky]))
+
+
+def test_one_camera_stays_where_it_is():
+    camera = ring(1, 48)["000.png"]
+    for stop in closed_path([camera], 5):
+        np.testing.assert_allclose(stop.cam_from_world, camera.cam_from_world, atol=1e-9)
+
+
+def test_opposite_cameras_do_not_break_the_path():
+    cameras = ring(2, 48)
+    for camera in closed_path([cameras[name] for name in cameras.names], 16):
+        assert np.isfinite(camera.cam_from_world).all()
+
+
+def test_short_round_undoes_crossings():
+    corners = np.array([[0, 0], [1, 1], [1, 0], [0, 1.0]])
+    distances = np.linalg.norm(corners[:, None] - corners[None], axis=2)
+    tour = short_round(distances)
+    assert sum(distances[a, b] for a, b in zip(tour, tour[1:] + tour[:1], strict=True)) == pytest.approx(4)
+
+
+def flat_picture(camera: Camera) -> np.ndarray:
+    """A colour that tells where the camera is."""
+    return np.full((48, 48, 3), int(128 + 40 * camera.centre[0]), np.uint8)
+
+
+def test_sheet_without_ffmpeg_and_one_line_about_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    cameras = ring(12, 48)
+    line = write_flyaround(tmp_path, [cameras[name] for name in cameras.names], flat_picture)
+    assert line == "no film: ffmpeg is not on PATH"
+    assert [path.name for path in tmp_path.iterdir()] == ["flyaround.png"]
+    assert Image.open(tmp_path / "flyaround.png").size == (4 * 52, 3 * 52)
+
+
+def fake_ffmpeg(folder: Path, monkeypatch, script: str) -> None:
+    """A program of that name on PATH, for what becomes of its exit."""
+    program = folder / "bin" / "ffmpeg"
+    program.parent.mkdir()
+    program.write_text("#!/bin/sh\n" + script)
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setenv("PATH", f"{program.parent}{os.pathsep}{os.environ['PATH']}")
+
+
+def test_film_gets_every_frame(tmp_path, monkeypatch):
+    # keeps what is fed in, as the file that is named last
+    fake_ffmpeg(tmp_path, monkeypatch, 'for last; do :; done\ncat > "$last"\n')
+    (tmp_path / "out").mkdir()
+    cameras = ring(12, 48)
+    line = write_flyaround(tmp_path / "out", [cameras[name] for name in cameras.names], flat_picture)
+    assert line == f"flyaround.mp4: {FRAMES} frames at {flyaround.FRAMES_PER_S} per second"
+    raw = np.frombuffer((tmp_path / "out" / "flyaround.mp4").read_bytes(), np.uint8).reshape(-1, 48, 48, 3)
+    assert len(raw) == FRAMES
+    path = closed_path([cameras[name] for name in cameras.names], FRAMES)
+    np.testing.assert_array_equal(raw[7], flat_picture(path[7]))
+
+
+def test_an_ffmpeg_that_fails_is_told_of_and_stops_nothing(tmp_path, monkeypatch):
+    fake_ffmpeg(tmp_path, monkeypatch, "cat > /dev/null\necho Unknown encoder libx264 >&2\nexit 1\n")
+    (tmp_path / "out").mkdir()
+    cameras = ring(12, 48)
+    line = write_flyaround(tmp_path / "out", [cameras[name] for name in cameras.names], flat_picture)
+    assert line == "no film: ffmpeg failed: Unknown encoder libx264"
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["flyaround.png"]
+
+
+def test_sheet_shrinks_by_averages():
+    picture = np.zeros((6, 8, 3), np.uint8)
+    picture[:, ::2] = 100
+    sheet = contact_sheet([picture, picture], columns=1, max_side_px=4)
+    assert sheet.shape == (2 * 7, 8, 3)
+    assert (sheet[:3, :4] == 50).all()
+    assert (sheet[3:7] == 255).all()

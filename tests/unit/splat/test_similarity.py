@@ -1,0 +1,119 @@
+"""Gaussians moved by a similarity look the same from a camera that moved along."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from hilsplat.base.errors import HilsplatError
+from hilsplat.scene.assemble import move_cameras
+from hilsplat.scene.cameras import Camera
+from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.rasterise.api import render
+from hilsplat.splat.rasterise.reference import _SH
+from hilsplat.splat.rotations import multiply, rotate, sh_basis, sh_rotation
+from hilsplat.splat.similarity import decompose, move_gaussians
+
+
+def turned(seed: int) -> np.ndarray:
+    return Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+
+
+def directions(number: int) -> np.ndarray:
+    values = np.random.default_rng(5).normal(size=(number, 3))
+    return values / np.linalg.norm(values, axis=1, keepdims=True)
+
+
+def random_gaussians(degree: int) -> Gaussians:
+    """Forty in a box of side 2 about the origin, of every colour and shape."""
+    generator = np.random.default_rng(degree)
+    n = 40
+    return Gaussians(
+        torch.from_numpy(generator.uniform(-1, 1, (n, 3)).astype(np.float32)),
+        torch.from_numpy(np.log(generator.uniform(0.05, 0.4, (n, 3))).astype(np.float32)),
+        torch.from_numpy(generator.normal(size=(n, 4)).astype(np.float32)),
+        torch.from_numpy(generator.normal(size=n).astype(np.float32)),
+        torch.from_numpy(generator.normal(size=(n, (degree + 1) ** 2, 3)).astype(np.float32)),
+    )
+
+
+def test_basis_is_that_of_3dgs():
+    d = directions(30)
+    expected = np.stack([harmonic(*d.T) for harmonic in _SH], axis=1)
+    np.testing.assert_allclose(sh_basis(d, 3), expected, atol=1e-14)
+
+
+def test_linear_band_turns_like_a_vector():
+    # about z by 90 degrees: what was along x is along y. 3DGS: row 1 is -y, row 2 is z, row 3 is -x
+    quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    along_x = np.array([0, 0, 0, -1.0])
+    np.testing.assert_allclose(sh_rotation(quarter, 1) @ along_x, [0, -1, 0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_turned_harmonics_show_the_old_colour_along_the_turned_direction(degree):
+    rotation, d = turned(degree), directions(50)
+    coefficients = np.random.default_rng(1).normal(size=(degree + 1) ** 2)
+    before = sh_basis(d, degree) @ coefficients
+    after = sh_basis(d @ rotation.T, degree) @ (sh_rotation(rotation, degree) @ coefficients)
+    np.testing.assert_allclose(after, before, atol=1e-12)
+
+
+def test_turning_by_a_quaternion_is_turning_by_its_matrix():
+    first, second = (
+        Rotation.random(rng=np.random.default_rng(1)),
+        Rotation.random(rng=np.random.default_rng(2)),
+    )
+    q1, q2 = (np.roll(r.as_quat(), 1) for r in (first, second))
+    vector = np.array([[1.0, -2.0, 0.5]])
+    np.testing.assert_allclose(rotate(q1[None], vector)[0], first.as_matrix() @ vector[0], atol=1e-12)
+    both = multiply(q2, q1[None])
+    expected = second.as_matrix() @ first.as_matrix() @ vector[0]
+    np.testing.assert_allclose(rotate(both, vector)[0], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_rendered_view_is_unchanged_under_a_similarity(degree):
+    gaussians = random_gaussians(degree)
+    pose = np.eye(4)
+    pose[:3, :3] = turned(9)
+    pose[:3, 3] = (0.1, -0.2, 4.0)
+    K = np.array([[60, 0, 25.0], [0, 66, 19.0], [0, 0, 1]])
+    similarity = np.eye(4)
+    similarity[:3, :3] = 0.37 * turned(7)
+    similarity[:3, 3] = (5.0, -3.0, 2.0)
+    before = render(gaussians, Camera("v", pose, K, (40, 56)))
+    moved_pose = move_cameras(pose[None], similarity)[0]
+    after = render(move_gaussians(gaussians, similarity), Camera("v", moved_pose, K, (40, 56)))
+    assert before.alpha.mean() > 0.2
+    # float32 parameters; a pixel at the cut of 1/255 may fall on either side
+    np.testing.assert_allclose(after.color.numpy(), before.color.numpy(), atol=5e-3)
+    assert np.abs(after.color.numpy() - before.color.numpy()).mean() < 1e-5
+
+
+def test_there_and_back_is_nothing():
+    gaussians = random_gaussians(3)
+    similarity = np.eye(4)
+    similarity[:3, :3] = 4 * turned(3)
+    similarity[:3, 3] = (1, 2, 3)
+    back = move_gaussians(move_gaussians(gaussians, similarity), np.linalg.inv(similarity))
+    for name in ("means", "log_scales", "opacity_logits", "sh"):
+        np.testing.assert_allclose(getattr(back, name), getattr(gaussians, name), atol=1e-5)
+    # a quaternion and its negative are the same rotation
+    same = (back.quats * gaussians.quats).sum(dim=1) / (back.quats.norm(dim=1) * gaussians.quats.norm(dim=1))
+    np.testing.assert_allclose(same.abs(), 1, atol=1e-6)
+
+
+def test_what_is_no_similarity_is_refused():
+    with pytest.raises(HilsplatError, match="no similarity"):
+        decompose(np.diag([1.0, 1.0, -1.0, 1.0]))  # mirrors
+    with pytest.raises(HilsplatError, match="no similarity"):
+        decompose(np.diag([1.0, 2.0, 1.0, 1.0]))  # stretches
+    with pytest.raises(HilsplatError, match="no similarity"):
+        decompose(np.full((4, 4), math.nan))
+    scale, rotation, translation = decompose(np.diag([2.0, 2.0, 2.0, 1.0]))
+    assert scale == pytest.approx(2, rel=1e-12)
+    np.testing.assert_allclose(rotation, np.eye(3), atol=1e-12)
+    assert translation.tolist() == [0, 0, 0]

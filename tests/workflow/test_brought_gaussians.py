@@ -1,0 +1,65 @@
+"""A scene whose row names somebody's PLY is not fitted; its report says where the Gaussians are from."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.ply import save_ply
+from tests.workflow.conftest import Project, copy_project
+
+SCENE = "results/synthetic/tiny"
+
+
+def three_gaussians(seed: int) -> Gaussians:
+    """Three round ones at random places."""
+    n = 3
+    return Gaussians(
+        torch.randn(n, 3, generator=torch.Generator().manual_seed(seed)),
+        torch.full((n, 3), -2.0),
+        torch.tensor([[1.0, 0, 0, 0]] * n),
+        torch.zeros(n),
+        torch.ones(n, 4, 3),
+    )
+
+
+@pytest.fixture
+def brought(project: Path, tmp_path: Path) -> Project:
+    """A project whose tiny scene brings three Gaussians along."""
+    copy = copy_project(project, tmp_path / "project", results=False)
+    save_ply(copy.root / "their things" / "three.ply", three_gaussians(seed=0))
+    sheet = copy.root / "config/scenes.tsv"
+    lines = []
+    for line in sheet.read_text().splitlines():
+        cell = "gaussians" if line.startswith("dataset\t") else "-"
+        if line.startswith("synthetic\ttiny\t"):
+            cell = "their things/three.ply"
+        lines.append(line if line.startswith("#") else f"{line}\t{cell}")
+    sheet.write_text("\n".join(lines) + "\n")
+    return copy
+
+
+def test_brought_gaussians_take_the_place_of_a_fit(brought: Project) -> None:
+    brought.snakemake("--keep-going", f"{SCENE}/gaussians.ply")
+    report = json.loads((brought.root / SCENE / "gaussians/report.json").read_text())
+    assert report["origin"]["kind"] == "brought along"
+    assert report["origin"]["file"] == "three.ply"
+    assert report["gaussians"] == 3
+    assert report["warnings"]  # three random Gaussians do not show the scene
+    coordinates = json.loads((brought.root / SCENE / "gaussians.json").read_text())
+    assert coordinates["ply"] == "gaussians.ply"
+    provenance = json.loads((brought.root / f"{SCENE}/gaussians.ply.provenance.json").read_text())
+    assert provenance["inputs"]["brought"]["path"].endswith("their things/three.ply")
+    # other Gaussians rerun the stage
+    save_ply(brought.root / "their things/three.ply", three_gaussians(seed=1))
+    assert "rule gaussians:" in brought.snakemake("-n", f"{SCENE}/gaussians.ply").stdout
+
+
+def test_a_lost_ply_stops_the_run_at_once(brought: Project) -> None:
+    (brought.root / "their things/three.ply").unlink()
+    result = brought.snakemake("-n", check=False)
+    assert result.returncode != 0
+    assert "column gaussians" in result.stdout + result.stderr
+    assert "Traceback" not in result.stderr
