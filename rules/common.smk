@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 from pathlib import Path
 
 from snakemake.exceptions import WorkflowError
@@ -83,8 +84,37 @@ def settings_of(section):
 
 
 def code(stage):
-    """Parameter: digest of the code that a stage runs."""
+    """Parameter: digest of the code that a stage runs; a function tells the stage from the wildcards."""
+    if callable(stage):
+        return lambda wildcards: code(stage(wildcards))
     return or_stop(code_of, STAGE_MODULES[stage])
+
+
+def stage_of_masks(wildcards):
+    """Stage that makes the masks; the diagnostic segmenter has its own."""
+    diagnostic = stages_of(wildcards).masks.segmenter == "truth-perturbed"
+    return "truth_masks" if diagnostic else "masks"
+
+
+def truth_of_masks(wildcards):
+    """Input of masks: the true labels where the diagnostic segmenter is asked for, else nothing."""
+    if stage_of_masks(wildcards) == "masks":
+        return []
+    row = row_of(wildcards)
+    if not row.world:
+        raise WorkflowError(
+            f"{row.name}, variant {wildcards.variant}: masks.segmenter truth-perturbed needs the true "
+            "labels of a synthetic scene, and this one has none"
+        )
+    return f"results/{row.dataset}/{row.scene}/world/truth"
+
+
+def truth_option_of_masks(wildcards, input):
+    """Parameter of masks: the options of the diagnostic segmenter, else nothing."""
+    if not input.truth:
+        return ""
+    faults = stages_of(wildcards).perturb.model_dump_json()
+    return f"--truth {shlex.quote(input.truth)} --perturb {shlex.quote(faults)}"
 
 
 def shared_variant(stage, wildcards):
@@ -119,6 +149,20 @@ def photos_of(wildcards):
         for path in folder.rglob("*")
         if path.is_file() and not path.name.startswith(".")
     )
+
+
+def brought_gaussians_of(wildcards):
+    """Input: somebody's PLY that takes the place of a fit, with the JSON beside it; mostly nothing."""
+    ply = row_of(wildcards).gaussians
+    if ply is None:
+        return []
+    beside = ply.with_suffix(".json")
+    return [str(ply), *([str(beside)] if beside.is_file() else [])]
+
+
+def brought_option_of(wildcards, input):
+    """Parameter: the option that brings somebody's PLY, else nothing."""
+    return f"--brought {shlex.quote(input.brought[0])}" if input.brought else ""
 
 
 def digest_of_model(section):

@@ -2,6 +2,7 @@
 rule masks:
     input:
         scene="results/{dataset}/{scene}/scene",
+        truth=truth_of_masks,  # nothing, but for the diagnostic segmenter
     output:
         masks=directory("results/{dataset}/{scene}/{variant}/masks"),
     log:
@@ -16,11 +17,12 @@ rule masks:
     params:
         settings=settings_of("masks"),
         model=digest_of_model("masks"),
+        truth=truth_option_of_masks,
         cache="results/.cache",
-        code=code("masks"),
+        code=code(stage_of_masks),
     shell:
-        "hilsplat masks --scene {input.scene} --settings {params.settings:q} --threads {threads}"
-        " --cache {params.cache} --out {output.masks} --log {log}"
+        "hilsplat masks --scene {input.scene} --settings {params.settings:q} {params.truth}"
+        " --threads {threads} --cache {params.cache} --out {output.masks} --log {log}"
 
 
 rule tree:

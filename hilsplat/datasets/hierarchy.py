@@ -5,7 +5,7 @@ The format of our own for Hi-LERF-like benchmarks (theirs is unpublished). A fol
     annotations.json          nodes (the tree) and, per view, the nodes that are annotated there
     labels/<view>.<level>.png 16-bit label images: node id + 1, 0 where there is none
 
-Only `evaluate` reads it; no stage before may.
+Only `evaluate` reads it; no stage before may, but for the diagnostic segmenter (`truth_masks`).
 """
 
 from collections.abc import Iterable, Mapping

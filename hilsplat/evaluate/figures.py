@@ -22,7 +22,10 @@ from hilsplat.evaluate.pictures import (
     save_figure,
     show,
 )
-from hilsplat.evaluate.protocols import ViewTruth, rule_of
+from hilsplat.evaluate.protocols.view_truth import ViewTruth
+from hilsplat.evaluate.protocols.views import rule_of
+from hilsplat.evaluate.scores import made_from_truth
+from hilsplat.evaluate.stage import masks_label
 from hilsplat.language.query import PATH_SEPARATOR, LanguageScene, NodeHits
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
@@ -162,13 +165,15 @@ def draw_panel(
     row_in = WIDTH_IN / columns * aspect + 0.1
     queries_in = len(rows) * row_in + (0.2 if rows else 0)
     figure = Figure(figsize=(WIDTH_IN, overview_in + queries_in + 0.45), layout="constrained")
-    figure.suptitle(scene.name, fontsize=12, fontweight="bold")
+    label = masks_label(masks_folder)
+    warning = ": a diagnostic, masks made from the true labels" if made_from_truth(label) else ""
+    figure.suptitle(scene.name + warning, fontsize=12, fontweight="bold")
     parts = figure.subfigures(2, 1, height_ratios=[overview_in, queries_in]) if rows else [figure]
     grid = parts[0].subplots(2, 4, squeeze=False)
     image = scene.image(masked)
     masks = HierarchicalMasks.load(Path(masks_folder) / f"{masked}.npz")
     show(grid[0, 0], image, f"photograph {masked} (training view)")
-    label_left(grid[0, 0], "masks")
+    label_left(grid[0, 0], f"masks: {label}")
     show(grid[1, 0], scene.image(held_out), f"photograph {held_out} ({scene.split[held_out]} view)")
     label_left(grid[1, 0], "language field")
     for level in LEVELS:

@@ -20,6 +20,8 @@ from hilsplat.evaluate.pictures import (
     show,
     show_from_above,
 )
+from hilsplat.evaluate.scores import made_from_truth
+from hilsplat.evaluate.stage import masks_label
 from hilsplat.language.query import PATH_SEPARATOR, Hit, LanguageScene
 
 LISTED = 10
@@ -36,6 +38,7 @@ class Artifacts:
     language: Path
     autoencoder: Path
     clip: Path
+    masks: Path
 
 
 def answer(
@@ -76,14 +79,25 @@ def answer(
     hits = scene.query(text, level, limit=LISTED)
     panel = (Path(out) if out is not None else folder / "queries" / file_name(text)) / "panel.png"
     shown = views_of(scene, hits, views)
-    query_panel(scene, text, shown, panel, level=level)
-    return "\n".join([told(text, hits, scene.scene.unit), f"wrote {panel}"])
+    label = masks_label(parts.masks)
+    note = f"; a diagnostic, masks made from the true labels: {label}" if made_from_truth(label) else ""
+    query_panel(scene, text, shown, panel, level=level, note=note)
+    return "\n".join([told(text, hits, scene.scene.unit) + note, f"wrote {panel}"])
 
 
 def query_panel(
-    scene: LanguageScene, text: str, views: Sequence[str], out_png: Path, *, level: str = "auto"
+    scene: LanguageScene,
+    text: str,
+    views: Sequence[str],
+    out_png: Path,
+    *,
+    level: str = "auto",
+    note: str = "",
 ) -> None:
-    """Draw a query: per view photograph, answer and relevancy at three levels; the scene from above."""
+    """Draw a query: per view photograph, answer and relevancy at three levels; the scene from above.
+
+    `note` stands in the title, after what was found.
+    """
     hits = scene.find(text, level)
     last = text.split(PATH_SEPARATOR)[-1].strip()
     size_hw = scene.scene.cameras[views[0]].size_hw
@@ -92,7 +106,7 @@ def query_panel(
     map_in = 4.2
     figure = Figure(figsize=(width_in, len(views) * row_in + map_in + 0.6), layout="constrained")
     found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
-    figure.suptitle(f"“{text}” in {scene.scene.name}: {found}", fontsize=12, fontweight="bold")
+    figure.suptitle(f"“{text}” in {scene.scene.name}: {found}{note}", fontsize=12, fontweight="bold")
     upper, lower = figure.subfigures(2, 1, height_ratios=[len(views) * row_in, map_in])
     grid = upper.subplots(len(views), columns, squeeze=False)
     for axes, view in zip(grid, views, strict=True):
@@ -181,13 +195,15 @@ def locate(folder: Path, variant: str) -> Artifacts:
                 fix="name it under ablation_variants and run the workflow",
             )
     autoencoder = _input_of(language, "autoencoder", folder)
+    clip = _input_of(autoencoder, "clip", folder)
     parts = Artifacts(
         folder / "scene",
         folder / "gaussians.ply",
         _input_of(autoencoder, "semantic_tree", folder),
         language,
         autoencoder,
-        _input_of(autoencoder, "clip", folder),
+        clip,
+        _input_of(clip, "masks", folder),
     )
     for path in vars(parts).values():
         if not path.exists():

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import ArtifactError
 from hilsplat.evaluate.metrics.registry import METRICS
+from hilsplat.evaluate.protocols.cards import card_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -23,13 +24,13 @@ class Score:
         dataset: data set of the scene.
         scene: scene name.
         variant: named set of settings.
-        masks: what made the masks, such as `sam-tiny`.
+        masks: what made the masks, such as `sam-tiny`; see `made_from_truth`.
         method: what answered: `tree`, `tree-path`, `field`, or `truth` for the annotations' own HC.
         view: view name.
         query: text; empty for a number of a whole view.
         level: level label of the annotation; empty where the protocol knows none.
         metric: a key of `METRICS`.
-        protocol: how the answer was made and compared.
+        protocol: full name of how the answer was made and compared (`protocols.cards`), with departures.
         value: in the metric's bounds.
         n: how many things the value is a mean of.
     """
@@ -48,6 +49,11 @@ class Score:
     n: int
 
 
+def made_from_truth(masks: str) -> bool:
+    """Whether a row's masks were made from true labels: a diagnostic that is no result."""
+    return masks.startswith("truth-perturbed")
+
+
 COLUMNS: tuple[str, ...] = tuple(field.name for field in fields(Score))
 
 
@@ -59,6 +65,7 @@ def write_scores(path: Path, scores: Iterable[Score]) -> None:
     rows = []
     for score in scores:
         assert score.metric in METRICS, score.metric
+        assert score.metric in card_of(score.protocol).metrics, (score.metric, score.protocol)
         row = asdict(score)
         row["value"] = f"{score.value:.6f}"
         rows.append([str(row[name]) for name in COLUMNS])

@@ -6,7 +6,9 @@ from pathlib import Path
 from hilsplat.base.artifacts import read_index
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
-from hilsplat.evaluate.protocols import Selections, ViewTruth, measure_view
+from hilsplat.evaluate.protocols.answers import Selections
+from hilsplat.evaluate.protocols.view_truth import ViewTruth
+from hilsplat.evaluate.protocols.views import measure_view
 from hilsplat.evaluate.scores import Score, write_scores
 from hilsplat.language.query import LanguageScene
 from hilsplat.scene.scene import Scene
@@ -100,6 +102,12 @@ def run_evaluate(
 
 
 def masks_label(masks_folder: Path) -> str:
-    """What made the masks, as rows name it: the model folder's name, or the segmenter without one."""
+    """What made the masks, as rows name it.
+
+    The model folder's name, or the segmenter without one; masks made from true labels bring a label that
+    also tells their faults.
+    """
     index = read_index(masks_folder)
+    if "label" in index:
+        return str(index["label"])
     return Path(index["model"]).name if index["model"] else index["segmenter"]

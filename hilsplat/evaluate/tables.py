@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING
 from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
-from hilsplat.evaluate.scores import read_scores
+from hilsplat.evaluate.protocols.cards import ANNOTATIONS, LEVEL_AUTO, LEVEL_GIVEN, PATH, card_of
+from hilsplat.evaluate.scores import made_from_truth, read_scores
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,10 +38,10 @@ ANSWERS = {
 """How tables name the methods of score rows, in the order of their rows."""
 
 PROTOCOLS = {
-    "hierarchy:level=given": "level given",
-    "hierarchy:level=auto": "level chosen",
-    "hierarchy:path": "path of texts",
-    "hierarchy:annotations": "reference",
+    LEVEL_GIVEN.full_name: "level given",
+    LEVEL_AUTO.full_name: "level chosen",
+    PATH.full_name: "path of texts",
+    ANNOTATIONS.full_name: "reference",
 }
 """How tables name protocols; others keep their name."""
 
@@ -48,6 +49,15 @@ STAND_IN_NOTE = (
     "Rows of a synthetic stand-in are measured on generated scenes with the models named under Masks. "
     "They show how the parts of the method compare with each other and are not comparable with reported "
     "rows."
+)
+
+TRUE_MASKS = "diagnostic, true masks: "
+"""Before the method's name in rows whose masks were made from true labels."""
+
+TRUE_MASKS_NOTE = (
+    "Rows that begin with 'diagnostic, true masks' were given masks made from the true labels, with the "
+    "faults named under Masks. They are no results and are ranked with nothing; they tell errors of the "
+    "method from errors of the segmenter."
 )
 
 
@@ -283,7 +293,10 @@ def measured_blocks(
             }
             if method == "truth":
                 names["Method"] = "annotations"
+            elif made_from_truth(masks):
+                names["Method"] = TRUE_MASKS + names["Method"]
             place = (
+                made_from_truth(masks),
                 list(PROTOCOLS).index(protocol) if protocol in PROTOCOLS else -1,
                 order.index(variant) if variant in order else len(order),
                 variant,
@@ -292,7 +305,8 @@ def measured_blocks(
                 protocol,
             )
             group = protocol if ranked_by_protocol else ""
-            rows.append((place, Row(names, cells_of(part), None if method == "truth" else group)))
+            ranked = method != "truth" and not made_from_truth(masks)
+            rows.append((place, Row(names, cells_of(part), group if ranked else None)))
         rows = [row for _, row in sorted(rows, key=lambda item: item[0])]
         seen: dict[tuple, None] = {}
         distinct = []
@@ -370,7 +384,7 @@ def hierarchy_table(published: list, scores: "pd.DataFrame", labels: Mapping[str
     blocks += measured_blocks(
         scores,
         labels,
-        lambda protocol: protocol.startswith("hierarchy:"),
+        lambda protocol: protocol.startswith("hierarchy/"),
         cells_of,
         lambda _: columns,
         frozenset({"HC literal", "Avg, best threshold", "Pairs"}),
@@ -408,7 +422,7 @@ def lerf_table(published: list, scores: "pd.DataFrame", labels: Mapping[str, str
     blocks += measured_blocks(
         scores,
         labels,
-        lambda protocol: not protocol.startswith("hierarchy:"),
+        lambda protocol: protocol.startswith("lerf/"),
         cells_of,
         columns_of,
         ranked_by_protocol=False,
@@ -416,8 +430,8 @@ def lerf_table(published: list, scores: "pd.DataFrame", labels: Mapping[str, str
     footnotes = (
         "All in %. mIoU and mBIoU are means over (view, text) pairs of a scene; Average is the mean of the "
         "scenes. Localization: the point of highest smoothed relevancy lies in a box of the text.",
-        "langsplat_lerf: mean filter (30 px at a height of 730, scaled), min-max above 0.7, 7 x 7 majority, "
-        "level of the highest relevancy. node_selection: tree nodes, level chosen by the tree.",
+        "lerf/langsplat: mean filter (30 px at a height of 730, scaled), min-max above 0.7, 7 x 7 majority, "
+        "level of the highest relevancy. lerf/tree-nodes: tree nodes, level chosen by the tree.",
         "*: reproduced by the paper's authors; other reported rows come from the methods' own papers.",
     )
     return finished("lerf", "Segmentation and localization", blocks, footnotes)
@@ -438,7 +452,7 @@ def ablation_table(published: list, scores: "pd.DataFrame", labels: Mapping[str,
                 families=False,
             )
         )
-    flat = scores[~scores["protocol"].str.startswith("hierarchy:")]
+    flat = scores[scores["protocol"].str.startswith(("lerf/langsplat@", "lerf/tree-nodes@"))]
 
     def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
         first = part.iloc[0]
@@ -459,7 +473,7 @@ def ablation_table(published: list, scores: "pd.DataFrame", labels: Mapping[str,
     blocks += measured_blocks(
         scores[scores["method"] != "truth"],
         labels,
-        lambda protocol: protocol in ("hierarchy:level=given", "hierarchy:path"),
+        lambda protocol: card_of(protocol) in (LEVEL_GIVEN, PATH),
         cells_of,
         lambda _: columns,
         frozenset({"Avg, best threshold"}),
@@ -498,10 +512,14 @@ def efficiency_table(published: list, scores: "pd.DataFrame", labels: Mapping[st
 
 
 def finished(name: str, title: str, blocks: Iterable[Block], footnotes: Sequence[str]) -> Table:
-    """A table with the warning that its stand-in rows need."""
+    """A table with the warnings that its rows need."""
     blocks = tuple(blocks)
-    warns = any(block.kind == "synthetic stand-in" for block in blocks)
-    return Table(name, title, blocks, ((STAND_IN_NOTE,) if warns else ()) + tuple(footnotes))
+    warnings = []
+    if any(block.kind == "synthetic stand-in" for block in blocks):
+        warnings.append(STAND_IN_NOTE)
+    if any(made_from_truth(row.names.get("Masks", "")) for block in blocks for row in block.rows):
+        warnings.append(TRUE_MASKS_NOTE)
+    return Table(name, title, blocks, (*warnings, *footnotes))
 
 
 BUILDERS: dict[str, Callable[..., Table]] = {

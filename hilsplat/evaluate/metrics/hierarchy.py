@@ -45,7 +45,9 @@ def family_consistency(family: Family, reading: Reading) -> float:
 def hierarchical_consistency(
     transitions: Sequence[Sequence[Family]], reading: Reading = "containment", pooled: bool = False
 ) -> float:
-    """HC of one view (paper, Sec. IV-A).
+    """HC of one view (paper, Sec. IV-A). Averaging: children of a parent, parents of a level, levels.
+
+    A scene's value is the mean over its views with at least one parent; then scenes are averaged.
 
     Departs: the printed normaliser uses N_l outside the sum over l, where it is not defined; here
     it is the mean over the parents of each level, then over the L - 1 transitions. A transition
@@ -56,7 +58,16 @@ def hierarchical_consistency(
         reading: see `family_consistency`.
         pooled: mean over all parents of all levels instead.
     """
-    scores = [[family_consistency(family, reading) for family in families] for families in transitions]
+    return mean_over_parents(consistency_of_families(transitions, reading), pooled)
+
+
+def consistency_of_families(transitions: Sequence[Sequence[Family]], reading: Reading) -> list[list[float]]:
+    """Score of every parent, per level of the parent."""
+    return [[family_consistency(family, reading) for family in families] for families in transitions]
+
+
+def mean_over_parents(scores: Sequence[Sequence[float]], pooled: bool = False) -> float:
+    """Mean over the parents of each level and then over the levels, or over all parents at once."""
     if pooled:
         every = [score for level in scores for score in level]
         return float(np.mean(every)) if every else 0.0

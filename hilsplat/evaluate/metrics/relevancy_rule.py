@@ -1,10 +1,9 @@
-"""From relevancy maps of three levels to one mask: the rule of LangSplat's LERF evaluation.
+"""From relevancy maps of three levels to one mask: the rules of LangSplat and its successors.
 
-Source: minghanqin/LangSplat `eval/evaluate_iou_loc.py`; every departure is a setting of
-`RelevancyRule` and shows in its name.
+Source: minghanqin/LangSplat `eval/evaluate_iou_loc.py`; every departure is a field of `RelevancyRule`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
@@ -17,6 +16,7 @@ MAJORITY_REACH_PX = 3
 
 ThresholdOn = Literal["normalised_pm1", "normalised_01", "raw"]
 LevelRule = Literal["max", "mean_in_mask"]
+Border = Literal["langsplat", "inside"]
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,10 @@ class RelevancyRule:
         majority: smooth the mask with the 7 x 7 majority filter.
         level_rule: `max`: the level whose (mixed) map has the highest value; `mean_in_mask`: the
             highest mean inside its own mask (LangSplat's text on 3D-OVS).
+        border: windows at the border. `langsplat`: the mean filter reflects, the majority filter
+            never looks at the last row and column; `inside`: both average what lies in the image
+            (LangSplatV2).
+        levels: levels among which one is chosen (LangSplatV2 on 3D-OVS: whole and part).
     """
 
     filter_px: int = 0
@@ -41,24 +45,27 @@ class RelevancyRule:
     threshold_on: ThresholdOn = "normalised_pm1"
     majority: bool = True
     level_rule: LevelRule = "max"
+    border: Border = "langsplat"
+    levels: tuple[Level, ...] = LEVELS
 
-    @property
-    def name(self) -> str:
-        """`langsplat_lerf`, followed by whatever departs from it."""
-        departures = []
-        if self.filter_px:
-            departures.append(f"filter {self.filter_px}")
-        if not self.mix:
-            departures.append("no mix")
-        if self.threshold != 0.4:
-            departures.append(f"threshold {self.threshold:g}")
-        if self.threshold_on != "normalised_pm1":
-            departures.append(self.threshold_on)
-        if not self.majority:
-            departures.append("no majority")
-        if self.level_rule != "max":
-            departures.append(self.level_rule)
-        return "langsplat_lerf" + (f" ({', '.join(departures)})" if departures else "")
+    def departures(self, reference: "RelevancyRule") -> tuple[str, ...]:
+        """What differs from another rule, a few words each, as names of protocols carry it."""
+        words = {
+            "filter_px": f"filter {self.filter_px}" if self.filter_px else "filter scaled",
+            "mix": "mix" if self.mix else "no mix",
+            "threshold": f"threshold {self.threshold:g}",
+            "threshold_on": self.threshold_on,
+            "majority": "majority" if self.majority else "no majority",
+            "level_rule": self.level_rule,
+            "border": f"border {self.border}",
+            "levels": "levels " + "+".join(level.label for level in self.levels),
+        }
+        differing = [
+            field.name
+            for field in fields(self)
+            if getattr(self, field.name) != getattr(reference, field.name)
+        ]
+        return tuple(words[name] for name in differing)
 
 
 def filter_side_px(filter_px: int, height_px: int) -> int:
@@ -66,17 +73,25 @@ def filter_side_px(filter_px: int, height_px: int) -> int:
     return filter_px or max(1, round(30 * height_px / 730))
 
 
-def mean_filter(relevancy: Float[np.ndarray, "H W"], side_px: int) -> Float32[np.ndarray, "H W"]:
-    """Mean over a square window, as OpenCV does by default.
+def mean_filter(
+    relevancy: Float[np.ndarray, "H W"], side_px: int, border: Border = "langsplat"
+) -> Float32[np.ndarray, "H W"]:
+    """Mean over a square window.
 
-    Borders are reflected without repeating the edge pixel, and the anchor of an even window stands
-    right of its middle: for side 30, output y averages rows y - 15 .. y + 14.
+    `langsplat`: as OpenCV does by default. Borders are reflected without repeating the edge pixel,
+    and the anchor of an even window stands right of its middle: for side 30, output y averages rows
+    y - 15 .. y + 14. `inside`: the mean over those pixels of the window that lie in the image.
     """
     import cv2
 
-    return cv2.boxFilter(
-        relevancy.astype(np.float32), cv2.CV_32F, (side_px, side_px), borderType=cv2.BORDER_DEFAULT
+    values, side_hw = relevancy.astype(np.float32), (side_px, side_px)
+    if border == "langsplat":
+        return cv2.boxFilter(values, cv2.CV_32F, side_hw, borderType=cv2.BORDER_DEFAULT)
+    summed, count = (
+        cv2.boxFilter(each, cv2.CV_32F, side_hw, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for each in (values, np.ones_like(values))
     )
+    return summed / count
 
 
 def threshold_mask(
@@ -92,29 +107,25 @@ def threshold_mask(
     return np.clip(2 * normalised - 1, 0, 1) > threshold
 
 
-def majority_smooth(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+def majority_smooth(mask: Bool[np.ndarray, "H W"], border: Border = "langsplat") -> Bool[np.ndarray, "H W"]:
     """Each pixel becomes the most frequent value of its 7 x 7 window; a tie gives False.
 
-    The window is rows max(0, i - 3) .. min(i + 4, h - 1) - 1 and columns likewise, as LangSplat's
-    code slices it: the last row and column are never looked at, so the filter is not symmetric
-    near the lower and right edges.
+    `langsplat`: the window is rows max(0, i - 3) .. min(i + 4, h - 1) - 1 and columns likewise, as its
+    code slices it: the last row and column are never looked at, so the filter is not symmetric near
+    the lower and right edges. `inside`: the part of the window that lies in the image.
     """
-    height, width = mask.shape
-    summed = np.zeros((height + 1, width + 1), dtype=np.int32)
-    summed[1:, 1:] = mask.cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
-    top, bottom = _window(height)
-    left, right = _window(width)
-    ones = summed[bottom][:, right] - summed[top][:, right] - summed[bottom][:, left] + summed[top][:, left]
-    count = (bottom - top)[:, None] * (right - left)[None, :]
+    import cv2
+
+    seen = np.ones(mask.shape, np.uint8)
+    if border == "langsplat":
+        seen[-1, :] = seen[:, -1] = 0
+    side_hw = (2 * MAJORITY_REACH_PX + 1,) * 2
+    # At most 49 ones in a window, so that 8 bits hold every sum.
+    ones, count = (
+        cv2.boxFilter(each, cv2.CV_8U, side_hw, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for each in ((mask & (seen > 0)).view(np.uint8), seen)
+    )
     return 2 * ones > count
-
-
-def _window(length: int) -> tuple[np.ndarray, np.ndarray]:
-    """First and one-past-last index of each position's window along an axis."""
-    positions = np.arange(length)
-    start = np.maximum(0, positions - MAJORITY_REACH_PX)
-    stop = np.maximum(start, np.minimum(positions + MAJORITY_REACH_PX + 1, length - 1))
-    return start, stop
 
 
 @dataclass(frozen=True)
@@ -134,7 +145,7 @@ class SmoothedRelevancy:
         """Filter all three levels."""
         side_px = filter_side_px(rule.filter_px, relevancy.shape[1])
         raw = relevancy.astype(np.float32)
-        filtered = np.stack([mean_filter(raw[level.index], side_px) for level in LEVELS])
+        filtered = np.stack([mean_filter(raw[level.index], side_px, rule.border) for level in LEVELS])
         return SmoothedRelevancy(filtered, 0.5 * (filtered + raw) if rule.mix else raw)
 
 
@@ -145,22 +156,29 @@ def relevancy_mask(
 
     def mask_of(level: Level) -> np.ndarray:
         mask = threshold_mask(smoothed.mixed[level.index], rule.threshold, rule.threshold_on)
-        return majority_smooth(mask) if rule.majority else mask
+        return majority_smooth(mask, rule.border) if rule.majority else mask
 
     if level is not None:
         return mask_of(level), level
     if rule.level_rule == "max":
-        chosen = LEVELS[int(smoothed.mixed.max(axis=(1, 2)).argmax())]
+        highest = [smoothed.mixed[level.index].max() for level in rule.levels]
+        chosen = rule.levels[int(np.argmax(highest))]
         return mask_of(chosen), chosen
-    masks = [mask_of(level) for level in LEVELS]
-    chosen = level_by_mean_in_mask(smoothed.mixed, np.stack(masks))
+    masks = np.zeros(smoothed.mixed.shape, dtype=bool)
+    for each in rule.levels:
+        masks[each.index] = mask_of(each)
+    chosen = level_by_mean_in_mask(smoothed.mixed, masks, rule.levels)
     return masks[chosen.index], chosen
 
 
-def level_by_mean_in_mask(relevancy: Float[np.ndarray, "3 H W"], masks: Bool[np.ndarray, "3 H W"]) -> Level:
+def level_by_mean_in_mask(
+    relevancy: Float[np.ndarray, "3 H W"],
+    masks: Bool[np.ndarray, "3 H W"],
+    levels: tuple[Level, ...] = LEVELS,
+) -> Level:
     """The level whose mean relevancy inside its own mask is highest; an empty mask comes last."""
     means = [
         float(relevancy[level.index][masks[level.index]].mean()) if masks[level.index].any() else -np.inf
-        for level in LEVELS
+        for level in levels
     ]
-    return LEVELS[int(np.argmax(means))]
+    return levels[int(np.argmax(means))]

@@ -90,7 +90,7 @@ def test_file_names_hold_no_separators():
 def finished_scene(folder, variant="default"):
     (folder / "scene").mkdir(parents=True, exist_ok=True)
     (folder / "gaussians.ply").touch()
-    for part in ("semantic_tree", "autoencoder", "clip"):
+    for part in ("semantic_tree", "autoencoder", "clip", "masks"):
         (folder / variant / part).mkdir(parents=True, exist_ok=True)
     (folder / variant / "language.safetensors").touch()
     return folder

@@ -1,19 +1,18 @@
 """Every example here is small enough to check with pencil and paper."""
 
-import importlib
-import inspect
-import pkgutil
-
+import hypothesis.extra.numpy as hnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from hilsplat.base.levels import Level
-from hilsplat.evaluate import metrics
 from hilsplat.evaluate.metrics.averages import (
     accuracy_at,
     mean_over_classes,
     mean_over_levels,
     mean_over_pairs,
+    mean_over_scenes,
 )
 from hilsplat.evaluate.metrics.hierarchy import Family, hierarchical_consistency
 from hilsplat.evaluate.metrics.localization import box_of, hits_a_box, hits_the_mask, peak_points
@@ -22,9 +21,11 @@ from hilsplat.evaluate.metrics.masks import (
     boundary,
     boundary_iou,
     boundary_width_px,
+    exceeds,
+    foreground,
     iou,
 )
-from hilsplat.evaluate.metrics.registry import BUILDING_BLOCKS, METRICS
+from hilsplat.evaluate.metrics.pixel_classes import argmax_masks, pixel_accuracy
 from hilsplat.evaluate.metrics.relevancy_rule import (
     RelevancyRule,
     SmoothedRelevancy,
@@ -161,8 +162,39 @@ def test_level_by_mean_in_mask_prefers_the_higher_mean_not_the_higher_value():
 
 
 def test_rule_names_what_departs_from_langsplat():
-    assert RelevancyRule().name == "langsplat_lerf"
-    assert RelevancyRule(filter_px=20, threshold_on="raw").name == "langsplat_lerf (filter 20, raw)"
+    assert RelevancyRule().departures(RelevancyRule()) == ()
+    rule = RelevancyRule(filter_px=20, mix=False, threshold=0.5, threshold_on="raw", majority=False)
+    expected = ("filter 20", "no mix", "threshold 0.5", "raw", "no majority")
+    assert rule.departures(RelevancyRule()) == expected
+    assert RelevancyRule().departures(RelevancyRule(filter_px=20)) == ("filter scaled",)
+
+
+def test_windows_inside_the_image_average_what_is_there():
+    row = np.array([[1.0, 2.0, 4.0]])
+    # side 3 at column 0: values 1, 2; LangSplat's reflection would see 2, 1, 2
+    np.testing.assert_allclose(mean_filter(row, 3, "inside"), [[1.5, 7 / 3, 3.0]], rtol=1e-6)
+
+
+def test_majority_inside_the_image_sees_the_last_row_and_column():
+    mask = rectangle((4, 8), (4, 8), (8, 8))
+    # turned by 180 degrees this is the same square at the other corner, and so is the smoothed mask
+    turned = majority_smooth(mask[::-1, ::-1], "inside")[::-1, ::-1]
+    np.testing.assert_array_equal(majority_smooth(mask, "inside"), turned)
+    # at (7, 7) the window holds rows and columns 4 .. 7: all ones. LangSplat's window drops row and column 7.
+    assert majority_smooth(mask, "inside")[7, 7]
+    corner = rectangle((7, 8), (0, 8), (8, 8))
+    assert not majority_smooth(corner).any()
+
+
+def test_level_is_chosen_among_the_levels_of_the_rule():
+    relevancy = np.zeros((3, 8, 8), dtype=np.float32)
+    relevancy[0, 2, 2], relevancy[1, 5, 5], relevancy[2, 1, 1] = 0.6, 0.7, 0.9
+    two = (Level.WHOLE, Level.PART)
+    for level_rule in ("max", "mean_in_mask"):
+        rule = RelevancyRule(filter_px=1, majority=False, level_rule=level_rule, levels=two)
+        mask, level = relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)
+        assert level is Level.PART
+        assert np.argwhere(mask).tolist() == [[5, 5]]
 
 
 # --- masks ----------------------------------------------------------------------------------------
@@ -209,6 +241,56 @@ def test_best_threshold_finds_the_best_cut_and_keeps_ties_together():
     assert best_threshold_iou(score, truth) == pytest.approx(3 / 4)
 
 
+@settings(max_examples=30, deadline=None)
+@given(
+    hnp.arrays(np.float32, (4, 5), elements=st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0])),
+    hnp.arrays(bool, (4, 5)),
+)
+def test_best_threshold_equals_trying_every_cut(score, truth):
+    expected = max(iou(score >= cut, truth) for cut in np.unique(score))
+    assert best_threshold_iou(score, truth) == pytest.approx(expected)
+
+
+def test_accuracy_of_a_pair_needs_more_than_the_threshold():
+    truth, quarter = rectangle((0, 1), (0, 4)), rectangle((0, 1), (0, 1))  # IoU 1/4
+    assert exceeds(quarter, truth, 0.25) == 0
+    assert exceeds(rectangle((0, 1), (0, 2)), truth, 0.25) == 1
+
+
+def test_foreground_is_above_the_value_and_resized_by_the_nearest_pixel():
+    grey = np.array([[128, 129], [255, 0]], dtype=np.uint8)
+    np.testing.assert_array_equal(foreground(grey, 128, (2, 2)), [[False, True], [True, False]])
+    np.testing.assert_array_equal(foreground(grey, 254, (2, 2)), [[False, False], [True, False]])
+    np.testing.assert_array_equal(
+        foreground(grey, 128, (4, 4)), np.kron([[0, 1], [1, 0]], np.ones((2, 2))).astype(bool)
+    )
+
+
+# --- every pixel a class --------------------------------------------------------------------------
+
+
+def test_argmax_protocol_of_3d_ovs_on_four_pixels():
+    truth = np.array([[[1, 1, 0, 0]], [[0, 0, 1, 0]], [[0, 0, 0, 1]]], dtype=bool)  # classes 0, 0, 1, 2
+    similarity = np.array([[[0.9, 0.1, 0.2, 0.2]], [[0.3, 0.5, 0.4, 0.2]], [[0.1, 0.4, 0.3, 0.3]]])
+    prediction = argmax_masks(similarity)  # 0, 1, 1, 2
+    ious = [iou(prediction[row], truth[row]) for row in range(3)]
+    assert ious == [1 / 2, 1 / 2, 1]
+    assert np.mean(ious) == pytest.approx(0.666667, abs=1e-6)
+    assert pixel_accuracy(prediction, truth) == 0.75
+
+
+def test_equal_similarities_go_to_the_first_class_and_an_absent_class_has_no_iou():
+    prediction = argmax_masks(np.zeros((2, 1, 3)))
+    assert prediction[0].all()
+    assert not prediction[1].any()
+    assert iou(prediction[1], np.zeros((1, 3), dtype=bool)) == 0
+
+
+def test_pixel_with_two_true_classes_is_never_right():
+    truth = np.array([[[1, 1]], [[1, 0]]], dtype=bool)
+    assert pixel_accuracy(argmax_masks(np.array([[[1.0, 1.0]], [[0.0, 0.0]]])), truth) == 0.5
+
+
 # --- localization ---------------------------------------------------------------------------------
 
 
@@ -242,6 +324,20 @@ def test_pooled_and_class_averages_differ():
     values = {("f1", "apple"): 0.8, ("f1", "egg"): 0.3, ("f2", "apple"): 0.6}
     assert mean_over_pairs(values) == pytest.approx(1.7 / 3)
     assert mean_over_classes(values) == pytest.approx((0.7 + 0.3) / 2)
+
+
+def test_scenes_weigh_equally_whatever_their_pairs():
+    assert mean_over_scenes([0.5, 0.7, float("nan")]) == pytest.approx(0.6)
+    assert np.isnan(mean_over_scenes([]))
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.permutations([("f1", "a"), ("f1", "b"), ("f2", "a"), ("f3", "b"), ("f3", "c")]))
+def test_averages_do_not_depend_on_the_order_of_views_and_queries(pairs):
+    value = {("f1", "a"): 0.1, ("f1", "b"): 0.7, ("f2", "a"): 0.2, ("f3", "b"): 0.3, ("f3", "c"): 0.9}
+    shuffled = {pair: value[pair] for pair in pairs}
+    assert mean_over_pairs(shuffled) == mean_over_pairs(value)
+    assert mean_over_classes(shuffled) == mean_over_classes(value)
 
 
 def test_level_averages_weigh_levels_equally():
@@ -292,28 +388,3 @@ def test_whole_image_fools_all_readings_but_the_anchored_one():
 
 def test_transition_without_parents_contributes_nothing():
     assert hierarchical_consistency([families()[0], []]) == pytest.approx(0.4375)
-
-
-# --- registry -------------------------------------------------------------------------------------
-
-
-def public_functions():
-    for module_info in pkgutil.iter_modules(metrics.__path__):
-        module = importlib.import_module(f"{metrics.__name__}.{module_info.name}")
-        for name, function in inspect.getmembers(module, inspect.isfunction):
-            if function.__module__ == module.__name__ and not name.startswith("_"):
-                yield f"{module_info.name}.{name}"
-
-
-def test_every_metric_is_listed():
-    listed = {metric.function for metric in METRICS.values()} | BUILDING_BLOCKS
-    assert set(public_functions()) == listed
-
-
-@pytest.mark.parametrize("name", ["iou", "boundary_iou"])
-def test_symmetric_metrics_are_symmetric(name):
-    rng = np.random.default_rng(3)
-    first, second = rng.random((2, 30, 30)) > 0.6
-    function = {"iou": iou, "boundary_iou": boundary_iou}[name]
-    assert METRICS[name].symmetric
-    assert function(first, second) == function(second, first)

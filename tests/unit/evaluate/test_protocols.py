@@ -8,8 +8,10 @@ import pytest
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.hierarchy import AnnotatedNode, HierarchyAnnotations, write_hierarchy
-from hilsplat.evaluate.metrics.registry import METRICS
-from hilsplat.evaluate.protocols import QueryableScene, Selections, ViewTruth, measure_view
+from hilsplat.evaluate.protocols.answers import QueryableScene, Selections
+from hilsplat.evaluate.protocols.cards import PROTOCOLS, card_of
+from hilsplat.evaluate.protocols.view_truth import ViewTruth
+from hilsplat.evaluate.protocols.views import measure_view
 from hilsplat.evaluate.scores import COLUMNS, Score, read_scores, write_scores
 from hilsplat.evaluate.stage import masks_label
 from hilsplat.settings import EvaluateSettings
@@ -93,12 +95,14 @@ def test_fake_and_real_scene_fit_the_protocol(block_world):
 def test_consistency_rows_match_the_worked_example(tmp_path):
     scene, truth = worked_example(tmp_path)
     values = measured(scene, truth, methods=("tree", "tree-path"))
-    for method, protocol in (("tree", "level=given"), ("tree", "level=auto"), ("tree-path", "path")):
-        key = (method, f"hierarchy:{protocol}", "", "")
+    for method, protocol in (("tree", "level-given"), ("tree", "level-auto"), ("tree-path", "path")):
+        key = (method, f"hierarchy/{protocol}@1", "", "")
         assert values[*key, "hc_containment"] == pytest.approx(0.9375)
         assert values[*key, "hc_literal"] == pytest.approx(0.27)
+        assert values[*key, "hc_containment_pooled"] == pytest.approx(0.916667, abs=1e-6)
+        assert values[*key, "hc_literal_pooled"] == pytest.approx(0.293333, abs=1e-6)
     # the annotations nest perfectly: a2 is 8 px of A, so literal is ((20 + 8)/50/2 + 10/25)/2 = 0.34
-    reference = ("truth", "hierarchy:annotations", "", "")
+    reference = ("truth", "hierarchy/annotations@1", "", "")
     assert values[*reference, "hc_containment"] == 1
     assert values[*reference, "hc_literal"] == pytest.approx((0.34 + 0.2) / 2)
 
@@ -106,9 +110,9 @@ def test_consistency_rows_match_the_worked_example(tmp_path):
 def test_missing_answer_counts_zero_and_breaks_consistency(tmp_path):
     scene, truth = worked_example(tmp_path, without=("x",))
     values = measured(scene, truth, methods=("tree",))
-    assert values["tree", "hierarchy:level=given", "x", "subpart", "iou"] == 0
-    assert values["tree", "hierarchy:level=given", "A", "whole", "iou"] == 1
-    assert values["tree", "hierarchy:level=given", "", "", "hc_containment"] == pytest.approx(0.4375)
+    assert values["tree", "hierarchy/level-given@1", "x", "subpart", "iou"] == 0
+    assert values["tree", "hierarchy/level-given@1", "A", "whole", "iou"] == 1
+    assert values["tree", "hierarchy/level-given@1", "", "", "hc_containment"] == pytest.approx(0.4375)
 
 
 def test_regions_with_the_same_text_are_united(tmp_path):
@@ -120,7 +124,7 @@ def test_regions_with_the_same_text_are_united(tmp_path):
     assert truth.queries[0].boxes_xyxy.tolist() == [[0, 0, 3, 3], [6, 6, 9, 9]]
     scene = HandMade([mask_of((0, 4), (0, 4))], {("cup", Level.WHOLE): [0], ("cup", None): [0]})
     values = measured(scene, truth, methods=("tree",))
-    assert values["tree", "hierarchy:level=given", "cup", "whole", "iou"] == pytest.approx(0.5)
+    assert values["tree", "hierarchy/level-given@1", "cup", "whole", "iou"] == pytest.approx(0.5)
 
 
 def test_text_at_two_levels_is_one_category_and_two_queries(tmp_path):
@@ -167,14 +171,46 @@ def test_automatic_level_of_the_field_follows_the_highest_value(tmp_path):
     relevancy[2, 8, 8] = 0.9  # wrong place, finest level, higher
     scene = HandMade([], {}, {"cup": relevancy})
     values = measured(scene, truth, methods=("field",), filter_px=1, majority=False)
+    given, auto, lerf = (
+        f"{name}@1 (filter 1, no majority)"
+        for name in ("hierarchy/level-given", "hierarchy/level-auto", "lerf/langsplat")
+    )
     key = ("cup", "whole", "iou")
-    assert values["field", "hierarchy:level=given", *key] == 1
-    assert values["field", "hierarchy:level=auto", *key] == 0
-    lerf = "langsplat_lerf (filter 1, no majority)"
+    assert values["field", given, *key] == 1
+    assert values["field", auto, *key] == 0
     assert values["field", lerf, "cup", "", "iou"] == 0
     assert values["field", lerf, "cup", "", "localization_box"] == 0
-    assert values["field", "hierarchy:level=given", "cup", "whole", "localization_box"] == 1
-    assert values["field", "hierarchy:level=given", "cup", "whole", "best_threshold_iou"] == 1
+    assert values["field", given, "cup", "whole", "localization_box"] == 1
+    assert values["field", given, "cup", "whole", "best_threshold_iou"] == 1
+
+
+def test_other_protocols_are_measured_with_their_own_rules():
+    # The right place has the higher mean, another level the higher value.
+    relevancy = np.full((3, *SIZE), 0.1, np.float32)
+    relevancy[0, 2:6, 2:6] = 0.8
+    relevancy[2, 8, 8], relevancy[2, 8, 9] = 0.9, 0.66  # min-max 0.7: just in the mask
+    truth = ViewTruth.flat({"cup": mask_of((2, 6), (2, 6))})
+    scene = HandMade([], {}, {"cup": relevancy})
+    cards = [PROTOCOLS["3d-ovs/langsplat@1"], PROTOCOLS["3d-ovs/langsplat-raw@1"]]
+    rows = list(
+        measure_view(
+            scene,
+            Selections(scene, 0.85),
+            truth,
+            "v.png",
+            SIZE,
+            EvaluateSettings(methods=("field",), filter_px=1, mix=False, majority=False, relevancy_scale=5),
+            cards,
+        )
+    )
+    ious = {row.protocol: row.value for row in rows if row.metric == "iou"}
+    assert ious == {
+        "lerf/langsplat@1 (filter 1, no mix, no majority, relevancy scale 5)": 0,
+        "3d-ovs/langsplat@1 (relevancy scale 5)": 1,
+        "3d-ovs/langsplat-raw@1 (relevancy scale 5)": 1,
+    }
+    own = {row.metric for row in rows if row.protocol.startswith("3d-ovs/")}
+    assert own == {"iou", "boundary_iou"}
 
 
 def test_path_localization_looks_inside_the_parent(tmp_path):
@@ -187,8 +223,8 @@ def test_path_localization_looks_inside_the_parent(tmp_path):
     answers = {("bear",): [0], ("bear", "nose"): [1], ("nose", Level.PART): [1]}
     scene = HandMade([mask_of(*each) for each in regions], answers, {"nose": relevancy})
     values = measured(scene, truth, methods=("tree", "tree-path"), filter_px=1)
-    assert values["tree", "hierarchy:level=given", "nose", "part", "localization_box"] == 0
-    assert values["tree-path", "hierarchy:path", "nose", "part", "localization_box"] == 1
+    assert values["tree", "hierarchy/level-given@1 (filter 1)", "nose", "part", "localization_box"] == 0
+    assert values["tree-path", "hierarchy/path@1 (filter 1)", "nose", "part", "localization_box"] == 1
 
 
 def test_perfect_tree_of_the_block_world_scores_one(block_world):
@@ -197,15 +233,16 @@ def test_perfect_tree_of_the_block_world_scores_one(block_world):
     truth = ViewTruth.of(block_world.annotations, view, size_hw, settings.min_region_px)
     selections = Selections(block_world.answers, settings.node_select)
     rows = list(measure_view(block_world.answers, selections, truth, view, size_hw, settings))
-    given = [row for row in rows if row.method == "tree" and row.protocol == "hierarchy:level=given"]
+    given = [row for row in rows if row.method == "tree" and row.protocol == "hierarchy/level-given@1"]
     ious = {row.query: row.value for row in given if row.metric == "iou"}
     assert ious == dict.fromkeys(("bear", "chest", "head", "lid", "nose"), 1.0)
     assert {row.value for row in given if row.metric in ("localization_box", "hc_containment")} == {1.0}
-    assert {row.metric for row in rows} == set(METRICS)
+    for name in {row.protocol for row in rows}:
+        assert {row.metric for row in rows if row.protocol == name} == set(card_of(name).metrics)
     field = {
         row.query: row.value
         for row in rows
-        if (row.method, row.protocol, row.metric) == ("field", "hierarchy:level=given", "iou")
+        if (row.method, row.protocol, row.metric) == ("field", "hierarchy/level-given@1", "iou")
     }
     assert field["bear"] > 0.9  # exact features; the filter rounds the corners
 
@@ -221,7 +258,7 @@ def score(**changes):
         "query": "cup",
         "level": "whole",
         "metric": "iou",
-        "protocol": "hierarchy:level=given",
+        "protocol": "hierarchy/level-given@1",
         "value": 0.5,
         "n": 1,
     }

@@ -26,7 +26,7 @@ PUBLISHED = Path(__file__).parents[3] / "config" / "published"
 
 def score(metric, value, *, scene="one", variant="default", method="tree", protocol=None, **more):
     fields = {"dataset": "synthetic", "view": "v.png", "query": "cup", "level": "whole", "masks": "sam-tiny"}
-    protocol = protocol or "hierarchy:level=given"
+    protocol = protocol or "hierarchy/level-given@1"
     return Score(
         **{**fields, **more},
         scene=scene,
@@ -52,13 +52,13 @@ SCORES = [
     score("hc_containment", 0.7, query="", level="", view="w.png"),
     score("hc_containment", 0.4, query="", level="", scene="two"),
     score("iou", 0.4, method="field"),
-    score("hc_containment", 1.0, method="truth", protocol="hierarchy:annotations", query="", level=""),
+    score("hc_containment", 1.0, method="truth", protocol="hierarchy/annotations@1", query="", level=""),
     # the LERF protocol
-    score("iou", 0.5, protocol="node_selection", level=""),
-    score("boundary_iou", 0.25, protocol="node_selection", level=""),
-    score("localization_box", 1.0, protocol="node_selection", level=""),
-    score("localization_box", 0.0, protocol="node_selection", level="", query="d"),
-    score("iou", 0.7, protocol="node_selection", level="", scene="two"),
+    score("iou", 0.5, protocol="lerf/tree-nodes@1", level=""),
+    score("boundary_iou", 0.25, protocol="lerf/tree-nodes@1", level=""),
+    score("localization_box", 1.0, protocol="lerf/tree-nodes@1", level=""),
+    score("localization_box", 0.0, protocol="lerf/tree-nodes@1", level="", query="d"),
+    score("iou", 0.7, protocol="lerf/tree-nodes@1", level="", scene="two"),
     # another variant
     score("iou", 0.9, variant="omega-2", method="field"),
 ]
@@ -124,7 +124,7 @@ def test_kinds_are_never_mixed_in_a_block(tmp_path):
 
 
 def test_rows_of_a_real_data_set_are_measured_rows(tmp_path):
-    scores = [score("iou", 0.5, dataset="lerf", protocol="langsplat_lerf", method="field", level="")]
+    scores = [score("iou", 0.5, dataset="lerf", protocol="lerf/langsplat@1", method="field", level="")]
     rows, forms = built(tmp_path, "lerf", scores)
     assert measured(rows, data="lerf")["kind"] == "measured"
     assert "## Measured on lerf" in forms[".md"]
@@ -133,7 +133,7 @@ def test_rows_of_a_real_data_set_are_measured_rows(tmp_path):
 
 def test_lerf_table_has_a_column_per_scene_and_the_mean_of_scenes(tmp_path):
     rows, _ = built(tmp_path, "lerf", labels={"default": "hilsplat"})
-    row = measured(rows, method="hilsplat", protocol="node_selection")
+    row = measured(rows, method="hilsplat", protocol="lerf/tree-nodes@1")
     assert (row["one mIoU"], row["two mIoU"], row["Average mIoU"]) == ("50.00", "70.00", "60.00")
     assert (row["one mBIoU"], row["Average mBIoU"]) == ("25.00", "25.00")
     assert row["Average localization"] == "50.00"

@@ -1,0 +1,210 @@
+"""Instance segmentation of points: AP, AP50 and AP25 of the ScanNet benchmark.
+
+Source: ScanNet/ScanNet `BenchmarkScripts/3d_evaluation/evaluate_semantic_instance.py`, which OpenMask3D
+uses too; the order of matching and the integration of the curve are that code's, quirks included.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int, Int64
+
+from hilsplat.base.errors import MisalignedArtifactError
+
+OVERLAPS: tuple[float, ...] = (*np.arange(0.5, 0.95, 0.05).tolist(), 0.25)
+"""IoU thresholds: nine from 0.50 to 0.90 (0.95 is not among them), then 0.25."""
+
+CLASS_STRIDE = 1000
+"""A vertex of class c and instance i carries c * 1000 + i; smaller values mean no object."""
+
+MIN_POINTS = 100
+"""Smaller instances and predictions are left out."""
+
+
+@dataclass(frozen=True)
+class InstanceScan:
+    """Truth and predictions of one scan.
+
+    Attributes:
+        truth: per point class * 1000 + instance; a value below 1000, or of a class that is not asked
+            for, is void.
+        masks: predicted instances over the same points; they may overlap.
+        classes: class id of each prediction.
+        confidences: higher is surer; one value for all where a method has none.
+    """
+
+    truth: Int[np.ndarray, " P"]
+    masks: Bool[np.ndarray, "M Q"]  # Q = P, which is checked
+    classes: Int[np.ndarray, " M"]
+    confidences: Float[np.ndarray, " M"]
+
+
+@dataclass(frozen=True)
+class InstanceMatches:
+    """What one scan adds to the precision-recall curves of K classes at T thresholds.
+
+    Scans are matched one by one and their curves are drawn together, so a workflow can keep these.
+
+    Attributes:
+        class_index: entries of the curves: class, 0 .. K - 1.
+        overlap_index: their threshold, 0 .. T - 1.
+        confidence: their confidence.
+        is_match: True for a match, False for a false positive.
+        misses: true instances that nothing matched.
+        has_truth: whether the scan has an instance of the class that is large enough.
+    """
+
+    class_index: Int64[np.ndarray, " E"]
+    overlap_index: Int64[np.ndarray, " E"]
+    confidence: Float64[np.ndarray, " E"]
+    is_match: Bool[np.ndarray, " E"]
+    misses: Int64[np.ndarray, "K T"]
+    has_truth: Bool[np.ndarray, " K"]
+
+
+def match_instances(
+    scan: InstanceScan, class_ids: Sequence[int], min_points: int = MIN_POINTS
+) -> InstanceMatches:
+    """Match predictions to true instances, per class and threshold.
+
+    In the order of the instances, each prediction of the class that overlaps by more than the threshold
+    and is unused matches; of several, the surest stays the match and each other is a false positive
+    with the lower confidence. A prediction counts as used only by a first match. A prediction that
+    overlaps no true instance enough is a false positive, unless the share of its points in void or in
+    instances that are too small exceeds the threshold.
+
+    Raises:
+        MisalignedArtifactError: masks and truth have different numbers of points.
+    """
+    if scan.masks.shape[1] != len(scan.truth):
+        raise MisalignedArtifactError(
+            "predicted instances are not of the scan's points",
+            expected=f"{len(scan.truth)} points",
+            found=scan.masks.shape[1],
+            fix="predict on the vertices of the evaluated mesh",
+        )
+    ids, instance_of_point = np.unique(scan.truth, return_inverse=True)
+    sizes = np.bincount(instance_of_point, minlength=len(ids))
+    points = scan.masks.sum(axis=1)
+    kept = np.flatnonzero((points >= min_points) & np.isin(scan.classes, class_ids))
+    # [kept prediction, true instance]: points in common
+    common = np.array(
+        [np.bincount(instance_of_point[scan.masks[row]], minlength=len(ids)) for row in kept], dtype=np.int64
+    ).reshape(len(kept), len(ids))
+    of_class = np.where(ids >= CLASS_STRIDE, ids // CLASS_STRIDE, 0)
+    void = ~np.isin(of_class, class_ids) | (ids < CLASS_STRIDE)
+
+    entries: list[tuple[int, int, float, bool]] = []
+    misses = np.zeros((len(class_ids), len(OVERLAPS)), dtype=np.int64)
+    has_truth = np.zeros(len(class_ids), dtype=bool)
+    for class_index, class_id in enumerate(class_ids):
+        own = np.flatnonzero((of_class == class_id) & ~void)
+        large = sizes[own] >= min_points
+        predictions = np.flatnonzero(scan.classes[kept] == class_id)
+        has_truth[class_index] = large.any()
+        shared = common[np.ix_(predictions, own)]
+        area = points[kept[predictions]]
+        overlap = shared / (area[:, None] + sizes[own][None, :] - shared)
+        ignored = (common[predictions][:, void].sum(axis=1) + shared[:, ~large].sum(axis=1)) / area
+        confidence = scan.confidences[kept[predictions]].astype(float)
+        for overlap_index, threshold in enumerate(OVERLAPS):
+            scored, missed = _matches(overlap > threshold, large, ignored > threshold, confidence)
+            misses[class_index, overlap_index] = missed
+            entries += [(class_index, overlap_index, *each) for each in scored]
+    columns = list(zip(*entries, strict=True)) or [(), (), (), ()]
+    return InstanceMatches(
+        np.array(columns[0], dtype=np.int64),
+        np.array(columns[1], dtype=np.int64),
+        np.array(columns[2], dtype=np.float64),
+        np.array(columns[3], dtype=bool),
+        misses,
+        has_truth,
+    )
+
+
+def _matches(
+    fits: Bool[np.ndarray, "M G"],
+    large: Bool[np.ndarray, " G"],
+    is_ignored: Bool[np.ndarray, " M"],
+    confidence: Float64[np.ndarray, " M"],
+) -> tuple[list[tuple[float, bool]], int]:
+    """(confidence, is it a match) of one class at one threshold, and the number of missed instances."""
+    used = np.zeros(len(fits), dtype=bool)
+    entries, missed = [], 0
+    for instance in np.flatnonzero(large):
+        candidates = np.flatnonzero(fits[:, instance] & ~used)
+        if not candidates.size:
+            missed += 1
+            continue
+        used[candidates[0]] = True
+        best = confidence[candidates[0]]
+        for lower in confidence[candidates[1:]]:
+            best, worse = max(best, lower), min(best, lower)
+            entries.append((float(worse), False))
+        entries.append((float(best), True))
+    alone = ~fits.any(axis=1) & ~is_ignored
+    return entries + [(float(value), False) for value in confidence[alone]], missed
+
+
+def curve_area(confidence: Float[np.ndarray, " E"], is_match: Bool[np.ndarray, " E"], misses: int) -> float:
+    """Area under one precision-recall curve, as the benchmark integrates it.
+
+    For each distinct confidence s, precision P and recall R count the entries of at least s; recall
+    misses the matches below s and the instances that nothing matched. The point (1, 0) ends the curve.
+    The area is the sum of P_k (R_(k-1) - R_(k+1)) / 2 with R_(-1) = R_0 and 0 after the last; there is
+    no interpolation envelope. No entry gives 0.
+    """
+    if not len(confidence):
+        return 0.0
+    levels, row = np.unique(confidence, return_inverse=True)
+    at_level = np.bincount(row, minlength=len(levels))
+    matches_at_level = np.bincount(row, weights=is_match, minlength=len(levels))
+    taken = at_level[::-1].cumsum()[::-1]
+    hits = matches_at_level[::-1].cumsum()[::-1]
+    truths = hits[0] + misses
+    precision = np.append(hits / taken, 1.0)
+    recall = np.append(hits / truths if truths else np.zeros(len(levels)), 0.0)
+    padded = np.concatenate([recall[:1], recall, [0.0]])
+    return float(precision @ ((padded[:-2] - padded[2:]) / 2))
+
+
+def average_precision(scans: Sequence[InstanceMatches]) -> Float64[np.ndarray, "K T"]:
+    """Average precision per class and threshold of all scans together.
+
+    nan for a class without a true instance in any scan; 0 where there are instances and no prediction.
+    """
+    result = np.full(scans[0].misses.shape, np.nan)
+    misses = np.sum([scan.misses for scan in scans], axis=0)
+    has_truth = np.any([scan.has_truth for scan in scans], axis=0)
+    classes, overlaps, confidence, is_match = (
+        np.concatenate([getattr(scan, name) for scan in scans])
+        for name in ("class_index", "overlap_index", "confidence", "is_match")
+    )
+    for class_index in np.flatnonzero(has_truth):
+        for overlap_index in range(result.shape[1]):
+            entries = (classes == class_index) & (overlaps == overlap_index)
+            result[class_index, overlap_index] = curve_area(
+                confidence[entries], is_match[entries], int(misses[class_index, overlap_index])
+            )
+    return result
+
+
+def ap(precisions: Float64[np.ndarray, "K T"]) -> float:
+    """Mean over the nine thresholds 0.50 .. 0.90 and the classes that have true instances."""
+    return _mean_of(precisions[:, :-1])
+
+
+def ap50(precisions: Float64[np.ndarray, "K T"]) -> float:
+    """Mean over the classes that have true instances, at an IoU above 0.5."""
+    return _mean_of(precisions[:, :1])
+
+
+def ap25(precisions: Float64[np.ndarray, "K T"]) -> float:
+    """Mean over the classes that have true instances, at an IoU above 0.25."""
+    return _mean_of(precisions[:, -1:])
+
+
+def _mean_of(values: np.ndarray) -> float:
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if known.size else float("nan")

@@ -1,0 +1,130 @@
+"""Semantic segmentation of points: ScanNet, ScanNet200, Replica and Waymo.
+
+Labels are 1 .. K; 0 means none: ignored in the truth, a miss in the prediction. All benchmarks share the
+counts of a class and its IoU; they differ in what is added up before (one scene or all) and over which
+classes the mean goes, and that is what the functions are named after.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import reduce
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Int64
+
+
+@dataclass(frozen=True)
+class ClassCounts:
+    """Points per class, over all points whose truth is not 0.
+
+    Attributes:
+        hits: points of the class that are predicted as it.
+        truth: points of the class; those predicted 0 are among them.
+        predicted: points predicted as the class.
+    """
+
+    hits: Int64[np.ndarray, " K"]
+    truth: Int64[np.ndarray, " K"]
+    predicted: Int64[np.ndarray, " K"]
+
+    @staticmethod
+    def of(
+        truth: Int[np.ndarray, " P"], prediction: Int[np.ndarray, " P"], num_classes: int
+    ) -> "ClassCounts":
+        """Count. Predictions on points whose truth is 0 are ignored."""
+        known = truth > 0
+        truth, prediction = truth[known], prediction[known]
+
+        def per_class(labels: np.ndarray) -> np.ndarray:
+            counts = np.bincount(labels, minlength=num_classes + 1)[1:].astype(np.int64)
+            assert len(counts) == num_classes, f"a label is above {num_classes}"
+            return counts
+
+        return ClassCounts(per_class(truth[truth == prediction]), per_class(truth), per_class(prediction))
+
+    def __add__(self, other: "ClassCounts") -> "ClassCounts":
+        """Counts of both point sets together."""
+        return ClassCounts(self.hits + other.hits, self.truth + other.truth, self.predicted + other.predicted)
+
+    @property
+    def union(self) -> Int64[np.ndarray, " K"]:
+        """Points that are of the class or predicted as it."""
+        return self.truth + self.predicted - self.hits
+
+
+def pooled(counts: Iterable[ClassCounts]) -> ClassCounts:
+    """Counts of all scenes added up: a large scene weighs more, unlike in a mean over scenes."""
+    return reduce(ClassCounts.__add__, counts)
+
+
+def class_iou(counts: ClassCounts) -> Float[np.ndarray, " K"]:
+    """TP / (TP + FP + FN) per class; nan where the class is neither in truth nor prediction."""
+    return _ratio(counts.hits, counts.union)
+
+
+def class_accuracy(counts: ClassCounts) -> Float[np.ndarray, " K"]:
+    """TP / (TP + FN) per class; nan where the truth lacks the class."""
+    return _ratio(counts.hits, counts.truth)
+
+
+def miou_over_present(counts: ClassCounts) -> float:
+    """Mean IoU over the classes of the truth; nan where it has none.
+
+    A wrong prediction of an absent class hurts only the true class. Source: yanmin-wu/OpenGaussian
+    `scripts/eval_scannet.py`, per scene.
+    """
+    return _mean(class_iou(counts)[counts.truth > 0])
+
+
+def macc_over_present(counts: ClassCounts) -> float:
+    """Mean accuracy over the classes of the truth; nan where it has none (OpenGaussian, per scene)."""
+    return _mean(class_accuracy(counts)[counts.truth > 0])
+
+
+def miou_over_occurring(counts: ClassCounts, among: Bool[np.ndarray, " K"] | None = None) -> float:
+    """Mean IoU over the classes of truth or prediction; nan where there is none.
+
+    A class that is only predicted counts 0. Source: ScanNet/ScanNet `evaluate_semantic_label.py`, pooled
+    over all scans.
+
+    Args:
+        counts: of all scans.
+        among: classes to take the mean of, such as the head, common or tail of ScanNet200.
+    """
+    ious = class_iou(counts)
+    return _mean(ious[(counts.union > 0) & (True if among is None else among)])
+
+
+def miou_over_all(counts: ClassCounts) -> float:
+    """Mean IoU over all K classes, where a class that occurs nowhere counts 0 (OpenScene, OpenNeRF)."""
+    return _mean(np.nan_to_num(class_iou(counts), nan=0.0))
+
+
+def macc_over_all(counts: ClassCounts) -> float:
+    """Mean accuracy over all K classes, where a class without truth counts 0 (OpenNeRF)."""
+    return _mean(np.nan_to_num(class_accuracy(counts), nan=0.0))
+
+
+def miou_absent_as_one(counts: ClassCounts) -> float:
+    """Mean IoU over all K classes, where a class that occurs nowhere counts 1 (Waymo).
+
+    Source: waymo-research/waymo-open-dataset `metrics/segmentation_metrics.cc`. It flatters subsets
+    that lack classes; report `miou_over_present` beside it.
+    """
+    return _mean(np.nan_to_num(class_iou(counts), nan=1.0))
+
+
+def frequency_weighted_iou(counts: ClassCounts) -> float:
+    """Mean IoU over the classes of the truth, weighted by their points; nan where it has none."""
+    points = counts.truth.sum()
+    if not points:
+        return float("nan")
+    return float(np.nan_to_num(class_iou(counts)) @ counts.truth / points)
+
+
+def _ratio(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
+    return np.divide(numerator, denominator, out=np.full(len(numerator), np.nan), where=denominator > 0)
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(values.mean()) if values.size else float("nan")

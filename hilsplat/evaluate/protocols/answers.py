@@ -1,0 +1,72 @@
+"""What a scene must answer to be scored, and its answers while one view is scored."""
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from hilsplat.base.levels import Level
+
+
+@runtime_checkable
+class QueryableScene(Protocol):
+    """What a scene must answer (`hilsplat.language.query.LanguageScene` does)."""
+
+    def field_relevancy(self, texts, view):
+        """Rendered relevancy, (T, 3, H, W)."""
+
+    def node_relevancy_map(self, texts, view):
+        """Relevancy of the node at each pixel, (T, 3, H, W)."""
+
+    def select_nodes(self, text, level=None, threshold=0.85, within=None):
+        """Nodes that answer a text, with the level they are of."""
+
+    def select_path(self, texts, threshold=0.85):
+        """Nodes that answer the last of a chain of texts."""
+
+    def node_masks(self, view, ids):
+        """Union of the rendered nodes in a view, (H, W)."""
+
+
+class PackedMasks:
+    """Predicted masks of one view, one bit a pixel, kept for hierarchical consistency."""
+
+    def __init__(self, size_hw: tuple[int, int]) -> None:
+        self.size_hw = size_hw
+        self.bits: dict[tuple, np.ndarray] = {}
+
+    def put(self, key: tuple, mask: np.ndarray) -> None:
+        """Keep a mask."""
+        self.bits[key] = np.packbits(mask)
+
+    def get(self, key: tuple) -> np.ndarray:
+        """Unpack a mask."""
+        height, width = self.size_hw
+        return np.unpackbits(self.bits[key], count=height * width).astype(bool).reshape(height, width)
+
+
+class Selections:
+    """Nodes chosen for texts and paths; they do not depend on the view, so each is chosen once."""
+
+    def __init__(self, scene: QueryableScene, threshold: float) -> None:
+        self.scene, self.threshold = scene, threshold
+        self._of: dict[tuple, np.ndarray] = {}
+
+    def text(self, text: str, level: Level | None) -> np.ndarray:
+        """Ids of the nodes that answer a text at a level, or at the level the tree chooses."""
+        key = (text, level)
+        if key not in self._of:
+            hits = self.scene.select_nodes(text, level=level, threshold=self.threshold)
+            self._of[key] = np.asarray(hits.ids)
+        return self._of[key]
+
+    def path(self, texts: tuple[str, ...]) -> np.ndarray:
+        """Ids of the nodes that answer a chain of texts."""
+        if texts not in self._of:
+            self._of[texts] = np.asarray(self.scene.select_path(texts, threshold=self.threshold).ids)
+        return self._of[texts]
+
+    def mask(self, view: str, ids: np.ndarray, size_hw: tuple[int, int]) -> np.ndarray:
+        """Union of some nodes in a view; no node gives an empty mask."""
+        if len(ids) == 0:
+            return np.zeros(size_hw, dtype=bool)
+        return np.asarray(self.scene.node_masks(view, ids)).astype(bool)

@@ -1,0 +1,331 @@
+"""Every protocol: its name, its version, and all that decides a number under it.
+
+A number without its protocol is not a result: the same model scores 51.4 under `lerf/langsplat` and 9.66
+under `lerf/opengaussian`. A row of `scores.csv` carries the full name, such as `lerf/langsplat@1`, followed
+in brackets by whatever its settings change: `lerf/langsplat@1 (filter 20, raw)`. Whoever changes what a
+card decides raises its version; a test holds the two together.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+from hilsplat.base.errors import ArtifactError
+from hilsplat.base.levels import Level
+from hilsplat.evaluate.metrics.relevancy_rule import RelevancyRule
+
+CANONICAL: tuple[str, ...] = ("object", "things", "stuff", "texture")
+"""Canonical phrases of every protocol that reads a relevancy (LERF, LangSplat)."""
+
+RELEVANCY_SCALE = 10.0
+"""Scale of the cosine in the relevancy (LERF, LangSplat)."""
+
+NODE_SELECT = 0.85
+"""Nodes above this share of the best (min-max) answer a text."""
+
+Averaging = Literal["pairs", "classes", "levels", "views", "scenes", "pooled"]
+"""How rows become a table's number.
+
+pairs: mean over the (view, query) pairs of a scene, then over scenes.
+classes: mean over the views of a query, then over the queries of a scene, then over scenes.
+levels: as pairs for each level; Avg is the mean of the levels.
+views: mean over the views of a scene, then over scenes.
+scenes: one number per scene, mean over scenes.
+pooled: counts of all scenes are added first; scenes weigh by their points.
+"""
+
+
+Missing = Literal["zero", "left out"]
+"""A (view, query) pair without a prediction: it counts 0, or is dropped, which flatters a method."""
+
+
+@dataclass(frozen=True)
+class ProtocolCard:
+    """One protocol.
+
+    Attributes:
+        name: `benchmark/variant`.
+        version: raised when anything below changes what a number means.
+        metrics: keys of `METRICS` that its rows carry.
+        averaging: see `Averaging`.
+        selection: how a prediction is chosen, threshold and level, in words.
+        source: repository or text it follows.
+        rule: how relevancy maps become masks, where they do.
+        missing: see `Missing`. A point without a predicted class is a miss under every protocol.
+        classes: name of the `ClassSet` that is queried, where it is fixed.
+    """
+
+    name: str
+    version: int
+    metrics: tuple[str, ...]
+    averaging: Averaging
+    selection: str
+    source: str
+    rule: RelevancyRule | None = None
+    missing: Missing = "zero"
+    classes: str = ""
+
+    @property
+    def full_name(self) -> str:
+        """Name with version."""
+        return f"{self.name}@{self.version}"
+
+    def labelled(self, departures: Iterable[str] = ()) -> str:
+        """What a row carries: the full name, then what its settings change."""
+        words = ", ".join(departures)
+        return f"{self.full_name} ({words})" if words else self.full_name
+
+
+MASK = ("iou", "boundary_iou")
+LOCALIZATION = ("localization_box", "localization_mask")
+CONSISTENCY = tuple(
+    f"hc_{reading}{suffix}"
+    for suffix in ("", "_pooled")
+    for reading in ("containment", "literal", "anchored")
+)
+PRESENT = ("class_iou", "class_accuracy", "miou_present", "macc_present")
+
+LANGSPLAT = "minghanqin/LangSplat eval/evaluate_iou_loc.py"
+OPENGAUSSIAN = "yanmin-wu/OpenGaussian scripts/eval_scannet.py"
+ARGMAX = "argmax of the cosine over the classes, no canonical phrases"
+PAPER = "Hi-LSplat, implementation details"
+
+LERF_LANGSPLAT = ProtocolCard(
+    "lerf/langsplat",
+    1,
+    MASK + LOCALIZATION,
+    "pairs",
+    "min-max relevancy above 0.7 after a mean filter of 30 px at a height of 730, scaled; level of the "
+    "highest value",
+    LANGSPLAT,
+    RelevancyRule(),
+)
+TREE_NODES = ProtocolCard(
+    "lerf/tree-nodes",
+    1,
+    MASK + LOCALIZATION,
+    "pairs",
+    "3D nodes above 0.85 of the min-max relevancy of the nodes, rendered; level chosen by the tree",
+    "ours",
+)
+LEVEL_GIVEN = ProtocolCard(
+    "hierarchy/level-given",
+    1,
+    (*MASK, *LOCALIZATION, "best_threshold_iou", *CONSISTENCY),
+    "levels",
+    "as lerf/langsplat for maps and lerf/tree-nodes for nodes, at the level of the annotation",
+    "Hi-LERF and Hi-3DOVS: l1, l2, l3 columns",
+    RelevancyRule(),
+)
+LEVEL_AUTO = ProtocolCard(
+    "hierarchy/level-auto",
+    1,
+    (*MASK, *LOCALIZATION, *CONSISTENCY),
+    "levels",
+    "as lerf/langsplat for maps and lerf/tree-nodes for nodes, level chosen by the method",
+    PAPER,
+    RelevancyRule(),
+)
+PATH = ProtocolCard(
+    "hierarchy/path",
+    1,
+    (*MASK, *LOCALIZATION, *CONSISTENCY),
+    "levels",
+    "3D nodes that answer the chain of texts from the whole down: more text than the paper gives",
+    "ours",
+)
+ANNOTATIONS = ProtocolCard(
+    "hierarchy/annotations", 1, CONSISTENCY, "views", "the annotations: what perfect masks score", "ours"
+)
+LERF_OPENGAUSSIAN = ProtocolCard(
+    "lerf/opengaussian",
+    1,
+    ("iou", "acc_25", "acc_50"),
+    "pairs",
+    "Gaussians selected in 3D by cosine, rendered, silhouette above 0.7; another task than lerf/langsplat",
+    "yanmin-wu/OpenGaussian scripts/compute_lerf_iou.py",
+)
+LERF_MASK = ProtocolCard(
+    "lerf-mask/gaussian-grouping",
+    1,
+    MASK,
+    "classes",
+    "masks as the method gives them, one per prompt",
+    "lkeab/gaussian-grouping script/eval_lerf_mask.py; departs: a missing prediction counts 0",
+)
+LERF_MASK_SKIPPING = ProtocolCard(
+    "lerf-mask/gaussian-grouping-skipping",
+    1,
+    MASK,
+    "classes",
+    "masks as the method gives them, one per prompt",
+    "lkeab/gaussian-grouping script/eval_lerf_mask.py, where a missing prediction is skipped",
+    missing="left out",
+)
+OVS_ARGMAX = ProtocolCard(
+    "3d-ovs/argmax",
+    1,
+    ("iou", "pixel_accuracy"),
+    "pairs",
+    f"{ARGMAX}, at an eighth of the image's size",
+    "Kunhao-Liu/3D-OVS renderer.py",
+)
+INSTANCES = ProtocolCard(
+    "scannet200/instances",
+    1,
+    ("ap", "ap50", "ap25"),
+    "pooled",
+    "predicted instances with class and confidence; fewer than 100 points are left out",
+    "ScanNet/ScanNet evaluate_semantic_instance.py",
+    classes="scannet200-instances",
+)
+
+
+def _maps(name: str, source: str, selection: str, metrics: tuple[str, ...], **rule) -> ProtocolCard:
+    """A protocol that differs from LangSplat's in its rule."""
+    return ProtocolCard(name, 1, metrics, "pairs", selection, source, RelevancyRule(**rule))
+
+
+def _points(
+    name: str,
+    classes: str,
+    source: str,
+    metrics: tuple[str, ...] = PRESENT,
+    averaging: Averaging = "scenes",
+) -> ProtocolCard:
+    """A protocol of points."""
+    return ProtocolCard(name, 1, metrics, averaging, ARGMAX, source, classes=classes)
+
+
+PER_CLASS = ("class_iou", "class_accuracy")
+
+CARDS: tuple[ProtocolCard, ...] = (
+    LERF_LANGSPLAT,
+    TREE_NODES,
+    _maps(
+        "lerf/langsplat-v2",
+        "ZhaoYujie2002/LangSplatV2",
+        "as lerf/langsplat with windows of 29 and 7 px that end at the border",
+        MASK + LOCALIZATION,
+        filter_px=29,
+        border="inside",
+    ),
+    _maps(
+        "lerf/paper-filter",
+        f"{PAPER}: first passage (LangSplat's text on LERF)",
+        "as lerf/langsplat with a filter of 20 px",
+        MASK + LOCALIZATION,
+        filter_px=20,
+    ),
+    _maps(
+        "lerf/paper-mean",
+        f"{PAPER}: second passage (LangSplat's text on 3D-OVS)",
+        "relevancy above 0.4; level of the highest mean in its mask",
+        MASK + LOCALIZATION,
+        filter_px=20,
+        mix=False,
+        threshold_on="raw",
+        majority=False,
+        level_rule="mean_in_mask",
+    ),
+    LERF_OPENGAUSSIAN,
+    LERF_MASK,
+    LERF_MASK_SKIPPING,
+    OVS_ARGMAX,
+    _maps(
+        "3d-ovs/langsplat",
+        "LangSplat's supplement; code unreleased, so the scale of the threshold is our reading",
+        "min-max relevancy above 0.7, unfiltered; level of the highest mean in its mask",
+        MASK,
+        mix=False,
+        majority=False,
+        level_rule="mean_in_mask",
+    ),
+    _maps(
+        "3d-ovs/langsplat-raw",
+        "LangSplat's supplement, taken literally",
+        "relevancy above 0.4, unfiltered; level of the highest mean in its mask",
+        MASK,
+        mix=False,
+        threshold_on="raw",
+        majority=False,
+        level_rule="mean_in_mask",
+    ),
+    _maps(
+        "3d-ovs/langsplat-v2",
+        "ZhaoYujie2002/LangSplatV2",
+        "min-max of the smoothed relevancy above 0.7; whole or part, by the highest mean in its mask",
+        MASK,
+        filter_px=29,
+        majority=False,
+        level_rule="mean_in_mask",
+        border="inside",
+        levels=(Level.WHOLE, Level.PART),
+    ),
+    _points("scannet/opengaussian-19", "scannet-19", OPENGAUSSIAN),
+    _points("scannet/opengaussian-15", "scannet-15", OPENGAUSSIAN),
+    _points("scannet/opengaussian-10", "scannet-10", OPENGAUSSIAN),
+    _points(
+        "scannet/benchmark",
+        "scannet-20",
+        "ScanNet/ScanNet evaluate_semantic_label.py",
+        (*PER_CLASS, "miou_occurring"),
+        "pooled",
+    ),
+    _points(
+        "scannet/openscene",
+        "scannet-20",
+        "pengsongyou/openscene",
+        (*PER_CLASS, "miou_all", "macc_all"),
+        "pooled",
+    ),
+    _points("scannet200/opengaussian", "scannet200", f"{OPENGAUSSIAN}, with 200 classes"),
+    _points(
+        "scannet200/benchmark",
+        "scannet200",
+        "ScanNet/ScanNet BenchmarkScripts/ScanNet200",
+        (*PER_CLASS, "miou_occurring", "miou_head", "miou_common", "miou_tail"),
+        "pooled",
+    ),
+    INSTANCES,
+    _points("replica/per-scene", "replica-48", "ours; the paper names no code"),
+    _points(
+        "replica/opennerf", "replica-51", "opennerf/opennerf", (*PER_CLASS, "miou_all", "macc_all"), "pooled"
+    ),
+    _points(
+        "replica/conceptgraphs",
+        "replica-51",
+        "ConceptGraphs' means, on mesh vertices",
+        (*PER_CLASS, "macc_present", "frequency_weighted_iou"),
+    ),
+    _points(
+        "waymo/segmentation",
+        "waymo-22",
+        "waymo-research/waymo-open-dataset metrics/segmentation_metrics.cc",
+        (*PER_CLASS, "miou_absent_as_one", "miou_present"),
+        "pooled",
+    ),
+    LEVEL_GIVEN,
+    LEVEL_AUTO,
+    PATH,
+    ANNOTATIONS,
+)
+
+PROTOCOLS: dict[str, ProtocolCard] = {card.full_name: card for card in CARDS}
+"""Full name -> protocol."""
+
+
+def card_of(label: str) -> ProtocolCard:
+    """The protocol that a row names, whatever its settings change.
+
+    Raises:
+        ArtifactError: there is none of that name and version.
+    """
+    full_name = label.split(" (")[0]
+    if full_name not in PROTOCOLS:
+        raise ArtifactError(
+            f"there is no protocol {full_name!r}",
+            expected=f"one of {', '.join(PROTOCOLS)}",
+            fix="delete the score file that names it and run evaluate again",
+        )
+    return PROTOCOLS[full_name]

@@ -1,0 +1,246 @@
+"""Carry what Gaussians know to the points that a benchmark labels: mesh vertices, lidar returns.
+
+| mode | a point gets |
+|---|---|
+| `frozen` | its own Gaussian, fitted without moving (OpenGaussian); transparent ones are not scored |
+| `nearest` | the nearest Gaussian that is opaque enough |
+| `vote` | the vote of the k nearest within a radius, weighted by opacity; nothing beyond the radius |
+| `density` | the mean of the k nearest, weighted by opacity times Gaussian falloff at the point |
+
+The numbers differ by mode, so the mode stands in every row. Of Gaussians at equal distances the search tree
+decides, always alike for the same input, whatever the number of threads.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
+from scipy.spatial import cKDTree
+
+from hilsplat.base.errors import MisalignedArtifactError
+
+Mode = Literal["frozen", "nearest", "vote", "density"]
+
+OPACITY_MIN = 0.1
+"""Gaussians below are transparent: OpenGaussian takes them out of the evaluation."""
+
+CHUNK_POINTS = 65536
+"""Points that are worked on at once; bounds the memory."""
+
+
+@dataclass(frozen=True)
+class CarriedPoints:
+    """Which Gaussians speak for each of P points, and how loudly.
+
+    Attributes:
+        mode: as rows name it, with what departs from the defaults.
+        index: Gaussians per point; where the weight is 0 the index means nothing.
+        weight: of each, not negative, summing to 1; all 0 where no Gaussian speaks for the point.
+        is_scored: False for points that the mode takes out of the evaluation.
+    """
+
+    mode: str
+    index: Int64[np.ndarray, "P k"]
+    weight: Float64[np.ndarray, "P k"]
+    is_scored: Bool[np.ndarray, " P"]
+
+    def labels(self, of_gaussian: Int[np.ndarray, " N"]) -> Int32[np.ndarray, " P"]:
+        """The label with the largest weight among a point's Gaussians; of equal ones the smallest.
+
+        Label 0 means none and has no vote; a point whose Gaussians have no label gets 0.
+        """
+        result = np.zeros(len(self.index), dtype=np.int32)
+        for rows in _chunks(len(self.index)):
+            labels = of_gaussian[self.index[rows]]
+            weight = np.where(labels > 0, self.weight[rows], 0.0)
+            same = labels[:, :, None] == labels[:, None, :]
+            votes = (same * weight[:, None, :]).sum(axis=2)
+            best = votes.max(axis=1)
+            # Sums of the same numbers in another order may differ in the last bits.
+            ties = (votes >= best[:, None] * (1 - 1e-12)) & (weight > 0)
+            winner = np.where(ties, labels, np.iinfo(np.int32).max).min(axis=1)
+            result[rows] = np.where(best > 0, winner, 0)
+        return result
+
+    def features(self, of_gaussian: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "P D"]:
+        """Weighted mean of the Gaussians' features; zeros where no Gaussian speaks for the point."""
+        result = np.zeros((len(self.index), of_gaussian.shape[1]), dtype=of_gaussian.dtype)
+        for rows in _chunks(len(self.index)):
+            result[rows] = np.einsum("pk,pkd->pd", self.weight[rows], of_gaussian[self.index[rows]])
+        return result
+
+    def truth(self, labels: Int[np.ndarray, " P"]) -> Int[np.ndarray, " P"]:
+        """The truth with 0 (ignored) at points that the mode takes out of the evaluation."""
+        return np.where(self.is_scored, labels, 0).astype(labels.dtype)
+
+
+def frozen(opacities: Float[np.ndarray, " N"], num_points: int) -> CarriedPoints:
+    """Gaussian i is point i: the fit neither moved, split nor dropped any.
+
+    Points whose Gaussian has an opacity below 0.1 are not scored (yanmin-wu/OpenGaussian
+    `scripts/eval_scannet.py` sets their truth to 0).
+
+    Raises:
+        MisalignedArtifactError: there are more or fewer Gaussians than points.
+    """
+    if len(opacities) != num_points:
+        raise MisalignedArtifactError(
+            "Gaussians are not the points of the ground truth",
+            expected=f"{num_points} Gaussians, one per point",
+            found=len(opacities),
+            fix="fit with frozen points, or carry by mode nearest, vote or density",
+        )
+    index = np.arange(num_points, dtype=np.int64)[:, None]
+    return CarriedPoints("frozen", index, np.ones((num_points, 1)), opacities >= OPACITY_MIN)
+
+
+def nearest(
+    points: Float[np.ndarray, "P 3"],
+    means: Float[np.ndarray, "N 3"],
+    opacities: Float[np.ndarray, " N"],
+    threads: int = 1,
+) -> CarriedPoints:
+    """The nearest Gaussian with an opacity of at least 0.1, however far.
+
+    Raises:
+        MisalignedArtifactError: no Gaussian is opaque enough.
+    """
+    index, _ = _neighbours(points, means, opacities, 1, np.inf, threads)
+    return CarriedPoints("nearest", index, np.ones(index.shape), np.ones(len(points), dtype=bool))
+
+
+def vote(
+    points: Float[np.ndarray, "P 3"],
+    means: Float[np.ndarray, "N 3"],
+    opacities: Float[np.ndarray, " N"],
+    radius: float = 0.1,
+    k: int = 5,
+    threads: int = 1,
+) -> CarriedPoints:
+    """The k nearest Gaussians of opacity at least 0.1 within a radius, weighted by opacity.
+
+    A point without any has no prediction, which counts as a miss.
+
+    Args:
+        points: what is labelled, scene units.
+        means: centres of the Gaussians, scene units.
+        opacities: peak alphas.
+        radius: scene units; 0.1 is 10 cm where the unit is a metre.
+        k: neighbours.
+        threads: threads of the search; they change nothing but the time.
+
+    Raises:
+        MisalignedArtifactError: no Gaussian is opaque enough.
+    """
+    index, distance = _neighbours(points, means, opacities, k, radius, threads)
+    weight = np.where(np.isfinite(distance), opacities[index], 0.0)
+    return CarriedPoints(
+        f"vote of {k} within {radius:g}", index, _normalised(weight), np.ones(len(points), dtype=bool)
+    )
+
+
+def density(
+    points: Float[np.ndarray, "P 3"],
+    means: Float[np.ndarray, "N 3"],
+    opacities: Float[np.ndarray, " N"],
+    scales: Float[np.ndarray, "N 3"],
+    quats: Float[np.ndarray, "N 4"],
+    k: int = 8,
+    threads: int = 1,
+) -> CarriedPoints:
+    """The k nearest Gaussians, weighted by opacity * exp(-d**2 / 2) with d the Mahalanobis distance.
+
+    This is the alpha that each has at the point, as 3DGS blends it. Candidates are the nearest centres:
+    a large Gaussian whose centre is far does not speak. Far from all Gaussians the relative weights still
+    decide, so that every point has a prediction.
+
+    Args:
+        points: what is labelled, scene units.
+        means: centres of the Gaussians, scene units.
+        opacities: peak alphas; below 0.1 a Gaussian is no candidate.
+        scales: standard deviations along the axes, scene units.
+        quats: world-from-Gaussian rotation, wxyz, any non-zero length.
+        k: neighbours.
+        threads: threads of the search; they change nothing but the time.
+
+    Raises:
+        MisalignedArtifactError: no Gaussian is opaque enough.
+    """
+    index, distance = _neighbours(points, means, opacities, k, np.inf, threads)
+    whiten = _gaussian_from_world(scales, quats)
+    weight = np.empty(index.shape)
+    for rows in _chunks(len(points)):
+        offset = points[rows, None, :].astype(float) - means[index[rows]]
+        squared = (np.einsum("pkij,pkj->pki", whiten[index[rows]], offset) ** 2).sum(axis=2)
+        log_weight = np.log(opacities[index[rows]].astype(float)) - squared / 2
+        log_weight = np.where(np.isfinite(distance[rows]), log_weight, -np.inf)
+        # Subtracting the largest keeps the ratios and never underflows to all zeros.
+        weight[rows] = np.exp(log_weight - log_weight.max(axis=1, keepdims=True))
+    return CarriedPoints(f"density of {k}", index, _normalised(weight), np.ones(len(points), dtype=bool))
+
+
+def argmax_labels(scores: Float[np.ndarray, "P K"]) -> Int32[np.ndarray, " P"]:
+    """Labels 1 .. K of the largest score (cosine or relevancy); of equal scores the first class.
+
+    A row that is all zero has no feature and gets 0, a miss. OpenGaussian's argmax gives such points its
+    first class, wall.
+    """
+    return np.where(scores.any(axis=1), scores.argmax(axis=1) + 1, 0).astype(np.int32)
+
+
+def classify(features: Float[np.ndarray, "P D"], texts: Float[np.ndarray, "K D"]) -> Int32[np.ndarray, " P"]:
+    """Labels 1 .. K by the largest cosine with the class texts: no canonical phrases, no "other".
+
+    Args:
+        features: of points or Gaussians, any length; zeros mean none and give 0.
+        texts: unit vectors.
+    """
+    # A feature's length does not change which cosine is largest.
+    parts = [argmax_labels(features[rows] @ texts.T) for rows in _chunks(len(features))]
+    return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int32)
+
+
+def _neighbours(
+    points: np.ndarray, means: np.ndarray, opacities: np.ndarray, k: int, radius: float, threads: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Index (P, k) and distance (P, k) of the nearest opaque Gaussians; infinite where there is none."""
+    opaque = np.flatnonzero(opacities >= OPACITY_MIN)
+    if not opaque.size:
+        raise MisalignedArtifactError(
+            "no Gaussian is opaque enough to speak for a point",
+            expected=f"an opacity of at least {OPACITY_MIN}",
+            found=f"{len(opacities)} Gaussians below",
+            fix="look at gaussians.ply; the fit has probably failed",
+        )
+    tree = cKDTree(means[opaque].astype(float))
+    # Within the radius includes its border.
+    bound = np.nextafter(radius, np.inf)
+    distance, place = tree.query(
+        points.astype(float), k=np.arange(1, k + 1), distance_upper_bound=bound, workers=threads
+    )
+    found = np.isfinite(distance)
+    return opaque[np.where(found, place, 0)].astype(np.int64), distance
+
+
+def _gaussian_from_world(scales: np.ndarray, quats: np.ndarray) -> np.ndarray:
+    """Matrices (N, 3, 3) that turn an offset from the centre into standard deviations."""
+    w, x, y, z = (quats.astype(float) / np.linalg.norm(quats, axis=1, keepdims=True)).T
+    world_from_gaussian = np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=-1),
+            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=-1),
+            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1),
+        ],
+        axis=-2,
+    )
+    return world_from_gaussian.transpose(0, 2, 1) / scales.astype(float)[:, :, None]
+
+
+def _normalised(weight: np.ndarray) -> np.ndarray:
+    total = weight.sum(axis=1, keepdims=True)
+    return np.divide(weight, total, out=np.zeros_like(weight, dtype=float), where=total > 0)
+
+
+def _chunks(length: int) -> list[slice]:
+    return [slice(start, start + CHUNK_POINTS) for start in range(0, length, CHUNK_POINTS)]

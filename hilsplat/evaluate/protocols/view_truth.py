@@ -1,0 +1,124 @@
+"""What is true in one view: the queries that are scored there and their regions."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.datasets.hierarchy import HierarchyAnnotations
+from hilsplat.evaluate.metrics.localization import box_of
+
+
+@dataclass(frozen=True)
+class Query:
+    """One annotated text in one view.
+
+    Attributes:
+        text: what is asked.
+        level: level of its annotation; None where the protocol unites levels.
+        paths: chains of texts that lead to its nodes, each once.
+        truth: true region.
+        boxes_xyxy: box of each annotated node, borders included.
+    """
+
+    text: str
+    level: Level | None
+    paths: tuple[tuple[str, ...], ...]
+    truth: Bool[np.ndarray, "H W"]
+    boxes_xyxy: Int[np.ndarray, "B 4"]
+
+
+@dataclass(frozen=True)
+class ViewTruth:
+    """Everything that is scored in one view.
+
+    Attributes:
+        queries: one per (text, level).
+        categories: one per text, levels united.
+        regions: true region of each path that is large enough.
+    """
+
+    queries: tuple[Query, ...]
+    categories: tuple[Query, ...]
+    regions: dict[tuple[str, ...], Bool[np.ndarray, "H W"]]
+
+    @staticmethod
+    def of(
+        annotations: HierarchyAnnotations, view: str, size_hw: tuple[int, int], min_px: int
+    ) -> "ViewTruth":
+        """Collect the regions of at least `min_px` pixels.
+
+        Raises:
+            MisalignedArtifactError: the label images are of another size than the camera.
+        """
+        queries: list[Query] = []
+        by_path: dict[tuple[str, ...], np.ndarray] = {}
+        for level in LEVELS:
+            texts = annotations.texts(view, level)
+            if not texts:
+                continue
+            labels = annotations.label_image(view, level)
+            if labels.shape != tuple(size_hw):
+                raise MisalignedArtifactError(
+                    f"label image of view {view}, level {level.label}, does not fit its camera",
+                    expected=f"{size_hw[0]} x {size_hw[1]} (height x width)",
+                    found=f"{labels.shape[0]} x {labels.shape[1]}",
+                    fix="annotate the images of the scene folder, or run poses without shrinking them",
+                )
+            for text, ids in texts.items():
+                regions = {node: labels == node for node in ids}
+                truth = np.any(list(regions.values()), axis=0)
+                if np.count_nonzero(truth) < min_px:
+                    continue
+                boxes = np.stack([box_of(region) for region in regions.values() if region.any()])
+                paths = tuple(dict.fromkeys(annotations.path_of(node) for node in ids))
+                queries.append(Query(text, level, paths, truth, boxes))
+                for node, region in regions.items():
+                    path = annotations.path_of(node)
+                    by_path[path] = by_path[path] | region if path in by_path else region
+        categories = []
+        for text in dict.fromkeys(query.text for query in queries):
+            same = [query for query in queries if query.text == text]
+            categories.append(
+                Query(
+                    text,
+                    None,
+                    tuple(path for query in same for path in query.paths),
+                    np.any([query.truth for query in same], axis=0),
+                    np.concatenate([query.boxes_xyxy for query in same]),
+                )
+            )
+        large = {path: region for path, region in by_path.items() if np.count_nonzero(region) >= min_px}
+        return ViewTruth(tuple(queries), tuple(categories), large)
+
+    @staticmethod
+    def flat(
+        truths: Mapping[str, Bool[np.ndarray, "H W"]],
+        boxes_xyxy: Mapping[str, Int[np.ndarray, "B 4"]] | None = None,
+    ) -> "ViewTruth":
+        """Truth of a benchmark without levels: LERF-OVS, LERF-Mask, 3D-OVS.
+
+        Args:
+            truths: true region per text; objects of one text are united.
+            boxes_xyxy: annotated boxes per text, borders included; the box of the region where None.
+        """
+        categories = tuple(
+            Query(text, None, ((text,),), truth, boxes_xyxy[text] if boxes_xyxy else box_of(truth)[None])
+            for text, truth in truths.items()
+        )
+        return ViewTruth((), categories, {})
+
+    def families(self) -> list[list[tuple[tuple[str, ...], list[tuple[str, ...]]]]]:
+        """(parent path, child paths) per transition whole -> part, part -> subpart."""
+        transitions: list[list[tuple[tuple[str, ...], list[tuple[str, ...]]]]] = []
+        for depth in range(1, len(LEVELS)):
+            families = []
+            for parent in (path for path in self.regions if len(path) == depth):
+                children = [path for path in self.regions if path[:-1] == parent]
+                if children:
+                    families.append((parent, children))
+            transitions.append(families)
+        return transitions

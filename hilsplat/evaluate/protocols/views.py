@@ -1,0 +1,280 @@
+"""Score the answers of a scene in one view: LERF-OVS, 3D-OVS, Hi-LERF and Hi-3DOVS.
+
+| protocol | queries | answer |
+|---|---|---|
+| `lerf/langsplat` | every distinct text; regions of all levels united | field; level chosen by the rule |
+| `lerf/tree-nodes` | the same | tree; level chosen by the tree |
+| `hierarchy/level-given` | every (text, level) | field or tree, at the annotation's level |
+| `hierarchy/level-auto` | every (text, level) | field or tree, level chosen by the method |
+| `hierarchy/path` | every (text, level), asked as the chain of texts from the whole down | tree |
+| `hierarchy/annotations` | - | the annotations themselves, HC only: what perfect masks would score |
+
+A path holds one more piece of information than a flat query and is not the paper's protocol. A missing
+or empty prediction counts 0.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.evaluate.metrics.hierarchy import READINGS, Family, consistency_of_families, mean_over_parents
+from hilsplat.evaluate.metrics.localization import hits_a_box, hits_the_mask, peak_points
+from hilsplat.evaluate.metrics.masks import best_threshold_iou, boundary_iou, iou
+from hilsplat.evaluate.metrics.relevancy_rule import (
+    RelevancyRule,
+    SmoothedRelevancy,
+    filter_side_px,
+    mean_filter,
+    relevancy_mask,
+)
+from hilsplat.evaluate.protocols.answers import PackedMasks, QueryableScene, Selections
+from hilsplat.evaluate.protocols.cards import (
+    ANNOTATIONS,
+    CANONICAL,
+    LERF_LANGSPLAT,
+    LEVEL_AUTO,
+    LEVEL_GIVEN,
+    NODE_SELECT,
+    PATH,
+    RELEVANCY_SCALE,
+    TREE_NODES,
+    ProtocolCard,
+)
+from hilsplat.evaluate.protocols.measured import Measured
+from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
+from hilsplat.settings import EvaluateSettings
+
+RELEVANCY_CHUNK_MIB = 128
+"""Relevancy maps of so many texts are held at once."""
+
+
+def rule_of(settings: EvaluateSettings) -> RelevancyRule:
+    """The map rule that the settings ask for."""
+    return RelevancyRule(
+        settings.filter_px,
+        settings.mix,
+        settings.relevancy_threshold,
+        settings.threshold_on,
+        settings.majority,
+        settings.level_rule,
+    )
+
+
+def label_of(card: ProtocolCard, method: str, settings: EvaluateSettings) -> str:
+    """Protocol of a row: the card's name, then what the settings change of what this method does."""
+    if method == "truth":
+        return card.labelled()
+    rule = rule_of(settings)
+    words = []
+    if method == "field":
+        words += rule.departures(RelevancyRule())
+    else:  # nodes are selected, not thresholded; localization and diagnostics still read smoothed maps
+        words += RelevancyRule(rule.filter_px, rule.mix).departures(RelevancyRule())
+        if settings.node_select != NODE_SELECT:
+            words.append(f"node share {settings.node_select:g}")
+    return card.labelled([*words, *relevancy_departures(settings)])
+
+
+def relevancy_departures(settings: EvaluateSettings) -> list[str]:
+    """What the settings change of the relevancy itself, whatever is made of it."""
+    words = []
+    if settings.canonical != CANONICAL:
+        words.append(f"canonical {'+'.join(settings.canonical)}")
+    if settings.relevancy_scale != RELEVANCY_SCALE:
+        words.append(f"relevancy scale {settings.relevancy_scale:g}")
+    return words
+
+
+def measure_view(
+    scene: QueryableScene,
+    selections: Selections,
+    truth: ViewTruth,
+    view: str,
+    size_hw: tuple[int, int],
+    settings: EvaluateSettings,
+    also: Sequence[ProtocolCard] = (),
+) -> Iterator[Measured]:
+    """All numbers of one view, in no particular order.
+
+    Args:
+        scene: what answers.
+        selections: its chosen nodes.
+        truth: what is scored.
+        view: its view.
+        size_hw: height and width of the view, px.
+        settings: methods, the map rule and what makes a relevancy.
+        also: further protocols for the field's flat queries, each with its own rule, such as
+            `3d-ovs/langsplat`.
+    """
+    masks = PackedMasks(size_hw)
+    texts = [query.text for query in truth.categories]
+    per_chunk = max(1, int(RELEVANCY_CHUNK_MIB * 2**20 / (2 * 3 * 4 * size_hw[0] * size_hw[1])))
+    for start in range(0, len(texts), per_chunk):
+        chunk = texts[start : start + per_chunk]
+        fields = _relevancy(scene.field_relevancy, chunk, view) if "field" in settings.methods else None
+        asks_nodes = {"tree", "tree-path"} & set(settings.methods)
+        nodes = _relevancy(scene.node_relevancy_map, chunk, view) if asks_nodes else None
+        for row, text in enumerate(chunk):
+            category = truth.categories[start + row]
+            queries = [query for query in truth.queries if query.text == text]
+            if fields is not None:
+                yield from _field_rows(fields[row], category, queries, settings, masks)
+                for card in also:
+                    yield from _flat_rows(fields[row], category, card, settings)
+            if nodes is not None and "tree" in settings.methods:
+                yield from _tree_rows(nodes[row], category, queries, settings, selections, view, masks)
+            if nodes is not None and "tree-path" in settings.methods:
+                yield from _path_rows(nodes[row], queries, settings, selections, view, masks)
+    yield from _consistency_rows(truth, masks, settings)
+
+
+def _relevancy(render, texts: Sequence[str], view: str) -> np.ndarray:
+    return np.asarray(render(tuple(texts), view), dtype=np.float32)
+
+
+def _rows(
+    method: str,
+    query: Query,
+    protocol: str,
+    mask: np.ndarray,
+    points_xy: np.ndarray,
+    metrics: Sequence[str] = LERF_LANGSPLAT.metrics,
+) -> Iterator[Measured]:
+    """IoU, boundary IoU and localization of one answer."""
+    level = query.level.label if query.level else ""
+    values = {
+        "iou": lambda: iou(mask, query.truth),
+        "boundary_iou": lambda: boundary_iou(mask, query.truth),
+        "localization_box": lambda: float(hits_a_box(points_xy, query.boxes_xyxy)),
+        "localization_mask": lambda: float(hits_the_mask(points_xy, query.truth)),
+    }
+    for metric in metrics:
+        yield Measured(method, query.text, level, metric, protocol, values[metric]())
+
+
+def _best_row(method: str, query: Query, protocol: str, mixed: np.ndarray) -> Measured:
+    level = query.level
+    assert level is not None
+    value = best_threshold_iou(mixed[level.index], query.truth)
+    return Measured(method, query.text, level.label, "best_threshold_iou", protocol, value)
+
+
+def _flat_rows(
+    relevancy: np.ndarray, category: Query, card: ProtocolCard, settings: EvaluateSettings
+) -> Iterator[Measured]:
+    """Rows of a protocol with a rule of its own."""
+    assert card.rule is not None, f"{card.full_name} has no rule for maps"
+    smoothed = SmoothedRelevancy.of(relevancy, card.rule)
+    mask, _ = relevancy_mask(smoothed, None, card.rule)
+    points, _ = peak_points(smoothed.filtered, None)
+    protocol = card.labelled(relevancy_departures(settings))
+    yield from _rows("field", category, protocol, mask, points, card.metrics)
+
+
+def _field_rows(
+    relevancy: np.ndarray,
+    category: Query,
+    queries: Sequence[Query],
+    settings: EvaluateSettings,
+    masks: PackedMasks,
+) -> Iterator[Measured]:
+    flat, given, auto = (
+        label_of(card, "field", settings) for card in (LERF_LANGSPLAT, LEVEL_GIVEN, LEVEL_AUTO)
+    )
+    rule = rule_of(settings)
+    smoothed = SmoothedRelevancy.of(relevancy, rule)
+    auto_mask, _ = relevancy_mask(smoothed, None, rule)
+    auto_points, _ = peak_points(smoothed.filtered, None)
+    yield from _rows("field", category, flat, auto_mask, auto_points)
+    masks.put(("field", auto, category.text), auto_mask)
+    for query in queries:
+        given_mask, _ = relevancy_mask(smoothed, query.level, rule)
+        given_points, _ = peak_points(smoothed.filtered, query.level)
+        yield from _rows("field", query, given, given_mask, given_points)
+        yield from _rows("field", query, auto, auto_mask, auto_points)
+        yield _best_row("field", query, given, smoothed.mixed)
+        masks.put(("field", given, query.text, query.level), given_mask)
+
+
+def _tree_rows(
+    relevancy: np.ndarray,
+    category: Query,
+    queries: Sequence[Query],
+    settings: EvaluateSettings,
+    selections: Selections,
+    view: str,
+    masks: PackedMasks,
+) -> Iterator[Measured]:
+    nodes, given, auto = (label_of(card, "tree", settings) for card in (TREE_NODES, LEVEL_GIVEN, LEVEL_AUTO))
+    smoothed = SmoothedRelevancy.of(relevancy, rule_of(settings))
+    size_hw = masks.size_hw
+    auto_mask = selections.mask(view, selections.text(category.text, None), size_hw)
+    auto_points, _ = peak_points(smoothed.filtered, None)
+    yield from _rows("tree", category, nodes, auto_mask, auto_points)
+    masks.put(("tree", auto, category.text), auto_mask)
+    for query in queries:
+        given_mask = selections.mask(view, selections.text(query.text, query.level), size_hw)
+        given_points, _ = peak_points(smoothed.filtered, query.level)
+        yield from _rows("tree", query, given, given_mask, given_points)
+        yield from _rows("tree", query, auto, auto_mask, auto_points)
+        yield _best_row("tree", query, given, smoothed.mixed)
+        masks.put(("tree", given, query.text, query.level), given_mask)
+
+
+def _path_rows(
+    relevancy: np.ndarray,
+    queries: Sequence[Query],
+    settings: EvaluateSettings,
+    selections: Selections,
+    view: str,
+    masks: PackedMasks,
+) -> Iterator[Measured]:
+    """Localization looks inside the prediction for the parent, where there is one."""
+    protocol = label_of(PATH, "tree-path", settings)
+    size_hw = masks.size_hw
+    side_px = filter_side_px(settings.filter_px, size_hw[0])
+    for query in queries:
+        assert query.level is not None
+        mask = np.zeros(size_hw, dtype=bool)
+        inside = np.zeros(size_hw, dtype=bool)
+        for path in query.paths:
+            path_mask = selections.mask(view, selections.path(path), size_hw)
+            masks.put(("tree-path", protocol, path), path_mask)
+            mask |= path_mask
+            if len(path) > 1:
+                inside |= selections.mask(view, selections.path(path[:-1]), size_hw)
+        level_map = relevancy[query.level.index]
+        filtered = mean_filter(np.where(inside, level_map, 0) if inside.any() else level_map, side_px)
+        points, _ = peak_points(np.stack([filtered] * len(LEVELS)), query.level)
+        yield from _rows("tree-path", query, protocol, mask, points)
+
+
+def _consistency_rows(truth: ViewTruth, masks: PackedMasks, settings: EvaluateSettings) -> Iterator[Measured]:
+    """HC of every method and of the annotations; a view without any parent gives no row."""
+    transitions = truth.families()
+    parents = sum(map(len, transitions))
+    if not parents:
+        return
+    lookups = {("truth", label_of(ANNOTATIONS, "truth", settings)): lambda path: truth.regions[path]}
+    for method in ("field", "tree"):
+        if method in settings.methods:
+            auto, given = ((method, label_of(card, method, settings)) for card in (LEVEL_AUTO, LEVEL_GIVEN))
+            lookups[auto] = lambda path, key=auto: masks.get((*key, path[-1]))
+            lookups[given] = lambda path, key=given: masks.get((*key, path[-1], Level(len(path))))
+    if "tree-path" in settings.methods:
+        key = ("tree-path", label_of(PATH, "tree-path", settings))
+        lookups[key] = lambda path, key=key: masks.get((*key, path))
+    for (method, protocol), mask_of in lookups.items():
+        families = [
+            [
+                Family(mask_of(parent), tuple(mask_of(child) for child in children), truth.regions[parent])
+                for parent, children in transition
+            ]
+            for transition in transitions
+        ]
+        for reading in READINGS:
+            scores = consistency_of_families(families, reading)
+            for suffix, pooled in (("", False), ("_pooled", True)):
+                value = mean_over_parents(scores, pooled)
+                yield Measured(method, "", "", f"hc_{reading}{suffix}", protocol, value, parents)

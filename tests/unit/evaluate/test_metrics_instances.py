@@ -1,0 +1,191 @@
+"""Average precision of instances: the worked examples, and the rules of matching one by one."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.evaluate.metrics.instances import (
+    OVERLAPS,
+    InstanceScan,
+    ap,
+    ap25,
+    ap50,
+    average_precision,
+    curve_area,
+    match_instances,
+)
+
+CLASS = 4
+
+
+def scan_of(truth, predictions, classes=None):
+    """Truth as (instance, points) runs of class 4; predictions as (first, stop, confidence)."""
+    points = np.concatenate([np.full(count, value) for value, count in truth])
+    masks = np.zeros((len(predictions), len(points)), dtype=bool)
+    for mask, (first, stop, _) in zip(masks, predictions, strict=True):
+        mask[first:stop] = True
+    return InstanceScan(
+        points.astype(np.int64),
+        masks,
+        np.array(classes or [CLASS] * len(predictions), dtype=np.int64),
+        np.array([confidence for *_, confidence in predictions], dtype=float),
+    )
+
+
+def precisions(*scans, class_ids=(CLASS,), min_points=1):
+    return average_precision([match_instances(scan, class_ids, min_points) for scan in scans])
+
+
+A, B, VOID = 4001, 4002, 0
+EXAMPLE = [(A, 4), (B, 3), (VOID, 3)]
+
+
+def test_thresholds_are_nine_and_a_quarter():
+    np.testing.assert_array_equal(OVERLAPS, np.append(np.arange(0.5, 0.95, 0.05), 0.25))
+    assert len(OVERLAPS) == 10
+
+
+def test_worked_example_of_ten_vertices():
+    # p1 is A; p2 lies in void; p3 = points 3-5 shares 2 of 4 with B
+    result = precisions(scan_of(EXAMPLE, [(0, 4, 0.9), (7, 9, 0.8), (3, 6, 0.6)]))
+    assert ap25(result) == 1.0
+    assert ap50(result) == 0.5
+    assert ap(result) == pytest.approx(0.5)
+
+
+def test_area_under_the_curves_of_the_worked_examples():
+    assert curve_area(np.array([0.9, 0.6]), np.array([True, False]), 1) == pytest.approx(0.5)
+    # P = 2/3, 1/2, 1, 1 and R = 2/3, 1/3, 1/3, 0: every step is 1/6
+    three = np.array([True, False, True])
+    assert curve_area(np.array([0.9, 0.8, 0.6]), three, 1) == pytest.approx(0.527778, abs=1e-6)
+    assert curve_area(np.ones(3), three, 1) == pytest.approx(0.555556, abs=1e-6)
+    assert curve_area(np.zeros(0), np.zeros(0, dtype=bool), 2) == 0
+
+
+def test_perfect_instances_score_one():
+    assert precisions(scan_of(EXAMPLE, [(0, 4, 0.9), (4, 7, 0.8)])).tolist() == [[1.0] * 10]
+
+
+def test_missing_predictions_score_zero_and_an_absent_class_nothing():
+    result = precisions(scan_of(EXAMPLE, []), class_ids=(CLASS, 9))
+    assert result[0].tolist() == [0.0] * 10
+    assert np.isnan(result[1]).all()
+    assert ap(result) == 0
+
+
+def test_second_match_of_an_instance_is_a_false_positive_of_the_lower_confidence():
+    # both overlap A by more than 0.5: 3 of 4 and 4 of 4. The surer stays the match, whatever the order.
+    for first, second in (((0, 3, 0.3), (0, 4, 0.9)), ((0, 4, 0.9), (0, 3, 0.3))):
+        matches = match_instances(scan_of([(A, 4), (VOID, 4)], [first, second]), (CLASS,), 1)
+        at_half = matches.overlap_index == 0
+        found = sorted(
+            zip(matches.confidence[at_half].tolist(), matches.is_match[at_half].tolist(), strict=True)
+        )
+        assert found == [(0.3, False), (0.9, True)]
+        assert matches.misses[0, 0] == 0
+
+
+def test_only_a_first_match_uses_a_prediction_up():
+    # one prediction over A and B overlaps each by 4 of 8 > 0.25: A takes it, B is missed
+    matches = match_instances(scan_of([(A, 4), (B, 4)], [(0, 8, 0.9)]), (CLASS,), 1)
+    quarter = len(OVERLAPS) - 1
+    assert matches.is_match[matches.overlap_index == quarter].tolist() == [True]
+    assert matches.misses[0, quarter] == 1
+
+
+def test_second_match_may_still_be_the_first_of_another_instance():
+    # at 0.25: the second prediction spans A and B, is a false positive on A and the match of B
+    matches = match_instances(scan_of([(A, 4), (B, 4)], [(0, 4, 0.9), (0, 8, 0.8)]), (CLASS,), 1)
+    entries = matches.overlap_index == len(OVERLAPS) - 1
+    found = sorted(zip(matches.confidence[entries].tolist(), matches.is_match[entries].tolist(), strict=True))
+    assert found == [(0.8, False), (0.8, True), (0.9, True)]
+    assert matches.misses[0, -1] == 0
+
+
+def test_prediction_is_ignored_only_where_more_than_the_threshold_lies_in_void():
+    # half of the surer prediction lies in void: not more than 0.5, so it is a false positive.
+    # P = 1/2, 0, 1 and R = 1, 0, 0: 1/2 * (1 - 0) / 2
+    truth = [(A, 4), (VOID, 4)]
+    assert ap50(precisions(scan_of(truth, [(0, 4, 0.9), (2, 6, 0.95)]))) == pytest.approx(0.25)
+    # three quarters of it: ignored
+    assert ap50(precisions(scan_of(truth, [(0, 4, 0.9), (3, 7, 0.95)]))) == 1
+
+
+def test_small_instances_are_neither_matched_nor_missed():
+    # B has 3 points, fewer than 4. Its prediction lies in what is left out: ignored.
+    scan = scan_of(EXAMPLE, [(0, 4, 0.9), (4, 8, 0.8)])
+    assert precisions(scan, min_points=4).tolist() == [[1.0] * 10]
+
+
+def test_small_predictions_and_other_classes_are_dropped():
+    scan = scan_of(EXAMPLE, [(0, 3, 0.9), (0, 4, 0.8)], classes=[CLASS, 77])
+    assert precisions(scan, min_points=4).tolist() == [[0.0] * 10]
+
+
+def test_prediction_on_an_object_of_another_class_is_a_false_positive():
+    truth = [(A, 4), (9001, 4)]
+    result = precisions(scan_of(truth, [(0, 4, 0.5), (4, 8, 0.9)]), class_ids=(CLASS, 9))
+    # the surer one is wrong: precision 1/2 at recall 1, R = 1, 0, 0 over P = 1/2, 0, 1
+    assert ap50(result[:1]) == pytest.approx(1 / 2 * 1 / 2 + 0 * 1 / 2 + 0)
+    # the same object is void where class 9 is not asked for
+    assert ap50(precisions(scan_of(truth, [(0, 4, 0.5), (4, 8, 0.9)]))) == 1
+
+
+def test_scans_share_one_curve():
+    good = scan_of([(A, 4)], [(0, 4, 0.9)])
+    missed = scan_of([(A, 4), (VOID, 4)], [])
+    # one match, one miss: P = 1, 1 and R = 1/2, 0: 1/4 + 1/4
+    assert ap50(precisions(good, missed)) == pytest.approx(0.5)
+
+
+def test_masks_of_other_points_are_refused():
+    scan = InstanceScan(np.zeros(3, int), np.ones((1, 4), bool), np.array([CLASS]), np.ones(1))
+    with pytest.raises(MisalignedArtifactError, match=r"expected  3 points\n  found     4"):
+        match_instances(scan, (CLASS,))
+
+
+# --- a second implementation ----------------------------------------------------------------------
+
+
+def plain_curve(entries, misses):
+    """Precision and recall counted anew at every confidence, then the stated sum."""
+    if not entries:
+        return 0.0
+    precision, recall = [], []
+    for least in sorted({confidence for confidence, _ in entries}):
+        taken = [hit for confidence, hit in entries if confidence >= least]
+        below = sum(hit for confidence, hit in entries if confidence < least)
+        precision.append(sum(taken) / len(taken))
+        truths = sum(taken) + below + misses
+        recall.append(sum(taken) / truths if truths else 0.0)
+    precision, recall = [*precision, 1.0], [*recall, 0.0]
+    before, after = [recall[0], *recall], [*recall[1:], 0.0]
+    return sum(p * (r0 - r1) / 2 for p, r0, r1 in zip(precision, before[:-1], after, strict=True))
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from([0.1, 0.4, 0.5, 0.9]), st.booleans()), max_size=12), st.integers(0, 4)
+)
+def test_area_equals_the_plain_sum_and_is_bounded(entries, misses):
+    confidence = np.array([value for value, _ in entries], dtype=float)
+    area = curve_area(confidence, np.array([hit for _, hit in entries], dtype=bool), misses)
+    assert area == pytest.approx(plain_curve(entries, misses))
+    assert 0 <= area <= 1 + 1e-12  # rounding of a sum of a dozen shares
+
+
+runs = st.lists(st.tuples(st.integers(0, 19), st.integers(1, 20)), max_size=5)
+
+
+@settings(max_examples=20, deadline=None)
+@given(runs, st.randoms(use_true_random=False))
+def test_order_of_predictions_does_not_matter_while_they_match_different_instances(cuts, random):
+    predictions = [
+        (first, min(first + length, 20), 0.1 + 0.1 * row) for row, (first, length) in enumerate(cuts)
+    ]
+    truth = [(A, 8), (B, 7), (VOID, 5)]
+    shuffled = random.sample(predictions, len(predictions))
+    one, other = precisions(scan_of(truth, predictions)), precisions(scan_of(truth, shuffled))
+    # Above one half a prediction can match one instance only.
+    np.testing.assert_allclose(one[:, :-1], other[:, :-1])

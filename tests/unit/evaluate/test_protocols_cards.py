@@ -1,0 +1,141 @@
+"""Every protocol has a name and a version, and nothing it decides changes without a new one."""
+
+import hashlib
+from dataclasses import asdict
+
+import pytest
+
+from hilsplat.base.errors import ArtifactError
+from hilsplat.base.levels import Level
+from hilsplat.datasets.classes import replica, scannet, scannet200, waymo
+from hilsplat.evaluate.metrics.registry import METRICS
+from hilsplat.evaluate.protocols.cards import (
+    CARDS,
+    LERF_LANGSPLAT,
+    LERF_MASK,
+    LERF_MASK_SKIPPING,
+    LEVEL_GIVEN,
+    PROTOCOLS,
+    TREE_NODES,
+    card_of,
+)
+from hilsplat.evaluate.protocols.totals import scene_value, table_value
+from hilsplat.evaluate.protocols.views import label_of
+from hilsplat.settings import EvaluateSettings
+
+DECIDED = {
+    # full name: first eight digits of what `digest` makes of metrics, averaging, missing, rule and classes
+    "lerf/langsplat@1": "704f6f3d",
+    "lerf/tree-nodes@1": "2cdcbb8d",
+    "lerf/langsplat-v2@1": "f209b912",
+    "lerf/paper-filter@1": "128bc7c0",
+    "lerf/paper-mean@1": "4fed36ea",
+    "lerf/opengaussian@1": "68a14e17",
+    "lerf-mask/gaussian-grouping@1": "34874a8b",
+    "lerf-mask/gaussian-grouping-skipping@1": "b146f4ac",
+    "3d-ovs/argmax@1": "44dac158",
+    "3d-ovs/langsplat@1": "f962ef1a",
+    "3d-ovs/langsplat-raw@1": "7797b61a",
+    "3d-ovs/langsplat-v2@1": "03965bde",
+    "scannet/opengaussian-19@1": "ced31f5d",
+    "scannet/opengaussian-15@1": "df507111",
+    "scannet/opengaussian-10@1": "e9893d38",
+    "scannet/benchmark@1": "fe414350",
+    "scannet/openscene@1": "1341871a",
+    "scannet200/opengaussian@1": "367d9a7d",
+    "scannet200/benchmark@1": "af79327f",
+    "scannet200/instances@1": "623d86d6",
+    "replica/per-scene@1": "5160df43",
+    "replica/opennerf@1": "2368b7a9",
+    "replica/conceptgraphs@1": "d89e022d",
+    "waymo/segmentation@1": "06e4086c",
+    "hierarchy/level-given@1": "02318fa5",
+    "hierarchy/level-auto@1": "d49b3f00",
+    "hierarchy/path@1": "2f58f979",
+    "hierarchy/annotations@1": "30da2922",
+}
+
+
+def digest(card):
+    """What decides a number, without the words that explain it."""
+    rule = asdict(card.rule) if card.rule else None
+    if rule:
+        rule["levels"] = [int(level) for level in rule["levels"]]
+    decided = (card.metrics, card.averaging, card.missing, rule, card.classes)
+    return hashlib.sha256(repr(decided).encode()).hexdigest()[:8]
+
+
+def test_what_a_protocol_decides_changes_only_with_its_version():
+    found = {name: digest(card) for name, card in PROTOCOLS.items()}
+    assert found == DECIDED, "raise the version of a protocol that changed, then write its digest here"
+
+
+def test_names_are_unique_and_say_benchmark_and_variant():
+    assert len(PROTOCOLS) == len(CARDS)
+    for card in CARDS:
+        benchmark, variant = card.name.split("/")
+        assert benchmark
+        assert variant
+        assert card.full_name == f"{card.name}@{card.version}"
+        assert card.selection
+        assert card.source
+
+
+def test_protocols_carry_known_metrics_and_every_metric_is_carried():
+    carried = {metric for card in CARDS for metric in card.metrics}
+    assert carried == set(METRICS)
+
+
+def test_classes_of_protocols_exist():
+    modules = (scannet, scannet200, replica, waymo)
+    known = {value.name for module in modules for value in vars(module).values() if hasattr(value, "texts")}
+    assert {card.classes for card in CARDS} - {""} <= known
+
+
+def test_rows_name_what_settings_change():
+    plain = EvaluateSettings()
+    assert label_of(LERF_LANGSPLAT, "field", plain) == "lerf/langsplat@1"
+    assert label_of(TREE_NODES, "tree", plain) == "lerf/tree-nodes@1"
+    changed = EvaluateSettings(filter_px=20, threshold_on="raw", node_select=0.7, relevancy_scale=5)
+    assert (
+        label_of(LERF_LANGSPLAT, "field", changed) == "lerf/langsplat@1 (filter 20, raw, relevancy scale 5)"
+    )
+    # nodes are not thresholded, so the scale of the threshold changes nothing of theirs
+    expected = "hierarchy/level-given@1 (filter 20, node share 0.7, relevancy scale 5)"
+    assert label_of(LEVEL_GIVEN, "tree", changed) == expected
+    assert label_of(LEVEL_GIVEN, "truth", changed) == "hierarchy/level-given@1"
+    other = EvaluateSettings(canonical=("object", "scene"))
+    assert label_of(LEVEL_GIVEN, "tree", other) == "hierarchy/level-given@1 (canonical object+scene)"
+
+
+def test_rows_lead_back_to_their_protocol():
+    assert card_of("lerf/langsplat@1 (filter 20, raw)") is LERF_LANGSPLAT
+    with pytest.raises(ArtifactError, match=r"no protocol 'lerf/langsplat@9'"):
+        card_of("lerf/langsplat@9")
+
+
+def test_averaging_order_belongs_to_the_protocol():
+    values = {("f1", "apple"): 0.8, ("f1", "egg"): 0.3, ("f2", "apple"): 0.6}
+    assert scene_value(LERF_LANGSPLAT, values) == pytest.approx(1.7 / 3)
+    assert scene_value(LERF_MASK, values) == pytest.approx((0.7 + 0.3) / 2)
+
+
+def test_scenes_of_a_table_weigh_equally():
+    scenes = {"one": {("f", "a"): 0.9, ("f", "b"): 0.5}, "two": {("f", "a"): 0.1}}
+    assert table_value(LERF_LANGSPLAT, scenes) == pytest.approx((0.7 + 0.1) / 2)
+
+
+def test_published_rules_differ_as_stated():
+    rules = {name: card.rule for name, card in PROTOCOLS.items() if card.rule}
+    assert rules["lerf/paper-filter@1"].departures(LERF_LANGSPLAT.rule) == ("filter 20",)
+    assert rules["lerf/langsplat-v2@1"].departures(LERF_LANGSPLAT.rule) == ("filter 29", "border inside")
+    literal, reading = rules["3d-ovs/langsplat-raw@1"], rules["3d-ovs/langsplat@1"]
+    assert literal.departures(reading) == ("raw",)
+    assert (reading.level_rule, reading.mix, reading.majority) == ("mean_in_mask", False, False)
+    assert rules["3d-ovs/langsplat-v2@1"].levels == (Level.WHOLE, Level.PART)
+
+
+def test_skipping_protocol_differs_in_nothing_but_missing_predictions():
+    assert (LERF_MASK.missing, LERF_MASK_SKIPPING.missing) == ("zero", "left out")
+    assert LERF_MASK.metrics == LERF_MASK_SKIPPING.metrics
+    assert all(card.missing == "zero" for card in CARDS if card is not LERF_MASK_SKIPPING)

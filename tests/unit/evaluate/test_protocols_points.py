@@ -1,0 +1,128 @@
+"""Rows of points, pooled and per scene, and how what Gaussians know comes to points."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.datasets.classes.class_set import ClassSet
+from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_19
+from hilsplat.datasets.classes.scannet200 import SCANNET200, SPLITS
+from hilsplat.datasets.classes.waymo import WAYMO_22
+from hilsplat.evaluate.metrics.instances import InstanceScan, match_instances
+from hilsplat.evaluate.protocols.cards import PROTOCOLS
+from hilsplat.evaluate.protocols.measured import Measured
+from hilsplat.evaluate.protocols.points import measure_instances, measure_points, pooled_points
+from hilsplat.evaluate.scores import Score, read_scores, write_scores
+
+OPENGAUSSIAN = PROTOCOLS["scannet/opengaussian-19@1"]
+WAYMO = PROTOCOLS["waymo/segmentation@1"]
+TRUTH = np.array([1, 1, 1, 1, 2, 2, 3, 3, 0, 0])
+PREDICTION = np.array([1, 1, 2, 4, 2, 2, 3, 1, 1, 2])
+
+
+def test_rows_of_the_worked_example():
+    rows = list(measure_points(OPENGAUSSIAN, "tree", TRUTH, PREDICTION, SCANNET_19, "frozen"))
+    assert {row.protocol for row in rows} == {"scannet/opengaussian-19@1 (points: frozen)"}
+    ious = {row.query: (row.value, row.n) for row in rows if row.metric == "class_iou"}
+    # the first four of the 19: wall, floor, cabinet, bed
+    assert ious == {
+        "wall": (pytest.approx(2 / 5), 5),
+        "floor": (pytest.approx(2 / 3), 3),
+        "cabinet": (pytest.approx(1 / 2), 2),
+        "bed": (0, 1),  # predicted only
+    }
+    accuracies = {row.query: (row.value, row.n) for row in rows if row.metric == "class_accuracy"}
+    assert accuracies == {"wall": (0.5, 4), "floor": (1, 2), "cabinet": (0.5, 2)}
+    means = {row.metric: row.value for row in rows if not row.query}
+    assert means == {
+        "miou_present": pytest.approx(0.522222, abs=1e-6),
+        "macc_present": pytest.approx(0.666667, abs=1e-6),
+    }
+
+
+def test_scene_without_predictions_counts_zero():
+    rows = list(measure_points(OPENGAUSSIAN, "tree", TRUTH, None, SCANNET_19, "frozen"))
+    assert {row.value for row in rows} == {0.0}
+    assert {row.query for row in rows} == {"", "wall", "floor", "cabinet"}
+
+
+def test_scene_without_truth_has_no_rows():
+    nothing = np.zeros(10, dtype=int)
+    assert list(measure_points(OPENGAUSSIAN, "tree", nothing, PREDICTION, SCANNET_19, "frozen")) == []
+
+
+def test_pooled_protocols_have_no_number_per_scene():
+    rows = list(measure_points(WAYMO, "tree", TRUTH, PREDICTION, WAYMO_22, "nearest"))
+    assert all(row.query for row in rows)
+
+
+def scored(rows):
+    return [
+        Score(dataset="waymo", scene="s", variant="default", masks="sam", view="", **vars(row))
+        for row in rows
+    ]
+
+
+def test_pooled_rows_equal_points_put_together_also_after_a_file(tmp_path):
+    rng = np.random.default_rng(0)
+    scenes = [(rng.integers(0, 6, 997), rng.integers(0, 6, 997)) for _ in range(3)]
+    rows = [list(measure_points(WAYMO, "tree", *scene, WAYMO_22, "nearest")) for scene in scenes]
+    together = np.concatenate(scenes, axis=1)
+    (expected,) = [
+        pooled_points(WAYMO, [list(measure_points(WAYMO, "t", *together, WAYMO_22, "x"))], WAYMO_22)
+    ]
+    assert pooled_points(WAYMO, rows, WAYMO_22) == expected
+    for number, each in enumerate(rows):
+        write_scores(tmp_path / f"{number}.csv", scored(each))
+    names = [field.name for field in fields(Measured)]
+    frames = [read_scores([tmp_path / f"{number}.csv"])[names] for number in range(3)]
+    read = [[Measured(**row) for row in frame.to_dict("records")] for frame in frames]
+    assert pooled_points(WAYMO, read, WAYMO_22) == expected
+    # five of 22 classes occur; the other 17 count 1 under Waymo's own mean
+    assert expected["miou_absent_as_one"] == pytest.approx((5 * expected["miou_present"] + 17) / 22)
+
+
+def test_scannet200_is_split_into_head_common_and_tail():
+    card = PROTOCOLS["scannet200/benchmark@1"]
+    places = [SPLITS[split].index(True) + 1 for split in ("head", "common", "tail")]
+    truth = np.repeat(places, 2)
+    prediction = truth * np.array([1, 1, 1, 0, 0, 0])  # head right, common half, tail missed
+    rows = list(measure_points(card, "tree", truth, prediction, SCANNET200, "nearest"))
+    assert pooled_points(card, [rows], SCANNET200) == {
+        "miou_occurring": 0.5,
+        "miou_head": 1.0,
+        "miou_common": 0.5,
+        "miou_tail": 0.0,
+    }
+
+
+def test_other_classes_and_other_points_are_refused():
+    with pytest.raises(MisalignedArtifactError, match=r"expected  scannet-19\n  found     scannet-10"):
+        list(measure_points(OPENGAUSSIAN, "tree", TRUTH, PREDICTION, SCANNET_10, "frozen"))
+    with pytest.raises(MisalignedArtifactError, match=r"expected  10 points\n  found     9"):
+        list(measure_points(OPENGAUSSIAN, "tree", TRUTH, PREDICTION[:9], SCANNET_19, "frozen"))
+
+
+def test_class_sets_turn_file_labels_into_rows():
+    classes = ClassSet("c", "here", (7, 3, 1191), ("a", "b", "c"))
+    found = classes.labels(np.array([3, 7, 1191, 5, 0, -2, 2000]))
+    assert found.tolist() == [2, 1, 3, 0, 0, 0, 0]
+
+
+def test_instance_rows_are_of_all_scans_together():
+    truth = np.repeat([4001, 0], 4)
+    mask = np.repeat([[True, False]], 4, axis=1)
+    found = InstanceScan(truth, mask, np.array([4]), np.ones(1))
+    missed = InstanceScan(truth, mask[:0], np.zeros(0, int), np.zeros(0))
+    scans = {name: match_instances(scan, (4,), 1) for name, scan in (("a", found), ("b", missed))}
+    rows = list(measure_instances("tree", scans, "nearest"))
+    assert [(row.metric, row.value, row.n) for row in rows] == [
+        ("ap", pytest.approx(0.5), 2),
+        ("ap50", pytest.approx(0.5), 2),
+        ("ap25", pytest.approx(0.5), 2),
+    ]
+    assert rows[0].protocol == "scannet200/instances@1 (points: nearest)"
+    nothing = {"a": match_instances(found, (9,), 1)}
+    assert list(measure_instances("tree", nothing, "nearest")) == []
