@@ -1,6 +1,7 @@
 """Colours and solid materials that the objects of the synthetic world are made of."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +18,7 @@ KINDS = (
     "brushed",
     "brick",
     "fur",
+    "tiles",
 )
 """Solid textures, by the number that the shader knows them under."""
 
@@ -47,8 +49,25 @@ ADJECTIVES: dict[str, str] = {
     "brushed": "metal",
     "brick": "brick",
     "fur": "furry",
+    "tiles": "tiled",
 }
 """How a text calls a thing with such a texture; a kind that is not here has no word."""
+
+SECOND_SHARE: dict[str, float] = {
+    "mottled": 0.47,
+    "stripes": 0.40,
+    "checks": 0.50,
+    "spots": 0.13,
+    "wood": 0.45,
+    "stone": 0.50,
+    "collage": 0.50,
+    "weave": 0.50,
+    "brushed": 0.43,
+    "brick": 0.18,
+    "fur": 0.50,
+    "tiles": 0.17,
+}
+"""Share of a texture that shows its second colour, on average over space (a test measures it)."""
 
 # (kinds to draw from, specular strength, shininess) per group of materials.
 GROUPS: dict[str, tuple[tuple[str, ...], float, float]] = {
@@ -63,7 +82,14 @@ GROUPS: dict[str, tuple[tuple[str, ...], float, float]] = {
     "plain": (("mottled",), 0.15, 20.0),
     "snow": (("mottled",), 0.10, 12.0),
     "collage": (("collage",), 0.05, 10.0),
+    "tiles": (("tiles",), 0.25, 30.0),
 }
+
+PATTERNS = ("stripes", "checks", "spots")
+"""Kinds whose second colour may be another than a shade of the first."""
+
+PATTERN_CONTRAST = 22.0
+"""Least distance between the two colours of a pattern, in L*a*b*."""
 
 WOOD_COLOURS = ("brown", "beige", "orange")
 
@@ -82,6 +108,7 @@ class Paint:
         shininess: Blinn-Phong exponent.
         grain: relative amplitude of the fine grain (structure from motion needs it).
         offset: shift of the texture, scene units; keeps cell borders off object faces.
+        choices: colour words that the thing may have; none: any.
     """
 
     colour: str
@@ -93,19 +120,47 @@ class Paint:
     shininess: float
     grain: float
     offset: tuple[float, float, float]
+    choices: tuple[str, ...] = ()
 
     @property
     def adjective(self) -> str | None:
         """Word for the texture, where there is one."""
         return ADJECTIVES.get(self.kind)
 
+    @property
+    def seen(self) -> Float[np.ndarray, " 3"]:
+        """Colour of the paint from afar, sRGB: both colours mixed in linear light as the texture does."""
+        share = SECOND_SHARE[self.kind]
+        first, second = (linear_from_srgb(np.array(colour)) for colour in (self.first, self.second))
+        return srgb_from_linear((1 - share) * first + share * second)
+
     def paled(self, share: float) -> "Paint":
-        """The same paint with both colours mixed with a light grey by `share`."""
+        """The same paint with both colours mixed with a light grey by `share`, and its word."""
 
         def mixed(colour: tuple[float, float, float]) -> tuple[float, float, float]:
             return tuple((1 - share) * value + share * 0.68 for value in colour)
 
-        return replace(self, first=mixed(self.first), second=mixed(self.second))
+        return self._called(replace(self, first=mixed(self.first), second=mixed(self.second)))
+
+    def shaded(self, factor: float) -> "Paint":
+        """The same paint darker (factor below 1) or nearer to white (above 1), and its word."""
+
+        def moved(colour: tuple[float, float, float]) -> tuple[float, float, float]:
+            if factor <= 1:
+                return tuple(max(0.03, factor * value) for value in colour)
+            return tuple(value + (factor - 1) * (0.95 - value) for value in colour)
+
+        return self._called(replace(self, first=moved(self.first), second=moved(self.second)))
+
+    def recoloured(self, word: str) -> "Paint":
+        """The same texture in another colour, with a second colour a shade away from it."""
+        first = np.array(COLOURS[word])
+        second = _relative(first)
+        return replace(self, colour=word, first=tuple(first.tolist()), second=tuple(second.tolist()))
+
+    @staticmethod
+    def _called(paint: "Paint") -> "Paint":
+        return replace(paint, colour=colour_word(paint.seen))
 
     def row(self) -> Float[np.ndarray, " 14"]:
         """Numbers for the shader.
@@ -132,6 +187,55 @@ class Paint:
 def linear_from_srgb(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     """sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_from_linear(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """Linear light in [0, 1] to sRGB (IEC 61966-2-1)."""
+    return np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055)
+
+
+_XYZ_FROM_RGB = np.array(
+    [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+)  # of sRGB, white D65
+
+
+def lab_from_srgb(colour: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape 3"]:
+    """CIE L*a*b* (D65) of sRGB colours; Euclidean distances in it follow the eye, 2.3 is just visible."""
+    xyz = linear_from_srgb(np.asarray(colour, dtype=np.float64)) @ _XYZ_FROM_RGB.T
+    t = xyz / _XYZ_FROM_RGB.sum(axis=1)
+    f = np.where(t > (6 / 29) ** 3, np.cbrt(t), t / (3 * (6 / 29) ** 2) + 4 / 29)
+    return np.stack(
+        [116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1
+    )
+
+
+_LAB = lab_from_srgb(np.array(list(COLOURS.values())))
+
+
+def colour_word(colour: Float[np.ndarray, " 3"]) -> str:
+    """The colour word whose colour is nearest to an sRGB colour, in L*a*b*.
+
+    Example:
+        >>> colour_word(np.array([0.9, 0.1, 0.1]))
+        'red'
+    """
+    return list(COLOURS)[int(np.linalg.norm(_LAB - lab_from_srgb(colour), axis=1).argmin())]
+
+
+def difference(first: Paint, second: Paint) -> float:
+    """How differently two paints look from afar: distance of `Paint.seen` in L*a*b*."""
+    return float(np.linalg.norm(_seen_lab(first) - _seen_lab(second)))
+
+
+@lru_cache(maxsize=4096)  # a builder compares each paint with many
+def _seen_lab(paint: Paint) -> Float[np.ndarray, " 3"]:
+    return lab_from_srgb(paint.seen)
+
+
+def _relative(first: np.ndarray) -> np.ndarray:
+    """A shade of a colour: darker of a light one, lighter of a dark one."""
+    light = float(first.mean()) > 0.5
+    return np.clip(first * (0.66 if light else 1.4) + (0.0 if light else 0.04), 0.02, 0.95)
 
 
 class PaintBox:
@@ -161,34 +265,42 @@ class PaintBox:
         if colour in self._left:
             self._left.remove(colour)
         first = np.clip(
-            np.array(COLOURS[colour]) * rng.uniform(0.88, 1.1) + rng.normal(0, 0.015, 3), 0.03, 0.95
+            np.array(COLOURS[colour]) * rng.uniform(0.9, 1.08) + rng.normal(0, 0.012, 3), 0.03, 0.95
         )
-        return Paint(
+        paint = Paint(
             colour,
             kind,
             tuple(first.tolist()),
-            tuple(self._second(kind, first).tolist()),
+            tuple(_relative(first).tolist()),
             scale * float(_CELLS[kind] * rng.uniform(0.8, 1.25)),
             specular * float(rng.uniform(0.7, 1.2)),
             shininess * float(rng.uniform(0.7, 1.4)),
             float(rng.uniform(0.22, 0.36)),
             tuple(rng.uniform(3.0, 17.0, 3).tolist()),
+            choice,
         )
+        if kind in PATTERNS:
+            paint = self._patterned(paint)
+        return paint if colour_word(paint.seen) == colour else paint.recoloured(colour)
 
     def _unused(self) -> list[str]:
         if not self._left:
             self._left = list(COLOURS)
         return self._left
 
-    def _second(self, kind: str, first: np.ndarray) -> np.ndarray:
-        """The other colour: a relative of the first, so that a region keeps one prevailing colour."""
-        light = float(first.mean()) > 0.5
-        if kind in ("stripes", "checks", "spots"):
-            other = np.array(COLOURS[str(self._rng.choice(list(COLOURS)))])
-            toward = 0.45 * other + (0.05 if light else 0.55) * (1 - 0.45)
-            return np.clip(0.45 * first + 0.55 * toward, 0.02, 0.95)
-        factor = 0.62 if light else 1.5
-        return np.clip(first * factor + (0.0 if light else 0.05), 0.02, 0.95)
+    def _patterned(self, paint: Paint) -> Paint:
+        """The paint with a second colour that shows, yet leaves its prevailing colour the same word.
+
+        Another word would be a lie of the texts: "red mug" for what looks brown from afar.
+        """
+        first = np.array(paint.first)
+        for word in self._rng.permutation(list(COLOURS)):
+            other = 0.3 * first + 0.7 * np.array(COLOURS[str(word)])
+            patterned = replace(paint, second=tuple(other.tolist()))
+            apart = np.linalg.norm(lab_from_srgb(other) - lab_from_srgb(first))
+            if apart > PATTERN_CONTRAST and colour_word(patterned.seen) == paint.colour:
+                return patterned
+        return paint
 
 
 _CELLS = {
@@ -203,4 +315,5 @@ _CELLS = {
     "brushed": 8.0,
     "brick": 13.0,
     "fur": 16.0,
+    "tiles": 9.0,
 }

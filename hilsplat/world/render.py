@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
 from hilsplat.scene.cameras import Camera
+from hilsplat.world.paints import srgb_from_linear
 from hilsplat.world.scenes.scene import Style, WorldScene
 from hilsplat.world.textures import albedo, hash01
 
@@ -21,10 +22,10 @@ RAYS_PER_PIXEL = 9
 """Shadow rays and occlusion rays per pixel, at least; with fewer sub-samples each casts more."""
 
 OCCLUSION_REACH = 0.55
-"""Farther things do not darken a surface, scene units."""
+"""Farther things do not darken a surface, scene units at `Style.scale` 1."""
 
-_LIFT = 2e-3  # rays start this far off the surface, scene units
-_HASH_CELLS = 160.0  # cells per scene unit of the hash that moves rays: about a pixel at 384 px
+_LIFT = 2e-3  # rays start this far off the surface, scene units at scale 1
+_HASH_CELLS = 160.0  # cells per unit, at scale 1, of the hash that moves rays: about a pixel at 384 px
 _SETTINGS = {"cache": True, "nogil": True}
 
 
@@ -86,14 +87,17 @@ def render_view(
     )
     rays_each = math.ceil(RAYS_PER_PIXEL / samples**2)
     lit, open_sky = np.zeros(count, np.float32), np.zeros(count, np.float32)
-    starts = points + _LIFT * facets
+    starts = points + np.float32(_LIFT * style.scale) * facets
     toward = np.empty((count, 3), np.float32)
     reach = np.empty(count, np.float32)
     light = np.array([*style.light_position, style.light_radius], np.float32)
+    cells = _HASH_CELLS / style.scale
     for ray in range(rays_each):
-        _light_rays(points, starts, light, samples, ray, rays_each, toward, reach)
+        _light_rays(points, starts, light, samples, ray, rays_each, cells, toward, reach)
+        np.minimum(reach, np.float32(style.shadow_reach), out=reach)
         lit += _cast(scene, starts, toward, reach) < 0
-        _sky_rays(points, facets, samples, ray, rays_each, toward, reach)
+        _sky_rays(points, facets, samples, ray, rays_each, cells, toward)
+        reach.fill(OCCLUSION_REACH * style.scale)
         open_sky += _cast(scene, starts, toward, reach) < 0
     image = np.zeros((camera.size_hw[0] * camera.size_hw[1], 3), np.float32)
     _shade(
@@ -112,7 +116,7 @@ def render_view(
         samples,
         image,
     )
-    return (_srgb_from_linear(image) * 255 + 0.5).astype(np.uint8).reshape(*camera.size_hw, 3)
+    return (srgb_from_linear(np.clip(image, 0, 1)) * 255 + 0.5).astype(np.uint8).reshape(*camera.size_hw, 3)
 
 
 def _cast(scene: WorldScene, origins: np.ndarray, directions: np.ndarray, reach: np.ndarray | None = None):
@@ -137,11 +141,6 @@ def _rays(camera: Camera, samples: int) -> tuple[np.ndarray, np.ndarray]:
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     origins = np.broadcast_to(camera.centre.astype(np.float32), directions.shape)
     return np.ascontiguousarray(origins), np.ascontiguousarray(directions, dtype=np.float32)
-
-
-def _srgb_from_linear(values: np.ndarray) -> np.ndarray:
-    values = np.clip(values, 0, 1)
-    return np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055)
 
 
 @numba.njit(**_SETTINGS)
@@ -205,27 +204,27 @@ def _surfaces(
 
 @numba.njit(**_SETTINGS)
 @no_type_check  # the shape checks of the test-suite cannot be compiled
-def _cell(point, salt):
+def _cell(point, cells, salt):
     """Hash in [0, 1) of the small cell of space that a point lies in."""
     return hash01(
-        math.floor(point[0] * _HASH_CELLS),
-        math.floor(point[1] * _HASH_CELLS),
-        math.floor(point[2] * _HASH_CELLS),
+        math.floor(point[0] * cells),
+        math.floor(point[1] * cells),
+        math.floor(point[2] * cells),
         salt,
     )
 
 
 @numba.njit(**_SETTINGS)
 @no_type_check  # the shape checks of the test-suite cannot be compiled
-def _light_rays(points, starts, light, samples, ray, rays_each, toward, reach):
+def _light_rays(points, starts, light, samples, ray, rays_each, cells, toward, reach):
     """Direction and distance from each point to its stratum of the (horizontal, round) light."""
     per_pixel = samples * samples
     strata = per_pixel * rays_each
     for i in range(len(points)):
         stratum = (i % per_pixel) * rays_each + ray
         # Sunflower arrangement: equal areas, all directions, for any number of strata.
-        radius = light[3] * math.sqrt((stratum + 0.15 + 0.7 * _cell(points[i], 301)) / strata)
-        angle = 2.399963 * stratum + 0.9 * (_cell(points[i], 302) - 0.5)
+        radius = light[3] * math.sqrt((stratum + 0.15 + 0.7 * _cell(points[i], cells, 301)) / strata)
+        angle = 2.399963 * stratum + 0.9 * (_cell(points[i], cells, 302) - 0.5)
         dx = light[0] + radius * math.cos(angle) - starts[i, 0]
         dy = light[1] + radius * math.sin(angle) - starts[i, 1]
         dz = light[2] - starts[i, 2]
@@ -236,14 +235,14 @@ def _light_rays(points, starts, light, samples, ray, rays_each, toward, reach):
 
 @numba.njit(**_SETTINGS)
 @no_type_check  # the shape checks of the test-suite cannot be compiled
-def _sky_rays(points, facets, samples, ray, rays_each, toward, reach):
+def _sky_rays(points, facets, samples, ray, rays_each, cells, toward):
     """A cosine-weighted direction of the hemisphere above each point, by stratum."""
     per_pixel = samples * samples
     strata = per_pixel * rays_each
     for i in range(len(points)):
         stratum = (i % per_pixel) * rays_each + ray
-        share = (stratum + 0.15 + 0.7 * _cell(points[i], 303)) / strata
-        angle = 2.399963 * stratum + 0.9 * (_cell(points[i], 304) - 0.5)
+        share = (stratum + 0.15 + 0.7 * _cell(points[i], cells, 303)) / strata
+        angle = 2.399963 * stratum + 0.9 * (_cell(points[i], cells, 304) - 0.5)
         radius, up = math.sqrt(share), math.sqrt(max(0.0, 1.0 - share))
         nx, ny, nz = facets[i, 0], facets[i, 1], facets[i, 2]
         # Frame around the normal (Duff et al. 2017, "Building an Orthonormal Basis, Revisited").
@@ -254,7 +253,6 @@ def _sky_rays(points, facets, samples, ray, rays_each, toward, reach):
         toward[i, 0] = c * (1.0 + sign * nx * nx * a) + s * b + up * nx
         toward[i, 1] = c * sign * b + s * (sign + ny * ny * a) + up * ny
         toward[i, 2] = -c * sign * nx - s * ny + up * nz
-        reach[i] = OCCLUSION_REACH
 
 
 @numba.njit(**_SETTINGS)
@@ -282,6 +280,10 @@ def _shade(
         if prim[i] < 0:
             for c in range(3):
                 image[pixel, c] += 0.8 * lights[1, c] / per_pixel
+            continue
+        if gloss[i, 1] <= 0:  # shines by itself: the sky, a lit lamp
+            for c in range(3):
+                image[pixel, c] += colours[i, c] / per_pixel
             continue
         lx, ly, lz = light[0] - points[i, 0], light[1] - points[i, 1], light[2] - points[i, 2]
         distance = math.sqrt(lx * lx + ly * ly + lz * lz)

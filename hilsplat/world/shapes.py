@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -88,20 +89,28 @@ def box(size: Point, centre: Point = (0.0, 0.0, 0.0), bevel: Number = 0.0) -> Me
     """
     half = np.asarray(size, dtype=np.float64) / 2
     bevel = float(min(bevel, 0.45 * 2 * half.min()))
+    signs, inset = _box_corners(bevel > 0)
+    return _flat(signs * (half - bevel * inset)).moved(*centre)
+
+
+@cache
+def _box_corners(bevelled: bool) -> tuple[Float[np.ndarray, "T 3 3"], Float[np.ndarray, "T 3 3"]]:
+    """Triangles of any box: per corner the side of the box on each axis (-1 or 1), and 1 where the bevel
+    insets it. A corner is full along the normal of its face and inset along the other two axes."""
     triangles: list[np.ndarray] = []
 
-    def corner(signs: Sequence[Number] | np.ndarray, inset_axis: int) -> np.ndarray:
-        """Corner of the face whose normal is `inset_axis`: full there, inset by the bevel elsewhere."""
-        inset = np.full(3, bevel)
-        inset[inset_axis] = 0.0
-        return np.asarray(signs) * (half - inset)
+    def corner(signs: Sequence[Number] | np.ndarray, full_axis: int) -> np.ndarray:
+        inset = np.ones(3)
+        inset[full_axis] = 0.0
+        return np.stack([np.asarray(signs, dtype=np.float64), inset])
 
     def add(polygon: list[np.ndarray]) -> None:
-        points = np.stack(polygon)
+        corners = np.stack(polygon)  # (corners, 2, 3)
+        points = corners[:, 0] * (1.0 - 0.25 * corners[:, 1])
         normal = np.cross(points[1] - points[0], points[2] - points[0])
         if normal @ points.mean(axis=0) < 0:
-            points = points[::-1]
-        triangles.extend(_fan(points))
+            corners = corners[::-1]
+        triangles.extend(_fan(corners))
 
     for axis in range(3):
         b, c = (axis + 1) % 3, (axis + 2) % 3
@@ -112,7 +121,7 @@ def box(size: Point, centre: Point = (0.0, 0.0, 0.0), bevel: Number = 0.0) -> Me
                 signs[axis], signs[b], signs[c] = sign, sb, sc
                 quad.append(corner(signs, axis))
             add(quad)
-    if bevel > 0:
+    if bevelled:
         for axis in range(3):
             b, c = (axis + 1) % 3, (axis + 2) % 3
             for sb in (-1.0, 1.0):
@@ -128,7 +137,8 @@ def box(size: Point, centre: Point = (0.0, 0.0, 0.0), bevel: Number = 0.0) -> Me
                 for sz in (-1.0, 1.0):
                     signs = np.array([sx, sy, sz])
                     add([corner(signs, 0), corner(signs, 1), corner(signs, 2)])
-    return _flat(np.stack(triangles)).moved(*centre)
+    stacked = np.stack(triangles)  # (triangles, 3 corners, 2, 3)
+    return stacked[:, :, 0], stacked[:, :, 1]
 
 
 def lathe(profile: Sequence[tuple[Number, Number]], segments: int = 28) -> Mesh:
@@ -271,3 +281,65 @@ def extrude(outline: Sequence[tuple[Number, Number]], depth: Number) -> Mesh:
         j = (i + 1) % len(points)
         triangles += [np.stack([front[i], back[j], front[j]]), np.stack([front[i], back[i], back[j]])]
     return _flat(np.stack(triangles))
+
+
+def loft(sections: Sequence[Sequence[Point] | np.ndarray]) -> Mesh:
+    """Flat-shaded solid through convex outlines of equally many points, closed at both ends.
+
+    Args:
+        sections: outlines one after another along the solid, all turning the same way. Whether that
+            is clockwise does not matter: the solid is wound so that its volume is positive.
+    """
+    outlines = [np.asarray(section, dtype=np.float64) for section in sections]
+    triangles = [*_fan(outlines[0][::-1]), *_fan(outlines[-1])]
+    for low, high in pairwise(outlines):
+        for i in range(len(low)):
+            j = (i + 1) % len(low)
+            triangles += [np.stack([low[i], low[j], high[j]]), np.stack([low[i], high[j], high[i]])]
+    solid = np.stack(triangles)
+    middle = solid.reshape(-1, 3).mean(axis=0)
+    corners = solid - middle
+    if np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:
+        solid = solid[:, ::-1]
+    return _flat(solid)
+
+
+def disc(radius: Number, back: Number, front: Number, segments: int = 28, bevel: Number = 0.0) -> Mesh:
+    """Closed cylinder about x, from x = back to x = front: what faces the viewer of an object's front."""
+    return cylinder(radius, back, front, segments, bevel).turned("y", 90)
+
+
+def ring(
+    radius: Number, tube: Number, centre: Point = (0.0, 0.0, 0.0), axis: str = "z", segments: int = 28
+) -> Mesh:
+    """Torus about a coordinate axis."""
+    angle = np.linspace(0, 2 * np.pi, segments + 1)
+    around = np.linspace(0, 2 * np.pi, 13)
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    direction[-1] = direction[0]
+    away, up = np.cos(around), np.sin(around)
+    away[-1], up[-1] = away[0], up[0]
+    normal = np.stack(
+        [
+            direction[:, None, 0] * away,
+            direction[:, None, 1] * away,
+            np.broadcast_to(up, (len(angle), len(up))),
+        ],
+        axis=-1,
+    )
+    points = tube * normal
+    points[..., :2] += radius * direction[:, None]
+    corner = [(0, 0), (1, 0), (1, 1)], [(0, 0), (1, 1), (0, 1)]
+
+    def picked(values: np.ndarray) -> np.ndarray:
+        rows, columns = len(angle) - 1, len(around) - 1
+        return np.concatenate(
+            [
+                np.stack([values[i : i + rows, j : j + columns] for i, j in three], axis=2).reshape(-1, 3, 3)
+                for three in corner
+            ]
+        )
+
+    mesh = Mesh(picked(points), picked(normal))
+    turned = {"z": mesh, "x": mesh.turned("y", 90), "y": mesh.turned("x", 90)}[axis]
+    return turned.moved(*centre)

@@ -7,10 +7,12 @@ from jaxtyping import Int32, UInt8
 
 from hilsplat.base.artifacts import atomic_path, read_index, read_json
 from hilsplat.base.images import list_images, read_image
-from hilsplat.base.levels import LEVELS, NONE
+from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.datasets.hierarchy import AnnotatedNode, HierarchyAnnotations
 
 VIEWS_SHOWN = 4
+LINES_SHOWN = 52
+"""Lines of the tree in a column; more would not be legible."""
 
 
 def show_world(world_folder: Path, out: Path) -> None:
@@ -41,12 +43,12 @@ def contact_sheet(truth_folder: Path, images_folder: Path, path: Path) -> None:
     colours = node_colours(len(truth.nodes))
     scored = {node for ids in truth.views.values() for node in ids}
     lines = tree_lines(truth.nodes)
-    columns = -(-len(lines) // 60)
-    figure = Figure(figsize=(10.5 + 3.0 * columns, 2.7 * len(picked) + 0.6), dpi=110)
+    columns = -(-len(lines) // LINES_SHOWN)
+    figure = Figure(figsize=(10.5 + 2.6 * columns, 2.7 * len(picked) + 0.6), dpi=110)
     grid = figure.add_gridspec(
         len(picked),
         4 + columns,
-        width_ratios=[1] * 4 + [1.15] * columns,
+        width_ratios=[1] * 4 + [0.95] * columns,
         left=0.01,
         right=0.99,
         bottom=0.01,
@@ -57,7 +59,7 @@ def contact_sheet(truth_folder: Path, images_folder: Path, path: Path) -> None:
     for row, image in enumerate(picked):
         panels = [("view", read_image(image))]
         for level in LEVELS:
-            panels.append((level.label, coloured(truth.label_image(image.name, level), colours)))
+            panels.append((level.label, _panel(truth, image.name, level, colours)))
         for column, (title, pixels) in enumerate(panels):
             axes = figure.add_subplot(grid[row, column])
             axes.imshow(pixels, interpolation="nearest")
@@ -76,8 +78,8 @@ def contact_sheet(truth_folder: Path, images_folder: Path, path: Path) -> None:
         for row, (depth, node) in enumerate(lines[column * per_column : (column + 1) * per_column]):
             shown = node.text if node.id in scored else f"[{node.text}]"
             y, x = row + 0.5, 0.06 + 0.09 * depth
-            axes.plot(x - 0.025, y, "s", color=colours[node.id] / 255, markersize=5)
-            axes.text(x, y, shown, fontsize=7.5, va="center", weight="bold" if depth == 0 else "normal")
+            axes.plot(x - 0.025, y, "s", color=colours[node.id] / 255, markersize=6)
+            axes.text(x, y, shown, fontsize=9, va="center", weight="bold" if depth == 0 else "normal")
     figure.suptitle(
         f"{record['source']} (generator {record['generator_version']}, {record['split']} seed): "
         f"{record['objects_placed']} of {record['objects_asked']} objects placed, {len(images)} views",
@@ -85,6 +87,16 @@ def contact_sheet(truth_folder: Path, images_folder: Path, path: Path) -> None:
     )
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png")
+
+
+def _panel(
+    truth: HierarchyAnnotations, view: str, level: Level, colours: UInt8[np.ndarray, "N 3"]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Labels of a level as colours; where it has no node, the whole is hinted at in dark grey."""
+    labels = truth.label_image(view, level)
+    panel = coloured(labels, colours)
+    whole = coloured(truth.label_image(view, Level.WHOLE), colours).mean(axis=-1, keepdims=True)
+    return np.where(labels[..., None] >= 0, panel, (0.28 * whole).astype(np.uint8))
 
 
 def node_colours(count: int) -> UInt8[np.ndarray, "N 3"]:

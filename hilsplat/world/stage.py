@@ -17,6 +17,7 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.hierarchy import write_hierarchy
 from hilsplat.settings import WorldSettings
+from hilsplat.world.lidar import scan_street
 from hilsplat.world.objects.catalogue import GENERATOR_VERSION
 from hilsplat.world.render import label_view, render_view
 from hilsplat.world.scenes.kinds import KINDS, build_scene, scene_cameras
@@ -25,6 +26,10 @@ from hilsplat.world.seeds import TRAINING_SEEDS, split_of_seed
 from hilsplat.world.truth import annotated_nodes, smallest_areas, write_mesh
 
 logger = logging.getLogger(__name__)
+
+MESH_EDGE: dict[str, float] = {"room": 0.08}
+"""Longest edge of the true mesh, scene units, for kinds of scene whose vertices are scored; others keep
+the triangles they were built of."""
 
 
 def parse_source(source: str) -> tuple[str, int]:
@@ -59,8 +64,8 @@ def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> 
 
     Writes two folders, each whole or absent: `out/images` (000.png, 001.png, ...), which is all that
     the next stages see, and `out/truth` (annotations.json and labels/ in the hierarchy format,
-    cameras.npz, mesh.ply, scene.json), which only `evaluate` may read. The bytes depend on source and
-    settings, not on `threads`.
+    cameras.npz, mesh.ply, scene.json, of a street also lidar.npz), which only `evaluate` may read. The
+    bytes depend on source and settings, not on `threads`.
 
     Raises:
         SceneError: the source names no scene, or nothing found a place in it.
@@ -89,7 +94,10 @@ def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> 
         with atomic_folder(out / "truth") as folder:
             write_hierarchy(folder, scene.nodes, labels, annotated)
             cameras.save(folder / "cameras.npz")
-            write_mesh(folder / "mesh.ply", scene)
+            write_mesh(folder / "mesh.ply", scene, cameras, MESH_EDGE.get(kind))
+            if kind == "street":
+                centres = np.stack([cameras[name].centre for name in cameras.names])
+                scan_street(scene, centres).save(folder / "lidar.npz")
             write_json(folder / "scene.json", _record(source, scene))
             write_index(
                 folder, {name: {"annotated": len(ids)} for name, ids in annotated.items()}, source=source

@@ -103,7 +103,7 @@ def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
     if kind == 1:  # stripes, slightly wavy
         bend = 0.35 * value_noise(0.5 * x, 0.5 * y, 0.5 * z, 11)
         wave = math.sin(2 * math.pi * (0.75 * z + 0.2 * x + 0.2 * y + bend))
-        return step_between(wave, -0.15, 0.15), 0.92 + 0.16 * value_noise(3 * x, 3 * y, 3 * z, 12)
+        return step_between(wave, 0.15, 0.45), 0.92 + 0.16 * value_noise(3 * x, 3 * y, 3 * z, 12)
     if kind == 2:  # checks
         cell = math.floor(0.62 * x) + math.floor(0.62 * y) + math.floor(0.62 * z)
         return float(cell & 1), 0.92 + 0.16 * value_noise(3 * x, 3 * y, 3 * z, 21)
@@ -146,6 +146,12 @@ def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
         )
         tone = hash01(brick, course, 0, 91)
         return 1 - step_between(joint, 0.05, 0.1), 0.78 + 0.4 * tone
+    if kind == 11:  # tiles of a floor: squares in x and y, so upright faces show them as stripes
+        column, row = math.floor(0.4 * x), math.floor(0.4 * y)
+        joint = min(min(0.4 * x - column, column + 1 - 0.4 * x), min(0.4 * y - row, row + 1 - 0.4 * y))
+        tone = hash01(column, row, 0, 111)
+        cloud = fractal_noise(0.8 * x, 0.8 * y, 0.8 * z, 3, 113)
+        return 1 - step_between(joint, 0.03, 0.06), 0.74 + 0.3 * tone + 0.24 * cloud
     if kind == 10:  # fur: short strokes
         stroke = fractal_noise(2.4 * x + 1.2 * z, 2.4 * y, 0.9 * z, 3, 101)
         cloud = fractal_noise(0.4 * x, 0.4 * y, 0.4 * z, 2, 105)

@@ -5,15 +5,19 @@ from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Int32
+from jaxtyping import Float32, Int32, Int64
 
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.hierarchy import AnnotatedNode
+from hilsplat.scene.cameras import Cameras
 from hilsplat.world.scenes.scene import WorldScene
 
 SUBPART_AREA_AT_PX = 384
 """Size of the view for which the smallest area of a subpart is stated."""
+
+HIDDEN_BY = 2e-3
+"""A point counts as hidden where something is nearer to the camera by this share of its distance."""
 
 
 def smallest_areas(image_px: int, min_area_px: int, min_subpart_area_px: int) -> dict[Level, float | int]:
@@ -64,26 +68,57 @@ def annotated_nodes(
     return tuple(sorted(kept))
 
 
-def write_mesh(path: Path, scene: WorldScene) -> None:
-    """Write the scene as binary PLY: vertices x, y, z; faces with `whole`, `part`, `subpart` node ids.
+def write_mesh(path: Path, scene: WorldScene, cameras: Cameras, longest_edge: float | None = None) -> None:
+    """Write the scene as binary PLY, with node ids of faces and of vertices.
 
-    Coordinates are those of the true cameras; corners at the same place are one vertex.
+    Vertices have x, y, z, the ids `whole`, `part` and `subpart` (-1 none) and `views`, the number of
+    cameras that see them (at most 255); faces have the same three ids. Corners at the same place are
+    one vertex where their faces agree in all ids: at a border each side has its own. Protocols that
+    score vertices, as ScanNet's does, need vertices of even density that a camera saw: a wall of two
+    triangles has four.
+
+    Args:
+        path: file to write.
+        scene: what is in it. Coordinates are those of the true cameras.
+        cameras: the views of the scene.
+        longest_edge: longer edges are halved until none is left, scene units; None keeps the triangles.
     """
-    corners, index = np.unique(scene.triangles.reshape(-1, 3), axis=0, return_inverse=True)
+    triangles, owner = scene.triangles, np.arange(len(scene.triangles))
+    if longest_edge is not None:
+        triangles, owner = refined(triangles, longest_edge)
+    ids = scene.node_ids[owner]
+    # Ids in front of the place: float32 holds them exactly up to 2**24.
+    rows = np.concatenate([np.repeat(ids, 3, axis=0).astype(np.float32), triangles.reshape(-1, 3)], axis=1)
+    unique, index = np.unique(rows, axis=0, return_inverse=True)
+    vertices = np.empty(
+        len(unique),
+        dtype=[
+            *((axis, "<f4") for axis in "xyz"),
+            *((level.label, "<i4") for level in LEVELS),
+            ("views", "u1"),
+        ],
+    )
+    for column, axis in enumerate("xyz"):
+        vertices[axis] = unique[:, 3 + column]
+    for level in LEVELS:
+        vertices[level.label] = unique[:, level.index]
+    vertices["views"] = np.minimum(views_of_points(scene, cameras, np.ascontiguousarray(unique[:, 3:])), 255)
     faces = np.empty(
-        len(scene.triangles),
-        dtype=[("count", "u1"), ("corners", "<i4", 3), ("whole", "<i4"), ("part", "<i4"), ("subpart", "<i4")],
+        len(triangles),
+        dtype=[("count", "u1"), ("corners", "<i4", 3), *((level.label, "<i4") for level in LEVELS)],
     )
     faces["count"] = 3
     faces["corners"] = index.reshape(-1, 3)
     for level in LEVELS:
-        faces[level.label] = scene.node_ids[:, level.index]
+        faces[level.label] = ids[:, level.index]
     header = "\n".join(
         [
             "ply",
             "format binary_little_endian 1.0",
-            f"element vertex {len(corners)}",
+            f"element vertex {len(vertices)}",
             *(f"property float {axis}" for axis in "xyz"),
+            *(f"property int {level.label}" for level in LEVELS),
+            "property uchar views",
             f"element face {len(faces)}",
             "property list uchar int vertex_indices",
             *(f"property int {level.label}" for level in LEVELS),
@@ -91,4 +126,71 @@ def write_mesh(path: Path, scene: WorldScene) -> None:
         ]
     )
     with atomic_path(path) as temporary:
-        temporary.write_bytes(header.encode() + corners.astype("<f4").tobytes() + faces.tobytes())
+        temporary.write_bytes(header.encode() + vertices.tobytes() + faces.tobytes())
+
+
+def views_of_points(
+    scene: WorldScene, cameras: Cameras, points: Float32[np.ndarray, "N 3"]
+) -> Int32[np.ndarray, " N"]:
+    """How many of the cameras see each point of the scene's surface: in the image and not hidden."""
+    seen = np.zeros(len(points), np.int32)
+    for name in cameras.names:
+        camera = cameras[name]
+        local = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x, y = (camera.K[a, a] * local[:, a] / local[:, 2] + camera.K[a, 2] for a in range(2))
+        height, width = camera.size_hw
+        rows = np.flatnonzero((local[:, 2] > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
+        if not len(rows):
+            continue
+        centre = camera.centre.astype(np.float32)
+        ways = points[rows] - centre
+        distance = np.linalg.norm(ways, axis=1).astype(np.float32)
+        origins = np.ascontiguousarray(np.broadcast_to(centre, ways.shape))
+        reach = distance * np.float32(1 - HIDDEN_BY)
+        hit = scene.embree.run(origins, ways / distance[:, None], dists=reach, query="OCCLUDED")
+        seen[rows] += hit < 0
+    return seen
+
+
+def refined(
+    triangles: Float32[np.ndarray, "F 3 3"], longest_edge: float
+) -> tuple[Float32[np.ndarray, "G 3 3"], Int64[np.ndarray, " G"]]:
+    """Halve all edges longer than a length until none is left.
+
+    Whether an edge is halved depends on its two ends alone, so that triangles that share it stay
+    joined, without cracks.
+
+    Args:
+        triangles: corners, scene units.
+        longest_edge: scene units.
+
+    Returns:
+        The smaller triangles, and the row of `triangles` that each is a piece of.
+    """
+    owner = np.arange(len(triangles))
+    done, done_owner = [], []
+    while len(triangles):
+        ends = triangles[:, [1, 2, 0]]
+        long = np.linalg.norm(ends - triangles, axis=2) > longest_edge  # edge k: from corner k to the next
+        count = long.sum(axis=1)
+        done.append(triangles[count == 0])
+        done_owner.append(owner[count == 0])
+        pieces, owners = [], []
+        for number in (1, 2, 3):
+            rows = np.flatnonzero(count == number)
+            # Turned so that the long edges come first: 0; 0 and 1; all.
+            first = long[rows].argmax(axis=1) if number == 1 else (long[rows].argmin(axis=1) + 1) % 3
+            order = (first[:, None] + np.arange(3)) % 3
+            a, b, c = (triangles[rows, order[:, k]] for k in range(3))
+            ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+            split = {
+                1: [(a, ab, c), (ab, b, c)],
+                2: [(ab, b, bc), (a, ab, bc), (a, bc, c)],
+                3: [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)],
+            }[number]
+            for corners in split:
+                pieces.append(np.stack(corners, axis=1))
+                owners.append(owner[rows])
+        triangles, owner = np.concatenate(pieces), np.concatenate(owners)
+    return np.concatenate(done), np.concatenate(done_owner)

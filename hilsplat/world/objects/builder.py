@@ -1,5 +1,6 @@
 """How an object of the synthetic world is put together: a true tree of whole, parts and subparts."""
 
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -8,8 +9,18 @@ import numpy as np
 from jaxtyping import Float, Int32
 
 from hilsplat.base.levels import NONE
-from hilsplat.world.paints import Paint, PaintBox
+from hilsplat.world.paints import COLOURS, Paint, PaintBox, difference
 from hilsplat.world.shapes import Mesh, joined
+
+PARENT_CONTRAST = 24.0
+"""Least distance in L*a*b* between a subpart and the part it sits on."""
+
+NEIGHBOUR_CONTRAST = 11.0
+"""Least distance in L*a*b* between other parts and subparts of an object that touch."""
+
+_SHADES = (1.0, 0.85, 1.15, 0.72, 1.3, 0.6, 1.45, 0.5, 1.6)
+_TOUCH = 0.03  # boxes nearer than this touch, share of the object's size
+_PREVAILS = {1: 0.5, 2: 0.6, 3: 0.6}  # share of a surface from which a colour or material names it, by level
 
 
 @dataclass(frozen=True)
@@ -60,7 +71,7 @@ class Builder:
     def __init__(self, name: str, aliases: tuple[str, ...], rng: np.random.Generator) -> None:
         self.name, self.aliases, self.rng = name, aliases, rng
         self.paints = PaintBox(rng)
-        self._nodes: list[tuple[int, int, str, tuple[str, ...]]] = [(1, NONE, name, aliases)]
+        self._nodes: list[_Named] = [_Named(1, NONE, name, aliases)]
         self._pieces: list[tuple[int, Mesh, Paint]] = []
 
     def between(self, low: float | int, high: float | int) -> float:
@@ -73,53 +84,108 @@ class Builder:
 
     def part(self, word: str, *aliases: str) -> int:
         """A new part of the object; `word` is its name without the object's."""
-        self._nodes.append((2, 0, word, aliases))
+        self._nodes.append(_Named(2, 0, word, aliases))
         return len(self._nodes) - 1
 
-    def subpart(self, part: int, word: str, *aliases: str) -> int:
-        """A new subpart of a part."""
-        self._nodes.append((3, part, word, aliases))
+    def subpart(self, part: int, word: str, *aliases: str, at: str = "on") -> int:
+        """A new subpart of a part; `at` is the preposition of "knob on the kettle lid"."""
+        self._nodes.append(_Named(3, part, word, aliases, at))
         return len(self._nodes) - 1
 
     def put(self, node: int, paint: Paint, *meshes: Mesh) -> None:
         """Add meshes that belong to a part or subpart."""
         self._pieces.append((node, joined(*meshes), paint))
 
+    def shift(self, nodes: tuple[int, ...], x: float | int, y: float | int, z: float | int) -> None:
+        """Move what was put on these nodes so far."""
+        self._pieces = [
+            (node, mesh.moved(x, y, z) if node in nodes else mesh, paint)
+            for node, mesh, paint in self._pieces
+        ]
+
+    def turn(self, degrees: float | int) -> None:
+        """Turn all that was put so far about the vertical axis."""
+        self._pieces = [(node, mesh.turned("z", degrees), paint) for node, mesh, paint in self._pieces]
+
     def build(self) -> ObjectModel:
-        paints = list(dict.fromkeys(paint for _, _, paint in self._pieces))
+        """The finished object: it stands on z = 0, and parts that touch differ in colour."""
         triples = []
-        for level, parent, _, _ in self._nodes:
+        for level, parent, *_ in self._nodes:
             row = len(triples)
             triples.append(
                 (0, NONE, NONE) if level == 1 else (0, row, NONE) if level == 2 else (0, parent, row)
             )
-        area = {}  # of each paint on each node, to know what colour a node has
-        for node, mesh, paint in self._pieces:
-            edges = mesh.triangles[:, 1:] - mesh.triangles[:, :1]
-            surface = float(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum())
+        pieces = self._contrasted()
+        paints = list(dict.fromkeys(paint for _, _, paint in pieces))
+        area: dict[int, dict[Paint, float]] = defaultdict(lambda: defaultdict(float))
+        for node, mesh, paint in pieces:
             for owner in triples[node]:
                 if owner != NONE:
-                    per_paint = area.setdefault(owner, {})
-                    per_paint[paint] = per_paint.get(paint, 0.0) + surface
-        triangles = np.concatenate([mesh.triangles for _, mesh, _ in self._pieces])
+                    area[owner][paint] += _surface(mesh)
+        triangles = np.concatenate([mesh.triangles for _, mesh, _ in pieces])
         triangles[..., 2] -= triangles[..., 2].min()
         return ObjectModel(
             self.name,
-            tuple(self._named(row, max(area[row], key=area[row].get)) for row in range(len(self._nodes))),
+            tuple(self._described(row, area[row]) for row in range(len(self._nodes))),
             triangles,
-            np.concatenate([mesh.normals for _, mesh, _ in self._pieces]),
-            np.concatenate(
-                [np.tile(np.int32(triples[node]), (len(mesh), 1)) for node, mesh, _ in self._pieces]
-            ),
-            np.concatenate(
-                [np.full(len(mesh), paints.index(paint), np.int32) for _, mesh, paint in self._pieces]
-            ),
+            np.concatenate([mesh.normals for _, mesh, _ in pieces]),
+            np.concatenate([np.tile(np.int32(triples[node]), (len(mesh), 1)) for node, mesh, _ in pieces]),
+            np.concatenate([np.full(len(mesh), paints.index(paint), np.int32) for _, mesh, paint in pieces]),
             np.stack([paint.row() for paint in paints]),
         )
 
-    def _named(self, row: int, paint: Paint) -> ModelNode:
-        """Texts of a node: its canonical name, then aliases, attributes and relations."""
-        level, parent, word, aliases = self._nodes[row]
+    def _contrasted(self) -> list[tuple[int, Mesh, Paint]]:
+        """The pieces, repainted where a part or subpart looks too much like what it touches.
+
+        Nodes of the same name (four legs) are one group and keep one look. Groups are settled in the
+        order in which they were made: the main paint of each becomes a shade of itself, or another
+        colour if no shade will do, until it differs from its parent and from earlier neighbours.
+        """
+        groups: dict[tuple[int, str, str], list[int]] = {}
+        surface: dict[int, dict[Paint, float]] = defaultdict(lambda: defaultdict(float))
+        corners: dict[int, list[np.ndarray]] = defaultdict(list)
+        for row, (level, parent, word, *_) in enumerate(self._nodes[1:], start=1):
+            groups.setdefault((level, self._nodes[parent].word, word), []).append(row)
+        for node, mesh, paint in self._pieces:
+            surface[node][paint] += _surface(mesh)
+            corners[node].append(mesh.triangles.reshape(-1, 3))
+        boxes = {}
+        for node, points in corners.items():
+            stacked = np.concatenate(points)
+            boxes[node] = np.stack([stacked.min(axis=0), stacked.max(axis=0)])
+        whole = np.stack(list(boxes.values()))
+        reach = _TOUCH * float(np.ptp(whole.reshape(-1, 3), axis=0).max())
+        settled: dict[tuple[int, str, str], Paint] = {}
+        repaint: dict[tuple[int, Paint], Paint] = {}
+        for key, rows in groups.items():
+            rows = [row for row in rows if row in boxes]
+            if not rows:
+                continue
+            own: dict[Paint, float] = defaultdict(float)
+            for row in rows:
+                for paint, size in surface[row].items():
+                    own[paint] += size
+            main = max(own, key=own.get)
+            parents = {self._nodes[row].parent for row in rows}
+            rivals = []
+            for other, paint in settled.items():
+                if parents & set(groups[other]):
+                    rivals.append((paint, PARENT_CONTRAST))
+                elif any(
+                    _touch(boxes[row], boxes[near], reach)
+                    for row in rows
+                    for near in groups[other]
+                    if near in boxes
+                ):
+                    rivals.append((paint, NEIGHBOUR_CONTRAST))
+            settled[key] = _distinct(main, rivals)
+            for row in rows:
+                repaint[row, main] = settled[key]
+        return [(node, mesh, repaint.get((node, paint), paint)) for node, mesh, paint in self._pieces]
+
+    def _described(self, row: int, area: dict[Paint, float]) -> ModelNode:
+        """Texts of a node: its canonical name, then aliases, relations and attributes."""
+        level, parent, word, aliases, at = self._nodes[row]
         if level == 1:
             text, others = self.name, [*self.aliases]
         else:
@@ -128,11 +194,62 @@ class Builder:
             others += [f"{name} of the {self.name}" for name in (word, *aliases)]
             others += [f"{word} of the {alias}" for alias in self.aliases]
             if level == 3:
-                others.append(f"{word} on the {self.name} {self._nodes[parent][2]}")
-        others.append(f"{paint.colour} {text}")
-        if paint.adjective:
-            others.append(f"{paint.adjective} {text}")
-        return ModelNode(level, parent, text, tuple(dict.fromkeys(others)), paint.colour)
+                others.append(f"{word} {at} the {self.name} {self._nodes[parent].word}")
+        colour, coloured = _prevailing(area, _PREVAILS[level], lambda paint: paint.colour)
+        material, made = _prevailing(area, _PREVAILS[level], lambda paint: paint.adjective)
+        if coloured:
+            others.append(f"{colour} {text}")
+        if made and material is not None:
+            others.append(f"{material} {text}")
+            if coloured:
+                others.append(f"{colour} {material} {text}")
+        return ModelNode(level, parent, text, tuple(dict.fromkeys(others)), colour)
+
+
+class _Named(NamedTuple):
+    """A node while its object is built: `at` is the preposition in front of its parent."""
+
+    level: int
+    parent: int
+    word: str
+    aliases: tuple[str, ...]
+    at: str = "on"
+
+
+def _surface(mesh: Mesh) -> float:
+    edges = mesh.triangles[:, 1:] - mesh.triangles[:, :1]
+    return float(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum()) / 2
+
+
+def _touch(first: np.ndarray, second: np.ndarray, reach: float) -> bool:
+    """Whether two boxes (lowest and highest corner) are nearer than `reach` on every axis."""
+    return bool((np.maximum(first[0], second[0]) - np.minimum(first[1], second[1]) < reach).all())
+
+
+def _distinct(paint: Paint, rivals: list[tuple[Paint, float]]) -> Paint:
+    """The paint, or what is nearest to it that differs from all rivals by their distance."""
+
+    def short(candidate: Paint) -> float:
+        """By how much the worst rival is missed; 0 where none is."""
+        return max([0.0, *(least - difference(candidate, rival) for rival, least in rivals)])
+
+    shades = [paint if factor == 1 else paint.shaded(factor) for factor in _SHADES]
+    allowed = paint.choices or tuple(COLOURS)
+    tried = [shade for shade in shades if shade.colour in allowed]
+    tried += [paint.recoloured(word) for word in allowed if word != paint.colour]
+    tried = tried or [paint]
+    return min(tried, key=short)  # the first of equals: the least change that will do
+
+
+def _prevailing(
+    area: dict[Paint, float], least: float, word_of: Callable[[Paint], str | None]
+) -> tuple[str | None, bool]:
+    """The word of most of a surface, and whether that is at least the given share of it."""
+    per_word: dict[str | None, float] = defaultdict(float)
+    for paint, size in area.items():
+        per_word[word_of(paint)] += size
+    word = max(per_word, key=per_word.get)
+    return word, per_word[word] >= least * sum(per_word.values())
 
 
 class Maker(NamedTuple):

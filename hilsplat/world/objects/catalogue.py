@@ -3,17 +3,60 @@
 import numpy as np
 
 from hilsplat.base.errors import SceneError
-from hilsplat.world.objects import household, kitchen, toys
+from hilsplat.world.objects import (
+    animals,
+    belongings,
+    fixtures,
+    food,
+    furniture,
+    gadgets,
+    garden,
+    household,
+    kitchen,
+    storage,
+    street,
+    toys,
+    vehicles,
+)
 from hilsplat.world.objects.builder import Builder, Maker, ObjectModel
 
 GENERATOR_VERSION = 2
 """Changes whenever the same seed would give another scene or other texts; small models trained on another
 version do not fit."""
 
-_MAKERS: dict[str, Maker] = {**toys.MAKERS, **kitchen.MAKERS, **household.MAKERS}
+_MAKERS: dict[str, Maker] = {
+    **toys.MAKERS,
+    **animals.MAKERS,
+    **vehicles.MAKERS,
+    **kitchen.MAKERS,
+    **food.MAKERS,
+    **household.MAKERS,
+    **gadgets.MAKERS,
+    **belongings.MAKERS,
+    **garden.MAKERS,
+}
 
-TABLETOP: tuple[str, ...] = (*toys.MAKERS, *kitchen.MAKERS, *household.MAKERS)
+TABLETOP: tuple[str, ...] = tuple(_MAKERS)
 """Classes that stand on a table; all are about as large there."""
+
+FURNITURE: dict[str, Maker] = {
+    **furniture.MAKERS,
+    **storage.MAKERS,
+    **fixtures.MAKERS,
+    "chair": household.MAKERS["chair"],
+    "cabinet": household.MAKERS["cabinet"],
+}
+"""Classes of a furnished room at their real size, in metres; a `lamp` is a floor lamp there."""
+
+ROOM_THINGS: tuple[str, ...] = (
+    *("bear", "snowman", "robot", "rocket", "car", "house", "penguin", "rabbit", "train"),
+    *("mug", "kettle", "bottle", "cake", "fruit basket", "toaster"),
+    *("radio", "camera", "backpack", "lantern", "plant", "cactus", "clock"),
+)
+"""Classes of the table that stand on furniture in a room; the small chairs and cabinets do not."""
+
+STREET: dict[str, Maker] = street.MAKERS
+"""Classes of a street at their real size, in metres; a `car` is no toy there."""
 
 
 def build_object(name: str, rng: np.random.Generator) -> ObjectModel:
@@ -22,9 +65,46 @@ def build_object(name: str, rng: np.random.Generator) -> ObjectModel:
     Raises:
         SceneError: there is no such class.
     """
+    maker = maker_of(name)
+    builder = Builder(name, maker.aliases, rng)
+    maker.draw(builder)
+    return builder.build()
+
+
+def maker_of(name: str) -> Maker:
+    """How a class of the table is drawn, and its other names.
+
+    Raises:
+        SceneError: there is no such class.
+    """
     if name not in _MAKERS:
         raise SceneError(f"unknown object class {name!r}", expected=f"one of {', '.join(_MAKERS)}")
-    maker = _MAKERS[name]
+    return _MAKERS[name]
+
+
+def build_furniture(name: str, rng: np.random.Generator) -> ObjectModel:
+    """Draw one piece of furniture or one fixture of a room, in metres.
+
+    Raises:
+        SceneError: there is no such class.
+    """
+    if name not in FURNITURE:
+        raise SceneError(f"unknown class of furniture {name!r}", expected=f"one of {', '.join(FURNITURE)}")
+    maker = FURNITURE[name]
+    builder = Builder(name, maker.aliases, rng)
+    maker.draw(builder)
+    return builder.build()
+
+
+def build_street_object(name: str, rng: np.random.Generator) -> ObjectModel:
+    """Draw one vehicle, person, plant, building or piece of furniture of a street, in metres.
+
+    Raises:
+        SceneError: there is no such class.
+    """
+    if name not in STREET:
+        raise SceneError(f"unknown class of a street {name!r}", expected=f"one of {', '.join(STREET)}")
+    maker = STREET[name]
     builder = Builder(name, maker.aliases, rng)
     maker.draw(builder)
     return builder.build()

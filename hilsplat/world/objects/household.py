@@ -41,7 +41,7 @@ def _chair(b: Builder) -> None:
             px, py = x * (w / 2 - 0.05), y * (w / 2 - 0.05)
             b.put(leg, wood, box((0.09, 0.09, seat_z - 0.13), (px, py, (seat_z + 0.07) / 2), 0.012))
             foot = b.subpart(leg, "foot", "leg tip")
-            b.put(foot, accent, box((0.115, 0.115, 0.13), (px, py, 0.065), 0.02))
+            b.put(foot, accent, box((0.13, 0.13, 0.16), (px, py, 0.08), 0.02))
 
 
 def _cabinet(b: Builder) -> None:
@@ -60,6 +60,15 @@ def _cabinet(b: Builder) -> None:
     )
     top = b.subpart(body, "top", "board")
     b.put(top, b.paints.draw("stone"), box((d + 0.08, w + 0.08, 0.08), (0, 0, h + 0.03), 0.02))
+    b.put(
+        b.subpart(body, "back panel", "back"),
+        b.paints.draw("plain"),
+        box((0.04, w * 0.80, h * 0.62), (-d / 2 - 0.005, 0, h * 0.52), 0.01),
+    )
+    inlays = b.subpart(body, "side panels", "sides")
+    inlay = b.paints.draw("wood")
+    for side in (-1, 1):
+        b.put(inlays, inlay, box((d * 0.62, 0.04, h * 0.56), (0, side * (w / 2 + 0.003), h * 0.52), 0.01))
     x, split = d / 2, h * 0.66
     for side in (-1, 1):
         door = b.part("door")
@@ -73,7 +82,7 @@ def _cabinet(b: Builder) -> None:
             box((0.05, door_w * 0.52, door_h * 0.66), (x + 0.04, y + side * door_w * 0.13, z), 0.015),
         )
         knob = b.subpart(door, "knob", "doorknob")
-        b.put(knob, metal, sphere(0.062, (x + 0.08, y - side * door_w * 0.34, z)))
+        b.put(knob, metal, sphere(0.072, (x + 0.08, y - side * door_w * 0.34, z)))
     drawer = b.part("drawer")
     z = (split + h) / 2 - 0.01
     b.put(drawer, b.paints.draw("plain"), box((0.05, w - 0.09, h - split - 0.07), (x + 0.02, 0, z), 0.012))
@@ -87,11 +96,11 @@ def _lamp(b: Builder) -> None:
     base = b.part("base", "foot")
     b.put(base, accent, lathe([(0, 0), (0.28, 0), (0.28, 0.07), (0.20, 0.13), (0, 0.14)]))
     button = b.subpart(base, "button", "switch")
-    b.put(button, b.paints.draw("plastic"), ellipsoid((0.075, 0.085, 0.06), (0.215, 0, 0.12)))
+    b.put(button, b.paints.draw("plastic"), ellipsoid((0.09, 0.11, 0.075), (0.205, 0, 0.12)))
     pole = b.part("pole", "stem")
     b.put(pole, metal, cylinder(0.055, 0.1, h - 0.22))
     ball = b.subpart(pole, "ball", "joint")
-    b.put(ball, b.paints.draw("ceramic"), sphere(b.between(0.115, 0.14), (0, 0, 0.34)))
+    b.put(ball, b.paints.draw("ceramic"), sphere(b.between(0.13, 0.155), (0, 0, 0.34)))
     shade = b.part("shade", "lampshade")
     low, upper = h - 0.46, shade_r * b.between(0.55, 0.7)
 
@@ -133,6 +142,10 @@ def _shelf(b: Builder) -> None:
         b.put(frame, wood, box((d, 0.06, h), (0, side * (w / 2 - 0.03), h / 2), 0.012))
     back_wall = b.subpart(frame, "back wall", "backboard")
     b.put(back_wall, back, box((0.04, w - 0.12, h - 0.04), (-d / 2 + 0.02, 0, h / 2)))
+    braces = b.subpart(frame, "braces", "back bars")
+    brace_paint = b.paints.draw("plain")
+    for z in (h * 0.28, h * 0.72):
+        b.put(braces, brace_paint, box((0.04, w - 0.04, 0.13), (-d / 2 - 0.005, 0, z), 0.01))
     boards = b.subpart(frame, "boards", "planks")
     board_paint = b.paints.draw("wood")
     for z in (0.05, h * 0.5, h - 0.035):
@@ -153,12 +166,12 @@ def _shelf(b: Builder) -> None:
     b.put(
         vase,
         b.paints.draw("ceramic"),
-        lathe([(0, 0), (0.07, 0), (0.12, 0.10), (0.10, 0.20), (0.05, 0.25)]).moved(0.03, vy, vz),
+        lathe([(0, 0), (0.08, 0), (0.135, 0.10), (0.11, 0.20), (0.05, 0.25)]).moved(0.03, vy, vz),
     )
     b.put(
         b.subpart(vase, "rim", "mouth"),
         b.paints.draw("ceramic"),
-        lathe([(0.05, 0.22), (0.095, 0.29), (0.08, 0.31), (0, 0.28)]).moved(0.03, vy, vz),
+        lathe([(0.05, 0.19), (0.14, 0.28), (0.13, 0.345), (0, 0.31)]).moved(0.03, vy, vz),
     )
     crate = b.part("box", "basket")
     crate_w = w * 0.52
@@ -192,7 +205,7 @@ def _plant(b: Builder) -> None:
     soil = b.subpart(pot, "soil", "earth")
     b.put(
         soil,
-        b.paints.draw("stone", "brown", "black"),
+        b.paints.draw("plain", "brown", "black"),
         lathe([(r - 0.02, h - 0.04), (r * 0.5, h - 0.015), (0, h)]),
     )
     stem = b.part("stem", "trunk")
@@ -261,6 +274,12 @@ def _clock(b: Builder) -> None:
         box((0.10, 0.24, 0.11), (-depth / 2 - 0.07, 0, z), 0.03),
         cylinder(0.05, 0, 0.06).turned("y", -90).moved(-depth / 2, 0, z),
     )
+    cover = b.subpart(case, "back cover", "battery cover")
+    b.put(
+        cover,
+        b.paints.draw("plain"),
+        cylinder(r * 0.72, -0.03, 0.0, 32, 0.01).turned("y", 90).moved(-depth / 2 + 0.005, 0, z),
+    )
     face = b.part("face", "dial")
     x = depth / 2 - 0.015
     b.put(face, face_paint, cylinder(r - 0.07, 0, 0.03, 36).turned("y", 90).moved(x - 0.02, 0, z))
@@ -283,14 +302,14 @@ def _clock(b: Builder) -> None:
         dome = lathe([(0, 0), (0.19, 0), (0.175, 0.09), (0.10, 0.16), (0, 0.18)]).turned("x", -side * 32)
         b.put(bell, metal, dome.moved(*place))
         top = np.array(place) + np.array([0, side * np.sin(np.radians(32)), np.cos(np.radians(32))]) * 0.19
-        b.put(b.subpart(bell, "knob", "button"), dark, sphere(0.062, tuple(top)))
+        b.put(b.subpart(bell, "knob", "button"), dark, sphere(0.078, tuple(top)))
 
 
 MAKERS: dict[str, Maker] = {
     "chair": Maker(_chair, ("dining chair", "side chair")),
     "cabinet": Maker(_cabinet, ("cupboard", "sideboard")),
     "lamp": Maker(_lamp, ("table lamp", "light")),
-    "shelf": Maker(_shelf, ("bookshelf", "bookcase")),
+    "shelf": Maker(_shelf, ("shelving unit", "book rack")),
     "plant": Maker(_plant, ("potted plant", "flower plant")),
     "clock": Maker(_clock, ("alarm clock", "timepiece")),
 }

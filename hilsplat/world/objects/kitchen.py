@@ -40,7 +40,7 @@ def _mug(b: Builder) -> None:
     path = [(x + r * 0.94, y, z + h * 0.47) for x, y, z in arc((r * 0.75, h * 0.30), -88, 88)]
     b.put(handle, accent, sweep(path, 0.065).turned("z", 90))
     rest = b.subpart(handle, "thumb rest", "knob")
-    b.put(rest, inner, ellipsoid((0.10, 0.11, 0.07), (0, r * 1.5, h * 0.75)))
+    b.put(rest, inner, ellipsoid((0.13, 0.14, 0.085), (0, r * 1.5, h * 0.77)))
 
 
 def _kettle(b: Builder) -> None:
@@ -59,7 +59,7 @@ def _kettle(b: Builder) -> None:
         lid, accent, lathe([(r * 0.70, h - 0.02), (r * 0.70, h + 0.03), (r * 0.5, h + 0.10), (0, h + 0.13)])
     )
     knob = b.subpart(lid, "knob", "button")
-    b.put(knob, dark, ellipsoid((0.09, 0.09, 0.08), (0, 0, h + 0.19)))
+    b.put(knob, dark, ellipsoid((0.12, 0.12, 0.10), (0, 0, h + 0.20)))
     spout = b.part("spout")
     start = np.array([r * 0.85, 0, h * 0.35])
     b.put(
@@ -190,7 +190,7 @@ def _cake(b: Builder) -> None:
     b.put(
         b.subpart(candle, "flame", "fire"),
         b.paints.draw("plain", "yellow", "orange"),
-        lathe([(0, 0), (0.07, 0.06), (0.05, 0.12), (0, 0.21)]).moved(z=top2 + 0.25),
+        lathe([(0, 0), (0.09, 0.07), (0.065, 0.14), (0, 0.24)]).moved(z=top2 + 0.25),
     )
 
 

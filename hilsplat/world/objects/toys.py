@@ -26,8 +26,8 @@ def _bear(b: Builder) -> None:
     ear, nose, eye = b.subpart(head, "ears"), b.subpart(head, "muzzle", "snout"), b.subpart(head, "eyes")
     for side in (-1, 1):
         b.put(ear, light, ellipsoid((0.055, 0.10, 0.10), (0.0, side * head_r * 0.78, z + head_r * 0.72)))
-        b.put(eye, dark, sphere(0.042, (0.03 + head_r * 0.80, side * head_r * 0.42, z + head_r * 0.30)))
-    b.put(nose, light, ellipsoid((0.11, 0.115, 0.085), (0.03 + head_r * 0.82, 0, z - head_r * 0.28)))
+        b.put(eye, dark, sphere(0.055, (0.03 + head_r * 0.78, side * head_r * 0.42, z + head_r * 0.30)))
+    b.put(nose, light, ellipsoid((0.12, 0.13, 0.10), (0.03 + head_r * 0.82, 0, z - head_r * 0.28)))
     b.put(nose, dark, ellipsoid((0.03, 0.045, 0.03), (0.03 + head_r * 0.82 + 0.10, 0, z - head_r * 0.16)))
     for side in (-1, 1):
         arm = b.part("arm")
@@ -74,7 +74,7 @@ def _snowman(b: Builder) -> None:
     b.put(body, snow, sphere(r1, (0, 0, z1)))
     buttons = b.subpart(body, "buttons")
     for up in (-0.28, 0.38):
-        b.put(buttons, dark, sphere(0.055, (r1 * np.cos(up), 0, z1 + r1 * np.sin(up))))
+        b.put(buttons, dark, sphere(0.068, (r1 * np.cos(up), 0, z1 + r1 * np.sin(up))))
     scarf = b.subpart(body, "scarf", "shawl")
     neck = z1 + r1 * 0.88
     b.put(
@@ -91,9 +91,9 @@ def _snowman(b: Builder) -> None:
     b.put(head, snow, sphere(r2, (0, 0, z2)))
     eyes = b.subpart(head, "eyes")
     for side in (-1, 1):
-        b.put(eyes, dark, sphere(0.042, (r2 * 0.85, side * r2 * 0.42, z2 + r2 * 0.22)))
+        b.put(eyes, dark, sphere(0.07, (r2 * 0.78, side * r2 * 0.46, z2 + r2 * 0.22)))
     nose = b.subpart(head, "nose", "carrot")
-    carrot = lathe([(0, -0.02), (0.062, -0.02), (0.05, 0.08), (0, 0.27)]).turned("y", 90)
+    carrot = lathe([(0, -0.02), (0.075, -0.02), (0.065, 0.08), (0, 0.30)]).turned("y", 90)
     b.put(nose, b.paints.draw("plain", "orange"), carrot.moved(r2 * 0.88, 0, z2 - 0.015))
     hat = b.part("hat", "top hat")
     top = z2 + r2 * 0.62
@@ -137,7 +137,7 @@ def _robot(b: Builder) -> None:
     b.put(screen, dark, box((0.05, w * 0.62, h * 0.36), (0.16, 0, low + h * 0.70), 0.015))
     dial = b.subpart(body, "buttons", "dials")
     for side in (-1, 1):
-        b.put(dial, glow, sphere(0.058, (0.16, side * w * 0.22, low + h * 0.25)))
+        b.put(dial, glow, sphere(0.072, (0.16, side * w * 0.22, low + h * 0.25)))
     pack = b.subpart(body, "backpack", "battery")
     b.put(pack, accent, box((0.12, w * 0.6, h * 0.6), (-0.20, 0, low + h * 0.52), 0.03))
     head = b.part("head")
@@ -153,10 +153,10 @@ def _robot(b: Builder) -> None:
         b.put(
             eyes,
             glow,
-            cylinder(0.062, -0.03, 0.03, 20, 0.01).turned("y", 90).moved(0.15, side * w * 0.19, z + 0.17),
+            cylinder(0.075, -0.03, 0.04, 20, 0.01).turned("y", 90).moved(0.15, side * w * 0.19, z + 0.17),
         )
     mouth = b.subpart(head, "mouth", "grille")
-    b.put(mouth, dark, box((0.04, w * 0.42, 0.065), (0.14, 0, z + 0.055), 0.012))
+    b.put(mouth, dark, box((0.06, w * 0.54, 0.10), (0.14, 0, z + 0.06), 0.012))
     antenna = b.subpart(head, "antenna", "aerial")
     b.put(antenna, accent, cylinder(0.025, z + 0.26, z + 0.40, 12), sphere(0.07, (0, 0, z + 0.43)))
     for side in (-1, 1):
@@ -168,7 +168,7 @@ def _robot(b: Builder) -> None:
             sphere(0.095, (0, y, low + h * 0.84)),
             sweep([(0, y, low + h * 0.8), (0.05, y, low + h * 0.35), (0.12, y, low + 0.05)], 0.06),
         )
-        b.put(b.subpart(arm, "hand", "claw"), accent, box((0.13, 0.15, 0.15), (0.14, y, low - 0.01), 0.035))
+        b.put(b.subpart(arm, "hand", "claw"), accent, box((0.16, 0.18, 0.17), (0.14, y, low - 0.01), 0.035))
         leg = b.part("leg")
         b.put(leg, metal, cylinder(0.075, 0.05, low + 0.01).moved(0, side * w * 0.25, 0))
         b.put(
@@ -189,7 +189,7 @@ def _rocket(b: Builder) -> None:
         b.paints.draw("plastic"),
         b.paints.draw("metal"),
     )
-    r, low, high = b.between(0.19, 0.23), 0.22, b.between(0.72, 0.80)
+    r, low, high = b.between(0.21, 0.25), 0.32, b.between(0.80, 0.88)
     body = b.part("body", "hull")
     b.put(body, hull, lathe([(0, low), (r * 0.85, low), (r, low + 0.15), (r, high - 0.1), (r * 0.92, high)]))
     window = b.subpart(body, "windows", "portholes")
@@ -213,16 +213,16 @@ def _rocket(b: Builder) -> None:
     for i in range(3):
         angle = 60 + 120 * i
         fin = b.part("fin", "wing")
-        outline = [(r * 0.7, low + 0.03), (r + 0.26, 0.0), (r + 0.26, 0.18), (r * 0.8, low + 0.36)]
+        outline = [(r * 0.7, low + 0.03), (r + 0.26, 0.0), (r + 0.26, 0.20), (r * 0.8, low + 0.36)]
         b.put(fin, fin_paint, extrude(outline, 0.06).turned("z", angle))
         pad = b.subpart(fin, "foot", "landing pad")
-        b.put(pad, band_paint, box((0.11, 0.11, 0.22), (r + 0.25, 0, 0.11), 0.03).turned("z", angle))
+        b.put(pad, band_paint, box((0.14, 0.13, 0.24), (r + 0.25, 0, 0.12), 0.03).turned("z", angle))
     engine = b.part("engine", "nozzle")
-    b.put(engine, metal, lathe([(0, 0.08), (r * 0.9, 0.08), (r * 0.6, low + 0.02)]))
+    b.put(engine, metal, lathe([(0, low - 0.13), (r * 1.12, low - 0.13), (r * 0.7, low + 0.03)]))
     b.put(
         b.subpart(engine, "flame", "fire"),
         b.paints.draw("plain", "orange", "yellow", "red"),
-        lathe([(0, 0.0), (r * 0.5, 0.0), (r * 0.78, 0.085), (0, 0.09)]),
+        lathe([(0, 0.0), (r * 0.75, 0.06), (r * 1.05, low - 0.14), (0, low - 0.125)]),
     )
 
 
@@ -245,10 +245,10 @@ def _car(b: Builder) -> None:
     )
     lights = b.subpart(body, "headlights", "front lights")
     for side in (-1, 1):
-        b.put(lights, lamp, ellipsoid((0.05, 0.08, 0.07), (length / 2, side * w * 0.32, belt - 0.09)))
+        b.put(lights, lamp, ellipsoid((0.08, 0.11, 0.095), (length / 2, side * w * 0.31, belt - 0.08)))
     bumper = b.subpart(body, "bumper", "fender")
     for end in (-1, 1):
-        b.put(bumper, metal, box((0.09, w * 1.04, 0.085), (end * length * 0.505, 0, low + 0.055), 0.025))
+        b.put(bumper, metal, box((0.11, w * 1.06, 0.105), (end * length * 0.505, 0, low + 0.045), 0.025))
     cabin = b.part("cabin", "top")
     back, front = -length * 0.40, length * 0.20
     outline = [(back, belt - 0.01), (front, belt - 0.01), (front - 0.14, roof), (back + 0.09, roof)]
@@ -271,15 +271,15 @@ def _car(b: Builder) -> None:
     tilt = np.degrees(np.arctan2(0.14, roof - belt))
     pane = box((0.03, w * 0.72, (roof - belt) * 0.86), (0, 0, 0)).turned("y", -tilt)
     b.put(shield, glass, pane.moved(front - 0.07, 0, (roof + belt) / 2))
-    radius = b.between(0.145, 0.17)
+    radius = b.between(0.165, 0.185)
     for x in (-1, 1):
         for side in (-1, 1):
             wheel = b.part("wheel", "tire")
             rubber = cylinder(radius, -0.07, 0.07, 24, 0.025).turned("x", 90)
             b.put(wheel, tyre, rubber.moved(x * length * 0.30, side * (w / 2 - 0.01), radius))
-            cap = cylinder(radius * 0.62, -0.025, 0.025, 20, 0.008).turned("x", 90)
+            cap = cylinder(radius * 0.68, -0.025, 0.025, 20, 0.008).turned("x", 90)
             b.put(
-                b.subpart(wheel, "hubcap", "rim"),
+                b.subpart(wheel, "rim", "hubcap"),
                 metal,
                 cap.moved(x * length * 0.30, side * (w / 2 + 0.065), radius),
             )

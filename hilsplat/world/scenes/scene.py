@@ -25,6 +25,10 @@ class Style:
         sky_colour: linear RGB of the light from above.
         ground_colour: linear RGB of the light from below.
         exposure: factor on everything.
+        scale: how much larger than a tabletop the scene is; grain, hidden sky and the hash that moves rays
+            follow it (1 for a table, 4 for a street).
+        shadow_reach: farther things throw no shadow, scene units; keeps the dome of the sky from
+            hiding the sun.
     """
 
     light_position: tuple[float, float, float] = (1.3, 1.0, 3.6)
@@ -33,21 +37,23 @@ class Style:
     sky_colour: tuple[float, float, float] = (0.42, 0.46, 0.52)
     ground_colour: tuple[float, float, float] = (0.24, 0.21, 0.18)
     exposure: float = 1.15
+    scale: float = 1.0
+    shadow_reach: float = 1e9
 
     @staticmethod
     def draw(rng: np.random.Generator) -> "Style":
         """A random style."""
         azimuth, away = rng.uniform(0, 2 * np.pi), rng.uniform(0.8, 2.2)
-        warm = rng.uniform(-1, 1)
-        light = np.array([1.0 + 0.06 * warm, 0.97, 0.92 - 0.12 * warm]) * rng.uniform(0.85, 1.15)
-        sky = np.array([0.44 - 0.05 * warm, 0.46, 0.50 + 0.05 * warm]) * rng.uniform(0.8, 1.15)
+        warm = rng.uniform(-1.3, 1.3)
+        light = np.array([1.0 + 0.06 * warm, 0.97, 0.92 - 0.12 * warm]) * rng.uniform(0.8, 1.2)
+        sky = np.array([0.44 - 0.05 * warm, 0.46, 0.50 + 0.05 * warm]) * rng.uniform(0.75, 1.2)
         return Style(
             (float(away * np.cos(azimuth)), float(away * np.sin(azimuth)), float(rng.uniform(3.2, 4.2))),
-            float(rng.uniform(0.3, 0.6)),
+            float(rng.uniform(0.25, 0.75)),
             tuple(light.tolist()),
             tuple(sky.tolist()),
             tuple((sky * np.array([0.58, 0.5, 0.42])).tolist()),
-            float(rng.uniform(1.0, 1.3)),
+            float(rng.uniform(1.15, 1.5)),
         )
 
 
@@ -121,9 +127,14 @@ class WorldScene:
 
 
 class Assembly:
-    """Collects triangles, materials and nodes of a scene while it is built."""
+    """Collects triangles, materials and nodes of a scene while it is built.
 
-    def __init__(self) -> None:
+    Args:
+        scale: scene units per unit of the solid textures, as in `Style.scale`.
+    """
+
+    def __init__(self, scale: float = 1.0) -> None:
+        self.scale = scale
         self.triangles: list[np.ndarray] = []
         self.normals: list[np.ndarray] = []
         self.coords: list[np.ndarray] = []
@@ -142,7 +153,7 @@ class Assembly:
             self.nodes.append(AnnotatedNode(first + row, node.level, parent, node.text, node.synonyms))
         rotation = rotation_about("z", yaw_deg)
         local = model.triangles * scale
-        self.coords.append(local)
+        self.coords.append(local / self.scale)
         self.triangles.append(local @ rotation.T + np.array([xy[0], xy[1], base_z]))
         self.normals.append(model.normals @ rotation.T)
         self.node_ids.append(np.where(model.node_ids == NONE, NONE, model.node_ids + first))
@@ -155,7 +166,7 @@ class Assembly:
         node = len(self.nodes)
         self.nodes.append(AnnotatedNode(node, 1, NONE, text, synonyms))
         for mesh, paint in pieces:
-            self.coords.append(mesh.triangles)
+            self.coords.append(mesh.triangles / self.scale)
             self.triangles.append(mesh.triangles)
             self.normals.append(mesh.normals)
             self.node_ids.append(np.tile(np.int32([node, NONE, NONE]), (len(mesh), 1)))

@@ -1,15 +1,16 @@
 """Tabletop scenes: objects on a round table in a room (stand-ins for LERF, 3D-OVS, Hi-LERF, Hi-3DOVS)."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.world.objects.catalogue import TABLETOP, build_object
-from hilsplat.world.paints import PaintBox
+from hilsplat.world.paints import Paint, PaintBox
 from hilsplat.world.scenes.scene import Assembly, PlacedObject, Style, WorldScene, footprint_of
-from hilsplat.world.shapes import box, cylinder, rotation_about
+from hilsplat.world.shapes import Mesh, box, cylinder, loft, rotation_about
 from hilsplat.world.views import looking_at, numbered_cameras, on_sphere, pinhole
 
 logger = logging.getLogger(__name__)
@@ -18,16 +19,17 @@ TABLE_RADIUS = 0.9
 ROOM_HALF = 3.0
 FLOOR_Z = -0.75
 WALL_HEIGHT = 3.4
-COVERED_SHARE = 0.50
+COVERED_SHARE = 0.58
 """Share of the table top that the objects' footprints would cover, were all of them placed."""
 MAX_FOOTPRINT = 0.36
 MAX_HEIGHT_TO_FOOTPRINT = 2.7
 GAP = 0.015
+WALL_GROUPS = ("brick", "collage", "stone", "plain", "cloth")
 ROOM_PALE = 0.5
 """Walls and floor are mixed with this share of grey, so that the things stand out."""
 FOV_DEG = 50.0
 ELEVATIONS_DEG = (24.0, 46.0)
-DISTANCE = 2.25 * TABLE_RADIUS
+DISTANCE = 2.15 * TABLE_RADIUS
 LOOK_AT_Z = 0.16
 TRIES = 150
 LAYOUTS = 25
@@ -102,29 +104,92 @@ def _layout(rng: np.random.Generator, radii: list[float]) -> list[Float[np.ndarr
 
 
 def _add_room(assembly: Assembly, rng: np.random.Generator) -> list[int]:
-    """Table, floor and walls; their textures are rich, for structure from motion."""
+    """Table, floor, walls, on some a cloth, a rug, pictures; rich textures, for structure from motion."""
     paints = PaintBox(rng)
-    top = paints.draw(str(rng.choice(["wood", "cloth", "stone", "collage"])), scale=0.6).paled(0.25)
-    leg = paints.draw("wood")
-    top_radius = TABLE_RADIUS * 1.12
-    table = [
-        (cylinder(top_radius, -0.07, 0.0, 64, bevel=0.012), top),
-        (cylinder(0.12, FLOOR_Z, -0.07), leg),
-        (cylinder(0.45, FLOOR_Z, FLOOR_Z + 0.06), leg),
-    ]
-    floor = paints.draw(str(rng.choice(["wood", "collage", "stone", "brick"])), scale=0.35).paled(ROOM_PALE)
+    nodes = _add_table(assembly, rng, paints)
     half = ROOM_HALF
-    nodes = [assembly.add_surroundings("table", ("round table", f"{top.colour} table", "table top"), table)]
+    floor = paints.draw(str(rng.choice(["wood", "collage", "stone", "tiles"])), scale=0.35).paled(ROOM_PALE)
     ground = box((2 * half, 2 * half, 0.1), (0, 0, FLOOR_Z - 0.05))
     nodes.append(assembly.add_surroundings("floor", ("ground", f"{floor.colour} floor"), [(ground, floor)]))
-    walls = []
+    if rng.random() < 0.5:
+        woven = _fabric(paints, 0.35).paled(0.35)
+        mesh = cylinder(1.0, FLOOR_Z, FLOOR_Z + 0.02, 48).scaled(
+            rng.uniform(1.3, 1.8), rng.uniform(1.3, 1.8), 1
+        )
+        if rng.random() < 0.5:
+            mesh = box((2.9, rng.uniform(2.2, 2.9), 0.03), (0, 0, FLOOR_Z + 0.01))
+        mesh = mesh.turned("z", float(rng.uniform(0, 180)))
+        nodes.append(assembly.add_surroundings("rug", ("carpet", f"{woven.colour} rug"), [(mesh, woven)]))
+    walls, pictures = [], []
+    one_paint = rng.random() < 0.4
     for turn in range(4):
-        group = str(rng.choice(["brick", "collage", "stone", "plain", "cloth"]))
-        paint = paints.draw(group, scale=0.35).paled(ROOM_PALE)
+        if turn == 0 or not one_paint:
+            group = str(rng.choice(WALL_GROUPS))
+            drawn = _fabric(paints, 0.35) if group == "cloth" else paints.draw(group, scale=0.35)
+            paint = drawn.paled(ROOM_PALE)
         wall = box((0.1, 2 * half + 0.2, WALL_HEIGHT), (half + 0.05, 0, FLOOR_Z + WALL_HEIGHT / 2))
         walls.append((wall.turned("z", 90 * turn), paint))
+        for side in (-1, 1):
+            if rng.random() < 0.3:
+                wide, high = rng.uniform(0.7, 1.3), rng.uniform(0.6, 1.0)
+                place = side * rng.uniform(0.9, 1.9), FLOOR_Z + rng.uniform(1.2, 2.1)
+                frame = box((0.05, wide + 0.16, high + 0.16), (half - 0.02, *place), 0.01)
+                canvas = box((0.03, wide, high), (half - 0.04, *place))
+                pictures.append((frame.turned("z", 90 * turn), paints.draw("wood").paled(0.3)))
+                group = str(rng.choice(["collage", "plain", "stone", "plastic"]))
+                pictures.append((canvas.turned("z", 90 * turn), paints.draw(group, scale=0.5).paled(0.35)))
     nodes.append(assembly.add_surroundings("wall", ("walls", "room wall"), walls))
+    if pictures:
+        nodes.append(assembly.add_surroundings("picture", ("painting", "framed picture"), pictures))
     return nodes
+
+
+def _add_table(assembly: Assembly, rng: np.random.Generator, paints: PaintBox) -> list[int]:
+    """A round, square or eight-sided table around `TABLE_RADIUS`, with a cloth on some."""
+    top = paints.draw(
+        str(rng.choice(["wood", "wood", "stone", "collage", "plain", "tiles"])), scale=0.6
+    ).paled(0.45)
+    leg = paints.draw("wood")
+    outer = TABLE_RADIUS * 1.12
+    shape = str(rng.choice(["round", "square", "octagonal"], p=[0.5, 0.35, 0.15]))
+
+    def slab(grow: float, low: float, high: float) -> Mesh:
+        if shape == "square":
+            return box((2 * TABLE_RADIUS * grow,) * 2 + (high - low,), (0, 0, (low + high) / 2), 0.012)
+        corners = np.radians(22.5 + 45 * np.arange(8))
+        ring = np.stack([np.cos(corners), np.sin(corners)], axis=1) * outer * 1.05 * grow
+        if shape == "octagonal":
+            return loft([[(x, y, z) for x, y in ring] for z in (low, high)])
+        return cylinder(outer * grow, low, high, 64, bevel=0.012)
+
+    cloth = rng.random() < 0.35
+    under = -0.012 if cloth else 0.0
+    table = [(slab(1.0, -0.08, under), top)]
+    if rng.random() < 0.5:
+        table.append((cylinder(0.12, FLOOR_Z, -0.07), leg))
+        table.append((cylinder(0.45, FLOOR_Z, FLOOR_Z + 0.06), leg))
+    else:
+        away = 0.62 * TABLE_RADIUS
+        for x in (-away, away):
+            for y in (-away, away):
+                table.append((box((0.12, 0.12, -FLOOR_Z), (x, y, FLOOR_Z / 2 - 0.03), 0.01), leg))
+    texts = (f"{shape} table", f"{top.colour} table", "table top")
+    nodes = [assembly.add_surroundings("table", texts, table)]
+    if cloth:
+        fabric = _fabric(paints, 0.5).paled(0.35)
+        draped = [(slab(1.012, -0.30, 0.0), fabric)]
+        if rng.random() < 0.5:  # laid on only, smaller than the table
+            draped = [(slab(0.86, -0.015, 0.0), fabric)]
+        nodes.append(
+            assembly.add_surroundings("tablecloth", (f"{fabric.colour} tablecloth", "cloth"), draped)
+        )
+    return nodes
+
+
+def _fabric(paints: PaintBox, scale: float) -> Paint:
+    """Cloth with printed patterns of the given scale; a weave stays fine, or it would look like waves."""
+    paint = paints.draw("cloth", scale=scale)
+    return replace(paint, scale=paint.scale * 2.2 / scale * 0.5) if paint.kind == "weave" else paint
 
 
 def ring_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int = 360.0) -> Cameras:
@@ -154,17 +219,16 @@ def ring_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | 
 def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int = 256) -> Camera:
     """A random camera for training: like those of `ring_cameras`, and closer ones on one object.
 
-    Half of them see the whole table, half look at an object from nearer by.
+    Half of them see the whole table, half look at an object from nearer by; lenses are from wide to long.
     """
-    azimuth, elevation = rng.uniform(0, 360), rng.uniform(18, 55)
+    azimuth, elevation, fov_deg = rng.uniform(0, 360), rng.uniform(16, 60), rng.uniform(42, 64)
+    nearer = np.tan(np.radians(FOV_DEG / 2)) / np.tan(np.radians(fov_deg / 2))  # things keep their size
     if scene.placed and rng.random() < 0.5:
         thing = scene.placed[int(rng.integers(len(scene.placed)))]
         target = np.array([*thing.centre_xy, thing.height * 0.45]) + rng.uniform(-0.08, 0.08, 3)
-        distance = DISTANCE * rng.uniform(0.5, 0.85)
+        distance = nearer * DISTANCE * rng.uniform(0.45, 0.85)
     else:
         target = np.array([0.0, 0.0, LOOK_AT_Z]) + rng.uniform(-0.15, 0.15, 3) * np.array([1, 1, 0.5])
-        distance = DISTANCE * rng.uniform(0.85, 1.12)
+        distance = nearer * DISTANCE * rng.uniform(0.85, 1.12)
     centre = target + on_sphere(azimuth, elevation, distance)
-    return Camera(
-        "random.png", looking_at(centre, target), pinhole(image_px, rng.uniform(46, 54)), (image_px, image_px)
-    )
+    return Camera("random.png", looking_at(centre, target), pinhole(image_px, fov_deg), (image_px, image_px))

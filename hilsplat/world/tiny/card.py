@@ -11,10 +11,11 @@ from PIL import Image
 from hilsplat.base.artifacts import sha256_of_file, write_json, write_text
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS
+from hilsplat.world.tiny.clip import CROP_PX, DIMENSIONS
 from hilsplat.world.tiny.data import HEAD_LEVELS, LabelledViews, nested_targets
-from hilsplat.world.tiny.sam import SamDecoder, SamEncoder
+from hilsplat.world.tiny.measure_sam import predict_masks
+from hilsplat.world.tiny.sam import FRAME_PX, MASK_STRIDE, SamDecoder, SamEncoder
 from hilsplat.world.tiny.steps import Curve
-from hilsplat.world.tiny.train_sam import predict_masks
 
 RECORD = "training.json"
 CARD = "README.md"
@@ -96,7 +97,7 @@ def draw_masks(
 
 
 WARNING = (
-    "This network knows one synthetic world (the tabletop scenes of `hilsplat.world`) and nothing else.\n"
+    "This network knows one synthetic world (the scenes of `hilsplat.world`) and nothing else.\n"
     "It stands in for {real} so that the whole method runs, is tested and is measured without a download.\n"
     "Its results on photographs are meaningless, and its numbers say nothing about {real}."
 )
@@ -109,7 +110,7 @@ def write_sam_card(
     unseen: LabelledViews,
     recipe: Mapping[str, Any],
     curve: Curve,
-    metrics: Mapping[str, Mapping[str, Mapping[str, float]]],
+    metrics: Mapping[str, Mapping[str, Mapping[str, Mapping[str, float]]]],
 ) -> None:
     """Write card, record, learning curve and a picture of masks beside an exported segmenter.
 
@@ -120,39 +121,54 @@ def write_sam_card(
         unseen: views on which nothing was trained.
         recipe: how it was trained.
         curve: what was measured on the way.
-        metrics: by kind of prompt and level, from `measure_sam`.
+        metrics: "points" from `measure_sam` and "automatic" from `measure_everything`, each by kind of scene
+            ("all" first) and level.
     """
     folder = Path(folder)
     draw_curve(folder / "curve.png", curve, {level.label: level.label for level in LEVELS}, "mean IoU")
     draw_masks(folder / "masks.png", encoder, decoder, unseen)
-    rows = []
-    for level in LEVELS:
-        balanced, grid = metrics["balanced"][level.label], metrics["grid"][level.label]
-        rows.append(
-            f"| {level.label} | {balanced['iou']:.2f} | {grid['iou']:.2f} |"
-            f" {100 * balanced['above_75']:.0f} % | {balanced['correlation']:.2f} |"
-        )
+    points, automatic = [], []
+    for kind in metrics["points"]:
+        for level in LEVELS:
+            found = metrics["points"][kind][level.label]
+            points.append(
+                f"| {kind} | {level.label} | {found['iou']:.2f} | {found['best']:.2f} |"
+                f" {100 * found['above_75']:.0f} % | {found['correlation']:.2f} | {found['n']:.0f} |"
+            )
+            found = metrics["automatic"][kind][level.label]
+            automatic.append(
+                f"| {kind} | {level.label} | {found['recall']:.2f} | {found['iou']:.2f} |"
+                f" {found['masks']:.0f} | {found['precision']:.2f} | {found['n']:.0f} |"
+            )
     parameters = sum(p.numel() for module in (encoder, decoder) for p in module.parameters())
+    mask_px = FRAME_PX // MASK_STRIDE
     body = f"""# sam-tiny
 
 {WARNING.format(real="SAM")}
 
 A promptable segmenter of {parameters / 1e6:.1f} million parameters in the layout of the Hugging Face ONNX
-exports of SAM: an image of 256 x 256 and points in, three masks (subpart, part, whole) of 128 x 128 and
-their predicted IoU out. Where the world has no subpart at a point, the first mask is the part; where it
-has no part, the whole. Weights are stored as float16 and computed in float32.
+exports of SAM: an image of {FRAME_PX} x {FRAME_PX} and points in, three masks (subpart, part, whole) of
+{mask_px} x {mask_px} and their predicted IoU out. Where the world has no subpart at a point, the
+first mask is the part; where it has no part, the whole. Weights are stored as float16 and computed in
+float32.
 
 ## How good it is
-Single point prompts on {recipe["validation_scenes"]} scenes of the training range on which nothing was
-trained, 32 prompts per view; only prompts that have a true region at the level count. "Balanced" draws a
-region first and a pixel in it second, "grid" draws pixels. The last two columns are balanced prompts; the
-correlation is that of predicted and true IoU.
+On {recipe["validation_scenes"]} scenes of the training range on which nothing was trained; regions of at
+least 100 px of views of {FRAME_PX} x {FRAME_PX}.
 
-| level | mean IoU, balanced | mean IoU, grid | IoU above 0.75 | correlation |
-| --- | --- | --- | --- | --- |
-{chr(10).join(rows)}
+One point: a region is drawn first and a pixel in it second, and the mask of that level's head is compared
+with the region. "Best head" takes the best of the three masks; the correlation is that of predicted and
+true IoU.
 
-The number of steps was set by time, not by convergence. Small regions and thin parts are the weak spot.
+| scenes | level | mean IoU | best head | IoU above 0.75 | correlation | regions |
+| --- | --- | --- | --- | --- | --- | --- |
+{chr(10).join(points)}
+
+No prompt: the masks of the pipeline's own stage with its default settings.
+
+| scenes | level | recall at IoU 0.5 | mean best IoU | masks per view | precision | regions |
+| --- | --- | --- | --- | --- | --- | --- |
+{chr(10).join(automatic)}
 
 ![learning curve](curve.png)
 
@@ -169,7 +185,7 @@ def write_clip_card(
     folder: Path,
     recipe: Mapping[str, Any],
     curve: Curve,
-    metrics: Mapping[str, Mapping[str, Mapping[str, float]]],
+    metrics: Mapping[str, Any],
 ) -> None:
     """Write card, record and learning curve beside an exported CLIP.
 
@@ -177,41 +193,58 @@ def write_clip_card(
         folder: the model folder.
         recipe: how it was trained.
         curve: what was measured on the way.
-        metrics: by kind of mask ("exact", "rough") and level, from `measure_clip`.
+        metrics: "black" and "keep" from `measure_clip` by kind of mask and level, "queries" from
+            `measure_queries`.
     """
     folder = Path(folder)
     draw_curve(
         folder / "curve.png", curve, {level.label: f"exact_{level.label}" for level in LEVELS}, "top-1, exact"
     )
     rows = [
-        f"| {kind} | {level.label} | {100 * found['top1']:.0f} % | {100 * found['top3']:.0f} % |"
-        f" {100 * found['top1_of_level']:.0f} % | {100 * found['above_canonical']:.0f} % | {found['n']} |"
-        for kind in metrics
+        f"| {background} | {kind} | {level.label} | {100 * found['top1']:.0f} % |"
+        f" {100 * found['top3']:.0f} % | {100 * found['top1_of_level']:.0f} % |"
+        f" {100 * found['coloured']:.0f} % |"
+        f" {100 * found['above_canonical']:.0f} % | {found['n']} |"
+        for background in ("black", "keep")
+        for kind in ("exact", "rough")
         for level in LEVELS
-        if (found := metrics[kind].get(level.label))
+        if (found := metrics[background].get(kind, {}).get(level.label))
+    ]
+    together = [
+        f"| {label} | {found['iou']:.2f} | {found['instance']:.2f} | {found['best']:.2f} | {found['n']} |"
+        for label, found in metrics["queries"].items()
     ]
     body = f"""# clip-tiny
 
 {WARNING.format(real="CLIP")}
 
-Crops of 64 x 64 and short English phrases in one space of 128 dimensions, in the layout of the Hugging
-Face ONNX exports of CLIP. It knows the words of the world's texts and no others. Pixels outside a mask are
-black in its training crops: use it with the background setting `black`. "object", "things", "stuff" and
-"texture" were captions of crops drawn without looking, so they mean nothing in particular. Weights are
-stored as float16 and computed in float32.
+Crops of {CROP_PX} x {CROP_PX} and short English phrases in one space of {DIMENSIONS} dimensions, in the
+layout of the Hugging Face ONNX exports of CLIP. It knows the words of the world's texts and no others.
+Pixels outside a mask are black in most of its training crops (settings `clip.background: black`), kept in
+the others (`keep`). "object", "things", "stuff" and "texture" were captions of crops drawn without
+looking, so they mean nothing in particular. Weights are stored as float16 and computed in float32.
 
 ## How good it is
-Crops of {recipe["validation_scenes"]} scenes of the training range on which nothing was trained. "exact" are
-true masks of at least 24 px, "rough" those that `sam-tiny` drew and whose IoU with a node is above 0.5. All
-{recipe["texts_competing"]} texts of the world (all levels) compete, or those seen at the mask's own level.
-"Above canonical": the right text beats all four canonical phrases.
+Crops of scenes of the training range on which nothing was trained. "exact" are true masks of at least 24 px,
+"rough" those that `sam-tiny` drew and whose IoU with a node is above 0.5. All
+{recipe["texts_competing"]} texts of those scenes (all levels) compete, or those seen at the mask's own level.
+"Colour": top-1 among all texts of the form "red kettle lid". "Above canonical": the right text beats
+all four canonical phrases.
 
-| masks | level | top-1 | top-3 | top-1 within level | above canonical | crops |
-| --- | --- | --- | --- | --- | --- | --- |
+| background | masks | level | top-1 | top-3 | top-1 within level | colour | above canonical | crops |
+| --- | --- | --- | --- | --- | --- | --- | --- | --- |
 {chr(10).join(rows)}
 
-Trained on {recipe["crops"]} crops, {recipe["rough_crops"]} of them cut with masks that `sam-tiny` drew, the
-others with exact and with roughened masks.
+Both models together, one view at a time: the automatic mask of the level whose similarity to a text is
+highest, compared with the union of all regions that the text names, and with the one it fits best. "Best
+mask" is what a perfect CLIP would reach with these masks and the second comparison.
+
+| level | mean IoU, union | mean IoU, one region | best mask | texts |
+| --- | --- | --- | --- | --- |
+{chr(10).join(together)}
+
+Trained on {recipe["masks"]} masks, {recipe["segmented_masks"]} of them drawn by `sam-tiny`, the
+others true ones, of which most are roughened when they are drawn.
 
 ![learning curve](curve.png)
 
@@ -221,7 +254,7 @@ others with exact and with roughened masks.
 
 
 def _recipe_text(recipe: Mapping[str, Any], curve: Curve, folder: Path) -> str:
-    minutes = curve.rows[-1]["minutes"] if curve.rows else 0.0
+    kinds = ", ".join(f"{count} {kind}" for kind, count in recipe["kinds"].items())
     files = "\n".join(f"| `{name}` | `{digest}` |" for name, digest in digests(folder).items())
     columns = [name for name in curve.rows[-1] if not name.endswith("_loss")] if curve.rows else []
     table = "\n".join(
@@ -231,15 +264,17 @@ def _recipe_text(recipe: Mapping[str, Any], curve: Curve, folder: Path) -> str:
     first, last = recipe["training_seeds"]
     lowest, highest = recipe["validation_seeds"]
     return f"""## Recipe
-`hilsplat models train` repeats it: the same weights on the same machine with the same number of threads;
-elsewhere the last digits of sums differ, and so do the weights.
+`hilsplat models train` repeats it: the same steps give the same weights on the same machine with the same
+number of threads; elsewhere the last digits of sums differ, and so do the weights.
 
 - generator of the world: version and digest of its output {recipe["generator"]}
-- training scenes: seeds {first} to {last}, {recipe["views"]} views each, 256 x 256
+- training scenes: seeds {first} to {last} ({kinds}), {recipe["views"]} views each, {FRAME_PX} x {FRAME_PX}
 - measured on: seeds {lowest} to {highest}. Benchmark and development scenes come from other ranges of
   seeds, and the code refuses them here.
-- steps: {recipe["sam_steps"]} (sam-tiny), {recipe["clip_steps"]} (clip-tiny); seed {recipe["seed"]}
-- {recipe["threads"]} threads, torch {recipe["torch"]}; {minutes:.0f} minutes on a shared machine
+- {recipe["steps"]} steps of AdamW with averaged weights; the learning rate is constant and falls to nothing
+  over the last quarter; seed {recipe["seed"]}, recipe {recipe["version"]}
+- {recipe["minutes"]:.0f} minutes with {recipe["threads"]} threads of a shared machine ({recipe["device"]}),
+  torch {recipe["torch"]}
 
 | {" | ".join(columns)} |
 |{" --- |" * len(columns)}
@@ -257,7 +292,7 @@ def _write_record(
     folder: Path,
     recipe: Mapping[str, Any],
     curve: Curve,
-    metrics: Mapping[str, Mapping[str, Mapping[str, float]]],
+    metrics: Mapping[str, Any],
 ) -> None:
     write_json(
         folder / RECORD,

@@ -44,14 +44,20 @@ class ClipVision(nn.Module):
             Residual(64),
             convolution(64, 128, stride=2),
             Residual(128),
-            convolution(128, 160, stride=2),
-            Residual(160),
+            Residual(128),
+            convolution(128, 192, stride=2),
+            Residual(192),
+            Residual(192),
         )
-        self.project = nn.Linear(160, DIMENSIONS)
+        self.project = nn.Linear(192, DIMENSIONS)
 
     def forward(self, pixels: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B D"]:
         """Unit vectors."""
-        return functional.normalize(self.project(self.layers(pixels).mean(dim=(2, 3))), dim=-1)
+        return self.projected(self.layers(pixels))
+
+    def projected(self, features: Float[Tensor, "B C h w"]) -> Float[Tensor, "B D"]:
+        """Unit vectors of what `layers` made of the crops."""
+        return functional.normalize(self.project(features.mean(dim=(2, 3))), dim=-1)
 
 
 class ClipText(nn.Module):

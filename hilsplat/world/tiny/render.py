@@ -12,12 +12,20 @@ import numpy as np
 
 from hilsplat.base.artifacts import read_npz, sha256_of_bytes, sha256_of_json, write_npz
 from hilsplat.base.errors import ArtifactError
-from hilsplat.base.levels import Level
+from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
 from hilsplat.datasets.hierarchy import AnnotatedNode
-from hilsplat.world.objects.catalogue import GENERATOR_VERSION
+from hilsplat.world.objects.catalogue import (
+    FURNITURE,
+    GENERATOR_VERSION,
+    STREET,
+    TABLETOP,
+    build_furniture,
+    build_object,
+    build_street_object,
+)
 from hilsplat.world.render import label_view, render_view
-from hilsplat.world.scenes.kinds import build_scene, scene_cameras, training_camera
+from hilsplat.world.scenes.kinds import build_scene, training_camera
 from hilsplat.world.scenes.scene import WorldScene
 from hilsplat.world.seeds import TRAINING_SEEDS, require_split
 from hilsplat.world.tiny.data import LabelledNode, LabelledViews
@@ -25,9 +33,12 @@ from hilsplat.world.tiny.sam import FRAME_PX
 
 logger = logging.getLogger(__name__)
 
-KIND = "tabletop"
-OBJECTS = (3, 9)
-"""Objects asked for, least and most."""
+MIXTURE: dict[str, tuple[float, int, int]] = {
+    "tabletop": (0.6, 3, 10),
+    "room": (0.2, 6, 14),
+    "street": (0.2, 6, 14),
+}
+"""Kinds of training scenes: share, and the least and most objects asked for."""
 SAMPLES = 2
 """Sub-samples per pixel side; half the time of the benchmark's 3, and no visible difference in a crop."""
 
@@ -50,30 +61,33 @@ def phrases_of(nodes: Sequence[AnnotatedNode]) -> tuple[LabelledNode, ...]:
     return tuple(labelled)
 
 
+def kind_of_seed(seed: int) -> tuple[str, int]:
+    """Kind of a training scene and how many objects it asks for; both follow from its seed."""
+    rng = np.random.default_rng((seed, 11))
+    kinds = list(MIXTURE)
+    kind = kinds[int(rng.choice(len(kinds), p=[MIXTURE[name][0] for name in kinds]))]
+    _, least, most = MIXTURE[kind]
+    return kind, int(rng.integers(least, most + 1))
+
+
 def scene_of_seed(seed: int) -> WorldScene:
-    """A training scene; its number of objects follows from its seed.
+    """A training scene.
 
     Raises:
         SceneError: the seed is not one of the training split.
     """
     require_split(seed, "training")
-    least, most = OBJECTS
-    objects = int(np.random.default_rng((seed, 11)).integers(least, most + 1))
-    return build_scene(KIND, seed, objects)
+    kind, objects = kind_of_seed(seed)
+    return build_scene(kind, seed, objects)
 
 
 def render_training_scene(seed: int, views: int, path: Path) -> None:
-    """Render views of a scene from random cameras and write images and labels.
-
-    Every other view comes from a camera like those of the benchmark's ring.
-    """
+    """Render views of a scene from random cameras and write images and labels."""
     scene = scene_of_seed(seed)
     rng = np.random.default_rng((seed, 12))
-    ring = scene_cameras(scene, 40, FRAME_PX, 360)
     images, labels = [], []
-    for view in range(views):
-        ringed = view % 2 == 0
-        camera = ring[str(rng.choice(ring.names))] if ringed else training_camera(scene, rng, FRAME_PX)
+    for _ in range(views):
+        camera = training_camera(scene, rng, FRAME_PX)
         images.append(render_view(scene, camera, SAMPLES))
         labels.append(label_view(scene, camera).astype(np.int16))
     nodes = json.dumps([asdict(node) for node in phrases_of(scene.nodes)]).encode()
@@ -83,14 +97,23 @@ def render_training_scene(seed: int, views: int, path: Path) -> None:
 
 
 def generator_digest() -> str:
-    """Version of the generator and a digest of what it makes of two training scenes.
+    """Version of the generator and a digest of what it makes: an object of each class, a scene of each kind.
 
     A digest of its output, not of its code: an edit that changes no pixel and no text keeps the cache.
     """
-    parts = []
-    for seed in (TRAINING_SEEDS.start, TRAINING_SEEDS.stop - 1):
-        scene = scene_of_seed(seed)
-        camera = training_camera(scene, np.random.default_rng((seed, 13)), 96)
+    parts: list[bytes] = []
+    for build, names in (
+        (build_object, TABLETOP),
+        (build_furniture, FURNITURE),
+        (build_street_object, STREET),
+    ):
+        for name in names:
+            model = build(name, np.random.default_rng(TRAINING_SEEDS.start))
+            texts = json.dumps([asdict(node) for node in model.nodes])
+            parts += [model.triangles.astype(np.float32).tobytes(), model.materials.tobytes(), texts.encode()]
+    for kind, (_, least, _) in MIXTURE.items():
+        scene = build_scene(kind, TRAINING_SEEDS.start, least)
+        camera = training_camera(scene, np.random.default_rng((TRAINING_SEEDS.start, 13)), 96)
         nodes = json.dumps([asdict(node) for node in phrases_of(scene.nodes)])
         parts += [
             render_view(scene, camera, 1).tobytes(),
@@ -114,7 +137,7 @@ def render_training_views(cache: Path, seeds: Sequence[int], views: int, workers
         "generator": generator_digest(),
         "views": views,
         "px": FRAME_PX,
-        "objects": OBJECTS,
+        "mixture": MIXTURE,
         "samples": SAMPLES,
     }
     folder = Path(cache) / f"views-{sha256_of_json(recipe)[:12]}"
@@ -126,16 +149,19 @@ def render_training_views(cache: Path, seeds: Sequence[int], views: int, workers
             jobs = pool.map(render_training_scene, *zip(*missing, strict=True), chunksize=4)
             for _ in track(jobs, "training scenes", total=len(missing)):
                 pass
-    images, labels, nodes = [], [], []
-    for path in paths:
+    # Filled in place: thousands of views are gigabytes, and joining a list of them would need twice that.
+    images = np.empty((len(paths) * views, FRAME_PX, FRAME_PX, 3), np.uint8)
+    labels = np.empty((len(paths) * views, len(LEVELS), FRAME_PX, FRAME_PX), np.int16)
+    nodes: list[tuple[LabelledNode, ...]] = []
+    for row, path in enumerate(paths):
         arrays = read_npz(path)
         if arrays["images"].shape[0] != views:
             raise ArtifactError(f"{path} is damaged", fix="delete it and run again")
-        images.append(arrays["images"])
-        labels.append(arrays["labels"])
+        at = slice(row * views, (row + 1) * views)
+        images[at], labels[at] = arrays["images"], arrays["labels"]
         rows = json.loads(arrays["nodes"].tobytes())
         nodes += [tuple(LabelledNode(r["level"], r["parent"], tuple(r["phrases"])) for r in rows)] * views
-    return LabelledViews(np.concatenate(images), np.concatenate(labels), tuple(nodes))
+    return LabelledViews(images, labels, tuple(nodes))
 
 
 def training_seeds(scenes: int, validation: int) -> tuple[list[int], list[int]]:

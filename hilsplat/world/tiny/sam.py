@@ -14,7 +14,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
-FRAME_PX = 256
+FRAME_PX = 384
 """Side of the square frame that the exported model takes."""
 STRIDE = 4
 """Image pixels per pixel of the embedding."""
@@ -25,15 +25,21 @@ UNIT_PX = 32.0
 HEADS = ("subpart", "part", "whole")
 """Order of the three output masks, as in SAM: fine to coarse."""
 
-FINE = 4
+PACK = (STRIDE // MASK_STRIDE) ** 2
+PIXEL = 24
+PACKED = PIXEL * PACK
 SEMANTIC = 64
 OFFSETS = 2 * len(HEADS)
-EMBEDDING = FINE * 4 + OFFSETS + SEMANTIC
+EMBEDDING = PACKED + OFFSETS + SEMANTIC
 FREQUENCIES = 3
 POSITIONAL = 2 + 4 * FREQUENCIES
-PIXEL = 16
 HIDDEN = 16
 TOKEN = 160
+STEM = 24
+WIDTHS = (64, 128, 192, 256)
+"""Channels at strides 4, 8, 16, 32."""
+DEPTHS = (2, 2, 3, 2)
+"""Residual blocks at each."""
 
 
 def convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
@@ -61,20 +67,18 @@ class Residual(nn.Module):
 
 
 class SamEncoder(nn.Module):
-    """Image to embedding: (B, 3, S, S) to (B, 86, S/4, S/4); S is a multiple of 32.
+    """Image to embedding: (B, 3, S, S) to (B, 166, S/4, S/4); S is a multiple of 32.
 
-    Channels of the embedding: 16 that hold 4 features at stride 2 (pixel-unshuffled, nothing lost),
+    Channels of the embedding: 96 that hold 24 features at stride 2 (pixel-unshuffled, nothing lost),
     6 offsets from a pixel to the centre of its region per head (x, y; in units of 32 px), and 64 that
-    say what the pixel shows.
+    say what the pixel shows. All that prompts share is computed here, once per image.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self.stem = convolution(3, 24, stride=2)
-        widths = (64, 96, 144, 192)
-        depths = (2, 2, 2, 1)
-        downs, previous = [], 24
-        for width, depth in zip(widths, depths, strict=True):
+        self.stem = convolution(3, STEM, stride=2)
+        downs, previous = [], STEM
+        for width, depth in zip(WIDTHS, DEPTHS, strict=True):
             downs.append(
                 nn.Sequential(
                     convolution(previous, width, stride=2), *(Residual(width) for _ in range(depth))
@@ -82,14 +86,20 @@ class SamEncoder(nn.Module):
             )
             previous = width
         self.downs = nn.ModuleList(downs)
-        self.laterals = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(widths))
-        self.merges = nn.ModuleList(convolution(width, width) for width in widths[:-1])
-        self.fine = nn.Conv2d(24, FINE, 3, padding=1)
-        self.semantic = nn.Conv2d(widths[0], SEMANTIC, 3, padding=1)
-        self.offsets = nn.Sequential(convolution(widths[0], 48), nn.Conv2d(48, OFFSETS, 1))
+        self.laterals = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(WIDTHS))
+        self.merges = nn.ModuleList(convolution(width, width) for width in WIDTHS[:-1])
+        self.semantic = nn.Conv2d(WIDTHS[0], SEMANTIC, 3, padding=1)
+        self.offsets = nn.Sequential(convolution(WIDTHS[0], 48), nn.Conv2d(48, OFFSETS, 1))
+        self.coarse = nn.Conv2d(WIDTHS[0], 24, 1)
+        self.sharpen = convolution(24 + STEM, 32)
+        self.pixel = nn.Conv2d(32, PIXEL, 1)
 
     def forward(self, pixels: Float[Tensor, "B 3 S S"]) -> Float[Tensor, "B C s s"]:
         """Embedding at stride 4."""
+        return torch.cat(self.features(pixels)[:3], dim=1)
+
+    def features(self, pixels: Float[Tensor, "B 3 S S"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The embedding's three groups of channels, and what the sharp features at stride 2 come from."""
         stem = self.stem(pixels)
         pyramid, x = [], stem
         for down in self.downs:
@@ -98,8 +108,12 @@ class SamEncoder(nn.Module):
         for scale in (2, 1, 0):
             up = functional.interpolate(self.laterals[scale](x), scale_factor=2.0, mode="nearest")
             x = self.merges[scale](pyramid[scale] + up)
-        fine = functional.pixel_unshuffle(self.fine(stem), STRIDE // MASK_STRIDE)
-        return torch.cat([fine, self.offsets(x), self.semantic(x)], dim=1)
+        enlarged = functional.interpolate(
+            self.coarse(x), scale_factor=2.0, mode="bilinear", align_corners=False
+        )
+        sharp = self.sharpen(torch.cat([enlarged, stem], dim=1))
+        packed = functional.pixel_unshuffle(self.pixel(sharp), STRIDE // MASK_STRIDE)
+        return packed, self.offsets(x), self.semantic(x), sharp
 
 
 def positional_embeddings(windows: Float[Tensor, "B 3"], cells: int) -> Float[Tensor, "B C cells cells"]:
@@ -130,9 +144,9 @@ def positional_embeddings(windows: Float[Tensor, "B 3"], cells: int) -> Float[Te
 
 
 class SamDecoder(nn.Module):
-    """Prompts to masks: the prompt writes the weights of a three-layer network run at every pixel.
+    """Prompts to masks: the prompt writes the weights of a two-layer network run at every pixel.
 
-    The pixel network sees 16 shared features, the pixel's position relative to the prompt, and, for
+    The pixel network sees 24 shared features, the pixel's position relative to the prompt, and, for
     each head, how far the centre that the pixel votes for lies from the one the prompted pixel votes
     for (difference and squared distance). All of these are affine in features shared by all prompts,
     so its first layer is one matrix product per image.
@@ -143,11 +157,8 @@ class SamDecoder(nn.Module):
         self.label = nn.Embedding(3, TOKEN)
         self.point = nn.Linear(EMBEDDING + POSITIONAL - 2, TOKEN)
         self.token = nn.Sequential(nn.ReLU(), nn.Linear(TOKEN, TOKEN), nn.ReLU())
-        self.mix = nn.Conv2d(OFFSETS + SEMANTIC, 24, 1)
-        self.sharpen = nn.Sequential(nn.Conv2d(24 + FINE, 24, 3, padding=1), nn.ReLU())
-        self.pixel = nn.Conv2d(24, PIXEL, 1)
         self.inputs = PIXEL + 2 + OFFSETS + len(HEADS)
-        self.sizes = (HIDDEN * self.inputs, HIDDEN, HIDDEN * HIDDEN, HIDDEN, len(HEADS) * HIDDEN, len(HEADS))
+        self.sizes = (HIDDEN * self.inputs, HIDDEN, len(HEADS) * HIDDEN, len(HEADS))
         self.weights = nn.Linear(TOKEN, sum(self.sizes))
         self.quality = nn.Sequential(
             nn.Linear(TOKEN + 3 * len(HEADS), 64), nn.ReLU(), nn.Linear(64, len(HEADS))
@@ -172,8 +183,54 @@ class SamDecoder(nn.Module):
             embeddings: from the encoder.
             positional: from `positional_embeddings`.
         """
-        cells = int(embeddings.shape[-1])  # constant in the exported graph
-        side = cells * (STRIDE // MASK_STRIDE)
+        side = int(embeddings.shape[-1]) * (STRIDE // MASK_STRIDE)  # constant in the exported graph
+        token, first, bias, second, shift = self.written(points, labels, embeddings, positional)
+        shared = self.shared_features(embeddings, positional).flatten(2)  # (B, K, h * w)
+        hidden = torch.matmul(first.flatten(1, 2), shared).unflatten(1, (-1, HIDDEN))  # (B, P, H, n)
+        hidden = functional.relu(hidden.add_(bias[..., None]), inplace=True)
+        logits = (torch.matmul(second, hidden) + shift[..., None]).unflatten(-1, (side, side))
+        # Every fourth pixel tells area and confidence well enough, at a quarter of the time.
+        seen = logits[..., ::2, ::2].flatten(3)
+        return self.predicted_iou(token, seen, seen.new_full((1, 1, 1), 4.0)), logits
+
+    def at_pixels(
+        self,
+        points: Float[Tensor, "B P N 2"],
+        labels: Int64[Tensor, "B P N"],
+        embeddings: Float[Tensor, "B C s s"],
+        positional: Float[Tensor, "B D s s"],
+        pixels: Int64[Tensor, "B P K"],
+        weights: Float[Tensor, "B P K"],
+    ) -> tuple[Float[Tensor, "B P 3"], Float[Tensor, "B P 3 K"]]:
+        """The same as `forward` at some pixels per prompt: what training needs, at a fraction of the time.
+
+        Args:
+            points: as in `forward`.
+            labels: as in `forward`.
+            embeddings: as in `forward`.
+            positional: as in `forward`.
+            pixels: flat indices into the mask.
+            weights: how many mask pixels each of them stands for.
+        """
+        token, first, bias, second, shift = self.written(points, labels, embeddings, positional)
+        shared = self.shared_features(embeddings, positional).flatten(2)
+        batch, channels, count = shared.shape
+        rows = shared.transpose(1, 2).reshape(batch * count, channels)
+        place = pixels + torch.arange(batch, device=pixels.device)[:, None, None] * count
+        chosen = rows.index_select(0, place.flatten()).view(*pixels.shape, channels)  # (B, P, K, C)
+        hidden = functional.relu(torch.matmul(chosen, first.transpose(2, 3)) + bias[:, :, None])
+        logits = (torch.matmul(hidden, second.transpose(2, 3)) + shift[:, :, None]).transpose(2, 3)
+        return self.predicted_iou(token, logits, weights), logits
+
+    def written(
+        self,
+        points: Float[Tensor, "B P N 2"],
+        labels: Int64[Tensor, "B P N"],
+        embeddings: Float[Tensor, "B C s s"],
+        positional: Float[Tensor, "B D s s"],
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Token of each prompt, and the weights it writes: matrix and bias of both layers."""
+        cells = int(embeddings.shape[-1])
         grid = points / (cells * STRIDE) * 2 - 1
         sampled = functional.grid_sample(
             torch.cat([embeddings, positional], dim=1), grid, padding_mode="border", align_corners=False
@@ -186,49 +243,50 @@ class SamDecoder(nn.Module):
 
         # What the prompt compares each pixel with: its place, and the centres it votes for.
         here = sampled[..., EMBEDDING : EMBEDDING + 2]
-        centres = sampled[..., FINE * 4 : FINE * 4 + OFFSETS] + here.repeat(1, 1, 1, len(HEADS))
+        centres = sampled[..., PACKED : PACKED + OFFSETS] + here.repeat(1, 1, 1, len(HEADS))
         anchor = torch.cat([here, centres], dim=-1) * inside
         anchor = anchor.sum(dim=2) / inside.sum(dim=2).clamp(min=1.0)  # (B, P, 2 + 6)
 
-        shared = self.shared_features(embeddings, positional, side)  # (B, K, h * w)
         parts = self.weights(token).split(self.sizes, dim=-1)
-        first = parts[0].unflatten(-1, (HIDDEN, self.inputs))
-        first, bias = _around_anchor(first, parts[1], anchor)
-        hidden = torch.matmul(first.flatten(1, 2), shared).unflatten(1, (-1, HIDDEN))  # (B, P, H, n)
-        hidden = functional.relu(hidden.add_(bias[..., None]), inplace=True)
-        second = parts[2].unflatten(-1, (HIDDEN, HIDDEN))
-        hidden = functional.relu(torch.matmul(second, hidden).add_(parts[3][..., None]), inplace=True)
-        third = parts[4].unflatten(-1, (len(HEADS), HIDDEN))
-        logits = torch.matmul(third, hidden) + parts[5][..., None]  # (B, P, 3, n)
-        return self.predicted_iou(token, logits), logits.unflatten(-1, (side, side))
+        first, bias = _around_anchor(parts[0].unflatten(-1, (HIDDEN, self.inputs)), parts[1], anchor)
+        return token, first, bias, parts[2].unflatten(-1, (len(HEADS), HIDDEN)), parts[3]
 
     def shared_features(
-        self, embeddings: Float[Tensor, "B C s s"], positional: Float[Tensor, "B D s s"], side: int
-    ) -> Float[Tensor, "B K n"]:
+        self, embeddings: Float[Tensor, "B C s s"], positional: Float[Tensor, "B D s s"]
+    ) -> Float[Tensor, "B K h w"]:
         """Features of every pixel at stride 2, the same for all prompts of an image."""
-        fine = functional.pixel_shuffle(embeddings[:, : FINE * 4], STRIDE // MASK_STRIDE)
-        coarse = self.mix(embeddings[:, FINE * 4 :])
+        pixel = functional.pixel_shuffle(embeddings[:, :PACKED], STRIDE // MASK_STRIDE)
+        side = int(embeddings.shape[-1]) * (STRIDE // MASK_STRIDE)
         here = positional[:, :2]
-        centres = embeddings[:, FINE * 4 : FINE * 4 + OFFSETS] + here.repeat(1, len(HEADS), 1, 1)
-        resized = functional.interpolate(
-            torch.cat([coarse, here, centres], dim=1), size=(side, side), mode="bilinear", align_corners=False
+        centres = embeddings[:, PACKED : PACKED + OFFSETS] + here.repeat(1, len(HEADS), 1, 1)
+        place = functional.interpolate(
+            torch.cat([here, centres], dim=1), size=(side, side), mode="bilinear", align_corners=False
         )
-        pixel = self.pixel(self.sharpen(torch.cat([fine, resized[:, :24]], dim=1)))
-        place = resized[:, 24:]
         squared = place[:, 2:].square()
         squared = squared[:, 0::2] + squared[:, 1::2]
-        return torch.cat([pixel, place, squared], dim=1).flatten(2)
+        return torch.cat([pixel, place, squared], dim=1)
 
     def predicted_iou(
-        self, token: Float[Tensor, "B P T"], logits: Float[Tensor, "B P 3 n"]
+        self,
+        token: Float[Tensor, "B P T"],
+        logits: Float[Tensor, "B P 3 n"],
+        weights: Float[Tensor, "#B #P #n"],
     ) -> Float[Tensor, "B P 3"]:
-        """Estimate each mask's IoU from its area, its confidence and the prompt; no gradient to the mask."""
+        """Estimate each mask's IoU from its area, its confidence and the prompt; no gradient to the mask.
+
+        Args:
+            token: of the prompts.
+            logits: at some pixels of the mask.
+            weights: how many mask pixels each of them stands for.
+        """
+        weights = weights[:, :, None]
         share = torch.sigmoid(logits.detach())
-        inside = (share > 0.5).to(share.dtype)
-        area = share.mean(dim=-1)
-        confidence = (share * inside).sum(dim=-1) / inside.sum(dim=-1).clamp(min=1.0)
-        blur = (share * (1 - share)).mean(dim=-1) / (area + 1e-3)
-        evidence = torch.cat([token.detach(), area.sqrt(), confidence, blur], dim=-1)
+        inside = (share > 0.5).to(share.dtype) * weights
+        area = inside.sum(dim=-1)
+        confidence = (share * inside).sum(dim=-1) / area.clamp(min=1.0)
+        blur = (share * (1 - share) * weights).sum(dim=-1) / (area + 1)
+        size = (area.sqrt() * (MASK_STRIDE / UNIT_PX)).clamp(max=16.0)
+        evidence = torch.cat([token.detach(), size, confidence, blur.clamp(max=4.0)], dim=-1)
         return torch.sigmoid(self.quality(evidence))
 
 

@@ -1,16 +1,18 @@
-"""What both trainings share: learning rate, batches prepared ahead, learning curve."""
+"""What both trainings share: budget, learning rate, batches prepared ahead, learning curve."""
 
 import logging
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from itertools import count
 from typing import TypeVar
-
-import numpy as np
 
 logger = logging.getLogger(__name__)
 
 Batch = TypeVar("Batch")
+
+DECAY_SHARE = 0.25
+"""Last part of a budget, during which the learning rate falls to almost nothing."""
 
 
 @dataclass
@@ -25,20 +27,52 @@ class Curve:
         logger.info("  ".join(f"{name} {value:g}" for name, value in self.rows[-1].items()))
 
 
-def learning_rate(step: int, steps: int, peak: float, warmup: int) -> float:
-    """Linear warm-up, then half a cosine down to 2 % of the peak."""
-    if step < warmup:
-        return peak * (step + 1) / warmup
-    share = (step - warmup) / max(1, steps - warmup)
-    return peak * (0.02 + 0.98 * 0.5 * (1 + np.cos(np.pi * share)))
+@dataclass(frozen=True)
+class Budget:
+    """How long to train: minutes or steps, whichever ends first; 0 sets no limit.
+
+    Steps repeat themselves on one machine; minutes fit the schedule to the machine at hand.
+    """
+
+    minutes: float = 0.0
+    steps: int = 0
+
+    def __post_init__(self) -> None:
+        if self.minutes <= 0 and self.steps <= 0:
+            raise ValueError("a training needs minutes or steps")
+
+    def is_time_to_decay(self, step: int, minutes: float) -> bool:
+        """Whether the learning rate should begin to fall."""
+        by_steps = self.steps > 0 and step >= int((1 - DECAY_SHARE) * self.steps)
+        return by_steps or (self.minutes > 0 and minutes >= (1 - DECAY_SHARE) * self.minutes)
+
+    def decay_steps(self, step: int, minutes: float) -> int:
+        """Steps over which it falls when it begins now: what is left, or a quarter where that is less.
+
+        A state that is already past the budget (trained with a larger one before) decays over a quarter.
+        """
+        left = []
+        if self.steps > 0:
+            left.append(max(self.steps - step, round(DECAY_SHARE * self.steps)))
+        if self.minutes > 0:
+            pace = step / minutes if minutes > 0 else 1.0
+            left.append(round(max(self.minutes - minutes, DECAY_SHARE * self.minutes) * pace))
+        return max(1, min(left))
 
 
-def prefetched(make: Callable[[int], Batch], steps: int) -> Iterator[Batch]:
-    """Yield make(0), make(1), ..., each prepared while its predecessor is worked on."""
+def learning_rate(step: int, peak: float, warmup: int, decay_from: int = -1, decay_steps: int = 0) -> float:
+    """Linear warm-up, a constant stretch, then a straight line down to 1 % of the peak."""
+    rate = peak * min(1.0, (step + 1) / warmup)
+    if decay_from >= 0:
+        rate *= max(0.01, 1 - (step - decay_from) / max(1, decay_steps))
+    return rate
+
+
+def prefetched(make: Callable[[int], Batch], first: int = 0) -> Iterator[Batch]:
+    """Yield make(first), make(first + 1), ..., each prepared while its predecessor is worked on."""
     with ThreadPoolExecutor(1) as pool:
-        upcoming = pool.submit(make, 0)
-        for step in range(steps):
+        upcoming = pool.submit(make, first)
+        for step in count(first + 1):
             ready = upcoming.result()
-            if step + 1 < steps:
-                upcoming = pool.submit(make, step + 1)
+            upcoming = pool.submit(make, step)
             yield ready

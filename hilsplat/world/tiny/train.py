@@ -1,176 +1,216 @@
 """The recipe of the embedded small models: render, train, measure, export, describe."""
 
 import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import torch
-from safetensors.numpy import load_file, save_file
-from torch import nn
 
-from hilsplat.base.artifacts import atomic_folder, atomic_path, read_json, sha256_of_json, write_json
-from hilsplat.base.progress import stage_log, track
+from hilsplat.base.artifacts import atomic_folder, sha256_of_json
+from hilsplat.base.errors import SettingsError
+from hilsplat.base.progress import stage_log
+from hilsplat.segment.sam import SamModel
+from hilsplat.settings import TrainingSettings
 from hilsplat.world.tiny.card import write_clip_card, write_sam_card
-from hilsplat.world.tiny.data import LabelledViews, RoughMask, collect_crops
+from hilsplat.world.tiny.crops import list_crops, list_segmented
+from hilsplat.world.tiny.data import LabelledViews
 from hilsplat.world.tiny.export import export_clip, export_sam
-from hilsplat.world.tiny.render import generator_digest, render_training_views, training_seeds
-from hilsplat.world.tiny.sam import SamDecoder, SamEncoder
-from hilsplat.world.tiny.steps import Curve
-from hilsplat.world.tiny.train_clip import measure_clip, train_clip
-from hilsplat.world.tiny.train_sam import measure_sam, segment_everything, train_sam
+from hilsplat.world.tiny.measure_clip import measure_clip, measure_queries
+from hilsplat.world.tiny.measure_sam import (
+    automatic_masks,
+    cached_masks,
+    measure_everything,
+    measure_sam,
+)
+from hilsplat.world.tiny.render import generator_digest, kind_of_seed, render_training_views, training_seeds
+from hilsplat.world.tiny.steps import Budget, Curve
+from hilsplat.world.tiny.train_clip import train_clip
+from hilsplat.world.tiny.train_sam import train_sam
 
 logger = logging.getLogger(__name__)
 
-RECIPE_VERSION = 1
-"""Raise it when networks, windows or losses change: a segmenter in the cache is then trained again."""
-ROUGH_VIEWS = 160
-"""Training views that the finished segmenter segments, so that CLIP meets masks as it draws them."""
-ROUGH_PROMPTS = 14
-"""Prompts per image side there; half as many as at run time give masks enough."""
-COPIES = {1: 4, 2: 1, 3: 1}
-"""Roughened copies of each exact mask, per level: whole objects are rare among masks."""
+RECIPE_VERSION = 2
+"""Raise it when networks, windows or losses change: a training in the cache then begins anew."""
+STAGES = ("render", "sam", "clip")
+AUTOMATIC_VIEWS = 48
+"""Unseen views that are segmented without prompts to measure recall."""
+
+
+ROUGH_PROMPTS = 20
+"""Prompts per image side when training views are segmented for CLIP; fewer than at run time do."""
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """Everything the small models follow from, except the number format of the machine.
+class Material:
+    """Rendered views and what they come from.
 
     Attributes:
-        scenes: training scenes.
-        views: views of each.
-        validation_scenes: further training-range scenes, for curves and metrics only.
-        sam_steps: optimisation steps of the segmenter.
-        clip_steps: optimisation steps of CLIP.
-        seed: of weights, windows, prompts, jitter and captions.
+        training: views to train on.
+        unseen: views of other scenes, to measure on.
+        unseen_kinds: kind of scene of each of them.
+        described: what a card says of them.
     """
 
-    scenes: int
-    views: int
-    validation_scenes: int
-    sam_steps: int
-    clip_steps: int
-    seed: int
+    training: LabelledViews
+    unseen: LabelledViews
+    unseen_kinds: tuple[str, ...]
+    described: dict[str, Any]
 
 
 def train_models(
     out: Path,
     cache: Path,
-    sam_steps: int = 1700,
-    clip_steps: int = 1500,
+    settings: TrainingSettings,
     seed: int = 0,
     threads: int = 2,
-    scenes: int = 400,
-    validation_scenes: int = 24,
-    views: int = 2,
+    stages: Sequence[str] | None = None,
 ) -> None:
     """Train the small SAM and CLIP on training scenes of the synthetic world, and write both model folders.
 
-    The recipe counts steps, not minutes, so it repeats itself on one machine with the same number of
-    threads; other machines differ in the last digits of sums, and so in the trained weights.
+    Views and the states of both trainings lie in the cache: a killed run goes on where it was, and a
+    finished one asked for more minutes or steps goes on from before its learning rate fell.
 
     Args:
         out: folder that will hold `sam-tiny` and `clip-tiny`.
-        cache: rendered views and the trained segmenter; a killed run goes on from there.
-        sam_steps: optimisation steps of the segmenter.
-        clip_steps: optimisation steps of CLIP.
+        cache: rendered views and training states.
+        settings: numbers of scenes, and how long to train.
         seed: of everything random but the scenes.
-        threads: of torch; also the number of rendering processes.
-        scenes: training scenes.
-        validation_scenes: further scenes, on which nothing is trained.
-        views: per scene.
+        threads: of torch; also the number of rendering and segmenting processes.
+        stages: of `STAGES`, all of them by default; `clip` needs a `sam-tiny` in `out`.
+
+    Raises:
+        SettingsError: a stage is unknown.
+        ModelError: `clip` is asked for and `out` holds no segmenter.
     """
-    recipe = Recipe(scenes, views, validation_scenes, sam_steps, clip_steps, seed)
+    stages = STAGES if stages is None else tuple(stages)
+    if not set(stages) <= set(STAGES):
+        raise SettingsError(
+            "unknown stage of training", expected=f"some of {', '.join(STAGES)}", found=str(stages)
+        )
     out, cache = Path(out), Path(cache)
-    train_seeds, other_seeds = training_seeds(scenes, validation_scenes)
+    material = rendered(cache, settings, threads)
     threads_before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        with stage_log("train", "sam-tiny") as counts:
-            training = render_training_views(cache, train_seeds, views, threads)
-            unseen = render_training_views(cache, other_seeds, views, threads)
-            encoder, decoder, curve = _trained_sam(training, unseen, recipe, cache, threads)
-            metrics = {
-                "balanced": measure_sam(encoder, decoder, unseen, 32, balanced=1.0),
-                "grid": measure_sam(encoder, decoder, unseen, 32, balanced=0.0),
-            }
-            counts.update({level: f"{value['iou']:.3f}" for level, value in metrics["balanced"].items()})
-            with atomic_folder(out / "sam-tiny") as folder:
-                export_sam(encoder, decoder, folder)
-                write_sam_card(folder, encoder, decoder, unseen, _described(recipe, threads), curve, metrics)
-        with stage_log("train", "clip-tiny") as counts:
-            crops = collect_crops(
-                training, _rough_masks(encoder, decoder, training, ROUGH_VIEWS), seed, copies=COPIES
-            )
-            others = collect_crops(
-                unseen, _rough_masks(encoder, decoder, unseen, len(unseen)), seed, jitter=False
-            )
-            counts["crops"] = len(crops.crops)
-            vision, text, tokenizer, curve = train_clip(crops, others, clip_steps, seed)
-            texts = [phrases[0] for phrases in crops.phrase_sets]
-            found = measure_clip(vision, text, tokenizer, others, texts)
-            metrics = {kind: {} for kind, _ in found}
-            for (kind, level), value in found.items():
-                metrics[kind][level] = value
-            with atomic_folder(out / "clip-tiny") as folder:
-                export_clip(vision, text, tokenizer, folder)
-                described = _described(recipe, threads) | {
-                    "crops": len(crops.crops),
-                    "rough_crops": int(crops.rough.sum()),
-                    "texts_competing": len(set(texts)),
-                }
-                write_clip_card(folder, described, curve, metrics)
+        if "sam" in stages:
+            _make_sam(out / "sam-tiny", cache, material, settings, seed, threads)
+        if "clip" in stages:
+            _make_clip(out, cache, material, settings, seed, threads)
     finally:
         torch.set_num_threads(threads_before)
 
 
-def _described(recipe: Recipe, threads: int) -> dict[str, object]:
-    """The recipe as it goes into a card."""
-    train_seeds, other_seeds = training_seeds(recipe.scenes, recipe.validation_scenes)
-    return asdict(recipe) | {
+def rendered(cache: Path, settings: TrainingSettings, threads: int) -> Material:
+    """Render the views that a recipe asks for, where the cache has none."""
+    train_seeds, other_seeds = training_seeds(settings.scenes, settings.validation_scenes)
+    with stage_log("render", "training scenes") as counts:
+        training = render_training_views(cache, train_seeds, settings.views, threads)
+        unseen = render_training_views(cache, other_seeds, settings.views, threads)
+        counts["views"], counts["unseen"] = len(training), len(unseen)
+    kinds = [kind_of_seed(seed)[0] for seed in train_seeds]
+    described = {
         "generator": generator_digest(),
+        "scenes": settings.scenes,
+        "views": settings.views,
+        "validation_scenes": settings.validation_scenes,
         "training_seeds": [train_seeds[0], train_seeds[-1]],
         "validation_seeds": [other_seeds[0], other_seeds[-1]],
+        "kinds": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
+    }
+    of_view = tuple(kind_of_seed(seed)[0] for seed in other_seeds for _ in range(settings.views))
+    return Material(training, unseen, of_view, described)
+
+
+def _state_name(model: str, material: Material, seed: int, more: Mapping[str, Any]) -> str:
+    """Names a training by all that its weights depend on, except how long it lasts."""
+    key = {"model": model, "seed": seed, "version": RECIPE_VERSION, **material.described, **more}
+    return f"{model}-{sha256_of_json(key)[:12]}"
+
+
+def _described(
+    material: Material, settings: TrainingSettings, budget: Budget, seed: int, threads: int, curve: Curve
+) -> dict[str, Any]:
+    """The recipe as it goes into a card."""
+    return material.described | {
+        "budget": asdict(budget),
+        "steps": int(curve.rows[-1]["step"]),
+        "minutes": curve.rows[-1]["minutes"],
+        "seed": seed,
         "threads": threads,
+        "device": settings.device,
         "torch": torch.__version__,
+        "version": RECIPE_VERSION,
     }
 
 
-def _trained_sam(
-    training: LabelledViews, unseen: LabelledViews, recipe: Recipe, cache: Path, threads: int
-) -> tuple[SamEncoder, SamDecoder, Curve]:
-    """Train the segmenter, or take the one this recipe already gave."""
-    record = asdict(recipe) | {"clip_steps": 0, "threads": threads, "version": RECIPE_VERSION}
-    record["generator"] = generator_digest()
-    path = cache / f"sam-{sha256_of_json(record)[:12]}.safetensors"
-    if path.is_file():
-        logger.info("taking the segmenter trained before: %s", path)
-        encoder, decoder = SamEncoder(), SamDecoder()
-        weights = load_file(path)
-        _load(encoder, weights, "encoder.")
-        _load(decoder, weights, "decoder.")
-        return encoder.eval(), decoder.eval(), Curve(read_json(path.with_suffix(".json")))
-    encoder, decoder, curve = train_sam(training, unseen, recipe.sam_steps, recipe.seed)
-    weights = {f"encoder.{name}": value.contiguous().numpy() for name, value in encoder.state_dict().items()}
-    weights |= {f"decoder.{name}": value.contiguous().numpy() for name, value in decoder.state_dict().items()}
-    write_json(path.with_suffix(".json"), curve.rows)
-    with atomic_path(path) as temporary:
-        save_file(weights, temporary)
-    return encoder, decoder, curve
+def _make_sam(
+    folder: Path, cache: Path, material: Material, settings: TrainingSettings, seed: int, threads: int
+) -> None:
+    budget = Budget(settings.sam_minutes, settings.sam_steps)
+    with stage_log("train", "sam-tiny") as counts:
+        name = _state_name("sam", material, seed, {})
+        encoder, decoder, curve = train_sam(
+            material.training, material.unseen, budget, seed, cache, name, device=settings.device
+        )
+        with atomic_folder(folder) as temporary:
+            export_sam(encoder, decoder, temporary)
+            points, automatic = {}, {}
+            for group, views in by_kind(material).items():
+                points[group] = measure_sam(encoder, decoder, views)
+                masks = automatic_masks(temporary, views.spread(AUTOMATIC_VIEWS), threads)
+                automatic[group] = measure_everything(masks, views.spread(AUTOMATIC_VIEWS))
+            counts.update({level: f"{value['iou']:.3f}" for level, value in points["all"].items()})
+            recipe = _described(material, settings, budget, seed, threads, curve)
+            metrics = {"points": points, "automatic": automatic}
+            write_sam_card(temporary, encoder, decoder, material.unseen, recipe, curve, metrics)
 
 
-def _load(module: nn.Module, weights: dict[str, np.ndarray], prefix: str) -> None:
-    module.load_state_dict(
-        {name: torch.from_numpy(weights[f"{prefix}{name}"]) for name in module.state_dict()}
-    )
+def _make_clip(
+    out: Path, cache: Path, material: Material, settings: TrainingSettings, seed: int, threads: int
+) -> None:
+    budget = Budget(settings.clip_minutes, settings.clip_steps)
+    segmenter = out / "sam-tiny"
+    with stage_log("train", "clip-tiny") as counts:
+        digest = SamModel.load(segmenter).digest
+        views, unseen = material.training, material.unseen.spread(AUTOMATIC_VIEWS)
+        count = min(settings.segmented_views, len(views))
+        masks = cached_masks(cache, segmenter, digest, views, count, ROUGH_PROMPTS, threads)
+        other_masks = cached_masks(cache, segmenter, digest, unseen, len(unseen), None, threads)
+        crops, others = list_crops(views, masks), list_crops(unseen, other_masks)
+        counts["masks"] = len(crops)
+        name = _state_name("clip", material, seed, {"segmenter": digest, "segmented_views": count})
+        vision, text, tokenizer, curve = train_clip(
+            crops, others, budget, seed, cache, name, device=settings.device
+        )
+        metrics: dict[str, Any] = {}
+        for background in ("black", "keep"):
+            found = measure_clip(vision, text, tokenizer, others, background=background)
+            for (kind, level), value in found.items():
+                metrics.setdefault(background, {}).setdefault(kind, {})[level] = value
+        metrics["queries"] = measure_queries(
+            vision, text, tokenizer, unseen, other_masks, list_segmented(unseen, other_masks)
+        )
+        counts.update({level: f"{v['top1']:.3f}" for level, v in metrics["black"]["exact"].items()})
+        recipe = _described(material, settings, budget, seed, threads, curve) | {
+            "segmenter": digest,
+            "masks": len(crops),
+            "segmented_masks": int(crops.rough.sum()),
+            "texts_competing": len({phrases[0] for phrases in others.phrase_sets}),
+        }
+        with atomic_folder(out / "clip-tiny") as temporary:
+            export_clip(vision, text, tokenizer, temporary)
+            write_clip_card(temporary, recipe, curve, metrics)
 
 
-def _rough_masks(
-    encoder: SamEncoder, decoder: SamDecoder, views: LabelledViews, count: int
-) -> list[list[RoughMask]]:
-    """The segmenter's own masks of the first views; none for the others."""
-    found = [
-        segment_everything(encoder, decoder, image, ROUGH_PROMPTS)
-        for image in track(views.images[:count], "rough masks")
-    ]
-    return found + [[] for _ in range(len(views) - len(found))]
+def by_kind(material: Material) -> dict[str, LabelledViews]:
+    """Unseen views, all of them and by kind of scene."""
+    groups = {"all": material.unseen}
+    for kind in dict.fromkeys(material.unseen_kinds):
+        rows = [row for row, of_view in enumerate(material.unseen_kinds) if of_view == kind]
+        views = material.unseen
+        groups[kind] = LabelledViews(
+            views.images[rows], views.labels[rows], tuple(views.nodes[row] for row in rows)
+        )
+    return groups

@@ -1,7 +1,7 @@
-"""Train the small CLIP on captioned crops, and measure it."""
+"""Train the small CLIP on captioned crops."""
 
-import time
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -10,22 +10,27 @@ from torch import Tensor, nn
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.world.tiny.clip import CANONICAL, ClipText, ClipVision, contrastive_loss, word_tokenizer
-from hilsplat.world.tiny.data import FRAMES, GENERIC_FRAMES, CaptionedCrops, Captioner, normalised
-from hilsplat.world.tiny.steps import Curve, learning_rate, prefetched
+from hilsplat.world.tiny.crops import FRAMES, GENERIC_FRAMES, Captioner, CropTable
+from hilsplat.world.tiny.data import normalised
+from hilsplat.world.tiny.loop import Training, Tuning
+from hilsplat.world.tiny.measure_clip import measure_clip, tokenised
+from hilsplat.world.tiny.steps import Budget, Curve
+from hilsplat.world.tiny.train_sam import has_fast_half
+
+TUNING = Tuning(peak=2e-3, warmup=60, measure_every=200)
+BATCH = 192
+THING_SHARE = 0.5
+"""Crops of a batch drawn several at a time from one object: its other parts are the hard negatives."""
+SIBLINGS = 6
+"""How many at a time, at most."""
+KEPT_SHARE = 0.2
+"""Crops whose surroundings are kept, so that the setting `keep` works too."""
+QUICK_CROPS = 3000
 
 
-def tokenised(tokenizer: Tokenizer, texts: Sequence[str]) -> tuple[Tensor, Tensor]:
-    """Word ids and attention mask of texts."""
-    encoded = tokenizer.encode_batch(list(texts))
-    return (
-        torch.tensor([row.ids for row in encoded], dtype=torch.int64),
-        torch.tensor([row.attention_mask for row in encoded], dtype=torch.int64),
-    )
-
-
-def crop_weights(crops: CaptionedCrops, nothing: float = 0.03, rough: float = 0.4) -> np.ndarray:
+def crop_weights(crops: CropTable, nothing: float = 0.03, rough: float = 0.45) -> np.ndarray:
     """Probability of each crop: levels equally often, the segmenter's masks for a share of each level."""
-    weights = np.zeros(len(crops.crops))
+    weights = np.zeros(len(crops))
     for level in (0, *map(int, LEVELS)):
         at_level = crops.level == level
         wanted = nothing if level == 0 else (1 - nothing) / len(LEVELS)
@@ -37,134 +42,134 @@ def crop_weights(crops: CaptionedCrops, nothing: float = 0.03, rough: float = 0.
     return weights / weights.sum()
 
 
-def train_clip(
-    crops: CaptionedCrops,
-    validation: CaptionedCrops,
-    steps: int,
-    seed: int,
-    batch: int = 192,
-    peak: float = 2e-3,
-    measure_every: int = 100,
-) -> tuple[ClipVision, ClipText, Tokenizer, Curve]:
-    """Train the small CLIP.
+class CropDraw:
+    """Draws batches of rows: some one by one, some as groups of crops of one object.
 
     Args:
-        crops: crops with their captions.
-        validation: crops of other scenes, for the learning curve.
-        steps: optimisation steps.
+        crops: what there is.
+        batch: rows of a batch.
+    """
+
+    def __init__(self, crops: CropTable, batch: int) -> None:
+        self.ends = np.cumsum(crop_weights(crops))
+        self.batch = batch
+        # Rows of one object of one view lie next to each other in this order.
+        key = crops.view * (int(crops.thing.max(initial=0)) + 2) + crops.thing + 1
+        self.order = np.argsort(key, kind="stable")
+        self.first = np.searchsorted(key[self.order], key, side="left")
+        self.last = np.searchsorted(key[self.order], key, side="right")
+
+    def draw(self, rng: np.random.Generator) -> np.ndarray:
+        """Rows of a batch."""
+        seeds = np.searchsorted(self.ends, rng.random(self.batch) * self.ends[-1], side="right")
+        seeds = np.minimum(seeds, len(self.ends) - 1)
+        rows = list(seeds[: round(self.batch * (1 - THING_SHARE))])
+        for seed in seeds[len(rows) :]:
+            room = min(SIBLINGS, self.batch - len(rows))
+            if room <= 0:
+                break
+            same = self.order[self.first[seed] : self.last[seed]]
+            rows += list(rng.permutation(same)[:room])
+        return np.array(rows[: self.batch])
+
+
+def jittered(rng: np.random.Generator, pixels: np.ndarray) -> np.ndarray:
+    """Crops in other light, mirrored, some noisy or blurred; a black background stays black."""
+    count = len(pixels)
+    pixels = pixels.astype(np.float32)
+    seen = pixels.max(axis=3, keepdims=True) > 0
+    gain = rng.normal(1.0, 0.07, (count, 1, 1, 1)) * rng.normal(1.0, 0.03, (count, 1, 1, 3))
+    pixels *= gain.astype(np.float32)
+    mirrored = rng.random(count) < 0.5
+    pixels[mirrored] = pixels[mirrored][:, :, ::-1]
+    seen[mirrored] = seen[mirrored][:, :, ::-1]
+    noisy = rng.random(count) < 0.3
+    noise = rng.normal(0, 4, pixels[noisy].shape).astype(np.float32)
+    pixels[noisy] += noise * seen[noisy]
+    blurred = rng.random(count) < 0.2
+    soft = pixels[blurred]
+    soft[:, 1:-1] = (soft[:, :-2] + 2 * soft[:, 1:-1] + soft[:, 2:]) / 4
+    soft[:, :, 1:-1] = (soft[:, :, :-2] + 2 * soft[:, :, 1:-1] + soft[:, :, 2:]) / 4
+    pixels[blurred] = soft
+    return pixels.clip(0, 255)
+
+
+def train_clip(
+    crops: CropTable,
+    validation: CropTable,
+    budget: Budget,
+    seed: int,
+    state: Path,
+    name: str = "clip",
+    batch: int = BATCH,
+    tuning: Tuning = TUNING,
+    device: str = "cpu",
+) -> tuple[ClipVision, ClipText, Tokenizer, Curve]:
+    """Train the small CLIP, or go on where a training with the same name was.
+
+    Args:
+        crops: masks with their captions.
+        validation: masks of other scenes, for the learning curve.
+        budget: how long.
         seed: of initial weights, batches and captions.
+        state: folder of the training's state.
+        name: of the state's files.
         batch: crops per step.
-        peak: highest learning rate.
-        measure_every: steps between rows of the learning curve.
+        tuning: how to optimise.
+        device: "cpu" or "cuda".
     """
     torch.manual_seed(seed)
+    where = torch.device(device)
+    half = has_fast_half(where)
     captioner = Captioner(crops.phrase_sets)
     frames = [frame.format("") for frame in (*FRAMES, *GENERIC_FRAMES)]
     tokenizer = word_tokenizer([*captioner.phrases, *CANONICAL, *frames])
     vision, text = ClipVision(), ClipText(tokenizer.get_vocab_size())
     vision.to(memory_format=torch.channels_last)
-    scale = nn.Parameter(torch.tensor(np.log(10.0), dtype=torch.float32))
-    matrices = [*vision.parameters(), *text.parameters()]
-    optimiser = torch.optim.AdamW(
-        [{"params": matrices, "weight_decay": 0.02}, {"params": [scale], "weight_decay": 0.0}], lr=peak
-    )
-    weights = crop_weights(crops)
-    curve, start, total = Curve(), time.monotonic(), 0.0
-    warmup = max(1, min(40, steps // 10))
+    scale = Scale()
+    training = Training({"vision": vision, "text": text, "scale": scale}, tuning, state, name, where)
+    drawer = CropDraw(crops, batch)
+    step_of_quick = max(1, len(validation) // QUICK_CROPS)
+    quick = np.arange(0, len(validation), step_of_quick)
 
     def make(step: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         rng = np.random.default_rng((seed, 3, step))
-        rows = rng.choice(len(weights), batch, p=weights)
-        pixels = crops.crops[rows].astype(np.float32)
-        gain = rng.normal(1.0, 0.06, (batch, 1, 1, 1)) * rng.normal(1.0, 0.03, (batch, 1, 1, 3))
-        pixels *= gain.astype(np.float32)
-        mirrored = rng.random(batch) < 0.5
-        pixels[mirrored] = pixels[mirrored][:, :, ::-1]
-        noisy = rng.random(batch) < 0.3
-        seen = pixels.max(axis=3, keepdims=True) > 0  # the black background stays black
-        noise = rng.normal(0, 4, pixels[noisy].shape).astype(np.float32)
-        pixels[noisy] += noise * seen[noisy]
-        texts, valid = captioner.draw(rng, crops.captions[rows])
+        rows = drawer.draw(rng)
+        cut = []
+        for row in rows.tolist():
+            background = "keep" if rng.random() < KEPT_SHARE else "black"
+            cut.append(crops.cut(row, background, rng if rng.random() < 0.6 else None))
+        texts, valid = captioner.draw(rng, crops.caption[rows])
         words, mask = tokenised(tokenizer, texts)
         forgotten = torch.from_numpy(rng.random(words.shape) < 0.02) & (mask == 1)
         words = torch.where(forgotten, torch.ones_like(words), words)
-        images = torch.from_numpy(normalised(pixels.clip(0, 255)))
+        images = torch.from_numpy(normalised(jittered(rng, np.stack(cut))))
         return images.contiguous(memory_format=torch.channels_last), words, mask, torch.from_numpy(valid)
 
-    for step, (pixels, words, mask, valid) in enumerate(prefetched(make, steps)):
-        for group in optimiser.param_groups:
-            group["lr"] = learning_rate(step, steps, peak, warmup)
-        vision.train()
-        text.train()
-        loss = contrastive_loss(vision(pixels), text(words, mask), valid, scale.exp().clamp(max=60.0))
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        nn.utils.clip_grad_norm_([*matrices, scale], 2.0)
-        optimiser.step()
-        total += loss.item()
-        if (step + 1) % measure_every == 0 or step + 1 == steps:
-            found = measure_clip(vision, text, tokenizer, validation, [sets[0] for sets in crops.phrase_sets])
-            curve.add(
-                step=step + 1,
-                minutes=(time.monotonic() - start) / 60,
-                loss=total / ((step % measure_every) + 1),
-                scale=scale.exp().item(),
-                **{f"{kind}_{level}": value["top1"] for (kind, level), value in found.items()},
-            )
-            total = 0.0
-    return vision.eval(), text.eval(), tokenizer, curve
+    def loss_of(material: tuple[Tensor, ...], step: int) -> tuple[Tensor, dict[str, float]]:
+        pixels, words, mask, valid = (part.to(where) for part in material)
+        with torch.autocast(where.type, torch.bfloat16, enabled=half):
+            features = vision.layers(pixels)
+        image = vision.projected(features.float())
+        loss = contrastive_loss(image, text(words, mask), valid, scale.logarithm.exp().clamp(max=60.0))
+        return loss, {"contrastive": loss.item()}
+
+    def measure() -> dict[str, float]:
+        found = measure_clip(vision, text, tokenizer, validation, quick)
+        return {f"{kind}_{level}": value["top1"] for (kind, level), value in found.items()}
+
+    curve = training.run(make, loss_of, measure, budget)
+    return vision.cpu().eval(), text.cpu().eval(), tokenizer, curve
 
 
-@torch.no_grad()
-def measure_clip(
-    vision: ClipVision, text: ClipText, tokenizer: Tokenizer, crops: CaptionedCrops, texts: Sequence[str]
-) -> dict[tuple[str, str], dict[str, float]]:
-    """How often the best of all texts is the crop's own, per kind of mask and level.
+class Scale(nn.Module):
+    """The factor on the cosines, as its logarithm."""
 
-    Args:
-        vision: image side.
-        text: text side.
-        tokenizer: of the text side.
-        crops: crops whose masks show a node.
-        texts: queries that compete (all levels together); repeats are dropped.
+    def __init__(self) -> None:
+        super().__init__()
+        self.logarithm = nn.Parameter(torch.tensor(np.log(10.0), dtype=torch.float32))
 
-    Returns:
-        by ("exact" or "rough", level): `top1` and `top3` of all texts, `top1_of_level` among the texts of
-        that level, share that beats every canonical phrase (`above_canonical`), `n`.
-    """
-    vision.eval()
-    text.eval()
-    texts = sorted(set(texts) | {phrases[0] for phrases in crops.phrase_sets})
-    row = {phrase: index for index, phrase in enumerate(texts)}
-    candidates = text(*tokenised(tokenizer, texts))
-    canonical = text(*tokenised(tokenizer, CANONICAL))
-    own = np.array([row[phrases[0]] for phrases in crops.phrase_sets], np.int64)
-    shown = np.flatnonzero(crops.captions >= 0)
-    vectors = torch.cat(
-        [
-            vision(torch.from_numpy(normalised(crops.crops[rows])))
-            for rows in np.array_split(shown, len(shown) // 256 + 1)
-        ]
-    )
-    similarity = (vectors @ candidates.T).numpy()
-    yardstick = (vectors @ canonical.T).numpy().max(axis=1)
-    wanted = own[crops.captions[shown]]
-    level, rough = crops.level[shown], crops.rough[shown]
-    mine = similarity[np.arange(len(shown)), wanted]
-    rank = (similarity > mine[:, None]).sum(axis=1)
-    report = {}
-    for kind, is_rough in (("exact", False), ("rough", True)):
-        for at in LEVELS:
-            group = (level == int(at)) & (rough == is_rough)
-            if not group.any():
-                continue
-            same = np.unique(wanted[level == int(at)])
-            rank_of_level = (similarity[group][:, same] > mine[group, None]).sum(axis=1)
-            report[(kind, at.label)] = {
-                "top1": float((rank[group] == 0).mean()),
-                "top3": float((rank[group] < 3).mean()),
-                "top1_of_level": float((rank_of_level == 0).mean()),
-                "above_canonical": float((mine[group] > yardstick[group]).mean()),
-                "n": int(group.sum()),
-            }
-    return report
+
+def texts_of(crops: Sequence[CropTable]) -> list[str]:
+    """The queries of all nodes that some crop shows."""
+    return sorted({phrases[0] for table in crops for phrases in table.phrase_sets})

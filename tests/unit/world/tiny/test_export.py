@@ -8,9 +8,17 @@ import pytest
 import torch
 from tokenizers import Tokenizer
 
-from hilsplat.world.tiny.clip import CANONICAL, ClipText, ClipVision, word_tokenizer
+from hilsplat.world.tiny.clip import CANONICAL, CROP_PX, ClipText, ClipVision, word_tokenizer
 from hilsplat.world.tiny.export import export_clip, export_sam
-from hilsplat.world.tiny.sam import SamDecoder, SamEncoder, positional_embeddings
+from hilsplat.world.tiny.sam import (
+    EMBEDDING,
+    FRAME_PX,
+    MASK_STRIDE,
+    STRIDE,
+    SamDecoder,
+    SamEncoder,
+    positional_embeddings,
+)
 
 
 def session(path) -> onnxruntime.InferenceSession:
@@ -40,8 +48,8 @@ def sam(tmp_path_factory):
 def test_exported_sam_equals_torch(sam, batch, prompts, points):
     encoder, decoder, folder = sam
     generator = torch.Generator().manual_seed(batch)
-    pixels = torch.randn(batch, 3, 256, 256, generator=generator)
-    points_xy = torch.rand(batch, prompts, points, 2, generator=generator) * 256
+    pixels = torch.randn(batch, 3, FRAME_PX, FRAME_PX, generator=generator)
+    points_xy = torch.rand(batch, prompts, points, 2, generator=generator) * FRAME_PX
     labels = torch.ones(batch, prompts, points, dtype=torch.int64)
     if points > 1:
         labels[:, 0, 1], labels[:, 1, 1] = 0, -1
@@ -60,9 +68,9 @@ def test_exported_sam_equals_torch(sam, batch, prompts, points):
         expected_embeddings = encoder(pixels)
         windows = torch.tensor([[0.0, 0.0, 1.0]]).repeat(batch, 1)
         expected_scores, expected_masks = decoder(
-            points_xy, labels, expected_embeddings, positional_embeddings(windows, 64)
+            points_xy, labels, expected_embeddings, positional_embeddings(windows, FRAME_PX // STRIDE)
         )
-    assert masks.shape == (batch, prompts, 3, 128, 128)
+    assert masks.shape == (batch, prompts, 3, FRAME_PX // MASK_STRIDE, FRAME_PX // MASK_STRIDE)
     # Batch normalisation is folded into weights before they become float16: that is the difference.
     assert np.abs(embeddings - expected_embeddings.numpy()).max() < 5e-3
     assert np.abs(scores - expected_scores.numpy()).max() < 1e-3
@@ -72,7 +80,7 @@ def test_exported_sam_equals_torch(sam, batch, prompts, points):
 
 def test_padding_points_change_nothing(sam):
     _, decoder, _ = sam
-    embeddings = torch.randn(1, 86, 64, 64, generator=torch.Generator().manual_seed(3))
+    embeddings = torch.randn(1, EMBEDDING, 64, 64, generator=torch.Generator().manual_seed(3))
     positional = positional_embeddings(torch.tensor([[0.0, 0.0, 1.0]]), 64)
     one = torch.tensor([[[[40.0, 90.0]]]])
     two = torch.tensor([[[[40.0, 90.0], [0.0, 0.0]]]])
@@ -87,8 +95,8 @@ def test_sam_folder_says_how_to_prepare_an_image(sam):
     folder = sam[2]
     assert json.loads((folder / "config.json").read_text())["model_type"] == "sam"
     prepare = json.loads((folder / "preprocessor_config.json").read_text())
-    assert prepare["size"] == {"longest_edge": 256}
-    assert prepare["pad_size"] == {"height": 256, "width": 256}
+    assert prepare["size"] == {"longest_edge": 384}
+    assert prepare["pad_size"] == {"height": 384, "width": 384}
 
 
 def test_exported_clip_equals_torch(tmp_path):
@@ -98,7 +106,7 @@ def test_exported_clip_equals_torch(tmp_path):
     text = round_to_half(ClipText(tokenizer.get_vocab_size()))
     export_clip(vision, text, tokenizer, tmp_path)
     for batch in (1, 3):
-        pixels = torch.randn(batch, 3, 64, 64)
+        pixels = torch.randn(batch, 3, CROP_PX, CROP_PX)
         (found,) = session(tmp_path / "onnx" / "vision_model.onnx").run(
             None, {"pixel_values": pixels.numpy()}
         )

@@ -1,13 +1,14 @@
-"""The whole recipe, as small as it gets: two scenes, a step each."""
+"""The whole recipe, as small as it gets: a scene of each kind, a step each."""
 
 import numpy as np
 import pytest
 
 from hilsplat.base.artifacts import read_json
-from hilsplat.base.errors import SceneError
+from hilsplat.base.errors import SceneError, SettingsError
 from hilsplat.datasets.hierarchy import AnnotatedNode
+from hilsplat.settings import TrainingSettings
 from hilsplat.world.tiny.card import RECORD, digests
-from hilsplat.world.tiny.render import phrases_of, scene_of_seed, training_seeds
+from hilsplat.world.tiny.render import MIXTURE, kind_of_seed, phrases_of, scene_of_seed, training_seeds
 from hilsplat.world.tiny.train import train_models
 
 
@@ -32,16 +33,31 @@ def test_a_part_may_be_named_without_its_object():
     assert part.phrases == ("bear head", "head of the bear", "head of the teddy", "head")
 
 
+def test_kinds_of_scenes_have_their_shares():
+    kinds = [kind_of_seed(seed)[0] for seed in range(1_000_000, 1_000_600)]
+    for kind, (share, _, _) in MIXTURE.items():
+        # three standard deviations of 600 draws are 0.06
+        assert kinds.count(kind) / 600 == pytest.approx(share, abs=0.06)
+
+
+def test_an_unknown_stage_of_training_is_refused(tmp_path):
+    with pytest.raises(SettingsError, match="unknown stage of training"):
+        train_models(tmp_path, tmp_path, TrainingSettings(), stages=["sams"])
+
+
 @pytest.mark.slow
 def test_the_recipe_writes_both_models_and_goes_on_from_its_cache(tmp_path):
-    small = {"sam_steps": 2, "clip_steps": 2, "scenes": 2, "validation_scenes": 1, "views": 2, "threads": 1}
-    train_models(tmp_path / "models", tmp_path / "cache", **small)
+    small = TrainingSettings(
+        scenes=4, views=1, validation_scenes=2, sam_minutes=0, sam_steps=2, clip_minutes=0, clip_steps=2,
+        segmented_views=1,
+    )  # fmt: skip
+    train_models(tmp_path / "models", tmp_path / "cache", small, threads=1)
     first = {name: read_json(tmp_path / "models" / name / RECORD) for name in ("sam-tiny", "clip-tiny")}
     for name, record in first.items():
         assert digests(tmp_path / "models" / name) == record["sha256"]
         assert (tmp_path / "models" / name / "curve.png").is_file()
-    assert set(first["sam-tiny"]["metrics"]["grid"]) == {"whole", "part", "subpart"}
-    assert np.isfinite(first["clip-tiny"]["curve"][-1]["loss"])
-    train_models(tmp_path / "models", tmp_path / "cache", **small)
+    assert set(first["sam-tiny"]["metrics"]["points"]["all"]) == {"whole", "part", "subpart"}
+    assert np.isfinite(first["clip-tiny"]["curve"][-1]["contrastive_loss"])
+    train_models(tmp_path / "models", tmp_path / "cache", small, threads=1)
     again = read_json(tmp_path / "models" / "sam-tiny" / RECORD)
     assert again["sha256"] == first["sam-tiny"]["sha256"]

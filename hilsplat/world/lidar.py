@@ -1,0 +1,124 @@
+"""A scan of a synthetic street by a spinning laser scanner on the roof of the car (metres).
+
+It stands in for the top lidar of the Waymo data: 64 beams between 17.6 degrees below the horizon and
+2.4 above. Rays are cast exactly; then each range gets noise, and some returns are lost. Points keep the
+true place of the scanner, as a logged drive does: its poses are not estimated from the images.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32, Int32
+
+from hilsplat.base.artifacts import write_npz
+from hilsplat.base.levels import NONE
+from hilsplat.world.scenes.scene import WorldScene
+
+BEAMS = 64
+INCLINATION_DEG = (-17.6, 2.4)
+"""Lowest and highest beam, as of Waymo's top lidar."""
+AZIMUTH_STEPS = 400
+"""Directions per turn; Waymo has 2650."""
+POSES = 5
+"""Places along the drive where a turn is recorded."""
+ABOVE_CAMERA_M = 0.35
+MAX_RANGE_M = 75.0
+RANGE_NOISE_M = 0.015
+"""Standard deviation of a range."""
+LOST_SHARE = 0.05
+"""Returns that are missing for no reason."""
+GLANCING_COSINE = 0.03
+"""A beam that meets a surface more flatly is not returned."""
+
+
+@dataclass(frozen=True, eq=False)
+class LidarScan:
+    """P points that a scanner measured, and what is true of each.
+
+    Attributes:
+        points: places in the world of the true cameras, noise included, metres.
+        node_ids: nodes that were hit (whole, part, subpart; -1 none).
+        pose_index: row of `origins` that each point was measured from.
+        range_m: measured distance to that origin.
+        beam: which of the 64 beams, 0 the lowest.
+        origins: where the scanner was.
+    """
+
+    points: Float32[np.ndarray, "P 3"]
+    node_ids: Int32[np.ndarray, "P 3"]
+    pose_index: Int32[np.ndarray, " P"]
+    range_m: Float32[np.ndarray, " P"]
+    beam: Int32[np.ndarray, " P"]
+    origins: Float[np.ndarray, "S 3"]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def save(self, path: Path) -> None:
+        """Write all fields as .npz; the same scan gives the same bytes."""
+        write_npz(path, **{name: getattr(self, name) for name in self.__dataclass_fields__})
+
+
+def beam_directions(azimuth_steps: int) -> Float[np.ndarray, "R 3"]:
+    """Unit vectors of one turn, beam by beam from the lowest, azimuth by azimuth from +x to +y."""
+    share = (np.arange(BEAMS) + 0.5) / BEAMS
+    up = np.radians(INCLINATION_DEG[0] + share * (INCLINATION_DEG[1] - INCLINATION_DEG[0]))[:, None]
+    around = 2 * np.pi * (np.arange(azimuth_steps) + 0.5)[None] / azimuth_steps
+    grid = [
+        np.cos(up) * np.cos(around),
+        np.cos(up) * np.sin(around),
+        np.broadcast_to(np.sin(up), (BEAMS, azimuth_steps)),
+    ]
+    return np.stack(grid, axis=-1).reshape(-1, 3)
+
+
+def scan_street(
+    scene: WorldScene,
+    camera_centres: Float[np.ndarray, "V 3"],
+    azimuth_steps: int = AZIMUTH_STEPS,
+    poses: int = POSES,
+    range_noise_m: float = RANGE_NOISE_M,
+    lost_share: float = LOST_SHARE,
+) -> LidarScan:
+    """Scan a scene from some of the places where its views were taken.
+
+    Args:
+        scene: its seed is that of noise and losses; the sky returns nothing.
+        camera_centres: along the drive, in order; the scanner is above evenly chosen ones.
+        azimuth_steps: directions per turn of each beam.
+        poses: number of turns recorded.
+        range_noise_m: standard deviation of the range.
+        lost_share: share of returns that is dropped.
+    """
+    rng = np.random.default_rng([scene.seed, 31])
+    chosen = np.unique(np.linspace(0, len(camera_centres) - 1, poses).round().astype(int))
+    origins = camera_centres[chosen] + np.array([0.0, 0.0, ABOVE_CAMERA_M])
+    sky = [node.id for node in scene.nodes if node.id in scene.background and node.text == "sky"]
+    directions = beam_directions(azimuth_steps)
+    beams = np.repeat(np.arange(BEAMS), azimuth_steps)
+    rows = []
+    for pose, origin in enumerate(origins):
+        starts = np.broadcast_to(origin, directions.shape).astype(np.float32)
+        hit = scene.embree.run(starts, directions.astype(np.float32), query="INTERSECT", output=True)
+        prim, away = hit["primID"], hit["tfar"].astype(np.float64)
+        triangle = scene.triangles[prim].astype(np.float64)
+        normal = np.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])
+        facing = np.abs((normal * directions).sum(axis=1)) / np.linalg.norm(normal, axis=1)
+        # Drawn for every ray, so that a lost point does not change the noise of the others.
+        noise, luck = rng.normal(0.0, 1.0, len(directions)), rng.random(len(directions))
+        ids = np.where((prim >= 0)[:, None], scene.node_ids[prim], NONE)
+        kept = (prim >= 0) & ~np.isin(ids[:, 0], sky) & (away < MAX_RANGE_M)
+        kept &= (facing > GLANCING_COSINE) & (luck >= lost_share)
+        measured = away[kept] + range_noise_m * noise[kept]
+        points = origin + measured[:, None] * directions[kept]
+        rows.append((points, ids[kept], np.full(kept.sum(), pose), measured, beams[kept]))
+    points, ids, pose_index, ranges, beam = (np.concatenate(column) for column in zip(*rows, strict=True))
+    return LidarScan(
+        points.astype(np.float32),
+        ids.astype(np.int32),
+        pose_index.astype(np.int32),
+        ranges.astype(np.float32),
+        beam.astype(np.int32),
+        origins,
+    )

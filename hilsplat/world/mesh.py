@@ -1,0 +1,65 @@
+"""The true surface of a synthetic scene, read back from its truth folder, and its exact depth."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+from plyfile import PlyData, PlyParseError
+
+from hilsplat.base.errors import ArtifactError
+from hilsplat.scene.cameras import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class TrueMesh:
+    """The triangles of a scene, in the frame of its true cameras.
+
+    Attributes:
+        triangles: corners, scene units.
+    """
+
+    triangles: Float32[np.ndarray, "F 3 3"]
+
+    @staticmethod
+    def load(path: Path) -> "TrueMesh":
+        """Read `truth/mesh.ply`.
+
+        Raises:
+            ArtifactError: it is missing or no mesh.
+        """
+        try:
+            record = PlyData.read(path)
+            vertices, faces = record["vertex"], record["face"]["vertex_indices"]
+        except FileNotFoundError as error:
+            raise ArtifactError(f"{path} is missing", fix="run the world stage") from error
+        except (PlyParseError, KeyError, ValueError) as error:
+            raise ArtifactError(
+                f"{path} cannot be read: {error}", fix="delete the truth folder and run the world stage again"
+            ) from error
+        corners = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
+        return TrueMesh(corners[np.stack(faces)])
+
+    @cached_property
+    def embree(self) -> object:
+        """Ray-casting structure, built on first use."""
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        scene = EmbreeScene()
+        TriangleMesh(scene, self.triangles)
+        return scene
+
+    def depth(self, camera: Camera) -> Float32[np.ndarray, "H W"]:
+        """Depth along the optical axis at each pixel's centre, scene units; inf where nothing is."""
+        height, width = camera.size_hw
+        y, x = np.mgrid[:height, :width] + 0.5
+        pixels = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+        rotation = camera.cam_from_world[:3, :3]
+        # directions of depth 1: the distance that Embree returns then is the depth
+        directions = (pixels @ np.linalg.inv(camera.K).T @ rotation).astype(np.float32)
+        origins = np.ascontiguousarray(np.broadcast_to(camera.centre.astype(np.float32), directions.shape))
+        hit = self.embree.run(origins, directions, query="INTERSECT", output=True)  # type: ignore[attr-defined]
+        depth = np.where(hit["primID"] >= 0, hit["tfar"], np.inf)
+        return depth.reshape(height, width).astype(np.float32)

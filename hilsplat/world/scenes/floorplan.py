@@ -1,0 +1,148 @@
+"""Where the furniture of a room goes: boxes along the walls that leave each other and the way free."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from hilsplat.world.shapes import rotation_about
+
+WALL_GAP = 0.03
+"""Furniture stands this far off its wall, and the skirting fits in between, m."""
+PIECE_GAP = 0.05
+PATH_GAP = 0.28
+"""Least distance, from above, of the cameras' path to what is as tall as they are, m."""
+PATH_LOW = 1.16
+"""Cameras are always well above this height, m; lower things may stand under their path."""
+TRIES = 120
+
+
+@dataclass(frozen=True)
+class Room:
+    """The inside of a room, its floor's middle at the origin; walls 0 to 3 face +x, +y, -x, -y.
+
+    Attributes:
+        width: length along x, m.
+        depth: length along y, m.
+        height: of the ceiling, m.
+    """
+
+    width: float
+    depth: float
+    height: float
+
+    def wall_length(self, wall: int) -> float:
+        """Length of a wall, m."""
+        return self.depth if wall % 2 == 0 else self.width
+
+    def at_wall(self, wall: int, along: float, away: float) -> Float[np.ndarray, " 2"]:
+        """Point before a wall: `along` from its middle, `away` from it into the room, m."""
+        half = self.width / 2 if wall % 2 == 0 else self.depth / 2
+        return rotation_about("z", yaw_of_wall(wall))[:2, :2] @ np.array([away - half, along])
+
+
+def yaw_of_wall(wall: int) -> float:
+    """Turn by which the front of a thing with its back to the wall faces the room, degree."""
+    return 90.0 * wall
+
+
+@dataclass(frozen=True)
+class Space:
+    """An upright box of space that is taken, m.
+
+    Attributes:
+        low: its lowest corner.
+        high: its highest corner.
+    """
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    @staticmethod
+    def of(corners: Float[np.ndarray, "N 3"]) -> "Space":
+        """The box around some points."""
+        return Space(tuple(corners.min(axis=0).tolist()), tuple(corners.max(axis=0).tolist()))
+
+    def meets(self, other: "Space", gap: float) -> bool:
+        """Whether two boxes come nearer than `gap` on every axis (heights: whether they overlap)."""
+        sides = all(self.low[a] < other.high[a] + gap and other.low[a] < self.high[a] + gap for a in range(2))
+        return sides and self.low[2] < other.high[2] and other.low[2] < self.high[2]
+
+    def beyond(self, room: Room, gap: float) -> bool:
+        """Whether the box leaves the room, less `gap` at the walls."""
+        half = (room.width / 2 - gap, room.depth / 2 - gap)
+        return any(self.low[a] < -half[a] or self.high[a] > half[a] for a in range(2))
+
+    def distance_xy(self, points: Float[np.ndarray, "N 2"]) -> float:
+        """Least distance of the points to the box, from above."""
+        low, high = np.array(self.low[:2]), np.array(self.high[:2])
+        return float(np.linalg.norm(np.maximum(0, np.maximum(low - points, points - high)), axis=1).min())
+
+
+class FloorPlan:
+    """What is taken of a room, while it is furnished."""
+
+    def __init__(self, room: Room, path: Float[np.ndarray, "N 2"]) -> None:
+        self.room, self.path = room, path
+        self.taken: list[Space] = []
+
+    def free(self, space: Space, gap: float = PIECE_GAP) -> bool:
+        """Whether a box of space is inside the room, off what is taken, and off the cameras' path."""
+        if space.beyond(self.room, 0.0) or any(space.meets(other, gap) for other in self.taken):
+            return False
+        return space.high[2] <= PATH_LOW or space.distance_xy(self.path) >= PATH_GAP
+
+    def take(self, space: Space) -> None:
+        """Nothing else may go there."""
+        self.taken.append(space)
+
+    def wall_spot(
+        self,
+        rng: np.random.Generator,
+        size: Float[np.ndarray, " 3"],
+        base_z: float,
+        clear: float,
+        walls: tuple[int, ...] = (0, 1, 2, 3),
+        gap: float = WALL_GAP,
+    ) -> tuple[int, Float[np.ndarray, " 2"], Space] | None:
+        """A random free place at a wall for a thing that faces the room.
+
+        Args:
+            rng: where to try.
+            size: of the thing in its own frame: depth, width, height, m.
+            base_z: height of its lowest point, m.
+            clear: room to leave free before it, m; not taken from others afterwards.
+            walls: those allowed.
+            gap: between it and the wall, m.
+
+        Returns:
+            The wall, the middle of the thing from above, and the space it takes; None if none was found.
+        """
+        for _ in range(TRIES):
+            wall = int(rng.choice(walls))
+            slack = self.room.wall_length(wall) / 2 - size[1] / 2 - 0.04
+            if slack <= 0:
+                continue
+            along = float(rng.uniform(-slack, slack))
+            spot = self.room.at_wall(wall, along, gap + size[0] / 2)
+            space = turned_space(spot, size, yaw_of_wall(wall), base_z)
+            front = turned_space(
+                self.room.at_wall(wall, along, gap + (size[0] + clear) / 2),
+                np.array([size[0] + clear, size[1], size[2]]),
+                yaw_of_wall(wall),
+                base_z,
+            )
+            if self.free(space) and not any(front.meets(other, 0.0) for other in self.taken):
+                return wall, spot, space
+        return None
+
+
+def turned_space(
+    spot: Float[np.ndarray, " 2"], size: Float[np.ndarray, " 3"], yaw_deg: float | int, base_z: float | int
+) -> Space:
+    """The space of a thing whose middle, from above, is at `spot`; `yaw_deg` is a multiple of 90."""
+    depth, width = (size[0], size[1]) if round(yaw_deg / 90) % 2 == 0 else (size[1], size[0])
+    return Space(
+        (float(spot[0] - depth / 2), float(spot[1] - width / 2), float(base_z)),
+        (float(spot[0] + depth / 2), float(spot[1] + width / 2), float(base_z + size[2])),
+    )

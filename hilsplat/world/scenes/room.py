@@ -1,0 +1,383 @@
+"""Room scenes: furniture along the walls, things on it (stand-ins for ScanNet, ScanNet200 and Replica)."""
+
+import logging
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from hilsplat.base.levels import NONE
+from hilsplat.world.objects.builder import ObjectModel
+from hilsplat.world.objects.catalogue import ROOM_THINGS, build_furniture, build_object
+from hilsplat.world.scenes.floorplan import WALL_GAP, FloorPlan, Room, Space, turned_space, yaw_of_wall
+from hilsplat.world.scenes.room_cameras import path_points
+from hilsplat.world.scenes.room_shell import add_shell, room_style
+from hilsplat.world.scenes.scene import Assembly, PlacedObject, WorldScene, footprint_of
+from hilsplat.world.shapes import rotation_about
+
+logger = logging.getLogger(__name__)
+
+FURNITURE_SHARE = 0.65
+"""Of the objects asked for, how many are furniture; the others are things that stand on it."""
+PATTERN_FACTOR = 2.0
+"""Things are drawn at half a metre and stand here at half of that: their patterns shrink with them."""
+
+
+class Piece(NamedTuple):
+    """How a piece of furniture is placed.
+
+    Attributes:
+        name: its class.
+        above: height kept free above it for what stands on it, m.
+        clear: room kept free before it, m.
+        partners: what comes with it, if that finds a place too: class and where ("before", "beside", "on").
+    """
+
+    name: str
+    above: float
+    clear: float
+    partners: tuple[tuple[str, str], ...] = ()
+
+
+LARGE: tuple[Piece, ...] = (
+    Piece("bed", 0.0, 0.15, (("nightstand", "beside"),)),
+    Piece("sofa", 0.0, 0.3),
+    Piece("desk", 0.75, 0.65, (("chair", "before"), ("monitor", "on"))),
+    Piece("tv stand", 0.72, 0.3, (("television", "on"),)),
+    Piece("counter", 0.5, 0.4, (("sink", "on"),)),
+    Piece("bookshelf", 0.0, 0.3),
+    Piece("refrigerator", 0.0, 0.4),
+    Piece("cabinet", 0.45, 0.3),
+)
+"""Pieces that stand at a wall; drawn in a random order, each once before any comes again."""
+
+SUPPORTS: dict[str, str] = {
+    "table": "table top",
+    "desk": "desk top",
+    "cabinet": "cabinet top",
+    "nightstand": "nightstand top",
+    "counter": "counter top",
+    "tv stand": "tv stand top",
+}
+"""Furniture that things stand on, and the node whose upper side carries them."""
+
+THING_SIZES: dict[str, tuple[float, float]] = {
+    "mug": (0.15, 0.2), "kettle": (0.24, 0.3), "bottle": (0.3, 0.36), "cake": (0.22, 0.28),
+    "fruit basket": (0.22, 0.28), "toaster": (0.2, 0.26), "radio": (0.22, 0.28), "camera": (0.18, 0.24),
+    "lantern": (0.3, 0.36), "clock": (0.26, 0.32), "backpack": (0.4, 0.46), "plant": (0.42, 0.55),
+}  # fmt: skip
+"""Heights of some things, m; a little larger than life, so that their subparts show across a room."""
+TOY_SIZE = (0.34, 0.44)
+"""Heights of all other things, m."""
+MAX_THING_RADIUS = 0.21
+EDGE = 0.03
+"""Things stay so far off the edge of what carries them, m; also off the wall of a counter."""
+MAX_FLAT = 0.05
+"""What lies on a board and is no higher carries things too, m."""
+
+
+class _Furnishing:
+    """A room while it is furnished: the scene so far, what is taken, what can carry things."""
+
+    def __init__(self, seed: int, room: Room, path: np.ndarray) -> None:
+        self.seed, self.plan = seed, FloorPlan(room, path)
+        self.assembly = Assembly()
+        self.placed: list[PlacedObject] = []
+        self.supports: list[Support] = []
+        self._drawn = 0
+
+    def model(self, name: str, *, thing: bool = False) -> ObjectModel:
+        """The next object of a class."""
+        self._drawn += 1
+        rng = np.random.default_rng([self.seed, 22, self._drawn])
+        return build_object(name, rng) if thing else build_furniture(name, rng)
+
+    def put(
+        self,
+        name: str,
+        model: ObjectModel,
+        spot: np.ndarray,
+        yaw_deg: float,
+        base_z: float = 0.0,
+        scale: float = 1.0,
+    ) -> Space:
+        """Add an object whose middle, from above, comes to `spot`; returns the space it takes."""
+        low, high = model.triangles.min(axis=(0, 1)) * scale, model.triangles.max(axis=(0, 1)) * scale
+        middle = (low + high)[:2] / 2
+        xy = spot - rotation_about("z", yaw_deg)[:2, :2] @ middle
+        node = self.assembly.add_object(model, scale, xy, yaw_deg, base_z)
+        added = self.assembly.triangles[-1]
+        centre, radius = footprint_of(added)
+        space = Space.of(added.reshape(-1, 3))
+        self.placed.append(
+            PlacedObject(
+                name,
+                node,
+                (float(centre[0]), float(centre[1])),
+                radius,
+                space.high[2] - base_z,
+                yaw_deg,
+                base_z,
+            )
+        )
+        if name in SUPPORTS:
+            self.supports.append(_support(model, added, SUPPORTS[name]))
+        return space
+
+
+class Support(NamedTuple):
+    """The upper side of a piece of furniture.
+
+    Attributes:
+        top: the space of its board.
+        flat: spaces of what lies on it, such as a table runner.
+        stand: middle and radius of the footprints that are on it already.
+    """
+
+    top: Space
+    flat: list[Space]
+    stand: list[tuple[np.ndarray, float]]
+
+    def height_at(self, spot: np.ndarray, radius: float) -> float:
+        """Height at which a thing of a footprint stands there: on the board, or on what lies on it."""
+        reach = np.array([radius, radius])
+        below = Space((*(spot - reach).tolist(), -1.0), (*(spot + reach).tolist(), 1e3))
+        return max([self.top.high[2], *(space.high[2] for space in self.flat if space.meets(below, 0.0))])
+
+
+def _support(model: ObjectModel, triangles: np.ndarray, text: str) -> Support:
+    """What an object that was added as `triangles` can carry on the node of a text."""
+    node = next(row for row, found in enumerate(model.nodes) if found.text == text)
+    own = model.node_ids[:, model.nodes[node].level - 1] == node
+    board = own & (model.node_ids[:, 2] == NONE) if model.nodes[node].level == 2 else own
+    top = Space.of(triangles[board].reshape(-1, 3))
+    flat = []
+    for row in np.unique(model.node_ids[own & ~board, 2]):
+        space = Space.of(triangles[model.node_ids[:, 2] == row].reshape(-1, 3))
+        if space.high[2] < top.high[2] + MAX_FLAT:
+            flat.append(space)
+    return Support(top, flat, [])
+
+
+def size_of(model: ObjectModel) -> Float[np.ndarray, " 3"]:
+    """Depth, width and height of an object in its own frame, scene units."""
+    return np.ptp(model.triangles.reshape(-1, 3), axis=0)
+
+
+def build_room(seed: int, objects: int) -> WorldScene:
+    """A room of about 4 x 5 m with furniture at its walls; the unit is the metre, the floor z = 0.
+
+    A door, a window with a curtain and two pictures (or a mirror) come with every room. Of `objects`,
+    about two thirds are furniture, the others things that stand on it (or on the floor, where nothing
+    carries them); what finds no place is left out. More objects fill the room: the loop of the cameras
+    stays free.
+
+    Args:
+        seed: not negative; same seed and number of objects, same scene.
+        objects: how many pieces of furniture and things to place.
+    """
+    rng = np.random.default_rng([seed, 21])
+    room = Room(float(rng.uniform(4.4, 5.0)), float(rng.uniform(3.8, 4.3)), 2.55)
+    work = _Furnishing(seed, room, path_points(room, np.linspace(0, 360, 72, endpoint=False)))
+    fixtures = _add_fixtures(work, rng)
+    furniture = _furnish(work, rng, max(1, round(FURNITURE_SHARE * objects)))
+    pictures = _hang_pictures(work, rng)
+    things = sum(_add_thing(work, rng, name) for name in _thing_names(rng, objects - furniture))
+    logger.info(
+        "scene room:%d: %d pieces of furniture, %d things of %d objects asked, %d fixtures: %s",
+        seed, furniture, things, objects, fixtures + pictures, ", ".join(thing.name for thing in work.placed),
+    )  # fmt: skip
+    background = add_shell(work.assembly, room, np.random.default_rng([seed, 23]))
+    style = room_style(room, np.random.default_rng([seed, 24]))
+    asked = objects + fixtures + 2
+    return work.assembly.finished("room", seed, asked, work.placed, background, style)
+
+
+def _add_fixtures(work: _Furnishing, rng: np.random.Generator) -> int:
+    """Door, window and curtain, on different walls; returns how many."""
+    room, plan = work.plan.room, work.plan
+    door_wall, window_wall = (int(wall) for wall in rng.permutation(4)[:2])
+    model = work.model("door")
+    size = size_of(model)
+    reach = room.wall_length(door_wall) / 2 - size[1] / 2 - 0.12
+    along = float(rng.choice([-1, 1]) * reach * rng.uniform(0.6, 1.0))
+    yaw = yaw_of_wall(door_wall)
+    work.put("door", model, room.at_wall(door_wall, along, size[0] / 2), yaw)
+    # The way in stays free, and so does the swing of the door.
+    plan.take(turned_space(room.at_wall(door_wall, along, 0.4), np.array([0.8, size[1], 2.1]), yaw, 0.0))
+    window, curtain = work.model("window"), work.model("curtain")
+    yaw, sill = yaw_of_wall(window_wall), 0.92
+    along = float(rng.uniform(-0.3, 0.3))
+    for name, model, base_z in (("window", window, sill), ("curtain", curtain, 0.84)):
+        size = size_of(model)
+        spot = room.at_wall(window_wall, along, size[0] / 2)
+        work.put(name, model, spot, yaw, base_z)
+    plan.take(turned_space(spot, size, yaw, base_z))
+    return 3
+
+
+def _furnish(work: _Furnishing, rng: np.random.Generator, count: int) -> int:
+    """Large pieces at the walls with what belongs to them, a table in the middle; returns how many."""
+    done, failures = 0, 0
+    queue: list[Piece] = []
+    with_rug = count >= 4 and bool(rng.random() < 0.5)
+    # A table goes where the others leave it place; lamp and stool come once so many pieces are there.
+    extras = [(5, "lamp"), (7, "stool")]
+    table_at = count - 1 - with_rug if count >= 3 else count
+    while done < count and failures < 2 * len(LARGE):
+        if done >= table_at:
+            table_at = count
+            done += _put_table(work, rng, with_rug and done + 2 <= count)
+            continue
+        if extras and done >= extras[0][0]:
+            done += _put_at_wall(work, rng, Piece(extras.pop(0)[1], 0.0, 0.0))
+            continue
+        if not queue:
+            queue = [LARGE[row] for row in rng.permutation(len(LARGE))]
+        piece = queue.pop()
+        if not _put_at_wall(work, rng, piece):
+            failures += 1
+            continue
+        done += 1
+        owner = len(work.placed) - 1
+        for name, where in piece.partners:
+            if done < count:
+                done += _put_partner(work, rng, owner, name, where)
+    if done < count:
+        logger.warning("scene room:%d: no place left for %d pieces of furniture", work.seed, count - done)
+    return done
+
+
+def _put_at_wall(work: _Furnishing, rng: np.random.Generator, piece: Piece) -> bool:
+    model = work.model(piece.name)
+    size = size_of(model)
+    found = work.plan.wall_spot(rng, size + np.array([0, 0, piece.above]), 0.0, piece.clear)
+    if found is None:
+        return False
+    wall, spot, space = found
+    work.plan.take(space)
+    work.put(piece.name, model, spot, yaw_of_wall(wall))
+    return True
+
+
+ON_TOP: dict[str, float] = {"television": -0.03, "monitor": -0.12, "sink": 0.0}
+"""How far before the middle of what carries it a thing stands that has its place there, m."""
+
+
+def _put_partner(work: _Furnishing, rng: np.random.Generator, owner_row: int, name: str, where: str) -> bool:
+    """Put what belongs to a piece before it, beside it or on it; tells whether there was place."""
+    model = work.model(name)
+    size = size_of(model)
+    owner = work.placed[owner_row]
+    turn = rotation_about("z", owner.yaw_deg)[:2, :2]
+    corners = np.concatenate(work.assembly.triangles[owner_row])
+    middle = np.array(owner.centre_xy)
+    half_depth, half_width = np.ptp((corners[:, :2] - middle) @ turn, axis=0) / 2
+    if where == "on":
+        support = work.supports[-1]
+        spot = middle + turn @ np.array([ON_TOP[name], 0.0])
+        radius = float(np.linalg.norm(size[:2]) / 2)
+        support.stand.append((spot, radius))
+        work.put(name, model, spot, owner.yaw_deg, support.height_at(spot, 0.4 * radius))
+        return True
+    for side in rng.permutation([-1.0, 1.0]):
+        if where == "before":
+            offset, yaw = np.array([half_depth + size[0] / 2 + 0.06, -0.1 * half_width]), owner.yaw_deg + 180
+        else:
+            offset = np.array([size[0] / 2 - half_depth, side * (half_width + size[1] / 2 + 0.06)])
+            yaw = owner.yaw_deg
+        spot = middle + turn @ offset
+        space = turned_space(spot, size + np.array([0, 0, 0.45 if name in SUPPORTS else 0.0]), yaw, 0.0)
+        if work.plan.free(space, 0.02):
+            work.plan.take(space)
+            work.put(name, model, spot, yaw)
+            return True
+    return False
+
+
+def _put_table(work: _Furnishing, rng: np.random.Generator, with_rug: bool) -> int:
+    """A table near the middle of the room, perhaps on a rug; returns how many pieces that were."""
+    model, rug = work.model("table"), work.model("rug")
+    size = size_of(rug) if with_rug else size_of(model)
+    base_z = float(size_of(rug)[2]) if with_rug else 0.0
+    for attempt in range(80):
+        yaw = 90.0 * int(rng.integers(4))
+        spot = rng.uniform(-1, 1, 2) * np.array([1.6, 1.0]) * (0.15 + 0.006 * attempt)
+        space = turned_space(spot, np.array([size[0], size[1], size_of(model)[2] + 0.46]), yaw, 0.0)
+        if work.plan.free(space, 0.25):
+            work.plan.take(space)
+            if with_rug:
+                work.put("rug", rug, spot, yaw)
+            work.put("table", model, spot, yaw, base_z)
+            return 1 + with_rug
+    return 0
+
+
+def _hang_pictures(work: _Furnishing, rng: np.random.Generator) -> int:
+    """A picture, and another or a mirror, where walls are free at eye height; returns how many."""
+    hung = 0
+    for name in ("picture", str(rng.choice(["picture", "mirror"]))):
+        model = work.model(name)
+        base_z = float(rng.uniform(1.28, 1.4))
+        found = work.plan.wall_spot(rng, size_of(model), base_z, 0.25, gap=0.0)
+        if found is not None:
+            wall, spot, space = found
+            work.plan.take(space)
+            work.put(name, model, spot, yaw_of_wall(wall), base_z)
+            hung += 1
+    return hung
+
+
+def _thing_names(rng: np.random.Generator, count: int) -> list[str]:
+    order = [str(name) for _ in range(1 + count // len(ROOM_THINGS)) for name in rng.permutation(ROOM_THINGS)]
+    return order[:count]
+
+
+def _add_thing(work: _Furnishing, rng: np.random.Generator, name: str) -> bool:
+    """Stand a thing on furniture, on the emptiest support first, else on the floor at a wall."""
+    model = work.model(name, thing=True)
+    _, radius = footprint_of(model.triangles)
+    height = float(model.triangles[..., 2].max())
+    target = float(rng.uniform(*THING_SIZES.get(name, TOY_SIZE)))
+    scale = min(target / height, MAX_THING_RADIUS / radius)
+    radius *= scale
+    pattern = model.materials.copy()
+    pattern[:, 7] *= PATTERN_FACTOR  # cells of the texture per metre, see Paint.row
+    model = replace(model, materials=pattern)
+    order = sorted(range(len(work.supports)), key=lambda row: (len(work.supports[row].stand), rng.random()))
+    for row in order:
+        support = work.supports[row]
+        low = np.array(support.top.low[:2]) + radius + EDGE
+        high = np.array(support.top.high[:2]) - radius - EDGE
+        if (high <= low).any():
+            continue
+        for _ in range(60):
+            spot = rng.uniform(low, high)
+            if all(np.linalg.norm(spot - other) > radius + size + 0.02 for other, size in support.stand):
+                support.stand.append((spot, radius))
+                _stand(work, rng, name, model, spot, support.height_at(spot, 0.6 * radius), scale)
+                return True
+    size = np.array([2 * radius, 2 * radius, height * scale])
+    found = work.plan.wall_spot(rng, size, 0.0, 0.2, gap=WALL_GAP + 0.05)
+    if found is None:
+        logger.warning("scene room:%d: no place left for the %s", work.seed, name)
+        return False
+    work.plan.take(found[2])
+    _stand(work, rng, name, model, found[1], 0.0, scale)
+    return True
+
+
+def _stand(
+    work: _Furnishing,
+    rng: np.random.Generator,
+    name: str,
+    model: ObjectModel,
+    spot: np.ndarray,
+    base_z: float,
+    scale: float,
+) -> None:
+    """Put a thing down, its front roughly towards the middle of the room."""
+    yaw = float(np.degrees(np.arctan2(-spot[1], -spot[0])) + rng.uniform(-50, 50))
+    # The circle around the footprint turns about its own middle: any yaw keeps it in place.
+    work.put(name, model, spot, yaw, base_z, scale)

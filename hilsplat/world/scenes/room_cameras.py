@@ -1,0 +1,107 @@
+"""Cameras of room scenes: a loop that structure from motion holds, and random ones for training."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from hilsplat.scene.cameras import Camera, Cameras
+from hilsplat.world.scenes.floorplan import Room
+from hilsplat.world.scenes.scene import WorldScene
+from hilsplat.world.views import looking_at, numbered_cameras, pinhole
+
+FOV_DEG = 62.0
+EYE_HEIGHTS = (1.34, 1.7)
+"""Heights of the cameras, by turns, m; the difference gives parallax that the loop alone lacks."""
+PATH_SHARE = 0.27
+"""Half axes of the cameras' loop, share of the room's width and depth."""
+LOOK_AT_Z = 0.78
+
+
+def path_points(room: Room, azimuths_deg: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 2"]:
+    """Points of the cameras' loop, an ellipse about the middle of the room, from above."""
+    angle = np.radians(azimuths_deg)
+    axes = PATH_SHARE * np.array([room.width, room.depth])
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1) * axes
+
+
+def room_of(scene: WorldScene) -> Room:
+    """The inside of a room scene."""
+    high = scene.triangles.reshape(-1, 3).max(axis=0)
+    return Room(2 * float(high[0]), 2 * float(high[1]), float(high[2]))
+
+
+def loop_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int = 360.0) -> Cameras:
+    """Cameras on a loop through the room, at two heights by turns, that look across its middle.
+
+    Looking across sees the far wall with all that stands there, and the middle from all sides; a
+    camera that turns on the spot and looks outwards would give no parallax.
+
+    Args:
+        scene: its seed is that of the jitter.
+        views: number of cameras, named 000.png, 001.png, ...
+        image_px: height and width.
+        arc_deg: azimuth of the loop that is used, about +x; a full ring does not repeat its first.
+    """
+    rng = np.random.default_rng([scene.seed, 25])
+    room = room_of(scene)
+    share = np.arange(views) / (views if arc_deg >= 360 else max(1, views - 1))
+    azimuths = arc_deg * (share - 0.5) + rng.uniform(-1, 1, views)
+    spots = path_points(room, azimuths)
+    transforms = []
+    for i in range(views):
+        centre = np.array([*spots[i], EYE_HEIGHTS[i % 2] + rng.uniform(-0.03, 0.03)])
+        target = np.array([*(-0.5 * spots[i]), LOOK_AT_Z]) + rng.uniform(-0.04, 0.04, 3)
+        transforms.append(looking_at(centre, target))
+    return numbered_cameras(transforms, pinhole(image_px, FOV_DEG), image_px)
+
+
+def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int = 256) -> Camera:
+    """A random camera for training: like those of `loop_cameras`, and closer ones on one object.
+
+    A third looks across the room, the others at an object, from a free place inside the room.
+    """
+    room = room_of(scene)
+    boxes = _boxes(scene)
+    if rng.random() < 1 / 3:
+        spot = path_points(room, np.array([rng.uniform(0, 360)]))[0]
+        centre = np.array([*spot, rng.uniform(1.3, 1.78)])
+        target = np.array([*(-0.5 * spot), LOOK_AT_Z]) + rng.uniform(-0.3, 0.3, 3)
+    else:
+        thing = scene.placed[int(rng.integers(len(scene.placed)))]
+        target = np.array([*thing.centre_xy, thing.base_z + 0.5 * thing.height]) + rng.uniform(-0.1, 0.1, 3)
+        size = max(thing.footprint, thing.height / 2)
+        centre = _free_centre(room, boxes, target, size, rng)
+    K = pinhole(image_px, rng.uniform(54, 66))
+    return Camera("random.png", looking_at(centre, target), K, (image_px, image_px))
+
+
+def _boxes(scene: WorldScene) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Lowest and highest corners of all placed objects."""
+    found = []
+    for thing in scene.placed:
+        points = scene.triangles[scene.node_ids[:, 0] == thing.node].reshape(-1, 3)
+        found.append((points.min(axis=0), points.max(axis=0)))
+    return found
+
+
+def _free_centre(
+    room: Room,
+    boxes: Sequence[tuple[np.ndarray, np.ndarray]],
+    target: np.ndarray,
+    size: float,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """A place in the room, outside all objects, from which something of a size fills much of a view."""
+    half = np.array([room.width, room.depth]) / 2 - 0.2
+    for _ in range(200):
+        azimuth, distance = rng.uniform(0, 2 * np.pi), size * rng.uniform(1.7, 3.2) + 0.35
+        flat = target[:2] + distance * np.array([np.cos(azimuth), np.sin(azimuth)])
+        centre = np.array([*flat, np.clip(target[2] + rng.uniform(0.05, 0.6) * distance, 0.45, 1.9)])
+        if (np.abs(flat) < half).all() and all(
+            ((centre < low - 0.12) | (centre > high + 0.12)).any() for low, high in boxes
+        ):
+            return centre
+    # In a corner that furniture encloses only the loop is surely free.
+    spot = path_points(room, np.array([rng.uniform(0, 360)]))[0]
+    return np.array([*spot, rng.uniform(1.3, 1.75)])

@@ -1,0 +1,351 @@
+"""Streets: a drive between houses, past vehicles, people, trees and signs (stand-in for Waymo). Metres.
+
+x runs along the street, y to the left of a driver who heads for +x, z up; the road is z = 0.
+"""
+
+import logging
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hilsplat.scene.cameras import Camera, Cameras
+from hilsplat.world.objects.builder import ObjectModel
+from hilsplat.world.objects.catalogue import build_street_object
+from hilsplat.world.scenes.scene import Assembly, PlacedObject, Style, WorldScene, footprint_of
+from hilsplat.world.scenes.street_ground import FRONT, KERB, LANE, SCALE, add_ground
+from hilsplat.world.shapes import rotation_about
+from hilsplat.world.views import looking_at, numbered_cameras, pinhole
+
+logger = logging.getLogger(__name__)
+
+COUNTED = ("car", "pedestrian", "heavy", "cyclist", "car", "pedestrian", "car")
+"""What is asked for: vehicles and people, in this mixture; "heavy" is a truck or a bus."""
+FURNITURE = (
+    "traffic light", "traffic sign", "tree", "street lamp", "tree", "bush", "fence", "tree", "traffic sign",
+    "bush", "street lamp", "tree", "fence", "bush",
+)  # fmt: skip
+"""What comes with every street, as far as it finds a place."""
+STREET_X = (-26.0, 42.0)
+"""The rows of buildings; both ends of the street are closed by buildings across."""
+THINGS_X = (-9.0, 25.0)
+"""Where vehicles, people and furniture stand: in view of the drive."""
+GAP = 0.12
+TRIES = 200
+
+LANE_Y = -LANE / 2
+"""The driver's lane (traffic keeps to the right)."""
+DRIVE_X = (-13.0, 10.5)
+CAMERA_Z = 1.8
+MAX_STEP = 0.51
+"""Farthest two neighbouring views are apart along the street, m."""
+SWEEP_VIEWS = 16
+"""Views in which the camera looks from the left to the right and back."""
+SWEEP_DEG = 36.0
+"""How far it looks to either side of straight ahead."""
+SWAY_M = 0.8
+"""How far it moves to either side of the lane's middle in one sweep. Without it, structure from motion
+measured 2.5 m off instead of 0.04 m: views that turn while they move straight ahead have hardly any
+parallax in common, and the two sides of the street came out at different scales."""
+FOV_DEG = 62.0
+SUN_DISTANCE = 1000.0
+
+
+class _Boxes:
+    """Axis-aligned boxes that are taken, one per part of each thing placed so far."""
+
+    def __init__(self) -> None:
+        self.low = np.zeros((0, 3))
+        self.high = np.zeros((0, 3))
+
+    def free(self, low: Float[np.ndarray, "P 3"], high: Float[np.ndarray, "P 3"]) -> bool:
+        """Whether boxes, grown by the gap, meet none that is taken."""
+        apart = (low[:, None] - GAP > self.high) | (high[:, None] + GAP < self.low)
+        return bool(apart.any(axis=2).all())
+
+    def take(self, low: Float[np.ndarray, "P 3"], high: Float[np.ndarray, "P 3"]) -> None:
+        """Add boxes."""
+        self.low, self.high = np.concatenate([self.low, low]), np.concatenate([self.high, high])
+
+
+class _Spot(NamedTuple):
+    """A place for a thing: (x, y), the height it stands on, and its turn."""
+
+    x: float
+    y: float
+    z: float
+    yaw_deg: float
+
+
+def part_boxes(
+    triangles: Float[np.ndarray, "F 3 3"], parts: np.ndarray
+) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]]:
+    """Lowest and highest corner of the box around each part of a thing."""
+    pieces = [triangles[parts == part].reshape(-1, 3) for part in np.unique(parts)]
+    return np.stack([p.min(axis=0) for p in pieces]), np.stack([p.max(axis=0) for p in pieces])
+
+
+class _Street:
+    """A street while things are put into it."""
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+        self.rng = np.random.default_rng([seed, 21])
+        self.assembly = Assembly(SCALE)
+        self.boxes = _Boxes()
+        self.drawn = 0
+
+    def draw(self, name: str) -> ObjectModel:
+        """The next thing of a class; its looks depend on the seed and on how many were drawn before."""
+        self.drawn += 1
+        return build_street_object(name, np.random.default_rng([self.seed, 22, self.drawn]))
+
+    def put(self, model: ObjectModel, spot: _Spot) -> PlacedObject | None:
+        """Place a thing where the spot says, unless it meets another."""
+        turned = model.triangles @ rotation_about("z", spot.yaw_deg).T + np.array([spot.x, spot.y, spot.z])
+        low, high = part_boxes(turned, model.node_ids[:, 1])
+        if not self.boxes.free(low, high):
+            return None
+        self.boxes.take(low, high)
+        node = self.assembly.add_object(model, 1.0, np.array([spot.x, spot.y]), spot.yaw_deg, spot.z)
+        centre, radius = footprint_of(turned)
+        height = float(model.triangles[..., 2].max())
+        xy = (float(centre[0]), float(centre[1]))
+        return PlacedObject(model.name, node, xy, radius, height, spot.yaw_deg, spot.z)
+
+    def try_spots(self, name: str, spot: Callable[[ObjectModel], _Spot]) -> PlacedObject | None:
+        """Place a thing at the first of some random spots that is free."""
+        model = self.draw(name)
+        for _ in range(TRIES):
+            placed = self.put(model, spot(model))
+            if placed is not None:
+                return placed
+        return None
+
+    def vehicle_spot(self, model: ObjectModel) -> _Spot:
+        """Parked at either kerb, oncoming, or ahead in the driver's lane."""
+        rng, width = self.rng, float(np.ptp(model.triangles[..., 1]))
+        half = float(np.ptp(model.triangles[..., 0])) / 2
+        x = float(rng.uniform(THINGS_X[0] + half, THINGS_X[1] - half))
+        kerb_y = KERB - width / 2 - float(rng.uniform(0.15, 0.3))
+        tilt = float(rng.uniform(-1.5, 1.5))
+        choice = rng.random()
+        if choice < 0.36:
+            return _Spot(x, -kerb_y, 0.0, tilt)
+        if choice < 0.68:
+            return _Spot(x, kerb_y, 0.0, 180 + tilt)
+        if choice < 0.84:
+            return _Spot(x, LANE / 2 + 0.15, 0.0, 180 + tilt)
+        return _Spot(float(rng.uniform(DRIVE_X[1] + half + 5, 27 + half)), LANE_Y, 0.0, tilt)
+
+    def cyclist_spot(self, model: ObjectModel) -> _Spot:
+        """Beside the lanes."""
+        rng = self.rng
+        if rng.random() < 0.5:
+            return _Spot(float(rng.uniform(-2, 18)), LANE + 0.05, 0.0, 180 + float(rng.uniform(-8, 8)))
+        return _Spot(float(rng.uniform(2, 20)), -LANE - 0.3, 0.0, float(rng.uniform(-8, 8)))
+
+    def pedestrian_spot(self, model: ObjectModel) -> _Spot:
+        """On a sidewalk, mostly along it."""
+        rng = self.rng
+        side = -1 if rng.random() < 0.6 else 1
+        yaw = float(rng.choice([0.0, 180.0]) + rng.uniform(-35, 35))
+        y = side * float(rng.uniform(KERB + 1.0, FRONT - 0.9))
+        return _Spot(float(rng.uniform(-6, 20)), y, 0.14, yaw)
+
+    def furniture_spot(self, name: str, side: int) -> Callable[[ObjectModel], _Spot]:
+        """In the strip of the sidewalk beside the kerb."""
+        rng = self.rng
+
+        def spot(model: ObjectModel) -> _Spot:
+            x = float(rng.uniform(*THINGS_X))
+            y = side * (KERB + 0.62)
+            toward_road = -90.0 * side
+            if name == "traffic sign":
+                return _Spot(x, y, 0.14, 180 + float(rng.uniform(-18, 18)))
+            if name == "traffic light":
+                return _Spot(float(rng.uniform(9.5, 13.0)), y, 0.14, 180 + float(rng.uniform(-8, 8)))
+            if name == "fence":
+                return _Spot(x, side * (KERB + 0.4), 0.14, toward_road)
+            return _Spot(x, y, 0.14, toward_road)
+
+        return spot
+
+
+def build_street(seed: int, objects: int) -> WorldScene:
+    """A stretch of street. `objects` counts vehicles and people; houses and furniture come with it.
+
+    Vehicles stand in the lanes or park at the kerbs, people walk on the sidewalks, trees, lamps, signs
+    and fences stand beside the kerb. The box around each part of a thing meets no box of another thing;
+    one that finds no place is left out. `placed` lists the counted ones.
+
+    Args:
+        seed: not negative; same seed and number of objects, same scene.
+        objects: how many vehicles and people to place; beyond 16 or so they find no place.
+    """
+    street = _Street(seed)
+    rng = street.rng
+    houses = _add_buildings(street)
+    placed: list[PlacedObject] = []
+    order = np.concatenate([rng.permutation(len(COUNTED)) for _ in range(1 + objects // len(COUNTED))])
+    for i in range(objects):
+        name = COUNTED[order[i]]
+        if name == "heavy":
+            name = str(rng.choice(["truck", "bus"]))
+        spots = {"pedestrian": street.pedestrian_spot, "cyclist": street.cyclist_spot}
+        thing = street.try_spots(name, spots.get(name, street.vehicle_spot))
+        if thing is None:
+            logger.warning("scene street:%d: no place left for the %s", seed, name)
+        else:
+            placed.append(thing)
+    furniture = 0
+    for i, name in enumerate(FURNITURE):
+        side = -1 if i == 0 or (i > 1 and rng.random() < 0.5) or i == 1 else 1
+        thing = street.try_spots(name, street.furniture_spot(name, side))
+        if thing is None:
+            logger.info("scene street:%d: no place left for the %s", seed, name)
+        else:
+            furniture += 1
+    background = add_ground(street.assembly, np.random.default_rng([seed, 23]))
+    logger.info(
+        "scene street:%d: %d of %d vehicles and people placed (%s), %d pieces of furniture, %d buildings",
+        seed, len(placed), objects, ", ".join(thing.name for thing in placed), furniture, houses,
+    )  # fmt: skip
+    style = _daylight(np.random.default_rng([seed, 24]))
+    return street.assembly.finished("street", seed, objects, placed, background, style)
+
+
+def _add_buildings(street: _Street) -> int:
+    """Rows of houses on both sides and across both ends; returns how many."""
+    rng, count = street.rng, 0
+    for side in (-1, 1):
+        x = STREET_X[0] + float(rng.uniform(0, 2))
+        while x < STREET_X[1] - 4:
+            model = street.draw("building")
+            width = float(np.ptp(model.triangles[..., 1])) + 2 * GAP
+            count += street.put(model, _Spot(x + width / 2, side * FRONT, 0.14, -90.0 * side)) is not None
+            x += width + (float(rng.uniform(1.5, 3.0)) if rng.random() < 0.25 else 0.0)
+    for x, yaw in ((STREET_X[1] + 8, 180.0), (STREET_X[0] - 8, 0.0)):
+        y = -16.0
+        while y < 12:
+            model = street.draw("building")
+            width = float(np.ptp(model.triangles[..., 1])) + 2 * GAP
+            count += street.put(model, _Spot(x, y + width / 2, 0.14, yaw)) is not None
+            y += width
+    return count
+
+
+def _daylight(rng: np.random.Generator) -> Style:
+    """Sun and sky; the sun is far away, so its light hardly falls off along the street."""
+    azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(38, 62))
+    warm = rng.uniform(0, 1)
+    toward = np.array(
+        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+    )
+    sun = np.array([1.0, 0.97 - 0.05 * warm, 0.90 - 0.14 * warm]) * rng.uniform(1.1, 1.35)
+    # The shader's light falls off as 13 / distance^2, which is 1 over a table.
+    sun *= SUN_DISTANCE**2 / 13.0
+    sky = np.array([0.40, 0.45, 0.54]) * rng.uniform(0.9, 1.1)
+    position = tuple((SUN_DISTANCE * toward).tolist())
+    ground = tuple((sky * np.array([0.62, 0.56, 0.48])).tolist())
+    return Style(
+        position,
+        14.0,
+        tuple(sun.tolist()),
+        tuple(sky.tolist()),
+        ground,
+        float(rng.uniform(1.0, 1.15)),
+        SCALE,
+        45.0,
+    )
+
+
+def drive_poses(scene: WorldScene, views: int) -> list[tuple[Float[np.ndarray, " 3"], float]]:
+    """Where the camera is and where it heads: centre and yaw in degrees, one per view.
+
+    The camera moves along its lane and sways, while its heading sweeps between the two sides of the
+    street; neighbours differ by 9 degrees. Few views make a shorter drive rather than a coarser one.
+    """
+    rng = np.random.default_rng([scene.seed, 25])
+    length = DRIVE_X[1] - DRIVE_X[0]
+    step = min(MAX_STEP, length / max(1, views - 1))
+    start = (DRIVE_X[0] + DRIVE_X[1] - step * (views - 1)) / 2
+    poses = []
+    for i in range(views):
+        phase = (i % SWEEP_VIEWS) / SWEEP_VIEWS
+        yaw = SWEEP_DEG * (4 * abs(phase - 0.5) - 1) + float(rng.uniform(-2, 2))
+        middle = np.array([start + i * step, LANE_Y + SWAY_M * np.sin(2 * np.pi * phase), CAMERA_Z])
+        poses.append((middle + rng.uniform(-1, 1, 3) * np.array([0.05, 0.15, 0.12]), yaw))
+    return poses
+
+
+def drive_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int = 360.0) -> Cameras:
+    """Cameras of a drive along the street.
+
+    Args:
+        scene: its seed is that of the jitter.
+        views: number of cameras, named 000.png, 001.png, ...
+        image_px: height and width.
+        arc_deg: not used: a drive is no ring.
+    """
+    rng = np.random.default_rng([scene.seed, 26])
+    transforms = []
+    for centre, yaw in drive_poses(scene, views):
+        transforms.append(looking_at(centre, centre + _heading(yaw, float(rng.uniform(-1, 3)))))
+    return numbered_cameras(transforms, pinhole(image_px, FOV_DEG), image_px)
+
+
+def _heading(yaw_deg: float, pitch_deg: float) -> Float[np.ndarray, " 3"]:
+    """Unit vector; positive pitch looks up."""
+    yaw, pitch = np.radians(yaw_deg), np.radians(pitch_deg)
+    return np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
+
+
+def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int = 256) -> Camera:
+    """A random camera for training: views from the road, and close ones of one thing that is in sight."""
+    intrinsics = pinhole(image_px, float(rng.uniform(56, 66)))
+    pose = _close_up(scene, rng) if rng.random() < 0.5 else None
+    if pose is None:
+        centre = np.array([rng.uniform(DRIVE_X[0], 14), rng.uniform(-2.4, -0.8), rng.uniform(1.5, 2.4)])
+        yaw = rng.uniform(-60, 60) if rng.random() < 0.85 else rng.uniform(90, 270)
+        pose = looking_at(centre, centre + _heading(yaw, rng.uniform(-6, 6)))
+    return Camera("random.png", pose, intrinsics, (image_px, image_px))
+
+
+def _close_up(scene: WorldScene, rng: np.random.Generator) -> Float[np.ndarray, "4 4"] | None:
+    """A camera on the road's side of a random thing that nothing hides, None if none is found."""
+    wholes = sorted(set(np.unique(scene.node_ids[:, 0]).tolist()) - scene.background)
+    for _ in range(30):
+        node = wholes[int(rng.integers(len(wholes)))]
+        if scene.nodes[node].text == "building" and rng.random() < 0.6:
+            continue  # houses are many
+        corners = scene.triangles[scene.node_ids[:, 0] == node].reshape(-1, 3).astype(np.float64)
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        if low[0] > 30 or high[0] < -16:
+            continue
+        target = low + (high - low) * rng.uniform(0.35, 0.65, 3)
+        size = float(np.linalg.norm(high - low))
+        toward = np.degrees(np.arctan2(-target[1], 0.3)) + rng.uniform(-70, 70)
+        away = rng.uniform(0.7, 1.5) * size
+        centre = target + away * _heading(float(toward), 0.0)
+        centre[2] = rng.uniform(0.9, 2.6)
+        inside = (corners.reshape(-1, 3).min(axis=0) < centre) & (centre < high)
+        if abs(centre[1]) > FRONT - 0.5 or inside.all():
+            continue
+        if _sees(scene, centre, corners, node, rng):
+            return looking_at(centre, target)
+    return None
+
+
+def _sees(
+    scene: WorldScene, centre: np.ndarray, corners: np.ndarray, node: int, rng: np.random.Generator
+) -> bool:
+    """Whether most of a thing's corners that face a point are seen from it, or what hides them is itself."""
+    chosen = corners[rng.integers(len(corners), size=40)]
+    directions = chosen - centre
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = np.broadcast_to(centre, directions.shape)
+    hit = scene.embree.run(origins.astype(np.float32), directions.astype(np.float32), query="INTERSECT")
+    seen: Bool[np.ndarray, " R"] = (hit >= 0) & (scene.node_ids[hit, 0] == node)
+    return bool(seen.mean() > 0.6)

@@ -1,0 +1,244 @@
+"""One step's material for the segmenter: windows, prompts, and the pixels at which masks are compared."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int64, Shaped, UInt8
+from scipy import ndimage
+from torch import Tensor
+
+from hilsplat.world.tiny.data import (
+    LabelledViews,
+    cut_window,
+    nested_targets,
+    normalised,
+    recolour,
+    region_centres,
+)
+from hilsplat.world.tiny.sam import HEADS, MASK_STRIDE, STRIDE, positional_embeddings
+
+MARGIN = 4
+"""Mask pixels around a region's box that belong to what is compared closely."""
+
+
+@dataclass(frozen=True)
+class CropStage:
+    """One way to fill a step.
+
+    Attributes:
+        share: of all steps.
+        crop_px: side of the windows.
+        batch: windows per step.
+        prompts: point prompts per window.
+        pixels: mask pixels per prompt at which its masks are compared with the truth.
+    """
+
+    share: float
+    crop_px: int
+    batch: int
+    prompts: int
+    pixels: int = 512
+
+
+@dataclass(frozen=True)
+class SamBatch:
+    """Windows, prompts and targets of one step; P prompts per window, K mask pixels per prompt.
+
+    Attributes:
+        pixels: the windows.
+        positional: of the windows.
+        classes: row of the text that names each pixel's region, per head; 0 for none.
+        offsets: from each pixel to its region's centre, see `region_centres`.
+        has_region: where there is one.
+        edges: 1 where a neighbour at stride 2 belongs to another region, per head.
+        points: x, y of the prompts, px.
+        labels: of the points: 1 inside, 0 outside, -1 no point.
+        known: 1 where a prompt has a true mask, per head.
+        places: flat indices of mask pixels.
+        weights: how many mask pixels each stands for.
+        truth: share of each of these mask pixels that belongs to the prompted region, per head.
+    """
+
+    pixels: Float[Tensor, "B 3 S S"]
+    positional: Float[Tensor, "B D s s"]
+    classes: Int64[Tensor, "B 3 s s"]
+    offsets: Float[Tensor, "B 6 s s"]
+    has_region: Float[Tensor, "B 3 s s"]
+    edges: Float[Tensor, "B 3 h w"]
+    points: Float[Tensor, "B P N 2"]
+    labels: Int64[Tensor, "B P N"]
+    known: Float[Tensor, "B P 3"]
+    places: Int64[Tensor, "B P K"]
+    weights: Float[Tensor, "B P K"]
+    truth: Float[Tensor, "B P 3 K"]
+
+    def to(self, device: torch.device) -> "SamBatch":
+        """The same on a device."""
+        return SamBatch(**{field.name: getattr(self, field.name).to(device) for field in fields(self)})
+
+
+def class_rows(views: LabelledViews) -> tuple[dict[str, int], list[np.ndarray]]:
+    """Number the texts of all nodes; per view, the class of each node id, with class 0 (none) at the end."""
+    texts = sorted({node.phrases[0] for nodes in views.nodes for node in nodes})
+    row = {text: index + 1 for index, text in enumerate(texts)}
+    return row, [np.array([*(row[node.phrases[0]] for node in nodes), 0]) for nodes in views.nodes]
+
+
+def draw_level_prompts(
+    rng: np.random.Generator, labels: np.ndarray, targets: np.ndarray, count: int, balanced: float = 0.8
+) -> Int64[np.ndarray, "count 2"]:
+    """Pixels (x, y) to prompt: for a share of them first a level is drawn, then a region, then its pixel.
+
+    The region's chance grows with the fourth root of its area: specks count, but less than what a
+    grid of prompts would meet. The other prompts are uniform, like that grid.
+
+    Args:
+        rng: source of all choices.
+        labels: (3, H, W) node ids, -1 for none.
+        targets: from `nested_targets`, for windows in which a level is missing.
+        count: number of prompts.
+        balanced: the share.
+    """
+    height, width = labels.shape[1:]
+    pixels = rng.integers(0, height * width, count)
+    choice = np.where(rng.random(count) < balanced, rng.integers(0, 3, count), -1)
+    for level in range(3):
+        rows = np.flatnonzero(choice == level)
+        flat = labels[level].reshape(-1)
+        if not (flat >= 0).any():
+            flat = targets[0].reshape(-1)
+        order = np.argsort(flat, kind="stable")
+        ids, starts, areas = np.unique(flat[order], return_index=True, return_counts=True)
+        known = np.flatnonzero(ids >= 0)
+        if not len(known) or not len(rows):
+            continue
+        chance = areas[known] ** 0.25
+        regions = rng.choice(known, len(rows), p=chance / chance.sum())
+        pixels[rows] = order[(starts[regions] + rng.random(len(rows)) * areas[regions]).astype(np.int64)]
+    return np.stack([pixels % width, pixels // width], axis=1).astype(np.int64)
+
+
+def boxes_of(target: Shaped[np.ndarray, "H W"]) -> dict[int, tuple[int, int, int, int]]:
+    """Box (x0, y0, x1, y1, end exclusive) of each region of a label image."""
+    found = ndimage.find_objects((target + 1).astype(np.int32))
+    return {
+        index: (box[1].start, box[0].start, box[1].stop, box[0].stop)
+        for index, box in enumerate(found)
+        if box is not None
+    }
+
+
+def compared_pixels(
+    rng: np.random.Generator, blocks: np.ndarray, chosen: Int64[np.ndarray, "P 3"], count: int
+) -> tuple[Int64[np.ndarray, "P K"], Float32[np.ndarray, "P K"], Float32[np.ndarray, "P 3 K"]]:
+    """Mask pixels per prompt: a quarter anywhere, a quarter in the box of each head's region.
+
+    A mask of thousands of pixels is compared at some hundred of them (as PointRend and Mask2Former do),
+    with weights that make sums over them estimate sums over all.
+
+    Args:
+        rng: source of all choices.
+        blocks: (3, h, w, n) node ids of the n pixels under each mask pixel, per head.
+        chosen: node per prompt and head, -1 for none.
+        count: K.
+
+    Returns:
+        flat indices, how many mask pixels each stands for (K of them stand for about h w), and the share of
+        each mask pixel that belongs to the region.
+    """
+    height, width = blocks.shape[1:3]
+    whole = (0, 0, width, height)
+    boxes = np.empty((len(chosen), 4, 4), np.int64)
+    boxes[:, 0] = whole
+    for head in range(len(HEADS)):
+        known = boxes_of(blocks[head, :, :, 0])
+        for row, node in enumerate(chosen[:, head].tolist()):
+            x0, y0, x1, y1 = known.get(node, whole) if node >= 0 else whole
+            boxes[row, head + 1] = (
+                max(0, x0 - MARGIN), max(0, y0 - MARGIN), min(width, x1 + MARGIN), min(height, y1 + MARGIN)
+            )  # fmt: skip
+    component = np.arange(count) % 4
+    drawn = boxes[:, component]  # (P, K, 4)
+    x = (drawn[..., 0] + rng.random(drawn.shape[:2]) * (drawn[..., 2] - drawn[..., 0])).astype(np.int64)
+    y = (drawn[..., 1] + rng.random(drawn.shape[:2]) * (drawn[..., 3] - drawn[..., 1])).astype(np.int64)
+    b = boxes[:, None]  # (P, 1, 4, 4)
+    inside = (x[..., None] >= b[..., 0]) & (x[..., None] < b[..., 2])
+    inside &= (y[..., None] >= b[..., 1]) & (y[..., None] < b[..., 3])
+    area = (b[..., 2] - b[..., 0]) * (b[..., 3] - b[..., 1])
+    density = (inside / (4.0 * area)).sum(axis=-1)
+    truth = (blocks[:, y, x] == chosen.T[:, :, None, None]).mean(axis=-1)  # (3, P, K)
+    return (
+        y * width + x,
+        (1 / (count * density)).astype(np.float32),
+        truth.transpose(1, 0, 2).astype(np.float32),
+    )
+
+
+def region_edges(blocks: np.ndarray) -> Float32[np.ndarray, "heads h w"]:
+    """1 where the region to the right or below is another one, and on that other side, per head."""
+    first = blocks[..., 0]
+    edges = np.zeros(first.shape, np.float32)
+    right = first[:, :, 1:] != first[:, :, :-1]
+    below = first[:, 1:] != first[:, :-1]
+    edges[:, :, 1:][right] = 1
+    edges[:, :, :-1][right] = 1
+    edges[:, 1:][below] = 1
+    edges[:, :-1][below] = 1
+    return edges
+
+
+def _strange(rng: np.random.Generator, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    """Now and then an image in other or no colours: regions must not hang on the hues of this world."""
+    draw = rng.random()
+    if draw < 0.08:
+        return np.ascontiguousarray(image[..., rng.permutation(3)])
+    if draw < 0.12:
+        return np.repeat(image.mean(axis=2, keepdims=True).astype(np.uint8), 3, axis=2)
+    return image
+
+
+def draw_batch(
+    views: LabelledViews, classes: Sequence[np.ndarray], stage: CropStage, rng: np.random.Generator
+) -> SamBatch:
+    """Windows with prompts; a sixth of the prompts has a second point, inside or outside."""
+    rows: list[tuple[np.ndarray, ...]] = []
+    windows = []
+    centre = slice(STRIDE // 2, None, STRIDE)
+    side = stage.crop_px // MASK_STRIDE
+    for view in rng.integers(0, len(views), stage.batch).tolist():
+        example = cut_window(rng, views.images[view], views.labels[view], stage.crop_px)
+        target = nested_targets(example.labels)
+        offset, region = region_centres(target[:, centre, centre], STRIDE)
+        place = draw_level_prompts(rng, example.labels, target, stage.prompts)
+        chosen = target[:, place[:, 1], place[:, 0]].T.astype(np.int64)  # (P, 3)
+        other = draw_level_prompts(rng, example.labels, target, stage.prompts)
+        same = target[:, other[:, 1], other[:, 0]].T
+        second = np.where(same[:, 0] == chosen[:, 0], 1, np.where(same[:, 2] == chosen[:, 2], -1, 0))
+        second = np.where(rng.random(stage.prompts) < 1 / 6, second, -1)
+        blocks = target.reshape(3, side, MASK_STRIDE, side, MASK_STRIDE).transpose(0, 1, 3, 2, 4)
+        blocks = np.ascontiguousarray(blocks).reshape(3, side, side, MASK_STRIDE**2)
+        places, weights, truth = compared_pixels(rng, blocks, chosen, stage.pixels)
+        windows.append(example.window)
+        rows.append(
+            (
+                recolour(rng, _strange(rng, example.image)),
+                classes[view][target[:, centre, centre]].astype(np.int64),
+                offset,
+                region.astype(np.float32),
+                region_edges(blocks),
+                np.stack([place, other], axis=1).astype(np.float32) + np.float32(0.5),
+                np.stack([np.ones_like(second), second], axis=1).astype(np.int64),
+                (chosen >= 0).astype(np.float32),
+                places,
+                weights,
+                truth,
+            )
+        )
+    images, *others = (np.stack(column) for column in zip(*rows, strict=True))
+    return SamBatch(
+        torch.from_numpy(normalised(images)).contiguous(memory_format=torch.channels_last),
+        positional_embeddings(torch.tensor(windows, dtype=torch.float32), stage.crop_px // STRIDE),
+        *(torch.from_numpy(column) for column in others),
+    )

@@ -1,0 +1,257 @@
+"""Crops that the small CLIP learns from, cut when needed: true, roughened and segmented masks."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Int64, UInt8
+from scipy import ndimage
+
+from hilsplat.base.crops import square_crop
+from hilsplat.base.levels import LEVELS, NONE
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.world.tiny.clip import CANONICAL, CROP_PX
+from hilsplat.world.tiny.data import LabelledViews
+
+FRAMES = ("{}", "{}", "{}", "the {}", "a {}", "a photo of a {}", "a photo of the {}", "a picture of a {}")
+"""Sentence frames around a phrase; the bare phrase is the usual one."""
+GENERIC_FRAMES = ("{}", "{}", "a photo of {}", "a photo of a {}", "the {}", "a {}")
+LEAST_PX = 24
+"""Smaller regions are not cut."""
+SHOWS, SHOWS_NOTHING = 0.5, 0.2
+"""A segmented mask shows the node with which its IoU is above the first; below the second, nothing."""
+
+
+@dataclass(frozen=True)
+class CropTable:
+    """N masks that can be cut out of labelled views, and what may be said of each.
+
+    Attributes:
+        views: the views.
+        masks: segmented masks per view; empty where none were asked for.
+        view: row of the view.
+        node: id of the node that the mask shows, -1 for nothing in particular.
+        level: `Level` of that node, 0 for nothing.
+        thing: which object the node belongs to; equal only within a view.
+        segmented: row of the view's segmented masks, -1 for the true region.
+        box: x0, y0, x1, y1 of the mask, end exclusive, px.
+        caption: row of `phrase_sets`, -1 for nothing in particular.
+        phrase_sets: the distinct sets of phrases; the first of each is the query.
+    """
+
+    views: LabelledViews
+    masks: Sequence[HierarchicalMasks]
+    view: Int64[np.ndarray, " N"]
+    node: Int64[np.ndarray, " N"]
+    level: Int64[np.ndarray, " N"]
+    thing: Int64[np.ndarray, " N"]
+    segmented: Int64[np.ndarray, " N"]
+    box: Int64[np.ndarray, "N 4"]
+    caption: Int64[np.ndarray, " N"]
+    phrase_sets: tuple[tuple[str, ...], ...]
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+    @property
+    def rough(self) -> Bool[np.ndarray, " N"]:
+        """Which masks are the segmenter's."""
+        return self.segmented >= 0
+
+    def cut(
+        self, row: int, background: str = "black", rng: np.random.Generator | None = None
+    ) -> UInt8[np.ndarray, "size size 3"]:
+        """The crop of a mask as CLIP sees it; with `rng`, a true mask is roughened first."""
+        x0, y0, x1, y1 = self.box[row].tolist()
+        image = self.views.images[self.view[row]]
+        margin = 2 + max(x1 - x0, y1 - y0) // 8 if rng is not None else 0
+        x0, y0 = max(0, x0 - margin), max(0, y0 - margin)
+        x1, y1 = min(image.shape[1], x1 + margin), min(image.shape[0], y1 + margin)
+        if self.segmented[row] >= 0:
+            found = self.masks[self.view[row]]
+            mask = found.dense(np.array([self.segmented[row]]))[0, y0:y1, x0:x1]
+        else:
+            labels = self.views.labels[self.view[row], self.level[row] - 1, y0:y1, x0:x1]
+            mask = labels == self.node[row]
+        image = image[y0:y1, x0:x1]
+        if rng is not None and self.segmented[row] < 0:
+            image, mask = _shrunk(image, mask, 2 * CROP_PX)
+            mask = roughen(rng, mask)
+        return square_crop(image, mask, background, 0.0, CROP_PX)
+
+
+def _shrunk(
+    image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"], side: int
+) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+    """Both at most `side` wide and high: roughening a large mask at full size costs more than it is worth."""
+    scale = side / max(mask.shape)
+    if scale >= 1:
+        return image, mask
+    size = (max(1, round(mask.shape[1] * scale)), max(1, round(mask.shape[0] * scale)))
+    small = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
+    if not small.any():
+        return image, mask
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA), small
+
+
+def roughen(rng: np.random.Generator, mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """A mask as a segmenter might have drawn it: grown, rounded, a bite taken out, a piece too much."""
+    rough = mask.astype(np.float32)
+    area = float(mask.sum())
+    sigma = float(np.clip(0.06 * area**0.5 * rng.uniform(0.2, 2.0), 0.4, 6.0))
+    noise = cv2.GaussianBlur(rng.normal(0, 1, mask.shape).astype(np.float32), (0, 0), 2 + sigma)
+    noise /= noise.std() + 1e-6
+    blurred = cv2.GaussianBlur(rough, (0, 0), sigma)
+    found = blurred + rng.uniform(0.05, 0.3) * noise * (blurred > 0.02) > rng.uniform(0.25, 0.65)
+    for chance, value in ((0.25, False), (0.2, True)):
+        if rng.random() < chance:
+            rows, columns = np.nonzero(mask)
+            pick = rng.integers(len(rows))
+            blob = np.zeros(mask.shape, np.uint8)
+            radius = int(area**0.5 * rng.uniform(0.12, 0.35)) + 1
+            cv2.circle(blob, (int(columns[pick]), int(rows[pick])), radius, 1, -1)
+            found = np.where(blob > 0, value, found)
+    # One that lost its region is no example of it.
+    return found if (found & mask).sum() > 0.5 * (found | mask).sum() else mask
+
+
+def best_node(
+    mask: Bool[np.ndarray, "H W"], level: int, labels: np.ndarray, num_nodes: int
+) -> tuple[int, float]:
+    """Node whose region has the highest IoU with a mask, over all levels, and that IoU.
+
+    Of equally good nodes the one of the given level wins: a part may be all that is seen of a whole.
+    """
+    best, best_iou = NONE, 0.0
+    area = int(mask.sum())
+    for candidate in LEVELS:
+        image = labels[candidate.index]
+        overlap = np.bincount(image[mask] + 1, minlength=num_nodes + 1)[1:]
+        total = np.bincount(image.reshape(-1) + 1, minlength=num_nodes + 1)[1:]
+        iou = overlap / np.maximum(total + area - overlap, 1)
+        node = int(iou.argmax()) if len(iou) else NONE
+        if node == NONE:
+            continue
+        better = iou[node] > best_iou + 1e-9
+        equal = abs(iou[node] - best_iou) <= 1e-9 and int(candidate) == level
+        if better or equal:
+            best, best_iou = node, float(iou[node])
+    return best, best_iou
+
+
+def list_crops(
+    views: LabelledViews, masks: Sequence[HierarchicalMasks] = (), least_px: int = LEAST_PX
+) -> CropTable:
+    """All masks of labelled views: the true regions, and the segmented masks where there are some.
+
+    Args:
+        views: labelled views.
+        masks: of the first views, as the segmenter drew them.
+        least_px: smaller regions are left out.
+    """
+    rows: list[tuple[int, ...]] = []
+    boxes: list[tuple[int, int, int, int]] = []
+    sets: dict[tuple[str, ...], int] = {}
+    for view in range(len(views)):
+        labels, nodes = views.labels[view], views.nodes[view]
+        root = list(range(len(nodes)))
+        for node, described in enumerate(nodes):
+            root[node] = root[described.parent] if described.parent >= 0 else node
+        for at in LEVELS:
+            areas = np.bincount(labels[at.index].reshape(-1) + 1, minlength=len(nodes) + 1)[1:]
+            for node, box in enumerate(ndimage.find_objects(labels[at.index].astype(np.int32) + 1)):
+                if box is None or areas[node] < least_px or not nodes[node].phrases:
+                    continue
+                caption = sets.setdefault(nodes[node].phrases, len(sets))
+                rows.append((view, node, nodes[node].level, root[node], -1, caption))
+                boxes.append((box[1].start, box[0].start, box[1].stop, box[0].stop))
+        found = masks[view] if view < len(masks) else None
+        for index in range(len(found) if found is not None else 0):
+            mask = found.dense(np.array([index]))[0]
+            node, iou = best_node(mask, int(found.level[index]), labels, len(nodes))
+            if iou > SHOWS and nodes[node].phrases:
+                caption = sets.setdefault(nodes[node].phrases, len(sets))
+                rows.append((view, node, nodes[node].level, root[node], index, caption))
+            elif iou < SHOWS_NOTHING:
+                rows.append((view, NONE, 0, NONE, index, NONE))
+            else:
+                continue
+            boxes.append(tuple(int(edge) for edge in found.box_xyxy[index]))
+    columns = np.array(rows, np.int64).reshape(-1, 6).T
+    view, node, level, thing, segmented, caption = (np.ascontiguousarray(column) for column in columns)
+    box = np.array(boxes, np.int64).reshape(-1, 4)
+    return CropTable(views, masks, view, node, level, thing, segmented, box, caption, tuple(sets))
+
+
+def list_segmented(views: LabelledViews, masks: Sequence[HierarchicalMasks]) -> CropTable:
+    """All segmented masks in their order, whatever they show; nothing is said of them."""
+    view = np.repeat(np.arange(len(masks)), [len(found) for found in masks])
+    segmented = np.concatenate([np.arange(len(found)) for found in masks] + [np.zeros(0, np.int64)])
+    box = np.concatenate([found.box_xyxy for found in masks] + [np.zeros((0, 4), np.int32)])
+    nothing = np.full(len(view), NONE, np.int64)
+    segmented = segmented.astype(np.int64)
+    none = np.zeros(len(view), np.int64)
+    return CropTable(views, masks, view, nothing, none, nothing, segmented, box.astype(np.int64), nothing, ())
+
+
+class Captioner:
+    """Draws a caption for each crop and says which captions are true of which crops.
+
+    A small share of crops is described by one of the canonical phrases instead of their own. The
+    draw does not look at the crop, so a canonical phrase comes to mean nothing in particular: the
+    yardstick that relevancy needs.
+
+    Args:
+        phrase_sets: distinct sets of phrases.
+        generic_share: share of crops that get a canonical phrase.
+    """
+
+    def __init__(self, phrase_sets: Sequence[tuple[str, ...]], generic_share: float = 0.06) -> None:
+        self.phrases = sorted({phrase for phrases in phrase_sets for phrase in phrases})
+        row = {phrase: index for index, phrase in enumerate(self.phrases)}
+        self.choices = [np.array([row[phrase] for phrase in phrases]) for phrases in phrase_sets]
+        self.attributed = [
+            np.array(
+                [row[phrase] for phrase in phrases if phrase != text and phrase.endswith(f" {text}")], int
+            )
+            for phrases in phrase_sets
+            for text in phrases[:1]
+        ]
+        self.generic_share = generic_share
+
+    def draw(
+        self, rng: np.random.Generator, captions: Int64[np.ndarray, " B"]
+    ) -> tuple[list[str], Float32[np.ndarray, "B B"]]:
+        """Texts for a batch of crops, and whether text j is true of crop i.
+
+        Args:
+            rng: source of all choices.
+            captions: row of `phrase_sets` per crop, -1 for none (the crop then gets a canonical phrase).
+        """
+        texts, drawn = [], np.zeros(len(captions), np.int64)
+        for index, caption in enumerate(captions.tolist()):
+            if caption < 0 or rng.random() < self.generic_share:
+                pick = int(rng.integers(len(CANONICAL)))
+                drawn[index] = len(self.phrases) + pick
+                phrase, frames = CANONICAL[pick], GENERIC_FRAMES
+            else:
+                choice, attributed, draw = self.choices[caption], self.attributed[caption], rng.random()
+                # The first phrase of a node is the text that queries use; "red kettle" is the next in use.
+                if draw < 0.4:
+                    pick = choice[0]
+                elif draw < 0.6 and len(attributed):
+                    pick = attributed[int(rng.integers(len(attributed)))]
+                else:
+                    pick = choice[int(rng.integers(len(choice)))]
+                drawn[index] = pick
+                phrase, frames = self.phrases[pick], FRAMES
+            texts.append(frames[int(rng.integers(len(frames)))].format(phrase))
+        generic = drawn >= len(self.phrases)
+        nothing = np.zeros(len(drawn), bool)
+        valid = np.stack(
+            [np.isin(drawn, self.choices[row]) if row >= 0 else nothing for row in captions.tolist()]
+        )
+        valid |= (drawn[:, None] == drawn[None, :]) & generic[None, :]
+        np.fill_diagonal(valid, True)
+        return texts, valid.astype(np.float32)

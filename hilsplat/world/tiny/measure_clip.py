@@ -1,0 +1,183 @@
+"""Measure the small CLIP on masks of unseen scenes, alone and together with the segmenter's masks."""
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from tokenizers import Tokenizer
+from torch import Tensor
+
+from hilsplat.base.levels import LEVELS
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.world.paints import COLOURS
+from hilsplat.world.tiny.clip import CANONICAL, ClipText, ClipVision
+from hilsplat.world.tiny.crops import CropTable
+from hilsplat.world.tiny.data import LabelledViews, normalised
+
+CHUNK = 256
+
+
+def tokenised(tokenizer: Tokenizer, texts: Sequence[str]) -> tuple[Tensor, Tensor]:
+    """Word ids and attention mask of texts."""
+    encoded = tokenizer.encode_batch(list(texts))
+    return (
+        torch.tensor([row.ids for row in encoded], dtype=torch.int64),
+        torch.tensor([row.attention_mask for row in encoded], dtype=torch.int64),
+    )
+
+
+@torch.no_grad()
+def embedded_crops(
+    vision: ClipVision, crops: CropTable, rows: np.ndarray, background: str = "black"
+) -> np.ndarray:
+    """Unit vectors of some crops."""
+    vision.eval()
+    device = next(vision.parameters()).device
+    parts = []
+    for start in range(0, len(rows), CHUNK):
+        cut = np.stack([crops.cut(int(row), background) for row in rows[start : start + CHUNK]])
+        parts.append(vision(torch.from_numpy(normalised(cut)).to(device)).cpu().numpy())
+    return np.concatenate(parts) if parts else np.zeros((0, 1), np.float32)
+
+
+@torch.no_grad()
+def embedded_texts(text: ClipText, tokenizer: Tokenizer, texts: Sequence[str]) -> np.ndarray:
+    """Unit vectors of some texts."""
+    text.eval()
+    device = next(text.parameters()).device
+    words, mask = tokenised(tokenizer, texts)
+    return text(words.to(device), mask.to(device)).cpu().numpy()
+
+
+def coloured_text(phrases: Sequence[str]) -> str | None:
+    """The phrase that names a node by colour and class, such as "red kettle", if there is one."""
+    wanted = re.compile(rf"({'|'.join(map(re.escape, COLOURS))}) {re.escape(phrases[0])}")
+    return next((phrase for phrase in phrases if wanted.fullmatch(phrase)), None)
+
+
+def measure_clip(
+    vision: ClipVision,
+    text: ClipText,
+    tokenizer: Tokenizer,
+    crops: CropTable,
+    rows: np.ndarray | None = None,
+    background: str = "black",
+) -> dict[tuple[str, str], dict[str, float]]:
+    """How often the best of all texts is the crop's own, per kind of mask and level.
+
+    Args:
+        vision: image side.
+        text: text side.
+        tokenizer: of the text side.
+        crops: masks; those that show nothing in particular are left out. All their nodes' texts compete.
+        rows: measure only these.
+        background: of the crops.
+
+    Returns:
+        by ("exact" or "rough", level): `top1` and `top3` of all texts, `top1_of_level` among the texts of
+        that level, share that beats every canonical phrase (`above_canonical`), `coloured`: top-1 among all
+        texts of colour and class, of the crops that have one, `n`.
+    """
+    rows = np.arange(len(crops)) if rows is None else rows
+    rows = rows[crops.caption[rows] >= 0]
+    texts = sorted({phrases[0] for phrases in crops.phrase_sets})
+    of_set = np.array([texts.index(phrases[0]) for phrases in crops.phrase_sets], np.int64)
+    coloured = [coloured_text(phrases) for phrases in crops.phrase_sets]
+    hues = sorted({phrase for phrase in coloured if phrase})
+    hue_row = {phrase: row for row, phrase in enumerate(hues)}
+    hue_of_set = np.array([hue_row.get(phrase, -1) for phrase in coloured], np.int64)
+    vectors = embedded_crops(vision, crops, rows, background)
+    similarity = vectors @ embedded_texts(text, tokenizer, texts).T
+    yardstick = (vectors @ embedded_texts(text, tokenizer, CANONICAL).T).max(axis=1)
+    wanted, hue = of_set[crops.caption[rows]], hue_of_set[crops.caption[rows]]
+    if hues:
+        hue_found = (vectors @ embedded_texts(text, tokenizer, hues).T).argmax(axis=1)
+    else:
+        hue_found = np.full(len(rows), -2)
+    level, rough = crops.level[rows], crops.rough[rows]
+    mine = similarity[np.arange(len(rows)), wanted]
+    rank = (similarity > mine[:, None]).sum(axis=1)
+    report = {}
+    for kind, is_rough in (("exact", False), ("rough", True)):
+        for at in LEVELS:
+            group = (level == int(at)) & (rough == is_rough)
+            if not group.any():
+                continue
+            same = np.unique(wanted[level == int(at)])
+            rank_of_level = (similarity[group][:, same] > mine[group, None]).sum(axis=1)
+            has_hue = group & (hue >= 0)
+            report[(kind, at.label)] = {
+                "top1": float((rank[group] == 0).mean()),
+                "top3": float((rank[group] < 3).mean()),
+                "top1_of_level": float((rank_of_level == 0).mean()),
+                "above_canonical": float((mine[group] > yardstick[group]).mean()),
+                "coloured": float((hue_found == hue)[has_hue].mean()) if has_hue.any() else 0.0,
+                "n": int(group.sum()),
+            }
+    return report
+
+
+def measure_queries(
+    vision: ClipVision,
+    text: ClipText,
+    tokenizer: Tokenizer,
+    views: LabelledViews,
+    masks: Sequence[HierarchicalMasks],
+    crops: CropTable,
+    least_px: int = 100,
+) -> dict[str, dict[str, float]]:
+    """Both models together, one view at a time: a text's best automatic mask of its level against the truth.
+
+    Args:
+        vision: image side.
+        text: text side.
+        tokenizer: of the text side.
+        views: labelled views.
+        masks: automatic masks of each.
+        crops: from `list_segmented` of the same views and masks.
+        least_px: regions below are not asked for.
+
+    Returns:
+        per level: mean `iou` of the mask most similar to the text with the union of all regions that the
+        text names; `instance`, the same with the region it fits best; `best`, of the best mask of the
+        level with the best region; `n` pairs of view and text.
+    """
+    vectors = embedded_crops(vision, crops, np.arange(len(crops)))
+    found: dict[str, list[tuple[float, float, float]]] = {level.label: [] for level in LEVELS}
+    for view in range(len(views)):
+        nodes = views.nodes[view]
+        for level in LEVELS:
+            labels = views.labels[view][level.index]
+            areas = np.bincount(labels.reshape(-1) + 1, minlength=len(nodes) + 1)[1:]
+            by_text: dict[str, list[int]] = {}
+            for node in np.flatnonzero(areas >= least_px).tolist():
+                if nodes[node].phrases:
+                    by_text.setdefault(nodes[node].phrases[0], []).append(node)
+            if not by_text:
+                continue
+            rows = masks[view].rows_of(level)
+            if not len(rows):
+                found[level.label] += [(0.0, 0.0, 0.0)] * len(by_text)
+                continue
+            guesses = masks[view].dense(rows).reshape(len(rows), labels.size)
+            own = np.flatnonzero(crops.view == view)
+            own = own[np.searchsorted(crops.segmented[own], rows)]
+            similarity = vectors[own] @ embedded_texts(text, tokenizer, list(by_text)).T
+            for column, ids in enumerate(by_text.values()):
+                truths = labels.reshape(1, -1) == np.array(ids)[:, None]
+                truths = np.concatenate([truths, truths.any(axis=0, keepdims=True)]).astype(np.float32)
+                shared = guesses.astype(np.float32) @ truths.T
+                union = guesses.sum(axis=1)[:, None] + truths.sum(axis=1)[None] - shared
+                iou = shared / union
+                pick = int(similarity[:, column].argmax())
+                found[level.label].append((float(iou[pick, -1]), float(iou[pick].max()), float(iou.max())))
+    return {
+        label: {
+            "iou": float(np.mean([row[0] for row in rows])) if rows else 0.0,
+            "instance": float(np.mean([row[1] for row in rows])) if rows else 0.0,
+            "best": float(np.mean([row[2] for row in rows])) if rows else 0.0,
+            "n": len(rows),
+        }
+        for label, rows in found.items()
+    }

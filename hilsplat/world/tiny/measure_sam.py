@@ -1,0 +1,202 @@
+"""Measure the small segmenter: single points, and the pipeline's own automatic masks."""
+
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+from hilsplat.base.artifacts import sha256_of_bytes
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.progress import track
+from hilsplat.segment.candidates import decode_candidates
+from hilsplat.segment.generate import masks_from_candidates
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.sam import SamModel
+from hilsplat.settings import MasksSettings
+from hilsplat.world.tiny.data import HEAD_LEVELS, LabelledViews, normalised
+from hilsplat.world.tiny.sam import MASK_STRIDE, STRIDE, SamDecoder, SamEncoder, positional_embeddings
+
+LEAST_PX = 100
+"""Smaller regions are not scored: a handful of pixels says little about a mask."""
+PER_LEVEL = 8
+"""Regions scored per view and level."""
+
+
+@torch.no_grad()
+def predict_masks(
+    encoder: SamEncoder, decoder: SamDecoder, image: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Scores (P, 3) and mask logits (P, 3, S/2, S/2) for single points (P, 2) of a square view."""
+    encoder.eval()
+    decoder.eval()
+    device = next(encoder.parameters()).device
+    embeddings = encoder(torch.from_numpy(normalised(image[None])).to(device))
+    whole = positional_embeddings(torch.tensor([[0.0, 0.0, 1.0]]), image.shape[0] // STRIDE).to(device)
+    prompts = torch.from_numpy(points.astype(np.float32))[None, :, None].to(device)
+    labels = torch.ones(prompts.shape[:3], dtype=torch.int64, device=device)
+    scores, logits = decoder(prompts, labels, embeddings, whole)
+    return scores[0].cpu().numpy(), logits[0].cpu().numpy()
+
+
+def draw_regions(
+    rng: np.random.Generator, labels: np.ndarray, per_level: int
+) -> list[tuple[int, int, float, float]]:
+    """Row of head, node, and a random pixel (x, y) of each drawn region, at most `per_level` per level."""
+    drawn = []
+    for head, level in enumerate(HEAD_LEVELS):
+        at_level = labels[level.index]
+        ids, areas = np.unique(at_level, return_counts=True)
+        for node in rng.permutation(ids[(ids >= 0) & (areas >= LEAST_PX)])[:per_level]:
+            ys, xs = np.nonzero(at_level == node)
+            pick = int(rng.integers(len(ys)))
+            drawn.append((head, int(node), xs[pick] + 0.5, ys[pick] + 0.5))
+    return drawn
+
+
+def measure_sam(
+    encoder: SamEncoder, decoder: SamDecoder, views: LabelledViews, per_level: int = PER_LEVEL, seed: int = 0
+) -> dict[str, dict[str, float]]:
+    """Mean IoU of single-point prompts, per level, every region of at least 100 px counting alike.
+
+    A region is drawn first and a pixel in it second; the mask compared is the one of that level's head.
+
+    Returns:
+        per level: mean `iou`; `best`, the same for the best of the three heads; share of prompts
+        `above_75` % IoU; `correlation` of predicted and true IoU; `n`.
+    """
+    found: dict[Level, list[tuple[float, float, float]]] = {level: [] for level in LEVELS}
+    for view in range(len(views)):
+        drawn = draw_regions(np.random.default_rng((seed, 2, view)), views.labels[view], per_level)
+        if not drawn:
+            continue
+        points = np.array([(x, y) for _, _, x, y in drawn])
+        scores, logits = predict_masks(encoder, decoder, views.images[view], points)
+        enlarged = functional.interpolate(
+            torch.from_numpy(logits), scale_factor=float(MASK_STRIDE), mode="bilinear", align_corners=False
+        ).numpy()
+        for row, (head, node, _, _) in enumerate(drawn):
+            level = HEAD_LEVELS[head]
+            truth, guess = views.labels[view][level.index] == node, enlarged[row] > 0
+            iou = (truth & guess).sum(axis=(1, 2)) / (truth | guess).sum(axis=(1, 2))
+            found[level].append((float(iou[head]), float(iou.max()), float(scores[row, head])))
+    report = {}
+    for level, rows in found.items():
+        values = np.array(rows).reshape(-1, 3)
+        spread = len(values) > 2 and values[:, [0, 2]].std(axis=0).min() > 0
+        report[level.label] = {
+            "iou": float(values[:, 0].mean()) if len(values) else 0.0,
+            "best": float(values[:, 1].mean()) if len(values) else 0.0,
+            "above_75": float((values[:, 0] > 0.75).mean()) if len(values) else 0.0,
+            "correlation": float(np.corrcoef(values[:, 0], values[:, 2])[0, 1]) if spread else 0.0,
+            "n": len(values),
+        }
+    return report
+
+
+def automatic_masks(
+    folder: Path, views: LabelledViews, workers: int, points_per_side: int = MasksSettings().points_per_side
+) -> list[HierarchicalMasks]:
+    """The masks that the pipeline's own stage makes of each view with an exported segmenter.
+
+    Args:
+        folder: model folder.
+        views: what to segment.
+        workers: processes.
+        points_per_side: of the grid of prompts; all else is as the settings' defaults have it.
+    """
+    if not len(views):
+        return []
+    job = partial(_segment, Path(folder), points_per_side)
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        return list(track(pool.map(job, views.images, chunksize=4), "segmenting", total=len(views)))
+
+
+def cached_masks(
+    cache: Path,
+    folder: Path,
+    digest: str,
+    views: LabelledViews,
+    count: int,
+    points_per_side: int | None,
+    workers: int,
+) -> list[HierarchicalMasks]:
+    """`automatic_masks` of the first views, kept in a cache by the digests of segmenter and pictures.
+
+    Args:
+        cache: folder that may be deleted at any time.
+        folder: model folder.
+        digest: of the segmenter.
+        views: what to segment.
+        count: how many of them.
+        points_per_side: of the grid of prompts; the settings' default where None.
+        workers: processes.
+    """
+    side = MasksSettings().points_per_side if points_per_side is None else points_per_side
+    settings = MasksSettings(points_per_side=side).model_dump_json()
+    images = views.images[:count]
+    keys = [sha256_of_bytes(digest.encode(), settings.encode(), image.tobytes()) for image in images]
+    paths = [Path(cache) / "masks" / f"{key[:24]}.npz" for key in keys]
+    missing = [row for row, path in enumerate(paths) if not path.is_file()]
+    job = partial(_segment_into, Path(folder), side)
+    if missing:
+        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+            jobs = pool.map(job, images[missing], [paths[row] for row in missing], chunksize=4)
+            for _ in track(jobs, "segmenting", total=len(missing)):
+                pass
+    return [HierarchicalMasks.load(path) for path in paths]
+
+
+def _segment_into(folder: Path, points_per_side: int, image: np.ndarray, path: Path) -> None:
+    _segment(folder, points_per_side, image).save(path)
+
+
+_OPEN: dict[Path, SamModel] = {}
+
+
+def _segment(folder: Path, points_per_side: int, image: np.ndarray) -> HierarchicalMasks:
+    """One view in a worker; the model stays open between calls."""
+    if folder not in _OPEN:
+        _OPEN[folder] = SamModel.load(folder)
+    settings = MasksSettings(points_per_side=points_per_side)
+    candidates = decode_candidates(image, _OPEN[folder], settings)
+    return masks_from_candidates(candidates, image.shape[:2], _OPEN[folder], settings)
+
+
+def measure_everything(masks: list[HierarchicalMasks], views: LabelledViews) -> dict[str, dict[str, float]]:
+    """How many regions of at least 100 px some automatic mask of their level covers.
+
+    Returns:
+        per level: `recall` at IoU 0.5, `iou` of the best mask, both averaged over regions; `masks` per
+        view and how many of them fit some region with IoU 0.5 (`precision`); regions `n`.
+    """
+    report = {}
+    for level in LEVELS:
+        best, fits, count = [], 0, 0
+        for view, found in enumerate(masks):
+            labels = views.labels[view][level.index]
+            rows = found.rows_of(level)
+            guesses = found.dense(rows).reshape(len(rows), labels.size)
+            ids, areas = np.unique(labels, return_counts=True)
+            keep = ids >= 0
+            truths = labels.reshape(1, -1) == ids[keep][:, None]
+            shared = truths.astype(np.float32) @ guesses.T.astype(np.float32)
+            union = areas[keep][:, None] + guesses.sum(axis=1)[None] - shared
+            iou = shared / np.maximum(union, 1)
+            scored = areas[keep] >= LEAST_PX
+            best += (iou[scored].max(axis=1) if len(rows) else np.zeros(int(scored.sum()))).tolist()
+            if len(iou):
+                fits += int((iou.max(axis=0) >= 0.5).sum())
+            count += len(rows)
+        values = np.array(best)
+        report[level.label] = {
+            "recall": float((values >= 0.5).mean()) if len(values) else 0.0,
+            "iou": float(values.mean()) if len(values) else 0.0,
+            "masks": count / max(1, len(masks)),
+            "precision": fits / max(1, count),
+            "n": len(values),
+        }
+    return report

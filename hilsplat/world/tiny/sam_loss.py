@@ -1,0 +1,113 @@
+"""What the small segmenter is trained on besides its own outputs, and the losses of all of it."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from hilsplat.world.tiny.batches import SamBatch
+from hilsplat.world.tiny.sam import HEADS, SEMANTIC, STRIDE, SamDecoder, SamEncoder
+
+SEMANTIC_PIXELS = 1536
+"""Pixels per batch that the auxiliary classifier sees besides the prompted ones."""
+
+
+def segmentation_loss(
+    scores: Float[Tensor, "B P 3"],
+    logits: Float[Tensor, "B P 3 K"],
+    truth: Float[Tensor, "B P 3 K"],
+    weights: Float[Tensor, "B P K"],
+    known: Float[Tensor, "B P 3"],
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """Loss of masks (dice and cross-entropy per area) and of the predicted IoU.
+
+    A prompt where nothing is labelled has no true mask: only its predicted IoU is trained, towards 0.
+
+    Args:
+        scores: predicted IoU.
+        logits: of the masks, at K pixels of each.
+        truth: true shares there.
+        weights: how many mask pixels each of them stands for.
+        known: 1 where there is a true mask.
+    """
+    weights = weights[:, :, None]
+    share = torch.sigmoid(logits)
+    area = (weights * truth).sum(dim=-1)
+    dice = 1 - (2 * (weights * share * truth).sum(dim=-1) + 1) / ((weights * share).sum(dim=-1) + area + 1)
+    entropy = functional.binary_cross_entropy_with_logits(logits, truth, reduction="none")
+    # Per area of the region, so that a region of 50 px counts as much as the floor.
+    entropy = (weights * entropy).sum(dim=-1) / (2 * area + 64)
+    masks = ((dice + entropy) * known).sum() / known.sum().clamp(min=1.0)
+    with torch.no_grad():
+        found, wanted = (logits > 0) * weights, truth > 0.5
+        overlap = (found * wanted).sum(dim=-1)
+        union = (found + wanted * weights).sum(dim=-1) - overlap
+        iou = overlap / union.clamp(min=1e-6)
+    quality = (scores - iou * known).square().mean()
+    return masks, quality
+
+
+class Teacher(nn.Module):
+    """Training only: which text names a pixel's region and where regions end, at each head."""
+
+    def __init__(self, num_classes: int) -> None:
+        super().__init__()
+        self.classify = nn.Linear(SEMANTIC, len(HEADS) * num_classes)
+        self.edge = nn.Conv2d(32, len(HEADS), 1)
+
+    def recognised(
+        self, semantic: Float[Tensor, "B C s s"], batch: SamBatch, generator: torch.Generator
+    ) -> Float[Tensor, ""]:
+        """Cross-entropy at prompted pixels (all sizes of region alike) and at random ones."""
+        rows, _, height, width = semantic.shape
+        cell = (batch.points[:, :, 0] / STRIDE).long().clamp(0, width - 1)
+        first = torch.arange(rows, device=cell.device)[:, None] * height * width
+        prompted = (first + cell[..., 1] * width + cell[..., 0]).flatten()
+        count = rows * height * width
+        others = torch.randint(0, count, (min(count, SEMANTIC_PIXELS),), generator=generator)
+        pixels = torch.cat([prompted, others.to(prompted.device)])
+        features = semantic.permute(0, 2, 3, 1).flatten(0, 2).index_select(0, pixels)
+        wanted = batch.classes.permute(0, 2, 3, 1).flatten(0, 2).index_select(0, pixels)
+        logits = self.classify(features).unflatten(-1, (len(HEADS), -1))
+        return functional.cross_entropy(logits.flatten(0, 1), wanted.flatten())
+
+    def bordered(self, sharp: Float[Tensor, "B C h w"], batch: SamBatch) -> Float[Tensor, ""]:
+        """Cross-entropy of the border maps; borders count four times."""
+        logits = self.edge(sharp).float()
+        entropy = functional.binary_cross_entropy_with_logits(logits, batch.edges, reduction="none")
+        return (entropy * (1 + 3 * batch.edges)).mean()
+
+
+def training_loss(
+    encoder: SamEncoder,
+    decoder: SamDecoder,
+    teacher: Teacher,
+    batch: SamBatch,
+    generator: torch.Generator,
+    half: bool,
+) -> tuple[Float[Tensor, ""], dict[str, float]]:
+    """Everything the segmenter is trained on: one step's loss, and its terms.
+
+    Args:
+        encoder: of the segmenter.
+        decoder: of the segmenter.
+        teacher: auxiliary outputs.
+        batch: windows and targets.
+        generator: draws the pixels of the auxiliary classifier.
+        half: run the encoder's convolutions in bfloat16.
+    """
+    with torch.autocast(batch.pixels.device.type, torch.bfloat16, enabled=half):
+        packed, offsets, semantic, sharp = encoder.features(batch.pixels)
+    packed, offsets, semantic = packed.float(), offsets.float(), semantic.float()
+    embeddings = torch.cat([packed, offsets, semantic], dim=1)
+    scores, logits = decoder.at_pixels(
+        batch.points, batch.labels, embeddings, batch.positional, batch.places, batch.weights
+    )
+    masks, quality = segmentation_loss(scores, logits, batch.truth, batch.weights, batch.known)
+    recognised = teacher.recognised(semantic, batch, generator)
+    bordered = teacher.bordered(sharp.float(), batch)
+    votes = offsets - batch.offsets
+    centred = (votes.abs() * batch.has_region.repeat_interleave(2, dim=1)).mean()
+    terms = {"mask": masks, "iou": quality, "semantic": recognised, "edge": bordered, "centre": centred}
+    loss = masks + quality + 0.5 * recognised + bordered + centred
+    return loss, {name: value.item() for name, value in terms.items()}

@@ -1,0 +1,38 @@
+"""The pictures and the table of the manual show the world as it is."""
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from hilsplat.world.gallery import class_table, draw_classes, draw_scenes
+from hilsplat.world.objects.catalogue import TABLETOP
+
+MANUAL = Path(__file__).parents[3] / "docs" / "world.md"
+
+
+def test_the_table_of_classes_in_the_manual_is_that_of_the_catalogue():
+    table = class_table()
+    assert len(table.splitlines()) == len(TABLETOP) + 2 and table in MANUAL.read_text()
+
+
+def test_the_table_lists_parts_once_with_their_subparts():
+    line = class_table(("chair",)).splitlines()[2]
+    assert line == (
+        "| chair | dining chair, side chair | seat (cushion); back (top rail, slats); leg (foot) |"
+    )
+
+
+def test_a_picture_of_classes_shows_each_on_a_plain_ground(tmp_path):
+    draw_classes(tmp_path / "classes.png", ("burger",))
+    with Image.open(tmp_path / "classes.png") as picture:
+        pixels = np.asarray(picture.convert("RGB")).astype(int)
+    colourful = np.ptp(pixels, axis=2) > 60  # the ground and the page are grey
+    assert 0.01 < colourful.mean() < 0.2
+
+
+def test_a_picture_of_scenes_is_written_for_any_number_of_them(tmp_path, monkeypatch):
+    monkeypatch.setattr("hilsplat.world.gallery.SCENE_PX", 48)
+    draw_scenes("tabletop", [100], tmp_path / "scenes.png")
+    with Image.open(tmp_path / "scenes.png") as picture:
+        assert picture.width > picture.height

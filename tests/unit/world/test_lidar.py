@@ -1,0 +1,109 @@
+"""Lidar points lie on surfaces, and a camera that sees one labels it alike."""
+
+import cv2
+import numpy as np
+import pytest
+
+from hilsplat.base.artifacts import read_npz, sha256_of_path
+from hilsplat.base.levels import LEVELS
+from hilsplat.settings import WorldSettings
+from hilsplat.world.lidar import (
+    ABOVE_CAMERA_M,
+    BEAMS,
+    INCLINATION_DEG,
+    MAX_RANGE_M,
+    beam_directions,
+    scan_street,
+)
+from hilsplat.world.render import depth_view, label_view
+from hilsplat.world.scenes.kinds import scene_cameras
+from hilsplat.world.stage import run_world
+
+
+@pytest.fixture(scope="module")
+def cameras(street):
+    return scene_cameras(street, 40, 384, 360.0)
+
+
+@pytest.fixture(scope="module")
+def centres(cameras):
+    return np.stack([cameras[name].centre for name in cameras.names])
+
+
+def test_beams_span_the_inclinations_of_the_scanner():
+    directions = beam_directions(8).reshape(BEAMS, 8, 3)
+    up = np.degrees(np.arcsin(directions[..., 2]))
+    half = (INCLINATION_DEG[1] - INCLINATION_DEG[0]) / BEAMS / 2  # beams sit in the middle of their share
+    assert up[0] == pytest.approx(INCLINATION_DEG[0] + half) and up[-1] == pytest.approx(
+        INCLINATION_DEG[1] - half
+    )
+    assert np.linalg.norm(directions, axis=-1) == pytest.approx(1.0)
+
+
+def test_beams_below_the_horizon_measure_the_flat_road(street, centres):
+    # A scanner h above the road meets it with a beam d degrees down at range h / sin(d).
+    scan = scan_street(street, centres, azimuth_steps=360, poses=2, range_noise_m=0.0, lost_share=0.0)
+    road = next(node.id for node in street.nodes if node.text == "road")
+    on_road = scan.node_ids[:, 0] == road
+    height = scan.origins[scan.pose_index, 2]
+    down = -np.radians(
+        INCLINATION_DEG[0] + (scan.beam + 0.5) / BEAMS * (INCLINATION_DEG[1] - INCLINATION_DEG[0])
+    )
+    expected = height / np.sin(down)
+    assert on_road.sum() > 1000
+    # Mended spots lie up to 6 mm above the road.
+    assert np.abs(scan.range_m * np.sin(down) - height)[on_road].max() < 0.01
+    assert np.median(np.abs(scan.range_m - expected)[on_road]) < 1e-3
+
+
+def test_points_are_origin_plus_range_and_the_noise_is_small(street, centres):
+    scan = scan_street(street, centres, azimuth_steps=90, poses=3)
+    exact = scan_street(street, centres, azimuth_steps=90, poses=3, range_noise_m=0.0)
+    assert scan.origins == pytest.approx(centres[[0, 20, 39]] + [0, 0, ABOVE_CAMERA_M])
+    away = np.linalg.norm(scan.points - scan.origins[scan.pose_index], axis=1)
+    assert away == pytest.approx(scan.range_m, abs=1e-4)
+    assert np.array_equal(scan.node_ids, exact.node_ids)  # noise moves points, it relabels none
+    error = (scan.range_m - exact.range_m).astype(np.float64)
+    assert error.std() == pytest.approx(0.015, rel=0.1) and abs(error.mean()) < 0.001
+    assert scan.range_m.max() < MAX_RANGE_M + 0.1
+
+
+def test_the_sky_returns_nothing_and_some_returns_are_lost(street, centres):
+    full = scan_street(street, centres, azimuth_steps=200, poses=1, lost_share=0.0)
+    some = scan_street(street, centres, azimuth_steps=200, poses=1, lost_share=0.2)
+    texts = {street.nodes[node].text for node in np.unique(full.node_ids[:, 0])}
+    assert "sky" not in texts and {"road", "sidewalk", "building"} <= texts
+    assert len(some) / len(full) == pytest.approx(0.8, abs=0.02)
+
+
+def test_a_camera_labels_points_as_the_scanner_does(street, cameras, centres):
+    scan = scan_street(street, centres)
+    assert 50_000 < len(scan) < 150_000
+    for name in ("004.png", "021.png"):
+        camera = cameras[name]
+        labels, depth = label_view(street, camera), depth_view(street, camera)
+        seen = scan.points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+        ahead = seen[:, 2] > 0.5
+        xy = (seen[ahead] @ camera.K.T)[:, :2] / seen[ahead, 2:]
+        inside = ((xy > 2) & (xy < 382)).all(axis=1)
+        column, row = np.floor(xy[inside]).astype(int).T
+        z, ids = seen[ahead][inside, 2], scan.node_ids[ahead][inside]
+        visible = np.abs(depth[row, column] - z) < 0.005 * z + 0.05
+        for level in LEVELS:
+            image = labels[level.index].astype(np.float32)
+            square = np.ones((5, 5), np.uint8)  # pixels at least two away from a border
+            within = visible & (cv2.dilate(image, square) == cv2.erode(image, square))[row, column]
+            assert within.sum() > 3000
+            assert (image[row, column] == ids[:, level.index])[within].mean() > 0.99
+
+
+def test_a_scan_gives_the_same_bytes_twice_and_is_part_of_the_truth(street, tmp_path):
+    settings = WorldSettings(views=3, image_px=48, objects=3, samples=1)
+    for name in ("first", "again"):
+        run_world("world:street:100", settings, tmp_path / name, threads=1)
+    first, again = (tmp_path / name / "truth" / "lidar.npz" for name in ("first", "again"))
+    assert sha256_of_path(first) == sha256_of_path(again)
+    arrays = read_npz(first)
+    assert set(arrays) == {"points", "node_ids", "pose_index", "range_m", "beam", "origins"}
+    assert len(arrays["points"]) == len(arrays["node_ids"]) == len(arrays["pose_index"])
+    assert set(np.unique(arrays["pose_index"])) == set(range(len(arrays["origins"])))

@@ -1,0 +1,91 @@
+"""The true mesh: even vertices that know their node at every level and how many views see them."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from hilsplat.base.levels import LEVELS
+from hilsplat.datasets.hierarchy import AnnotatedNode
+from hilsplat.scene.cameras import Cameras
+from hilsplat.world.scenes.scene import Style, WorldScene
+from hilsplat.world.shapes import box
+from hilsplat.world.truth import refined, views_of_points, write_mesh
+from hilsplat.world.views import looking_at, numbered_cameras, pinhole
+
+
+def scene_of(triangles: np.ndarray, node_ids: np.ndarray) -> WorldScene:
+    triangles = triangles.astype(np.float32)
+    nodes = tuple(AnnotatedNode(i, 1, -1, f"thing {i}", ()) for i in range(int(node_ids.max()) + 1))
+    count = len(triangles)
+    return WorldScene(
+        "room", 100, 1, (), triangles, np.zeros_like(triangles), triangles, node_ids.astype(np.int32),
+        np.zeros(count, np.int32), np.zeros((1, 14), np.float32), nodes, frozenset(), Style(),
+    )  # fmt: skip
+
+
+def cameras_at(*centres: tuple[float, float, float]) -> Cameras:
+    transforms = [looking_at(np.array(centre), np.zeros(3)) for centre in centres]
+    return numbered_cameras(transforms, pinhole(64, 60.0), 64)
+
+
+def area(triangles: np.ndarray) -> float:
+    edges = (triangles[:, 1:] - triangles[:, :1]).astype(np.float64)
+    return float(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum() / 2)
+
+
+def test_refined_triangles_cover_the_same_surface_with_short_edges():
+    solid = box((2.0, 1.0, 0.3)).triangles.astype(np.float32)
+    fine, owner = refined(solid, 0.25)
+    assert area(fine) == pytest.approx(area(solid)) == pytest.approx(2 * (2.0 + 0.6 + 0.3))
+    assert np.linalg.norm(fine - np.roll(fine, 1, axis=1), axis=2).max() <= 0.25
+    for row in range(len(solid)):
+        assert area(fine[owner == row]) == pytest.approx(area(solid[row : row + 1]))
+    facing = np.cross(fine[:, 1] - fine[:, 0], fine[:, 2] - fine[:, 0])
+    before = np.cross(solid[:, 1] - solid[:, 0], solid[:, 2] - solid[:, 0])[owner]
+    assert ((facing * before).sum(axis=1) > 0).all()
+
+
+def test_refined_triangles_have_no_cracks():
+    # Of a closed surface every edge has two triangles; a corner in the middle of an edge would leave one.
+    fine, _ = refined(box((2.0, 1.0, 0.3)).triangles.astype(np.float32), 0.4)
+    edges = Counter(
+        frozenset((tuple(triangle[k].tolist()), tuple(triangle[(k + 1) % 3].tolist())))
+        for triangle in fine
+        for k in range(3)
+    )
+    assert set(edges.values()) == {2}
+
+
+def test_triangles_that_are_small_enough_stay():
+    solid = box((0.2, 0.2, 0.2)).triangles.astype(np.float32)
+    fine, owner = refined(solid, 1.0)
+    assert np.array_equal(fine, solid) and np.array_equal(owner, np.arange(12))
+
+
+def test_a_vertex_at_a_border_of_nodes_has_one_copy_per_side(tmp_path):
+    # Two triangles of a square share its diagonal; they belong to two wholes, one of which has a part.
+    square = np.array([[[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 0, 0], [1, 1, 0], [0, 1, 0]]], np.float32)
+    scene = scene_of(square, np.array([[0, -1, -1], [1, 2, -1]]))
+    write_mesh(tmp_path / "mesh.ply", scene, cameras_at((0.1, 0.0, 3.0), (0.1, 0.0, -3.0)))
+    mesh = PlyData.read(tmp_path / "mesh.ply")
+    vertices, faces = mesh["vertex"].data, mesh["face"].data
+    places = Counter((float(v["x"]), float(v["y"])) for v in vertices)
+    assert places == {(0, 0): 2, (1, 1): 2, (1, 0): 1, (0, 1): 1}
+    for face in faces:
+        for corner in face["vertex_indices"]:
+            assert all(vertices[level.label][corner] == face[level.label] for level in LEVELS)
+    assert (vertices["views"] == 2).all()
+
+
+def test_a_point_is_seen_by_cameras_that_nothing_hides_it_from():
+    # A plate at z = 0 under a small plate at z = 1: seen from above, its middle is hidden, its corner not.
+    plate = np.array([[[-1, -1, 0], [1, -1, 0], [1, 1, 0]], [[-1, -1, 0], [1, 1, 0], [-1, 1, 0]]], np.float32)
+    lid = plate * np.float32(0.2) + np.array([0, 0, 1], np.float32)
+    scene = scene_of(np.concatenate([plate, lid]), np.zeros((4, 3), np.int32))
+    points = np.array([[0, 0, 0], [0.9, 0.9, 0], [0, 0, 1], [0, 0, 9]], np.float32)
+    above, below, near = cameras_at((0.01, 0, 4.0)), cameras_at((0.01, 0, -4.0)), cameras_at((0.01, 0, 0.5))
+    assert views_of_points(scene, above, points).tolist() == [0, 1, 1, 0]
+    assert views_of_points(scene, below, points).tolist() == [1, 1, 0, 0]
+    assert views_of_points(scene, near, points).tolist() == [1, 0, 0, 0]

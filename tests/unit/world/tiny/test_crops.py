@@ -1,0 +1,122 @@
+"""Crops for the small CLIP: what they show, how masks are roughened, what is said of them."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from hilsplat.base.crops import square_crop
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.world.tiny.clip import CANONICAL, CROP_PX
+from hilsplat.world.tiny.crops import Captioner, best_node, list_crops, list_segmented, roughen
+from hilsplat.world.tiny.measure_clip import coloured_text
+from hilsplat.world.tiny.train_clip import SIBLINGS, CropDraw, crop_weights
+from tests.unit.world.tiny.drawn import drawn_views
+
+
+def drawn_masks(*masks_of_level: tuple[int, np.ndarray]) -> HierarchicalMasks:
+    """Masks as a segmenter gives them, each with a level."""
+    ones = np.ones(len(masks_of_level), np.float32)
+    level = np.array([level for level, _ in masks_of_level], np.uint8)
+    return HierarchicalMasks.from_dense(np.stack([mask for _, mask in masks_of_level]), level, ones, ones)
+
+
+def test_best_node_prefers_the_level_that_drew_the_mask_where_regions_coincide():
+    labels = np.full((3, 4, 4), -1, int)
+    labels[0, :2] = 0
+    labels[1, :2] = 1
+    mask = labels[0] == 0
+    assert best_node(mask, 1, labels, 2) == (0, 1.0)
+    assert best_node(mask, 2, labels, 2) == (1, 1.0)
+    labels[0, 2] = 0  # now the whole has 12 pixels, 8 of them in the mask
+    assert best_node(mask, 1, labels, 2) == (1, 1.0)
+
+
+def test_roughened_masks_resemble_the_mask():
+    mask = np.zeros((64, 64), bool)
+    mask[16:48, 16:48] = True
+    for seed in range(20):
+        rough = roughen(np.random.default_rng(seed), mask)
+        iou = (mask & rough).sum() / (mask | rough).sum()
+        assert 0.5 < iou <= 1
+
+
+def test_crops_of_the_segmenter_are_captioned_by_overlap():
+    views = drawn_views(1, 64)
+    disc = views.labels[0, 0] == 3
+    nothing = np.zeros((64, 64), bool)
+    nothing[:6, :6] = True
+    crops = list_crops(views, [drawn_masks((1, disc), (3, nothing))])
+    assert crops.rough.tolist() == [False] * 4 + [True, True]
+    assert [crops.phrase_sets[row][0] for row in crops.caption[:5]] == [
+        "ball",
+        "coin",
+        "ball half",
+        "ball spot",
+        "coin",
+    ]
+    assert crops.caption[5] == -1
+    assert crops.level.tolist() == [1, 1, 2, 3, 1, 0]
+    # parts belong to the thing they are part of
+    assert crops.thing[:4].tolist() == [0, 3, 0, 0]
+
+
+def test_captions_are_valid_for_every_crop_they_are_true_of():
+    captioner = Captioner((("ball", "red ball"), ("coin",)), generic_share=0.0)
+    texts, valid = captioner.draw(np.random.default_rng(0), np.array([0, 0, 1]))
+    assert texts[2].endswith("coin")
+    assert valid[:2, :2].tolist() == [[1, 1], [1, 1]]
+    assert valid[2].tolist() == [0, 0, 1]
+
+
+def test_canonical_phrases_describe_only_the_crops_they_were_drawn_for():
+    captioner = Captioner((("ball",),), generic_share=0.5)
+    texts, valid = captioner.draw(np.random.default_rng(1), np.zeros(40, int))
+    generic = np.array([any(phrase in text for phrase in CANONICAL) for text in texts])
+    assert 8 < generic.sum() < 32
+    # a crop captioned "object" has that caption and, being a ball, all balls' captions
+    assert valid[np.ix_(~generic, generic)].sum() == 0
+    assert valid[:, ~generic].all()
+
+
+def test_a_crop_is_what_the_pipeline_cuts():
+    views = drawn_views(1, 64)
+    half = views.labels[0, 1] == 1
+    crops = list_crops(views, [drawn_masks((2, half))])
+    expected = square_crop(views.images[0], half, "black", 0.0, CROP_PX)
+    exact = int(np.flatnonzero((crops.node == 1) & ~crops.rough)[0])
+    segmented = int(np.flatnonzero(crops.rough)[0])
+    for row in (exact, segmented):
+        assert np.array_equal(crops.cut(row), expected)
+    kept = crops.cut(exact, "keep")
+    assert np.array_equal(kept, square_crop(views.images[0], half, "keep", 0.0, CROP_PX))
+    roughened = crops.cut(exact, rng=np.random.default_rng(0))
+    assert roughened.shape == expected.shape
+    assert not np.array_equal(roughened, expected)
+    only = list_segmented(views, [drawn_masks((2, half))])
+    assert np.array_equal(only.cut(0), expected)
+
+
+def test_levels_are_drawn_equally_often():
+    views = drawn_views(2, 64)
+    masks = [drawn_masks((1, views.labels[view, 0] == 3)) for view in range(2)]
+    crops = list_crops(views, masks)
+    weights = crop_weights(crops, nothing=0.0, rough=0.4)
+    for level in (1, 2, 3):
+        assert weights[crops.level == level].sum() == pytest.approx(1 / 3)
+    assert weights[(crops.level == 1) & crops.rough].sum() == pytest.approx(0.4 / 3)
+
+
+def test_half_of_a_batch_comes_in_groups_of_one_thing():
+    crops = list_crops(drawn_views(8, 64))
+    rows = CropDraw(crops, 40).draw(np.random.default_rng(0))
+    assert len(rows) == 40
+    grouped = list(zip(crops.view[rows[20:]], crops.thing[rows[20:]], strict=True))
+    changes = sum(first != second for first, second in pairwise(grouped))
+    # a ball has three nodes, a coin one: 20 rows are at least 20 / SIBLINGS groups and far fewer than 20
+    assert 20 / SIBLINGS - 1 <= changes < 19
+
+
+def test_the_text_of_colour_and_class_is_found_among_the_phrases():
+    assert coloured_text(("kettle lid", "orange kettle lid", "striped kettle lid")) == "orange kettle lid"
+    assert coloured_text(("kettle lid", "orange striped kettle lid")) is None
