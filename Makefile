@@ -1,5 +1,6 @@
 # make run    set up and run the default configuration (synthetic scenes, to tables and figures)
 # make test   set up and run lint and all tests
+# make bench  set up and time what must be fast; tables go to results/benchmarks (docs/benchmarks.md)
 PYTHON ?= python3
 CORES ?= 2
 VENV := .venv
@@ -7,7 +8,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: run test lint report setup
+.PHONY: run test lint bench report setup
 
 run: $(STAMP)
 	snakemake --cores $(CORES) --workflow-profile workflow/profiles/default
@@ -21,14 +22,17 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $(STAMP)
 
 lint: $(STAMP)
-	ruff check hilsplat tests
-	ruff format --check hilsplat tests
+	ruff check hilsplat tests benchmarks
+	ruff format --check hilsplat tests benchmarks
 	lint-imports
 	snakefmt --check Snakefile rules
 	snakemake --lint --configfile config/ci.yaml
 
 test: lint
 	python -m pytest
+
+bench: $(STAMP)
+	OMP_NUM_THREADS=1 python -m pytest -c benchmarks/pytest.ini benchmarks
 
 report: $(STAMP)
 	snakemake --cores $(CORES) --workflow-profile workflow/profiles/default

@@ -22,6 +22,7 @@ wildcard_constraints:
 
 
 include: "rules/world.smk"
+include: "rules/models.smk"
 include: "rules/scene.smk"
 include: "rules/splat.smk"
 include: "rules/segment.smk"

@@ -42,7 +42,7 @@ Log = Annotated[Path | None, typer.Option(help="also write the log to this file"
 Cache = Annotated[Path, typer.Option(help="folder of finished views, for resuming")]
 
 DEFAULT_CACHE = Path("results/.cache")
-MIN_FREE_MIB = 200
+MIN_FREE_MIB = 200.0
 """A stage does not begin with less free space than this."""
 
 STAGE_MODULES: dict[str, str] = {
@@ -50,6 +50,7 @@ STAGE_MODULES: dict[str, str] = {
     "poses": "hilsplat.scene.poses",
     "gaussians": "hilsplat.splat.fit",
     "masks": "hilsplat.segment.stage",
+    "truth_masks": "hilsplat.datasets.truth_masks",
     "tree": "hilsplat.segment.tree_stage",
     "clip": "hilsplat.language.clip_stage",
     "contributions": "hilsplat.language.contributions",
@@ -60,6 +61,8 @@ STAGE_MODULES: dict[str, str] = {
     "tables": "hilsplat.evaluate.tables",
     "efficiency": "hilsplat.evaluate.efficiency",
     "figures": "hilsplat.evaluate.figures",
+    "consistency": "hilsplat.evaluate.world_consistency",
+    "models": "hilsplat.world.tiny.train",
 }
 """Module of each stage, whose import closure is the stage's code (see `base.code_hash`)."""
 
@@ -192,17 +195,21 @@ def gaussians(
     out: PathOut,
     report: Annotated[Path, typer.Option(help="folder of the fit's report")],
     settings: Settings = "{}",
+    brought: Annotated[
+        Path | None, typer.Option(help="somebody's 3DGS PLY in the source's coordinates; skips the fit")
+    ] = None,
     cache: Cache = DEFAULT_CACHE,
     seed: Seed = 0,
     threads: Threads = 1,
     log: Log = None,
 ) -> None:
-    """Fit 3D Gaussians to the training views."""
+    """Fit 3D Gaussians to the training views, or take somebody's; the JSON beside them holds coordinates."""
     section = _section("gaussians", settings)
-    with stage("gaussians", out, log, settings=section, seed=seed, threads=threads, inputs={"scene": scene}):
+    inputs = {"scene": scene, **({"brought": brought} if brought else {})}
+    with stage("gaussians", out, log, settings=section, seed=seed, threads=threads, inputs=inputs):
         from hilsplat.splat.fit import run_gaussians
 
-        run_gaussians(scene, out, report, cache, section, seed, threads)
+        run_gaussians(scene, out, report, cache, section, seed, threads, brought)
 
 
 @app.command()
@@ -210,16 +217,46 @@ def masks(
     scene: PathIn,
     out: PathOut,
     settings: Settings = "{}",
+    truth: Annotated[
+        Path | None, typer.Option(help="truth folder; for the segmenter truth-perturbed alone")
+    ] = None,
+    perturb: Annotated[str, typer.Option(help="faults of truth-perturbed as JSON")] = "{}",
     cache: Cache = DEFAULT_CACHE,
     threads: Threads = 1,
     log: Log = None,
 ) -> None:
     """Segment each training view at three levels."""
     section = _section("masks", settings)
+    if section.segmenter == "truth-perturbed":
+        _masks_from_truth(scene, truth, out, section, _section("perturb", perturb), threads, log)
+        return
+    if truth is not None:
+        raise HilsplatError(
+            f"masks: the segmenter {section.segmenter} must not see the truth",
+            found=f"--truth {truth}",
+            fix="leave --truth out, or set masks.segmenter: truth-perturbed, a diagnostic",
+        )
     with stage("masks", out, log, settings=section, threads=threads, inputs={"scene": scene}):
         from hilsplat.segment.stage import run_masks
 
         run_masks(scene, out, cache, section, threads)
+
+
+def _masks_from_truth(
+    scene: Path, truth: Path | None, out: Path, section: Any, faults: Any, threads: int, log: Path | None
+) -> None:
+    """The diagnostic segmenter, a stage of its own in provenance and code."""
+    if truth is None:
+        raise HilsplatError(
+            "masks: the segmenter truth-perturbed needs the true labels of a synthetic scene",
+            expected="--truth results/<dataset>/<scene>/world/truth",
+            fix="name the folder, or take masks.segmenter: sam or graph",
+        )
+    inputs = {"scene": scene, "truth": truth}
+    with stage("truth_masks", out, log, settings=faults, seed=faults.seed, threads=threads, inputs=inputs):
+        from hilsplat.datasets.truth_masks import run_truth_masks
+
+        run_truth_masks(scene, truth, out, faults, section.min_area_px, threads)
 
 
 @app.command()
@@ -470,7 +507,7 @@ def new(
 ) -> None:
     """Add a folder of photographs to the scene sheet and tell what was found."""
     start_logging(None)
-    from hilsplat.scene.sheet import add_scene
+    from hilsplat.scene.photos import add_scene
 
     report = add_scene(sheet, name, photos)
     typer.echo(str(report))
@@ -530,6 +567,51 @@ def world_show(
     typer.echo(f"wrote {target}")
 
 
+@world_app.command("classes")
+def world_classes(
+    out: Annotated[Path, typer.Option(help="PNG to write")] = Path("world_classes.png"),
+) -> None:
+    """Write a picture of one object of each class of the table."""
+    start_logging(None)
+    from hilsplat.world.gallery import draw_classes
+
+    draw_classes(out)
+    typer.echo(f"wrote {out}")
+
+
+@world_app.command("gallery")
+def world_gallery(
+    kind: Annotated[str, typer.Argument(help="kind of scene: tabletop, room or street")],
+    seeds: Annotated[list[int], typer.Argument(help="seeds of the scenes")],
+    out: Annotated[Path | None, typer.Option(help="PNG to write; default: world_KIND.png")] = None,
+) -> None:
+    """Write a picture of some scenes, a view of each with its true labels by level."""
+    start_logging(None)
+    from hilsplat.world.gallery import draw_scenes
+
+    target = out or Path(f"world_{kind}.png")
+    draw_scenes(kind, seeds, target)
+    typer.echo(f"wrote {target}")
+
+
+@world_app.command("inconsistency")
+def world_inconsistency(
+    scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has masks")],
+    variant: Annotated[str, typer.Option(help="variant whose masks are measured")] = "default",
+    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    neighbours: Annotated[int, typer.Option(min=1, help="nearest views that each view is compared with")] = 2,
+    out: Annotated[Path | None, typer.Option(help="CSV to write; default: beside the masks")] = None,
+) -> None:
+    """Measure how often a surface point gets other masks in the next view, with exact geometry."""
+    truth, masks_folder = results / scene / "world" / "truth", results / scene / variant / "masks"
+    target = out or masks_folder.with_name("consistency.csv")
+    with stage("consistency", target, None, inputs={"truth": truth, "masks": masks_folder}):
+        from hilsplat.evaluate.world_consistency import run_consistency
+
+        table = run_consistency(truth, masks_folder, target, neighbours)
+    typer.echo(table)
+
+
 @models_app.command("check")
 def models_check(folder: Annotated[Path, typer.Argument(help="model folder")]) -> None:
     """Say what a model folder holds, and time one image."""
@@ -542,15 +624,22 @@ def models_check(folder: Annotated[Path, typer.Argument(help="model folder")]) -
 @models_app.command("train")
 def models_train(
     out: Annotated[Path, typer.Option(help="folder that holds sam-tiny and clip-tiny")] = Path("models"),
-    cache: Cache = Path("results/.cache/train"),
+    cache: Annotated[Path, typer.Option(help="views and training states")] = DEFAULT_CACHE / "models",
+    settings: Settings = "{}",
     seed: Seed = 0,
     threads: Threads = 2,
+    stage: Annotated[list[str] | None, typer.Option(help="render, sam, clip; default: all of them")] = None,
+    log: Log = None,
 ) -> None:
-    """Train the small SAM and CLIP on training scenes of the synthetic world (about 20 minutes)."""
-    start_logging(None)
+    """Train the small SAM and CLIP on training scenes of the synthetic world.
+
+    A killed training goes on where it was; a finished one goes on when it is asked for more minutes.
+    """
+    start_logging(log)
+    from hilsplat.settings import parse_section
     from hilsplat.world.tiny.train import train_models
 
-    train_models(out, cache, seed=seed, threads=threads)
+    train_models(out, cache, parse_section("training", settings), seed, threads, stage)
 
 
 @app.command("cache")

@@ -41,6 +41,7 @@ from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ContributionsSettings
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
+from hilsplat.splat.rasterise.device import choose_device
 
 logger = logging.getLogger(__name__)
 
@@ -186,6 +187,7 @@ def run_contributions(
     rows: dict[str, list[np.ndarray]] = {"view": [], "mask": [], "level": [], "area_px": []}
     read_index(masks_folder)
     with stage_log("contributions", scene.name) as counts:
+        device = choose_device(settings.device)
         for number, view in enumerate(track(views, "contributions of views")):
             camera = scene.cameras[view]
             masks_path = Path(masks_folder) / f"{view}.npz"
@@ -197,7 +199,9 @@ def run_contributions(
                     found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
                     fix="run the masks stage again",
                 )
-            raw = pixel_weights(gaussians, camera, min_weight=settings.min_weight, threads=threads)
+            raw = pixel_weights(
+                gaussians, camera, min_weight=settings.min_weight, threads=threads, device=device
+            )
             weights, _ = normalised_weights(raw)
             key = sha256_of_json(
                 {

@@ -44,7 +44,7 @@ class Encoded:
     """One image after the vision encoder."""
 
     embeddings: Float32[np.ndarray, "1 C h w"]
-    positional: Float32[np.ndarray, "1 C h w"]
+    positional: Float32[np.ndarray, "1 D h w"]
     frame: Frame
 
 

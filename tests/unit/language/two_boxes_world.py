@@ -146,7 +146,7 @@ def build_two_boxes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TwoBoxes
     monkeypatch.setattr(
         contributions,
         "pixel_weights",
-        lambda gaussians, camera, *, min_weight, threads: two_boxes_weights(names.index(camera.name)),
+        lambda gaussians, camera, *, min_weight, threads, device: two_boxes_weights(names.index(camera.name)),
     )
     return world
 

@@ -1,0 +1,19 @@
+# The small models of the synthetic world. Off the default path: the trained ones are committed.
+rule train_models:
+    output:
+        directory("results/models/sam-tiny"),
+        directory("results/models/clip-tiny"),
+    log:
+        "results/models/train.log",
+    conda:
+        ENVIRONMENT
+    threads: CORES
+    resources:
+        mem_mb=8000,
+    params:
+        settings=RUN.training.model_dump_json(),
+        seed=RUN.seed,
+        code=code("models"),
+    shell:
+        "hilsplat models train --out results/models --cache results/.cache/models"
+        " --settings {params.settings:q} --seed {params.seed} --threads {threads} --log {log}"
