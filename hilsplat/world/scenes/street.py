@@ -281,7 +281,7 @@ def drive_poses(scene: WorldScene, views: int) -> list[tuple[Float[np.ndarray, "
 
 
 def drive_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int = 360.0) -> Cameras:
-    """Cameras of a drive along the street.
+    """Cameras of a drive along the street; take the global mapper for them (`docs/world.md`).
 
     Args:
         scene: its seed is that of the jitter.

@@ -55,7 +55,7 @@ def test_true_regions_nest(world):
 def test_the_room_is_never_scored(world):
     truth = HierarchyAnnotations.load(world / "truth")
     background = read_json(world / "truth" / "scene.json")["background"]
-    assert {truth.nodes[node].text for node in background} == {"table", "floor", "wall"}
+    assert {"table", "floor", "wall"} <= {truth.nodes[node].text for node in background}
     assert not any(set(background) & set(ids) for ids in truth.views.values())
 
 
