@@ -1,4 +1,4 @@
-"""The `hilsplat` command: one subcommand per stage, plus new, query, world show, models.
+"""The `hilsplat` command: one subcommand per stage, plus new, query, world show, models, datasets.
 
 A stage here is thin: it reads its settings, takes the lock of its output, calls one function of the
 package and writes the provenance. Heavy libraries are imported by the functions, not by this file.
@@ -30,8 +30,12 @@ app = typer.Typer(
 )
 world_app = typer.Typer(help="The synthetic world.", no_args_is_help=True)
 models_app = typer.Typer(help="Model folders (SAM, CLIP).", no_args_is_help=True)
+datasets_app = typer.Typer(
+    help="Benchmarks: layouts, licences, and what is there of them.", no_args_is_help=True
+)
 app.add_typer(world_app, name="world")
 app.add_typer(models_app, name="models")
+app.add_typer(datasets_app, name="datasets")
 
 PathIn = Annotated[Path, typer.Option(help="input", show_default=False)]
 PathOut = Annotated[Path, typer.Option(help="output; written atomically", show_default=False)]
@@ -368,7 +372,6 @@ def language(
 @app.command()
 def evaluate(
     scene: PathIn,
-    truth: PathIn,
     gaussians: PathIn,
     semantic_tree: PathIn,
     language: PathIn,
@@ -378,16 +381,19 @@ def evaluate(
     out: PathOut,
     dataset: Annotated[str, typer.Option(help="data set, for the rows")],
     name: Annotated[str, typer.Option(help="scene, for the rows")],
+    truth: Annotated[Path | None, typer.Option(help="annotations of a synthetic scene")] = None,
+    labels: Annotated[str, typer.Option(help="or a labelled scene, as lerf_ovs/figurines")] = "",
+    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders")] = Path(),
     variant: Annotated[str, typer.Option(help="variant, for the rows")] = "default",
     settings: Settings = "{}",
     threads: Threads = 1,
     log: Log = None,
 ) -> None:
-    """Ask every annotated text in every test view and score the answers."""
+    """Ask every annotated text in every test view, or every labelled one, and score the answers."""
     section = _section("evaluate", settings)
     inputs = {
         "scene": scene,
-        "truth": truth,
+        **({"truth": truth} if truth else {}),
         "gaussians": gaussians,
         "semantic_tree": semantic_tree,
         "language": language,
@@ -396,9 +402,11 @@ def evaluate(
         "masks": masks,
     }
     with stage("evaluate", out, log, settings=section, threads=threads, inputs=inputs):
+        from hilsplat.datasets.registry import open_labelled
         from hilsplat.evaluate.stage import run_evaluate
 
         run_evaluate(
+            labels=open_labelled(labels, data_root) if labels else None,
             scene_folder=scene,
             truth=truth,
             gaussians=gaussians,
@@ -640,6 +648,36 @@ def models_train(
     from hilsplat.world.tiny.train import train_models
 
     train_models(out, cache, parse_section("training", settings), seed, threads, stage)
+
+
+@datasets_app.command("list")
+def datasets_list(
+    data_root: Annotated[Path | None, typer.Option(help="folder of the data sets' folders")] = None,
+) -> None:
+    """List data sets: citation, licence, layout and, with --data-root, which scenes are there."""
+    start_logging(None)
+    from hilsplat.datasets.overview import overview
+
+    typer.echo(overview(data_root))
+
+
+@datasets_app.command("check")
+def datasets_check(
+    name: Annotated[str, typer.Argument(help="data set, such as lerf_ovs")],
+    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders", show_default=False)],
+    scene: Annotated[
+        list[str] | None, typer.Option(help="scene to read; default: all that are there")
+    ] = None,
+) -> None:
+    """Read every label of a data set, scene by scene, and say what was found and what is odd."""
+    start_logging(None)
+    from hilsplat.datasets.overview import check
+    from hilsplat.datasets.registry import dataset_of
+
+    report, num_failed = check(dataset_of(name), data_root, scene or ())
+    typer.echo(report)
+    if num_failed:
+        raise typer.Exit(1)
 
 
 @app.command("cache")

@@ -13,6 +13,7 @@ from hilsplat.base.artifacts import sha256_of_path
 from hilsplat.base.code_hash import code_hash as code_of
 from hilsplat.base.errors import HilsplatError
 from hilsplat.cli import STAGE_MODULES
+from hilsplat.datasets.published import FRAMES, PROMPTS
 from hilsplat.scene.sheet import read_sheet
 from hilsplat.settings import UPSTREAM, parse_run
 
@@ -221,9 +222,29 @@ def image_files_of(wildcards):
     return images_of(wildcards) if row_of(wildcards).world else photos_of(wildcards)
 
 
+def labels_of(row):
+    """Published labels of a scene as `data set/scene`, or "" where it has none."""
+    dataset, _, scene = row.source.removeprefix("data:").partition("/")
+    is_published = row.source.startswith("data:") and dataset in (*FRAMES, *PROMPTS)
+    return f"{dataset}/{scene}" if is_published else ""
+
+
 def labelled(rows):
-    """Scenes that have annotations to be scored against."""
-    return [row for row in rows if row.world]
+    """Scenes that have annotations or labels to be scored against."""
+    return [row for row in rows if row.world or labels_of(row)]
+
+
+def truth_option_of(wildcards, input):
+    """Parameter: what a scene is scored against."""
+    row = row_of(wildcards)
+    if row.world:
+        return f"--truth {shlex.quote(str(input.truth))}"
+    root = (
+        row.folder.parent.parent
+    )  # the sheet resolved `data:<data set>/<scene>` below the data root
+    return (
+        f"--labels {shlex.quote(labels_of(row))} --data-root {shlex.quote(str(root))}"
+    )
 
 
 def scores_of(variants):

@@ -2,7 +2,7 @@
 rule evaluate:
     input:
         scene="results/{dataset}/{scene}/scene",
-        truth="results/{dataset}/{scene}/world/truth",
+        truth=truth_of,  # nothing, for published labels
         gaussians="results/{dataset}/{scene}/gaussians.ply",
         semantic_tree=shared("semantic_tree", "semantic_tree"),
         language=shared("language", "language.safetensors"),
@@ -23,8 +23,9 @@ rule evaluate:
     params:
         settings=settings_of("evaluate"),
         code=code("evaluate"),
+        truth=truth_option_of,
     shell:
-        "hilsplat evaluate --scene {input.scene} --truth {input.truth} --gaussians {input.gaussians}"
+        "hilsplat evaluate --scene {input.scene} {params.truth} --gaussians {input.gaussians}"
         " --semantic-tree {input.semantic_tree} --language {input.language}"
         " --autoencoder {input.autoencoder} --clip {input.clip} --masks {input.masks}"
         " --dataset {wildcards.dataset} --name {wildcards.scene} --variant {wildcards.variant}"

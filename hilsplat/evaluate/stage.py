@@ -1,11 +1,13 @@
 """The evaluate stage: a finished scene and its annotations in, `scores.csv` out."""
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
 
 from hilsplat.base.artifacts import read_index
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
+from hilsplat.datasets.labelled import LabelledScene, check_label_size
 from hilsplat.evaluate.protocols.answers import Selections
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import measure_view
@@ -15,6 +17,9 @@ from hilsplat.scene.scene import Scene
 from hilsplat.settings import EvaluateSettings
 
 logger = logging.getLogger(__name__)
+
+SHAPE_TOLERANCE = 0.01
+"""Views whose sides were rounded by undistortion or shrinking still fit their labels."""
 
 
 def run_evaluate(
@@ -32,8 +37,12 @@ def run_evaluate(
     scene: str,
     variant: str,
     threads: int,
+    labels: LabelledScene | None = None,
 ) -> None:
     """Score every annotated query in every annotated test view (see `protocols`).
+
+    With the labels of a published data set every labelled view is scored, held out or not: most of them
+    train on all views.
 
     Args:
         scene_folder: scene artifact; its test views were held out of every stage before.
@@ -50,26 +59,22 @@ def run_evaluate(
         scene: scene name.
         variant: named set of settings.
         threads: threads for rendering.
+        labels: labels of a published data set, in place of annotations.
 
     Raises:
         MisalignedArtifactError: label images are of another size than the cameras.
+        SceneError: a labelled view has no pose, or labels are of another shape than their view.
     """
     scores: list[Score] = []
     label = masks_label(masks_folder)
     with stage_log("evaluate", f"{dataset}/{scene}/{variant}") as counts:
-        if truth is None:
+        if truth is None and labels is None:
             logger.info("%s/%s has no annotations: nothing to score", dataset, scene)
         else:
-            annotations = HierarchyAnnotations.load(truth)
             posed = Scene.load(scene_folder)
-            views = [view for view in posed.views("test") if annotations.views.get(view)]
-            if not views:
-                logger.warning(
-                    "none of the %d test views of %s/%s is annotated: nothing to score",
-                    len(posed.views("test")),
-                    dataset,
-                    scene,
-                )
+            truths = labelled_truths(labels, posed) if labels else annotated_truths(truth, posed, settings)
+            if not truths:
+                logger.warning("no view of %s/%s is annotated: nothing to score", dataset, scene)
             answers = LanguageScene.open(
                 scene_folder,
                 gaussians,
@@ -82,10 +87,9 @@ def run_evaluate(
                 threads=threads,
             )
             selections = Selections(answers, settings.node_select)
-            for view in track(views, "views scored"):
+            for view in track(list(truths), "views scored"):
                 size_hw = posed.cameras[view].size_hw
-                regions = ViewTruth.of(annotations, view, size_hw, settings.min_region_px)
-                for measured in measure_view(answers, selections, regions, view, size_hw, settings):
+                for measured in measure_view(answers, selections, truths[view](), view, size_hw, settings):
                     scores.append(
                         Score(
                             dataset=dataset,
@@ -96,9 +100,42 @@ def run_evaluate(
                             **vars(measured),
                         )
                     )
-            counts["views"] = len(views)
+            counts["views"] = len(truths)
         counts["rows"] = len(scores)
         write_scores(out, scores)
+
+
+def annotated_truths(
+    truth: Path, posed: Scene, settings: EvaluateSettings
+) -> dict[str, Callable[[], ViewTruth]]:
+    """What is true in each annotated test view, read when its turn comes."""
+    annotations = HierarchyAnnotations.load(truth)
+    return {
+        view: lambda view=view: ViewTruth.of(
+            annotations, view, posed.cameras[view].size_hw, settings.min_region_px
+        )
+        for view in posed.views("test")
+        if annotations.views.get(view)
+    }
+
+
+def labelled_truths(labels: LabelledScene, posed: Scene) -> dict[str, Callable[[], ViewTruth]]:
+    """What is true in each labelled view of a published data set, read when its turn comes.
+
+    Raises:
+        SceneError: a labelled view has no pose, or its labels are of another shape.
+    """
+    for sentence in labels.warnings:
+        logger.warning("%s/%s: %s", labels.dataset, labels.scene, sentence)
+    truths: dict[str, Callable[[], ViewTruth]] = {}
+    for stem, view in labels.posed_views(posed.cameras.names).items():
+        size_hw, regions = posed.cameras[view].size_hw, labels.views[stem]
+        for label_hw in sorted({region.size_hw for region in regions}):
+            sentence = check_label_size(f"a label of view {view}", label_hw, size_hw, SHAPE_TOLERANCE)
+            if sentence:
+                logger.warning("%s/%s: %s", labels.dataset, labels.scene, sentence)
+        truths[view] = lambda regions=regions, size_hw=size_hw: ViewTruth.of_regions(regions, size_hw)
+    return truths
 
 
 def masks_label(masks_folder: Path) -> str:

@@ -1,4 +1,4 @@
-"""Scenes with known poses: COLMAP model folders and transforms.json (nerfstudio, Blender)."""
+"""Scenes with known poses: COLMAP models, transforms.json (nerfstudio, Blender), poses_bounds.npy (LLFF)."""
 
 import json
 import logging
@@ -25,6 +25,7 @@ from hilsplat.scene.features import (
     match_features,
     view_names,
 )
+from hilsplat.scene.llff import POSES_BOUNDS, llff_views
 from hilsplat.scene.model import pose_matrix, reprojection_errors, sparse_points
 from hilsplat.settings import PosesSettings
 
@@ -49,8 +50,8 @@ class KnownPoses:
 
     Attributes:
         root: the folder.
-        kind: "colmap" or "transforms".
-        files: the model folder, or the transforms files (training first, then testing).
+        kind: "colmap", "transforms" or "llff".
+        files: the model folder, the transforms files (training first, then testing), or LLFF's file.
     """
 
     root: Path
@@ -78,7 +79,7 @@ class KnownView:
 
 
 def find_known_poses(folder: Path) -> KnownPoses | None:
-    """Look for a COLMAP model, then for transforms files; None where the folder has neither.
+    """Look for a COLMAP model, transforms files, LLFF's file, in this order; None where there is none.
 
     Raises:
         SceneError: there is a `sparse/` folder without a complete model in it.
@@ -93,6 +94,8 @@ def find_known_poses(folder: Path) -> KnownPoses | None:
             if name == "transforms_train.json" and (folder / "transforms_test.json").is_file():
                 files.append(folder / "transforms_test.json")
             return KnownPoses(folder, "transforms", tuple(files))
+    if (folder / POSES_BOUNDS).is_file():
+        return KnownPoses(folder, "llff", (folder / POSES_BOUNDS,))
     if (folder / "sparse").is_dir():
         raise SceneError(
             f"{folder / 'sparse'} holds no complete COLMAP model",
@@ -129,12 +132,14 @@ def import_poses(
         SceneError: the model or transforms file cannot be used.
         RegistrationError: too few of its views have an image.
     """
-    points: tuple[np.ndarray, np.ndarray] | None
+    points: tuple[np.ndarray, np.ndarray] | None = None
+    errors: dict[str, dict[str, Any]] = {}
     if known.kind == "colmap":
         described, points, errors = read_colmap(known)
-    else:
+    elif known.kind == "transforms":
         described, points = read_transforms(known)
-        errors = {}
+    else:
+        described = known_views(known)
     present = [view for view in described if view.image is not None]
     missing = sorted(view.name for view in described if view.image is None)
     _check_present(known, name, present, missing, settings)
@@ -262,6 +267,24 @@ def _read_as_described(path: Path, camera: pycolmap.Camera) -> UInt8[np.ndarray,
         found=f"{upright.shape[1]} x {upright.shape[0]} px",
         fix="use the images that the poses were computed from",
     )
+
+
+def known_views(known: KnownPoses) -> list[KnownView]:
+    """Posed views of a folder, whatever it keeps them in.
+
+    Raises:
+        SceneError: they cannot be read.
+    """
+    if known.kind == "colmap":
+        return read_colmap(known)[0]
+    if known.kind == "transforms":
+        return read_transforms(known)[0]
+    folder = known.root / "images"
+    images = list_images(folder if folder.is_dir() else known.root)
+    return [
+        KnownView(image.name, image, camera, pose)
+        for image, camera, pose in llff_views(known.files[0], images)
+    ]
 
 
 def read_colmap(

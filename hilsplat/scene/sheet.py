@@ -100,8 +100,12 @@ def photo_folder(folder: Path) -> Path:
 
 
 def has_known_poses(folder: Path) -> bool:
-    """Whether a folder brings its own poses (COLMAP model or transforms*.json)."""
-    return (folder / "sparse").is_dir() or any(folder.glob("transforms*.json"))
+    """Whether a folder brings its own poses (COLMAP model, transforms*.json or poses_bounds.npy)."""
+    return (
+        (folder / "sparse").is_dir()
+        or any(folder.glob("transforms*.json"))
+        or (folder / "poses_bounds.npy").is_file()
+    )
 
 
 def read_sheet(

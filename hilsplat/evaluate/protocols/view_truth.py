@@ -1,6 +1,6 @@
 """What is true in one view: the queries that are scored there and their regions."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +9,7 @@ from jaxtyping import Bool, Int
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
+from hilsplat.datasets.labelled import LabelledRegion
 from hilsplat.evaluate.metrics.localization import box_of
 
 
@@ -79,20 +80,44 @@ class ViewTruth:
                 for node, region in regions.items():
                     path = annotations.path_of(node)
                     by_path[path] = by_path[path] | region if path in by_path else region
-        categories = []
-        for text in dict.fromkeys(query.text for query in queries):
-            same = [query for query in queries if query.text == text]
-            categories.append(
-                Query(
-                    text,
-                    None,
-                    tuple(path for query in same for path in query.paths),
-                    np.any([query.truth for query in same], axis=0),
-                    np.concatenate([query.boxes_xyxy for query in same]),
-                )
-            )
         large = {path: region for path, region in by_path.items() if np.count_nonzero(region) >= min_px}
-        return ViewTruth(tuple(queries), tuple(categories), large)
+        return ViewTruth(tuple(queries), _united(queries), large)
+
+    @staticmethod
+    def of_regions(regions: Iterable[LabelledRegion], size_hw: tuple[int, int]) -> "ViewTruth":
+        """Truth of a view of a published data set, with or without levels.
+
+        Regions of one text and level are united, their boxes all kept. A region without a pixel (a class
+        of 3D-OVS that the view does not show) is no query. A region whose chain of parents is broken is
+        asked for, but belongs to no family.
+
+        Args:
+            regions: the labels of the view.
+            size_hw: size of the predictions; labels of another size are resized by nearest neighbour.
+        """
+        masks = [(region, region.mask(size_hw)) for region in regions]
+        groups: dict[tuple[str, Level | None], list[tuple[LabelledRegion, np.ndarray]]] = {}
+        by_path: dict[tuple[str, ...], np.ndarray] = {}
+        for region, mask in masks:
+            if not mask.any():
+                continue
+            groups.setdefault((region.text, region.level), []).append((region, mask))
+            if region.level is not None and len(region.path) == int(region.level):
+                path = region.path
+                by_path[path] = by_path[path] | mask if path in by_path else mask
+        queries = [
+            Query(
+                text,
+                level,
+                tuple(dict.fromkeys(region.path for region, _ in same)),
+                np.any([mask for _, mask in same], axis=0),
+                np.concatenate([region.boxes(size_hw) for region, _ in same]),
+            )
+            for (text, level), same in groups.items()
+        ]
+        return ViewTruth(
+            tuple(query for query in queries if query.level is not None), _united(queries), by_path
+        )
 
     @staticmethod
     def flat(
@@ -122,3 +147,20 @@ class ViewTruth:
                     families.append((parent, children))
             transitions.append(families)
         return transitions
+
+
+def _united(queries: Iterable[Query]) -> tuple[Query, ...]:
+    """One query per text, levels united."""
+    by_text: dict[str, list[Query]] = {}
+    for query in queries:
+        by_text.setdefault(query.text, []).append(query)
+    return tuple(
+        Query(
+            text,
+            None,
+            tuple(path for query in same for path in query.paths),
+            np.any([query.truth for query in same], axis=0),
+            np.concatenate([query.boxes_xyxy for query in same]),
+        )
+        for text, same in by_text.items()
+    )

@@ -1,0 +1,146 @@
+"""What is known of a data set before one of its files is read: scenes, layout, licence, and who reads it."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from hilsplat.base.errors import SceneError
+
+
+@dataclass(frozen=True)
+class SceneReport:
+    """What the check of one scene found.
+
+    Attributes:
+        facts: what was read, in words and numbers: {"labelled views": 4, "texts": 21}.
+        warnings: what was read otherwise than written, or could not be used, each a sentence.
+    """
+
+    facts: dict[str, object]
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A benchmark in its published layout.
+
+    Attributes:
+        name: key in the registry, and data set in rows and paths.
+        title: as papers write it.
+        labels: what carries labels: pixels of "images", or "points" of a mesh or a scan.
+        folder: the data set's folder below `data_root`.
+        scenes: scenes that the paper's tables use.
+        licence: in one line.
+        terms: what the licence asks of a user, in one sentence.
+        citation: authors, title, venue, year.
+        layout: the expected tree, from `folder` down, for people.
+        required: places below `folder` that a scene cannot do without, relative.
+        open: reads a scene: (the data set's folder, scene) to a `LabelledScene` or its like for points.
+        check: reads everything of a scene and reports.
+    """
+
+    name: str
+    title: str
+    labels: Literal["images", "points"]
+    folder: str
+    scenes: tuple[str, ...]
+    licence: str
+    terms: str
+    citation: str
+    layout: str
+    required: Callable[[str], tuple[str, ...]]
+    open: Callable[[Path, str], Any]
+    check: Callable[[Path, str], SceneReport]
+
+    def missing(self, root: Path, scene: str) -> tuple[str, ...]:
+        """Required places of a scene that are not below the data set's folder `root`."""
+        return tuple(place for place in self.required(scene) if not _at(root, place).exists())
+
+    def found(self, root: Path) -> tuple[str, ...]:
+        """Known scenes of which nothing required is missing."""
+        return tuple(scene for scene in self.scenes if not self.missing(root, scene))
+
+    def locate(self, data_root: Path) -> Path:
+        """The data set's folder below `data_root`.
+
+        Raises:
+            SceneError: it is not there, or lies one level higher or deeper.
+        """
+        data_root = Path(data_root).expanduser()
+        root = data_root / self.folder
+        if self._has_begun(root):
+            return root
+        for deeper in _folders(root):
+            if self._has_begun(deeper):
+                raise SceneError(
+                    f"{self.title} lies one level too deep in {root}",
+                    expected=f"its scenes in {root}",
+                    found=f"them in {deeper}",
+                    fix=f"move the content of {deeper} one level up",
+                )
+        if self._has_begun(data_root):
+            raise SceneError(
+                f"{data_root} is the folder of {self.title} itself",
+                expected=f"a folder that holds {self.folder}/",
+                fix=f"rename it {self.folder} if it is not, and set data_root to the folder above it",
+            )
+        for deeper in _folders(data_root):
+            if self._has_begun(deeper / self.folder):
+                raise SceneError(
+                    f"{self.title} is not in {data_root} but one level deeper",
+                    expected=str(root),
+                    found=str(deeper / self.folder),
+                    fix=f"set data_root to {deeper}",
+                )
+        raise SceneError(
+            f"{self.title} is not below {data_root}",
+            expected=f"{root} with one of: {', '.join(self.scenes[:8])}",
+            found=_listing(root if root.is_dir() else data_root),
+            fix="unpack it there; its layout is printed by: hilsplat datasets list",
+        )
+
+    def require(self, root: Path, scene: str) -> None:
+        """Refuse a scene of which something required is missing.
+
+        Raises:
+            SceneError: naming what is missing; as after an archive was unpacked in part.
+        """
+        missing = self.missing(root, scene)
+        if missing:
+            here = [place for place in self.required(scene) if place not in missing]
+            raise SceneError(
+                f"scene {scene} of {self.title} is incomplete in {root}",
+                expected=f"also {', '.join(missing)}",
+                found=", ".join(here) or _listing(Path(root)),
+                fix="unpack the whole archive again, or correct the name of the scene",
+            )
+
+    def _has_begun(self, root: Path) -> bool:
+        """Whether anything of any known scene is in a folder."""
+        return any(
+            _at(root, place).exists()
+            for scene in self.scenes
+            for place in self.required(scene)
+            if not place.startswith("..")  # what lies beside the folder says nothing about it
+        )
+
+
+def _at(root: Path, place: str) -> Path:
+    """A place from a folder, which need not exist for `..` to lead out of it."""
+    return Path(os.path.normpath(Path(root) / place))
+
+
+def _folders(folder: Path) -> list[Path]:
+    """Folders in a folder, by name; none where it is missing."""
+    return sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+
+
+def _listing(folder: Path) -> str:
+    """First names of a folder, for messages."""
+    if not folder.is_dir():
+        return f"no folder {folder}"
+    names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+    more = f" and {len(names) - 8} more" if len(names) > 8 else ""
+    return ", ".join(names[:8]) + more if names else "nothing"

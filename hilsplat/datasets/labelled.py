@@ -1,0 +1,284 @@
+"""Scenes whose images carry labels: what every reader of such a data set returns.
+
+Views are named after the image file without its suffix ("frame_00041"), so that a label finds its image
+and its camera whatever else is missing.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Int
+from PIL import Image, UnidentifiedImageError
+
+from hilsplat.base.errors import ImageError, SceneError
+from hilsplat.base.files import list_images
+from hilsplat.base.levels import Level
+from hilsplat.datasets.dataset import SceneReport
+from hilsplat.scene.importers import KnownView, find_known_poses, known_views
+
+ROUNDING_PX = 1.0
+"""A label is a scaled copy of its image where the sides differ by no more than rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledRegion:
+    """One region of one view, with the text that asks for it.
+
+    Attributes:
+        text: the query, as the labels spell it.
+        size_hw: height and width of the label, px.
+        pixels: reads the region at the label's size; called whenever the mask is asked for.
+        boxes_xyxy: annotated boxes, borders included, label px; None where the data set has none.
+        level: None where the data set has no levels.
+        path: texts from the whole down to this region; the text alone without levels.
+    """
+
+    text: str
+    size_hw: tuple[int, int]
+    pixels: Callable[[], Bool[np.ndarray, "H W"]]
+    boxes_xyxy: Int[np.ndarray, "B 4"] | None = None
+    level: Level | None = None
+    path: tuple[str, ...] = ()
+
+    def mask(self, size_hw: tuple[int, int] | None = None) -> Bool[np.ndarray, "H W"]:
+        """The region, at the label's size or resized to another by nearest neighbour."""
+        mask = self.pixels()
+        return mask if size_hw is None else resize_nearest(mask, size_hw)
+
+    def boxes(self, size_hw: tuple[int, int] | None = None) -> Int[np.ndarray, "B 4"]:
+        """Boxes with borders included; the region's own extent where none is annotated.
+
+        At another size each side is scaled and rounded to the pixel that holds it. A region without a
+        pixel and without annotated boxes has none.
+        """
+        boxes = self.boxes_xyxy
+        if boxes is None:
+            mask = self.pixels()
+            rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+            if not len(rows):
+                return np.zeros((0, 4), dtype=np.int64)
+            boxes = np.array([[columns[0], rows[0], columns[-1], rows[-1]]])
+        if size_hw is None or tuple(size_hw) == self.size_hw:
+            return boxes
+        scale = np.array([size_hw[1] / self.size_hw[1], size_hw[0] / self.size_hw[0]] * 2)
+        scaled = np.floor((boxes + 0.5) * scale).astype(np.int64)
+        return np.clip(scaled, 0, np.array([size_hw[1], size_hw[0]] * 2) - 1)
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledScene:
+    """One scene of an image-labelled data set.
+
+    Attributes:
+        dataset: name of the data set.
+        scene: name of the scene.
+        images: image file by view, all images of the scene.
+        poses: folder that `scene.importers` finds poses in; None where the scene has none.
+        views: labelled regions by view, in order of the labels.
+        prompts: all texts of the scene, sorted.
+        warnings: what was read otherwise than written, each a sentence.
+    """
+
+    dataset: str
+    scene: str
+    images: Mapping[str, Path]
+    poses: Path | None
+    views: Mapping[str, tuple[LabelledRegion, ...]]
+    prompts: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def num_pairs(self) -> int:
+        """Pairs of view and text."""
+        return sum(len({region.text for region in regions}) for regions in self.views.values())
+
+    def posed_views(self, names: Iterable[str]) -> dict[str, str]:
+        """Labelled view to name of the posed view of the same stem ("frame_00041" to "frame_00041.png").
+
+        Raises:
+            SceneError: labelled views without a pose, by name.
+        """
+        by_stem = {Path(name).stem: name for name in names}
+        missing = [view for view in self.views if view not in by_stem]
+        if missing:
+            raise SceneError(
+                f"labelled views of {self.dataset}/{self.scene} have no pose: {', '.join(missing)}",
+                expected=f"all {len(self.views)} labelled views among the posed ones",
+                found=f"{len(by_stem)} posed views, {_some(sorted(by_stem))}",
+                fix="use the poses that come with the data set, or register those images",
+            )
+        return {view: by_stem[view] for view in self.views}
+
+
+def resize_nearest(mask: Bool[np.ndarray, "H W"], size_hw: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """Each new pixel takes the old one under its centre."""
+    if mask.shape == tuple(size_hw):
+        return mask
+    rows, columns = (
+        ((np.arange(new) + 0.5) * old / new).astype(np.int64)
+        for new, old in zip(size_hw, mask.shape, strict=True)
+    )
+    return mask[rows[:, None], columns[None, :]]
+
+
+def images_by_stem(folder: Path) -> dict[str, Path]:
+    """Image files of a folder by their name without suffix, sorted by it.
+
+    Raises:
+        SceneError: the folder is missing or empty, or two images share a stem.
+    """
+    folder = Path(folder)
+    files = list_images(folder) if folder.is_dir() else []
+    if not files:
+        raise SceneError(
+            f"{folder} {'has no images' if folder.is_dir() else 'is missing'}",
+            expected="the images of the scene, .jpg or .png",
+            fix="unpack the whole archive again",
+        )
+    by_stem: dict[str, Path] = {}
+    for path in sorted(files, key=lambda path: path.stem):
+        if path.stem in by_stem:
+            raise SceneError(
+                f"two images of {folder} have the same name but for the suffix",
+                found=f"{by_stem[path.stem].name}, {path.name}",
+                fix="remove one of them: labels are matched by the name without suffix",
+            )
+        by_stem[path.stem] = path
+    return by_stem
+
+
+def image_size_hw(path: Path) -> tuple[int, int]:
+    """Height and width of an image as stored, without reading its pixels.
+
+    Raises:
+        ImageError: it is missing or no image.
+    """
+    try:
+        with Image.open(path) as image:
+            return image.height, image.width
+    except FileNotFoundError as error:
+        raise ImageError(f"image {path} is missing") from error
+    except (UnidentifiedImageError, OSError) as error:
+        raise ImageError(f"image {path} cannot be read: {error}", fix="replace it by a whole copy") from error
+
+
+def read_mask_file(path: Path, least: int) -> Bool[np.ndarray, "H W"]:
+    """Foreground of a grey mask file: values of at least `least`.
+
+    Raises:
+        ImageError: it is missing, cut off or no image.
+    """
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("L")) >= least
+    except FileNotFoundError as error:
+        raise ImageError(f"mask {path} is missing") from error
+    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+        raise ImageError(f"mask {path} cannot be read: {error}", fix="replace it by a whole copy") from error
+
+
+def check_label_size(
+    where: str, label_hw: tuple[int, int], image_hw: tuple[int, int], share: float = 0.0
+) -> str | None:
+    """Compare the size of a label with that of its image.
+
+    Args:
+        where: the label, as a sentence begins.
+        label_hw: its height and width, px.
+        image_hw: those of its image, px.
+        share: how far heights may differ at equal widths, beyond rounding, as a share.
+
+    Returns:
+        None where they are equal, else the sentence that says that the label is resized.
+
+    Raises:
+        SceneError: one is no scaled copy of the other.
+    """
+    if label_hw == image_hw:
+        return None
+    scale = image_hw[1] / label_hw[1]
+    if abs(image_hw[0] - label_hw[0] * scale) > max(ROUNDING_PX, ROUNDING_PX * scale, share * image_hw[0]):
+        raise SceneError(
+            f"{where} does not fit its image",
+            expected=f"{image_hw[1]} x {image_hw[0]} px (width x height), or a scaled copy",
+            found=f"{label_hw[1]} x {label_hw[0]} px",
+            fix="use the images that the labels were drawn on (undistorted, of the same release)",
+        )
+    return (
+        f"{where} is {label_hw[1]} x {label_hw[0]} px, its image {image_hw[1]} x {image_hw[0]} px: "
+        "resized by nearest neighbour"
+    )
+
+
+def unlisted_texts(found: Iterable[str], published: Iterable[str]) -> str | None:
+    """A sentence on texts that the published list of the scene lacks, or None; an empty list says nothing."""
+    published = set(published)
+    new = sorted(set(found) - published)
+    if not published or not new:
+        return None
+    return f"texts that the published list lacks: {', '.join(new)}"
+
+
+def missing_frames(what: str, listed: Iterable[str], present: Iterable[str]) -> str | None:
+    """A sentence that names published frames without `what`, or None."""
+    gone = sorted(set(listed) - set(present))
+    return f"published frames without {what}: {', '.join(gone)}" if gone else None
+
+
+def posed_images(folder: Path, dataset: str) -> dict[str, KnownView]:
+    """Posed views of a scene folder by image stem, sorted by it.
+
+    Raises:
+        SceneError: the folder has no poses, they cannot be read, or their lenses are distorted, which
+            labels of undistorted images would not fit.
+    """
+    known = find_known_poses(folder)
+    if known is None:
+        raise SceneError(
+            f"{folder} has no poses",
+            expected="a COLMAP model in sparse/0/",
+            fix=f"unpack the whole archive of {dataset} again",
+        )
+    views = known_views(known)
+    bent = sorted({view.camera.model.name for view in views if not view.camera.is_undistorted()})
+    if bent:
+        raise SceneError(
+            f"the cameras of {known.files[0]} are distorted",
+            expected="PINHOLE or SIMPLE_PINHOLE, the model of the undistorted images",
+            found=", ".join(bent),
+            fix="take the model that lies beside the undistorted images, or undistort images and labels",
+        )
+    return {Path(view.name).stem: view for view in sorted(views, key=lambda view: Path(view.name).stem)}
+
+
+def report_of(scene: LabelledScene) -> SceneReport:
+    """Read every mask of a scene, and its poses, and say what is there."""
+    warnings = list(scene.warnings)
+    empty = [
+        f"{view}: {region.text}"
+        for view, regions in scene.views.items()
+        for region in regions
+        if not region.mask().any()
+    ]
+    if empty:
+        warnings.append(f"regions without a pixel: {'; '.join(empty)}")
+    facts: dict[str, object] = {
+        "images": len(scene.images),
+        "labelled views": len(scene.views),
+        "regions": sum(map(len, scene.views.values())),
+        "pairs of view and text": scene.num_pairs,
+        "texts": len(scene.prompts),
+    }
+    if scene.poses is None:
+        warnings.append("no poses come with this scene: they are computed from its images")
+    else:
+        posed = posed_images(scene.poses, scene.dataset)
+        facts["posed views"] = len(posed)
+        scene.posed_views(posed)
+    return SceneReport(facts, tuple(warnings))
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")

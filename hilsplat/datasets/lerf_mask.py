@@ -1,0 +1,154 @@
+"""LERF-Mask: three scenes of LERF with the masks of Gaussian Grouping.
+
+Test views are the posed images that `images_train` lacks, sorted by name; the folder `test_mask/0` belongs
+to the first of them, `test_mask/1` to the second. Every mask file there is one prompt, named after it.
+"""
+
+from pathlib import Path
+
+from hilsplat.base.errors import SceneError
+from hilsplat.datasets.dataset import Dataset, SceneReport
+from hilsplat.datasets.labelled import (
+    LabelledRegion,
+    LabelledScene,
+    check_label_size,
+    image_size_hw,
+    images_by_stem,
+    posed_images,
+    read_mask_file,
+    report_of,
+    unlisted_texts,
+)
+from hilsplat.datasets.published import PROMPTS
+
+FOREGROUND = 129
+"""Least grey value of the foreground: the evaluation takes what is above 128."""
+
+LAYOUT = """\
+lerf_mask/
+  figurines/  ramen/  teatime/
+    images/             all images
+    images_train/       training images; a posed image that is not here is a test view
+    sparse/0/*.bin      undistorted
+    test_mask/0/green apple.png ...     one folder per test view, one mask per prompt
+    object_mask/        tracked masks for training, not read
+"""
+
+
+def open_scene(root: Path, scene: str) -> LabelledScene:
+    """Read the test masks of a scene; pixels are read when asked for.
+
+    Args:
+        root: the folder `lerf_mask`.
+        scene: such as "figurines".
+
+    Raises:
+        SceneError: a part of the scene is missing, the folders of masks do not fit the test views, or
+            a prompt has a dot.
+    """
+    root = Path(root)
+    DATASET.require(root, scene)
+    folder = root / scene
+    images = images_by_stem(folder / "images")
+    test = held_out_views(folder)
+    masks = _mask_folders(folder / "test_mask", test)
+    warnings: list[str] = []
+    views: dict[str, tuple[LabelledRegion, ...]] = {}
+    for view, place in masks.items():
+        if view not in images:
+            raise SceneError(
+                f"test view {view} of {scene} has no image",
+                expected=f"an image of that name in {folder / 'images'}",
+                fix="unpack the images again",
+            )
+        image_hw = image_size_hw(images[view])
+        regions = []
+        for path in sorted(place.glob("*.png")):
+            text = prompt_of(path)
+            size_hw = image_size_hw(path)
+            sentence = check_label_size(f"mask {path}", size_hw, image_hw)
+            if sentence:
+                warnings.append(sentence)
+            read = lambda path=path: read_mask_file(path, FOREGROUND)  # noqa: E731
+            regions.append(LabelledRegion(text, size_hw, read, path=(text,)))
+        if not regions:
+            raise SceneError(f"{place} has no mask", expected="<prompt>.png", fix="unpack test_mask again")
+        views[view] = tuple(regions)
+    prompts = tuple(sorted({region.text for regions in views.values() for region in regions}))
+    new = unlisted_texts(prompts, PROMPTS["lerf_mask"].get(scene, ()))
+    if new:
+        warnings.append(new)
+    return LabelledScene("lerf_mask", scene, images, folder, views, prompts, tuple(warnings))
+
+
+def held_out_views(folder: Path) -> tuple[str, ...]:
+    """Posed images that are not in `images_train`, by stem, sorted.
+
+    Raises:
+        SceneError: there is none.
+    """
+    train = images_by_stem(folder / "images_train")
+    posed = posed_images(folder, "LERF-Mask")
+    test = tuple(view for view in posed if view not in train)
+    if not test:
+        raise SceneError(
+            f"{folder} has no test view",
+            expected="posed images that images_train lacks",
+            found=f"{len(posed)} posed images, all of them in images_train",
+            fix="unpack images_train again; it is no copy of images",
+        )
+    return test
+
+
+def prompt_of(path: Path) -> str:
+    """Prompt of a mask file: its name without `.png`.
+
+    Raises:
+        SceneError: the prompt has a dot; the published evaluation would cut it there.
+    """
+    if "." in path.stem:
+        raise SceneError(
+            f"mask {path} cannot be named after its prompt",
+            expected="a prompt without a dot",
+            found=path.stem,
+            fix="rename the file",
+        )
+    return path.stem
+
+
+def _mask_folders(folder: Path, test: tuple[str, ...]) -> dict[str, Path]:
+    """Folder of masks by test view: number i belongs to the i-th."""
+    places = [place for place in folder.iterdir() if place.is_dir() and not place.name.startswith(".")]
+    numbers = sorted((int(place.name), place) for place in places if place.name.isdecimal())
+    strange = sorted(place.name for place in places if not place.name.isdecimal())
+    if strange or [number for number, _ in numbers] != list(range(len(test))):
+        raise SceneError(
+            f"the folders of {folder} do not fit the test views",
+            expected=f"0 to {len(test) - 1}, for {', '.join(test[:10])}{', ...' if len(test) > 10 else ''}",
+            found=", ".join([place.name for _, place in numbers] + strange) or "no folder",
+            fix="unpack test_mask, images_train and sparse again: they belong together",
+        )
+    return {view: place for view, (_, place) in zip(test, numbers, strict=True)}
+
+
+def check_scene(root: Path, scene: str) -> SceneReport:
+    """Read everything of a scene."""
+    return report_of(open_scene(root, scene))
+
+
+DATASET = Dataset(
+    name="lerf_mask",
+    title="LERF-Mask",
+    labels="images",
+    folder="lerf_mask",
+    scenes=("figurines", "ramen", "teatime"),
+    licence="none stated for images and masks (the authors' code: Apache-2.0)",
+    terms="Take it for research use only, and do not redistribute.",
+    citation="images: Kerr et al., LERF, ICCV 2023; masks: Ye et al., Gaussian Grouping, ECCV 2024",
+    layout=LAYOUT,
+    required=lambda scene: tuple(
+        f"{scene}/{part}" for part in ("images", "images_train", "sparse", "test_mask")
+    ),
+    open=open_scene,
+    check=check_scene,
+)

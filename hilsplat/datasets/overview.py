@@ -1,0 +1,88 @@
+"""What the `hilsplat datasets` command says: which data sets there are, which scenes are there, and whether
+they can be read."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from hilsplat.base.errors import HilsplatError, SceneError
+from hilsplat.datasets.dataset import Dataset
+from hilsplat.datasets.registry import DATASETS
+
+
+def overview(data_root: Path | None) -> str:
+    """All data sets with licence, citation and layout and, below a folder, the scenes that are there."""
+    return "\n\n".join(describe(dataset, data_root) for dataset in DATASETS.values())
+
+
+def describe(dataset: Dataset, data_root: Path | None) -> str:
+    """One data set, in lines."""
+    lines = [
+        f"{dataset.name}: {dataset.title}, labels on {dataset.labels}",
+        f"  citation  {dataset.citation}",
+        f"  licence   {dataset.licence}",
+        f"  terms     {dataset.terms}",
+        f"  scenes    {', '.join(dataset.scenes) or 'all that are there'}",
+    ]
+    if data_root is not None:
+        lines.extend(f"  {line}" for line in _presence(dataset, data_root))
+    lines.append("  layout")
+    lines.extend(f"    {line}" for line in dataset.layout.rstrip().splitlines())
+    return "\n".join(lines)
+
+
+def _presence(dataset: Dataset, data_root: Path) -> list[str]:
+    """What is there of a data set, and what of its scenes is missing."""
+    try:
+        root = dataset.locate(data_root)
+    except SceneError as error:
+        return ["found     no scene", *(f"          {line}" for line in str(error).splitlines())]
+    lines = [f"found     {', '.join(dataset.found(root)) or 'no whole scene'} (in {root})"]
+    for scene in dataset.scenes:
+        missing = dataset.missing(root, scene)
+        if missing:
+            lines.append(f"missing   {scene}: {', '.join(missing)}")
+    return lines
+
+
+def check(dataset: Dataset, data_root: Path, scenes: Sequence[str] = ()) -> tuple[str, int]:
+    """Read scenes of a data set whole and tell what was found.
+
+    Args:
+        dataset: the data set.
+        data_root: folder that holds its folder.
+        scenes: scenes to read; where none is named, those of which anything is there.
+
+    Returns:
+        The report, and the number of scenes that cannot be read.
+
+    Raises:
+        SceneError: the data set's folder is not there.
+    """
+    root = dataset.locate(data_root)
+    known = dataset.scenes or dataset.found(root)  # where the paper names none, those that are there
+    absent = [
+        scene
+        for scene in known
+        if not scenes and set(dataset.missing(root, scene)) >= set(_own(dataset, scene))
+    ]
+    lines, num_failed = [], 0
+    known = dict.fromkeys((*dataset.scenes, *dataset.found(root)))
+    for scene in scenes or [scene for scene in known if scene not in absent]:
+        try:
+            report = dataset.check(root, scene)
+        except HilsplatError as error:
+            num_failed += 1
+            lines.append(f"{dataset.name}/{scene}: cannot be read")
+            lines.extend(f"  {line}" for line in str(error).splitlines())
+            continue
+        facts = ", ".join(f"{what}: {value}" for what, value in report.facts.items())
+        lines.append(f"{dataset.name}/{scene}: {facts}")
+        lines.extend(f"  warning   {sentence}" for sentence in report.warnings)
+    if absent:
+        lines.append(f"{dataset.name}: not there: {', '.join(absent)}")
+    return "\n".join(lines), num_failed
+
+
+def _own(dataset: Dataset, scene: str) -> tuple[str, ...]:
+    """Required places of a scene inside the data set's own folder."""
+    return tuple(place for place in dataset.required(scene) if not place.startswith(".."))

@@ -1,0 +1,159 @@
+"""3D-OVS: ten small scenes, five views of each segmented into the classes of the scene.
+
+`segmentations/classes.txt` names the classes; the class index is the position in the **sorted** list. Each
+test view is a folder with one mask per class. Only the value 255 is foreground.
+"""
+
+from pathlib import Path
+
+from hilsplat.base.errors import SceneError
+from hilsplat.datasets.dataset import Dataset, SceneReport
+from hilsplat.datasets.labelled import (
+    LabelledRegion,
+    LabelledScene,
+    check_label_size,
+    image_size_hw,
+    images_by_stem,
+    missing_frames,
+    read_mask_file,
+    report_of,
+    unlisted_texts,
+)
+from hilsplat.datasets.published import FRAMES, PROMPTS
+from hilsplat.scene.llff import POSES_BOUNDS
+
+FOREGROUND = 255
+"""The original loader computes int8(value / 255)."""
+
+SHAPE_TOLERANCE = 0.01
+"""Masks and photographs of one view come in sizes whose shapes differ a little."""
+
+LAYOUT = """\
+3d_ovs/
+  bed/  bench/  blue_sofa/  covered_desk/  lawn/  office_desk/  room/  snacks/  sofa/  table/
+    images/00.jpg ...                 (or .png)
+    segmentations/classes.txt         one prompt per line
+    segmentations/00/banana.png ...   one folder per test view, one mask per prompt
+    sparse/0/*.bin                    or, without it, poses_bounds.npy
+"""
+
+
+def open_scene(root: Path, scene: str) -> LabelledScene:
+    """Read the segmentations of a scene; pixels are read when asked for.
+
+    Regions of a view stand in the order of the sorted prompts; one of them may have no pixel.
+
+    Args:
+        root: the folder `3d_ovs`.
+        scene: such as "bed".
+
+    Raises:
+        SceneError: a part of the scene or a mask is missing, or a view has no image.
+    """
+    root = Path(root)
+    DATASET.require(root, scene)
+    folder = root / scene
+    images = images_by_stem(folder / "images")
+    prompts = read_classes(folder / "segmentations" / "classes.txt")
+    warnings: list[str] = []
+    views: dict[str, tuple[LabelledRegion, ...]] = {}
+    for place in _view_folders(folder / "segmentations"):
+        if place.name not in images:
+            raise SceneError(
+                f"view {place.name} of {scene} is segmented but has no image",
+                expected=f"{place.name}.jpg or {place.name}.png in {folder / 'images'}",
+                found=f"{len(images)} images, {next(iter(images))} to {list(images)[-1]}",
+                fix="unpack the images again",
+            )
+        views[place.name] = _regions(place, prompts, image_size_hw(images[place.name]), warnings)
+    poses = folder
+    if not (folder / "sparse").is_dir() and not (folder / POSES_BOUNDS).is_file():
+        poses = None
+    for sentence in (
+        missing_frames("segmentation", FRAMES["3d_ovs"].get(scene, ()), views),
+        unlisted_texts(prompts, PROMPTS["3d_ovs"].get(scene, ())),
+    ):
+        if sentence:
+            warnings.append(sentence)
+    return LabelledScene("3d_ovs", scene, images, poses, views, prompts, tuple(warnings))
+
+
+def read_classes(path: Path) -> tuple[str, ...]:
+    """Prompts of `classes.txt`: stripped, without empty lines, sorted (capitals first).
+
+    Raises:
+        SceneError: it is missing, empty, no text, or names a class twice.
+    """
+    try:
+        lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path} cannot be read: {error}", fix="unpack segmentations again") from error
+    prompts = sorted(line for line in lines if line)
+    twice = sorted({prompt for prompt in prompts if prompts.count(prompt) > 1})
+    if not prompts or twice:
+        raise SceneError(
+            f"{path} cannot be used",
+            expected="one class per line, each once",
+            found=f"twice: {', '.join(twice)}" if twice else "no class",
+            fix="unpack segmentations again",
+        )
+    return tuple(prompts)
+
+
+def _view_folders(folder: Path) -> list[Path]:
+    places = sorted(
+        place for place in folder.iterdir() if place.is_dir() and not place.name.startswith((".", "__"))
+    )
+    if not places:
+        raise SceneError(
+            f"{folder} has no segmented view", expected="00/, 04/, ...", fix="unpack segmentations again"
+        )
+    return places
+
+
+def _regions(
+    place: Path, prompts: tuple[str, ...], image_hw: tuple[int, int], warnings: list[str]
+) -> tuple[LabelledRegion, ...]:
+    files = {path.stem: path for path in place.glob("*.png") if not path.name.startswith(".")}
+    missing = [prompt for prompt in prompts if prompt not in files]
+    extra = sorted(set(files) - set(prompts))
+    if missing:
+        raise SceneError(
+            f"{place} lacks the masks of: {', '.join(missing)}",
+            expected="one <class>.png for every line of classes.txt",
+            found=f"classes that classes.txt lacks: {', '.join(extra)}" if extra else f"{len(files)} masks",
+            fix="spell classes.txt and the files alike, or unpack segmentations again",
+        )
+    if extra:
+        warnings.append(f"{place.name}: masks of unknown classes are not read: {', '.join(extra)}")
+    regions = []
+    for prompt in prompts:
+        path = files[prompt]
+        size_hw = image_size_hw(path)
+        sentence = check_label_size(f"mask {path}", size_hw, image_hw, SHAPE_TOLERANCE)
+        if sentence:
+            warnings.append(sentence)
+        read = lambda path=path: read_mask_file(path, FOREGROUND)  # noqa: E731
+        regions.append(LabelledRegion(prompt, size_hw, read, path=(prompt,)))
+    return tuple(regions)
+
+
+def check_scene(root: Path, scene: str) -> SceneReport:
+    """Read everything of a scene."""
+    return report_of(open_scene(root, scene))
+
+
+DATASET = Dataset(
+    name="3d_ovs",
+    title="3D-OVS",
+    labels="images",
+    folder="3d_ovs",
+    scenes=tuple(FRAMES["3d_ovs"]),
+    licence="none stated for images and masks (the authors' code: MIT)",
+    terms="Take it for research use only, and do not redistribute.",
+    citation="Liu et al., Weakly Supervised 3D Open-vocabulary Segmentation, NeurIPS 2023",
+    layout=LAYOUT,
+    required=lambda scene: (f"{scene}/images", f"{scene}/segmentations/classes.txt"),
+    open=open_scene,
+    check=check_scene,
+)

@@ -1,0 +1,187 @@
+"""Reading the kinds of file that labelled points come in, with messages that say what to do."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from plyfile import PlyData, PlyParseError
+
+from hilsplat.base.artifacts import atomic_path
+from hilsplat.base.errors import SceneError
+
+UNPACK_AGAIN = "unpack or download it again; the copy is not whole"
+
+
+def require_file(path: Path, fix: str = UNPACK_AGAIN) -> Path:
+    """The path of a file that must be there.
+
+    Raises:
+        SceneError: it is missing; lists what is there instead.
+    """
+    if not path.is_file():
+        raise SceneError(f"{path} is missing", found=listing(path.parent), fix=fix)
+    return path
+
+
+def listing(folder: Path) -> str:
+    """First names of a folder, for messages."""
+    if not folder.is_dir():
+        return f"no folder {folder}"
+    names = sorted(path.name for path in folder.iterdir())
+    more = f" and {len(names) - 8} more" if len(names) > 8 else ""
+    return (", ".join(names[:8]) + more) or f"an empty folder {folder}"
+
+
+def read_json_object(path: Path, keys: tuple[str, ...]) -> dict:
+    """Read a JSON object that must have some keys.
+
+    Raises:
+        SceneError: missing, no JSON, no object, or without a key.
+    """
+    require_file(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:  # UnicodeDecodeError is one
+        raise SceneError(f"{path} is not valid JSON: {error}", fix=UNPACK_AGAIN) from error
+    lacking = [key for key in keys if key not in content] if isinstance(content, dict) else list(keys)
+    if lacking:
+        found = sorted(content) if isinstance(content, dict) else [type(content).__name__]
+        raise SceneError(
+            f"{path} is not what it should be",
+            expected=f"an object with {', '.join(keys)}",
+            found=", ".join(found[:12]) or "an empty object",
+            fix=UNPACK_AGAIN,
+        )
+    return content
+
+
+def read_numbers(path: Path, columns: int) -> np.ndarray:
+    """Read a text file of numbers, `columns` per line (inf and nan are allowed).
+
+    Raises:
+        SceneError: missing, or a line has no or other numbers.
+    """
+    require_file(path)
+    rows = []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+        if not line.strip():
+            continue
+        try:
+            row = [float(word) for word in line.split()]
+        except ValueError:
+            row = []
+        if len(row) != columns:
+            raise SceneError(
+                f"{path}, line {number}: cannot be read",
+                expected=f"{columns} numbers",
+                found=line[:80],
+                fix=UNPACK_AGAIN,
+            )
+        rows.append(row)
+    return np.array(rows, dtype=np.float64).reshape(-1, columns)
+
+
+def read_matrix(path: Path) -> np.ndarray:
+    """Read a 4 x 4 matrix from text.
+
+    Raises:
+        SceneError: it has another shape.
+    """
+    matrix = read_numbers(path, 4)
+    if matrix.shape != (4, 4):
+        raise SceneError(f"{path} is no matrix", expected="4 lines", found=f"{len(matrix)}", fix=UNPACK_AGAIN)
+    return matrix
+
+
+def read_ply(path: Path, corners: int) -> PlyData:
+    """Read a mesh whose faces have `corners` corners each.
+
+    Raises:
+        SceneError: missing, truncated, no PLY, or with other faces.
+    """
+    require_file(path)
+    lists = {"face": {"vertex_indices": corners}}
+    try:
+        content = PlyData.read(path, known_list_len=lists)
+        for element in ("vertex", "face"):
+            content[element]  # a KeyError where it is not there
+    except (PlyParseError, KeyError, ValueError, OSError) as error:
+        raise SceneError(
+            f"{path} cannot be read: {error}",
+            expected=f"a PLY mesh with faces of {corners} corners",
+            found=f"a file of {path.stat().st_size} bytes",
+            fix=UNPACK_AGAIN,
+        ) from error
+    return content
+
+
+def ply_column(path: Path, content: PlyData, element: str, name: str) -> np.ndarray:
+    """A property of all vertices or faces, by name.
+
+    Raises:
+        SceneError: the file has no such property.
+    """
+    data = content[element].data
+    if name not in data.dtype.names:
+        raise SceneError(
+            f"{path} has no property {name} of its {element} element",
+            expected=name,
+            found=", ".join(data.dtype.names),
+            fix="take the file that carries labels, as the data set distributes it",
+        )
+    return np.asarray(data[name])
+
+
+def ply_places(path: Path, content: PlyData) -> np.ndarray:
+    """Vertices of a mesh, float32 (P, 3)."""
+    columns = [ply_column(path, content, "vertex", axis) for axis in "xyz"]
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+def ply_faces(path: Path, content: PlyData) -> np.ndarray:
+    """Corners of all faces, int32 (F, corners).
+
+    Raises:
+        SceneError: a corner is no vertex.
+    """
+    faces = ply_column(path, content, "face", "vertex_indices").astype(np.int32)
+    count = len(content["vertex"].data)
+    if faces.size and (faces.min() < 0 or faces.max() >= count):
+        raise SceneError(
+            f"{path}: a face has a corner that is no vertex",
+            expected=f"0 to {count - 1}",
+            found=f"{faces.min()} to {faces.max()}",
+            fix=UNPACK_AGAIN,
+        )
+    return faces
+
+
+PLY_TYPES = {"f4": "float", "u1": "uchar", "u2": "ushort", "i4": "int"}
+
+
+def write_ply(
+    path: Path, vertices: Mapping[str, np.ndarray], faces: np.ndarray, of_faces: Mapping[str, np.ndarray]
+) -> None:
+    """Write a binary little-endian mesh: columns of vertices, corners of faces, columns of faces."""
+    names = [(name, f"<{column.dtype.str[1:]}") for name, column in vertices.items()]
+    rows = np.empty(len(next(iter(vertices.values()))), dtype=names)
+    for name, column in vertices.items():
+        rows[name] = column
+    more = [(name, f"<{column.dtype.str[1:]}") for name, column in of_faces.items()]
+    polygons = np.empty(len(faces), dtype=[("count", "u1"), ("corners", "<i4", faces.shape[1:]), *more])
+    polygons["count"], polygons["corners"] = faces.shape[1], faces
+    for name, column in of_faces.items():
+        polygons[name] = column
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(rows)}",
+        *(f"property {PLY_TYPES[column.dtype.str[1:]]} {name}" for name, column in vertices.items()),
+        f"element face {len(polygons)}",
+        "property list uchar int vertex_indices",
+        *(f"property {PLY_TYPES[column.dtype.str[1:]]} {name}" for name, column in of_faces.items()),
+        "end_header\n",
+    ]
+    with atomic_path(path) as temporary:
+        temporary.write_bytes("\n".join(header).encode() + rows.tobytes() + polygons.tobytes())

@@ -1,0 +1,113 @@
+"""Images with the pose and lens that a data set gives them, and the folder that `poses` imports them from."""
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from hilsplat.base.artifacts import atomic_folder, write_text
+from hilsplat.base.errors import SceneError
+
+OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+HALF_PIXEL = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+"""Added to a K whose pixel centres are whole numbers: here the first pixel's centre is (0.5, 0.5)."""
+
+RIGID_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImage:
+    """One image and its camera, as the data set describes it.
+
+    Attributes:
+        name: file name in the folder that is imported.
+        image: the file, or its encoded bytes where the data set keeps images inside other files.
+        cam_from_world: world-to-camera transform, OpenCV axes, metres.
+        K: intrinsics, px; the centre of the first pixel is (0.5, 0.5).
+        size_hw: height and width, px.
+        distortion: k1, k2, p1, p2, k3 as OpenCV defines them.
+    """
+
+    name: str
+    image: Path | bytes
+    cam_from_world: Float[np.ndarray, "4 4"]
+    K: Float[np.ndarray, "3 3"]
+    size_hw: tuple[int, int]
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    @property
+    def world_from_cam(self) -> Float[np.ndarray, "4 4"]:
+        """Camera-to-world transform, OpenCV axes."""
+        return np.linalg.inv(self.cam_from_world)
+
+
+def cam_from_world_of(world_from_cam: Float[np.ndarray, "4 4"], where: str) -> Float[np.ndarray, "4 4"]:
+    """Invert a camera-to-world matrix.
+
+    Raises:
+        SceneError: it is no rotation and translation; `where` begins the message.
+    """
+    rotation = world_from_cam[:3, :3]
+    rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=RIGID_TOLERANCE)
+    if not rigid or np.linalg.det(rotation) < 0 or not np.allclose(world_from_cam[3], [0, 0, 0, 1]):
+        raise SceneError(
+            f"{where}: the pose is no rotation and translation",
+            expected="a 4 x 4 camera-to-world matrix, row by row, last row 0 0 0 1",
+            found=np.array2string(world_from_cam, precision=4, suppress_small=True).replace("\n", ""),
+            fix="export the poses again",
+        )
+    return np.linalg.inv(world_from_cam)
+
+
+def write_posed_images(folder: Path, images: Sequence[PosedImage]) -> None:
+    """Write `images/` and `transforms.json` (OpenGL axes, intrinsics per frame): a source for `poses`.
+
+    Images are copied byte by byte; lenses stay as they are, `poses` undistorts.
+
+    Args:
+        folder: written whole or not at all; what was there is replaced.
+        images: at least one, names all different.
+
+    Raises:
+        SceneError: two images share a name, or there is none.
+    """
+    names = [image.name for image in images]
+    twice = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
+    if twice or not images:
+        raise SceneError(
+            f"no folder of posed images can be made at {folder}",
+            expected="at least one image, each with a name of its own",
+            found=f"{len(images)} images, twice: {', '.join(twice) or 'none'}",
+        )
+    with atomic_folder(folder) as temporary:
+        (temporary / "images").mkdir()
+        frames = []
+        for image in images:
+            target = temporary / "images" / image.name
+            if isinstance(image.image, bytes):
+                target.write_bytes(image.image)
+            else:
+                shutil.copyfile(image.image, target)
+            frames.append(_frame(image))
+        write_text(temporary / "transforms.json", json.dumps({"frames": frames}, indent=1) + "\n")
+
+
+def _frame(image: PosedImage) -> dict[str, object]:
+    height, width = image.size_hw
+    frame: dict[str, object] = {
+        "file_path": f"images/{image.name}",
+        "transform_matrix": (image.world_from_cam @ OPENCV_TO_OPENGL).tolist(),
+        "w": width,
+        "h": height,
+        "fl_x": float(image.K[0, 0]),
+        "fl_y": float(image.K[1, 1]),
+        "cx": float(image.K[0, 2]),
+        "cy": float(image.K[1, 2]),
+    }
+    if any(image.distortion):
+        frame.update(zip(("k1", "k2", "p1", "p2", "k3"), image.distortion, strict=True))
+    return frame

@@ -1,0 +1,147 @@
+"""Waymo's range images as points, and its cameras (waymo-research/waymo-open-dataset, Apache-2.0).
+
+The formulas are those of `utils/range_image_utils.py` and `wdl_limited/camera`, written anew. Vehicle and
+camera axes are x forward, y left, z up.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+CV_FROM_WAYMO = np.array(
+    [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+"""Camera axes: OpenCV's x is Waymo's -y, y is -z, z is x."""
+
+RADIAL_RANGE = (0.8, 1.2)
+"""Outside this factor of radial distortion Waymo calls a projection invalid."""
+
+
+def beam_inclinations(
+    values: Float[np.ndarray, " H"] | None, lowest: float, highest: float, height: int
+) -> Float[np.ndarray, " H"]:
+    """Inclination of each row of a range image, radian; row 0 is the highest beam.
+
+    Args:
+        values: of the calibration, ascending; None where beams are evenly spaced.
+        lowest: border of the lowest beam, for evenly spaced ones.
+        highest: border of the highest.
+        height: rows.
+    """
+    if values is None:
+        values = lowest + (np.arange(height) + 0.5) / height * (highest - lowest)
+    return np.asarray(values, dtype=np.float64)[::-1]
+
+
+def column_azimuths(width: int, vehicle_from_lidar: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " W"]:
+    """Azimuth of each column in the lidar's frame, radian: from just below pi down to just above -pi,
+    less the turn of the lidar in the vehicle, so that column 0 looks backwards along the vehicle.
+
+    Example:
+        >>> np.degrees(column_azimuths(4, np.eye(4)))
+        array([ 135.,   45.,  -45., -135.])
+    """
+    turn = np.arctan2(vehicle_from_lidar[1, 0], vehicle_from_lidar[0, 0])
+    share = (width - np.arange(width) - 0.5) / width
+    return (2 * share - 1) * np.pi - turn
+
+
+def rotation_of(angles: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """Rz(yaw) Ry(pitch) Rx(roll) of (roll, pitch, yaw), radian."""
+    roll, pitch, yaw = (angles[..., column] for column in range(3))
+    (cr, sr), (cp, sp), (cy, sy) = ((np.cos(angle), np.sin(angle)) for angle in (roll, pitch, yaw))
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def range_image_points(
+    range_m: Float[np.ndarray, "H W"],
+    inclinations: Float[np.ndarray, " H"],
+    vehicle_from_lidar: Float[np.ndarray, "4 4"],
+) -> Float[np.ndarray, "H W 3"]:
+    """Places of all pixels in the vehicle's frame at the time of each pixel, metres.
+
+    Pixels whose range is not positive have no point; their places mean nothing.
+    """
+    azimuth = column_azimuths(range_m.shape[1], vehicle_from_lidar)[None]
+    up = inclinations[:, None]
+    sensor = range_m[..., None] * np.stack(
+        [np.cos(azimuth) * np.cos(up), np.sin(azimuth) * np.cos(up), np.sin(up) + 0 * azimuth], axis=-1
+    )
+    return sensor @ vehicle_from_lidar[:3, :3].T + vehicle_from_lidar[:3, 3]
+
+
+def to_world(
+    points: Float[np.ndarray, "H W 3"], pixel_pose: Float[np.ndarray, "H W 6"]
+) -> Float[np.ndarray, "H W 3"]:
+    """Move points of the top lidar into the world by the vehicle's pose at each pixel.
+
+    Args:
+        points: in the vehicle's frame at the time of the pixel.
+        pixel_pose: roll, pitch, yaw (radian), x, y, z (metres) of the vehicle in the world.
+    """
+    pose = pixel_pose.astype(np.float64)
+    turned = np.einsum("hwij,hwj->hwi", rotation_of(pose[..., :3]), points)
+    return turned + pose[..., 3:]
+
+
+@dataclass(frozen=True, eq=False)
+class WaymoCamera:
+    """One camera of the car.
+
+    Attributes:
+        name: such as FRONT.
+        intrinsic: f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3; px with the first pixel's left edge at 0,
+            which is this project's convention too.
+        vehicle_from_cam: pose on the vehicle, Waymo's camera axes.
+        size_hw: height and width, px.
+    """
+
+    name: str
+    intrinsic: Float[np.ndarray, " 9"]
+    vehicle_from_cam: Float[np.ndarray, "4 4"]
+    size_hw: tuple[int, int]
+
+    @property
+    def K(self) -> Float[np.ndarray, "3 3"]:
+        """Intrinsics without distortion, px; the centre of the first pixel is (0.5, 0.5)."""
+        f_u, f_v, c_u, c_v = self.intrinsic[:4]
+        return np.array([[f_u, 0.0, c_u], [0.0, f_v, c_v], [0.0, 0.0, 1.0]])
+
+    @property
+    def distortion(self) -> tuple[float, float, float, float, float]:
+        """k1, k2, p1, p2, k3, as OpenCV orders and defines them."""
+        k1, k2, p1, p2, k3 = self.intrinsic[4:].tolist()
+        return k1, k2, p1, p2, k3
+
+    def cam_from_world(self, world_from_vehicle: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+        """World-to-camera transform in OpenCV axes.
+
+        Args:
+            world_from_vehicle: the pose stored with the image; the frame's is of another moment.
+        """
+        return CV_FROM_WAYMO @ np.linalg.inv(world_from_vehicle @ self.vehicle_from_cam)
+
+    def project(
+        self, points: Float[np.ndarray, "P 3"]
+    ) -> tuple[Float[np.ndarray, "P 2"], Bool[np.ndarray, " P"]]:
+        """Pixels of points given in this camera's Waymo axes, distortion included; rolling shutter is not.
+
+        Returns:
+            Places in the image, px (subtract 0.5 for samplers that put the first pixel's centre at 0), and
+            whether each point is in front with a radial factor inside `RADIAL_RANGE`.
+        """
+        f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3 = self.intrinsic
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = -points[:, 1] / points[:, 0], -points[:, 2] / points[:, 0]
+        r2 = u * u + v * v
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        x = f_u * (u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)) + c_u
+        y = f_v * (v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v) + c_v
+        valid = (points[:, 0] > 0) & (radial >= RADIAL_RANGE[0]) & (radial <= RADIAL_RANGE[1])
+        return np.stack([x, y], axis=1), valid

@@ -1,0 +1,104 @@
+"""Poses of LLFF's `poses_bounds.npy`, which 3D-OVS and other forward-facing data sets bring."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from PIL import Image
+
+from hilsplat.base.errors import SceneError
+from hilsplat.scene.colmap import pycolmap
+
+POSES_BOUNDS = "poses_bounds.npy"
+
+
+def read_poses_bounds(
+    path: Path,
+) -> tuple[Float64[np.ndarray, "N 4 4"], Float64[np.ndarray, "N 3"], Float64[np.ndarray, "N 2"]]:
+    """Read the file: N rows of 17 numbers.
+
+    The first 15 are a 3 x 5 matrix by rows: rotation columns (down, right, back), translation, and the
+    column (height, width, focal). OpenCV's axes are x = right, y = down, z = -back. The last two are the
+    near and the far depth.
+
+    Returns:
+        World-to-camera transforms (OpenCV axes), rows (height, width, focal) in px, rows (near, far).
+
+    Raises:
+        SceneError: it is no such array, or a rotation is none.
+    """
+    try:
+        rows = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise SceneError(f"{path} cannot be read: {error}", fix="unpack it again") from error
+    if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows).all():
+        raise SceneError(
+            f"{path} holds no LLFF poses",
+            expected="finite numbers of shape (images, 17)",
+            found=f"shape {rows.shape}",
+            fix="unpack it again",
+        )
+    rows = rows.astype(np.float64)
+    matrices = rows[:, :15].reshape(-1, 3, 5)
+    world_from_cam = np.tile(np.eye(4), (len(rows), 1, 1))
+    down, right, back = (matrices[:, :, column] for column in range(3))
+    world_from_cam[:, :3, :3] = np.stack([right, down, -back], axis=2)
+    world_from_cam[:, :3, 3] = matrices[:, :, 3]
+    rotations = world_from_cam[:, :3, :3]
+    products = rotations @ rotations.transpose(0, 2, 1)
+    proper = np.isclose(products, np.eye(3), atol=1e-3).all(axis=(1, 2)) & (np.linalg.det(rotations) > 0)
+    if not proper.all() or (matrices[:, :, 4] <= 0).any():
+        raise SceneError(
+            f"{path}, row {int(np.argmin(proper))}: no rigid pose with size and focal length",
+            expected="rotation columns down, right, back, then translation, then height, width, focal",
+            fix="write it again with LLFF's axes",
+        )
+    return np.linalg.inv(world_from_cam), matrices[:, :, 4], rows[:, 15:]
+
+
+def llff_views(
+    path: Path, images: Sequence[Path]
+) -> list[tuple[Path, pycolmap.Camera, Float64[np.ndarray, "4 4"]]]:
+    """Image, lens and world-to-camera transform of every row; rows belong to the images by name.
+
+    The lens is SIMPLE_PINHOLE with its centre in the middle, for the image as it is on disk.
+
+    Raises:
+        SceneError: as `read_poses_bounds`, or there are more or fewer images than rows.
+    """
+    poses, sizes, _ = read_poses_bounds(path)
+    images = sorted(images, key=lambda image: image.stem)
+    if len(images) != len(poses):
+        raise SceneError(
+            f"{path} has {len(poses)} poses for {len(images)} images",
+            expected="one row per image, in the order of their names",
+            found=f"{images[0].name} to {images[-1].name}" if images else "no image",
+            fix="unpack the images again, and remove what is no photograph of the scene",
+        )
+    views = []
+    for image, pose, (_, width_px, focal_px) in zip(images, poses, sizes, strict=True):
+        with Image.open(image) as opened:
+            width, height = opened.size
+        camera = pycolmap.Camera(
+            model="SIMPLE_PINHOLE",
+            width=width,
+            height=height,
+            params=[float(focal_px * width / width_px), width / 2, height / 2],
+        )
+        views.append((image, camera, pose))
+    return views
+
+
+def write_poses_bounds(
+    path: Path,
+    cam_from_world: Float64[np.ndarray, "N 4 4"],
+    height_width_focal: Float64[np.ndarray, "N 3"],
+    bounds: Float64[np.ndarray, "N 2"],
+) -> None:
+    """Write the file, the inverse of `read_poses_bounds`."""
+    world_from_cam = np.linalg.inv(cam_from_world)
+    right, down, forward = (world_from_cam[:, :3, column] for column in range(3))
+    matrices = np.stack([down, right, -forward, world_from_cam[:, :3, 3], height_width_focal], axis=2)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, np.concatenate([matrices.reshape(-1, 15), bounds], axis=1), allow_pickle=False)

@@ -1,0 +1,128 @@
+"""The registry, where data sets are looked for, and the `hilsplat datasets` command."""
+
+import pytest
+from typer.testing import CliRunner
+
+from hilsplat.base.errors import SceneError
+from hilsplat.cli import app
+from hilsplat.datasets.published import FRAMES, LABEL_SIZES_WH, PAIRS, PROMPTS
+from hilsplat.datasets.registry import DATASETS, dataset_of
+from hilsplat.datasets.write_labelled import write_lerf_ovs
+
+
+@pytest.fixture
+def data_root(tmp_path, true_world):
+    """One scene of LERF-OVS, `figurines`."""
+    write_lerf_ovs(true_world, tmp_path / "data" / "lerf_ovs", "figurines", ["001.png"])
+    return tmp_path / "data"
+
+
+@pytest.mark.parametrize("dataset", DATASETS.values(), ids=DATASETS)
+def test_every_data_set_says_what_a_user_must_know(dataset):
+    assert DATASETS[dataset.name] is dataset and dataset.labels in ("images", "points")
+    for text in (dataset.title, dataset.licence, dataset.terms, dataset.citation, dataset.layout):
+        assert text.strip()
+    assert dataset.folder and all(map(dataset.required, dataset.scenes))
+    assert dataset.scenes or dataset.name == "waymo"  # the paper names no segment: all that are there
+
+
+def test_an_unknown_name_lists_the_known_ones():
+    with pytest.raises(SceneError, match=r"'lerf' is unknown\n.*lerf_ovs, lerf_mask, 3d_ovs, hi_lerf"):
+        dataset_of("lerf")
+
+
+def test_published_lists_have_the_published_counts():
+    assert sum(map(len, FRAMES["lerf_ovs"].values())) == 22
+    assert {len(views) for views in FRAMES["3d_ovs"].values()} == {5}
+    assert {len(views) for views in FRAMES["hi_lerf"].values()} == {10}  # 40 images of 4 scenes
+    assert {len(views) for views in FRAMES["hi_3dovs"].values()} == {6}  # 60 images of 10 scenes
+    assert len(FRAMES["3d_ovs"]) == len(FRAMES["hi_3dovs"]) == 10
+    assert {scene: len(texts) for scene, texts in PROMPTS["lerf_mask"].items()} == {
+        "figurines": 7,
+        "ramen": 6,
+        "teatime": 10,
+    }
+    assert PAIRS.keys() == LABEL_SIZES_WH.keys() == FRAMES["lerf_ovs"].keys()
+    assert not any("." in text for texts in PROMPTS["lerf_mask"].values() for text in texts)
+
+
+def test_frames_of_hi_lerf_contain_those_of_lerf_ovs():
+    for scene, frames in FRAMES["lerf_ovs"].items():
+        assert set(frames) < set(FRAMES["hi_lerf"][scene])
+
+
+def test_the_folder_is_found_below_data_root(data_root):
+    dataset = DATASETS["lerf_ovs"]
+    root = dataset.locate(data_root)
+    assert root == data_root / "lerf_ovs"
+    assert dataset.found(root) == ("figurines",)
+    assert dataset.missing(root, "ramen") == ("ramen/images", "ramen/sparse", "label/ramen")
+
+
+def test_a_folder_one_level_too_deep_is_detected(data_root):
+    inner = data_root / "lerf_ovs" / "LERF-OVS"
+    (data_root / "lerf_ovs").rename(data_root / "moved")
+    inner.parent.mkdir()
+    (data_root / "moved").rename(inner)
+    with pytest.raises(SceneError, match=r"one level too deep.*\n.*\n.*them in .*LERF-OVS\n.*move"):
+        DATASETS["lerf_ovs"].locate(data_root)
+
+
+def test_a_data_root_that_is_the_data_set_itself_is_detected(data_root):
+    with pytest.raises(SceneError, match="is the folder of LERF-OVS itself"):
+        DATASETS["lerf_ovs"].locate(data_root / "lerf_ovs")
+
+
+def test_a_data_root_one_level_too_high_is_detected(data_root):
+    with pytest.raises(SceneError, match=f"set data_root to {data_root}"):
+        DATASETS["lerf_ovs"].locate(data_root.parent)
+
+
+def test_a_missing_data_set_tells_what_is_there(data_root):
+    with pytest.raises(SceneError, match=r"LERF-Mask is not below .*\n.*\n.*lerf_ovs"):
+        DATASETS["lerf_mask"].locate(data_root)
+
+
+def test_the_images_of_another_data_set_do_not_make_hi_lerf_present(data_root):
+    (data_root / "hi_lerf").mkdir()
+    with pytest.raises(SceneError, match="Hi-LERF is not below"):
+        DATASETS["hi_lerf"].locate(data_root)
+
+
+def run(*words):
+    """The command's exit code and output."""
+    result = CliRunner().invoke(app, ["datasets", *map(str, words)])
+    return result.exit_code, result.output, result.exception
+
+
+def test_the_command_lists_data_sets_and_what_is_there(data_root):
+    code, output, _ = run("list")
+    assert code == 0 and "found" not in output
+    for dataset in DATASETS.values():
+        assert f"{dataset.name}: {dataset.title}" in output and dataset.licence in output
+    code, output, _ = run("list", "--data-root", data_root)
+    assert code == 0
+    assert f"found     figurines (in {data_root / 'lerf_ovs'})" in output
+    assert "missing   ramen: ramen/images, ramen/sparse, label/ramen" in output
+
+
+def test_the_command_checks_scenes(data_root):
+    code, output, _ = run("check", "lerf_ovs", "--data-root", data_root)
+    assert code == 0
+    assert "lerf_ovs/figurines: images: 4, labelled views: 1, regions: 5" in output
+    assert "warning   published frames without label: frame_00041" in output
+    assert "lerf_ovs: not there: ramen, teatime, waldo_kitchen" in output
+
+
+def test_the_command_fails_on_a_scene_that_cannot_be_read_and_goes_on(data_root):
+    (data_root / "lerf_ovs" / "ramen" / "images").mkdir(parents=True)
+    code, output, _ = run("check", "lerf_ovs", "--data-root", data_root)
+    assert code == 1
+    assert "lerf_ovs/ramen: cannot be read\n  scene ramen of LERF-OVS is incomplete" in output
+    assert "also ramen/sparse, label/ramen" in output
+    assert "lerf_ovs/figurines: images: 4" in output
+
+
+def test_the_command_refuses_an_unknown_data_set(data_root):
+    code, _, error = run("check", "lerf", "--data-root", data_root)
+    assert code == 1 and isinstance(error, SceneError)
