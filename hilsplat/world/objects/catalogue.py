@@ -60,26 +60,12 @@ STREET: dict[str, Maker] = street.MAKERS
 
 
 def build_object(name: str, rng: np.random.Generator) -> ObjectModel:
-    """Draw one object of a class: sizes, colours, materials.
+    """Draw one object of a class of the table: sizes, colours, materials.
 
     Raises:
         SceneError: there is no such class.
     """
-    maker = maker_of(name)
-    builder = Builder(name, maker.aliases, rng)
-    maker.draw(builder)
-    return builder.build()
-
-
-def maker_of(name: str) -> Maker:
-    """How a class of the table is drawn, and its other names.
-
-    Raises:
-        SceneError: there is no such class.
-    """
-    if name not in _MAKERS:
-        raise SceneError(f"unknown object class {name!r}", expected=f"one of {', '.join(_MAKERS)}")
-    return _MAKERS[name]
+    return _drawn(name, maker_of(name), rng)
 
 
 def build_furniture(name: str, rng: np.random.Generator) -> ObjectModel:
@@ -88,12 +74,7 @@ def build_furniture(name: str, rng: np.random.Generator) -> ObjectModel:
     Raises:
         SceneError: there is no such class.
     """
-    if name not in FURNITURE:
-        raise SceneError(f"unknown class of furniture {name!r}", expected=f"one of {', '.join(FURNITURE)}")
-    maker = FURNITURE[name]
-    builder = Builder(name, maker.aliases, rng)
-    maker.draw(builder)
-    return builder.build()
+    return _drawn(name, _known(name, FURNITURE, "class of furniture"), rng)
 
 
 def build_street_object(name: str, rng: np.random.Generator) -> ObjectModel:
@@ -102,9 +83,25 @@ def build_street_object(name: str, rng: np.random.Generator) -> ObjectModel:
     Raises:
         SceneError: there is no such class.
     """
-    if name not in STREET:
-        raise SceneError(f"unknown class of a street {name!r}", expected=f"one of {', '.join(STREET)}")
-    maker = STREET[name]
+    return _drawn(name, _known(name, STREET, "class of a street"), rng)
+
+
+def maker_of(name: str) -> Maker:
+    """How a class of the table is drawn, and its other names.
+
+    Raises:
+        SceneError: there is no such class.
+    """
+    return _known(name, _MAKERS, "object class")
+
+
+def _known(name: str, makers: dict[str, Maker], what: str) -> Maker:
+    if name not in makers:
+        raise SceneError(f"unknown {what} {name!r}", expected=f"one of {', '.join(makers)}")
+    return makers[name]
+
+
+def _drawn(name: str, maker: Maker, rng: np.random.Generator) -> ObjectModel:
     builder = Builder(name, maker.aliases, rng)
     maker.draw(builder)
     return builder.build()
