@@ -13,6 +13,7 @@ from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS
 from hilsplat.world.tiny.clip import CROP_PX, DIMENSIONS
 from hilsplat.world.tiny.data import HEAD_LEVELS, LabelledViews, nested_targets
+from hilsplat.world.tiny.measure_clip import COMMON
 from hilsplat.world.tiny.measure_sam import predict_masks
 from hilsplat.world.tiny.sam import FRAME_PX, MASK_STRIDE, SamDecoder, SamEncoder
 from hilsplat.world.tiny.steps import Curve
@@ -203,7 +204,7 @@ def write_clip_card(
     rows = [
         f"| {background} | {kind} | {level.label} | {100 * found['top1']:.0f} % |"
         f" {100 * found['top3']:.0f} % | {100 * found['top1_of_level']:.0f} % |"
-        f" {100 * found['coloured']:.0f} % |"
+        f" {100 * found['top1_of_common']:.0f} % | {100 * found['coloured']:.0f} % |"
         f" {100 * found['above_canonical']:.0f} % | {found['n']} |"
         for background in ("black", "keep")
         for kind in ("exact", "rough")
@@ -227,12 +228,12 @@ looking, so they mean nothing in particular. Weights are stored as float16 and c
 ## How good it is
 Crops of scenes of the training range on which nothing was trained. "exact" are true masks of at least 24 px,
 "rough" those that `sam-tiny` drew and whose IoU with a node is above 0.5. All
-{recipe["texts_competing"]} texts of those scenes (all levels) compete, or those seen at the mask's own level.
-"Colour": top-1 among all texts of the form "red kettle lid". "Above canonical": the right text beats
-all four canonical phrases.
+{recipe["texts_competing"]} texts of those scenes (all levels) compete, or those seen at the mask's own
+level, or the {COMMON} commonest of each level (for masks that have one of them). "Colour": top-1 among all
+texts of the form "red kettle lid". "Canonical": the right text beats all four canonical phrases.
 
-| background | masks | level | top-1 | top-3 | top-1 within level | colour | above canonical | crops |
-| --- | --- | --- | --- | --- | --- | --- | --- | --- |
+| background | masks | level | top-1 | top-3 | of level | of {3 * COMMON} | colour | canonical | crops |
+| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |
 {chr(10).join(rows)}
 
 Both models together, one view at a time: the automatic mask of the level whose similarity to a text is

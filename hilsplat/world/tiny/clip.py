@@ -86,22 +86,24 @@ class ClipText(nn.Module):
 
 def contrastive_loss(
     image: Float[Tensor, "B D"],
-    text: Float[Tensor, "B D"],
-    valid: Float[Tensor, "B B"],
+    text: Float[Tensor, "T D"],
+    valid: Float[Tensor, "B T"],
     scale: Float[Tensor, ""],
 ) -> Float[Tensor, ""]:
-    """Symmetric contrastive loss in which one crop may have several right captions in the batch.
+    """Symmetric contrastive loss; a crop may have several right texts, a text several crops or none.
 
     Args:
         image: unit vectors of crops.
-        text: unit vectors of captions; caption i was drawn for crop i.
-        valid: 1 where caption j is true of crop i; the diagonal is all ones.
+        text: unit vectors of texts.
+        valid: 1 where text j is true of crop i; every crop has one that is.
         scale: factor on the cosines (inverse temperature).
 
     Returns:
-        mean of both directions' cross-entropy against uniform targets on the valid pairs.
+        mean of both directions' cross-entropy against uniform targets on the valid pairs; texts that are
+        true of no crop only compete.
     """
     logits = scale * image @ text.T
     by_image = -(valid * torch.log_softmax(logits, dim=1)).sum(dim=1) / valid.sum(dim=1)
-    by_text = -(valid * torch.log_softmax(logits, dim=0)).sum(dim=0) / valid.sum(dim=0)
-    return (by_image.mean() + by_text.mean()) / 2
+    shown = valid.sum(dim=0)
+    by_text = -(valid * torch.log_softmax(logits, dim=0)).sum(dim=0) / shown.clamp(min=1.0)
+    return (by_image.mean() + by_text.sum() / (shown > 0).sum()) / 2

@@ -202,14 +202,21 @@ class Captioner:
     draw does not look at the crop, so a canonical phrase comes to mean nothing in particular: the
     yardstick that relevancy needs.
 
+    Every query of the vocabulary and some further phrases stand beside the captions of a batch: texts cost
+    little, and against them a crop learns at once what else it is and is not.
+
     Args:
-        phrase_sets: distinct sets of phrases.
+        phrase_sets: distinct sets of phrases; the first of each is the query.
         generic_share: share of crops that get a canonical phrase.
+        others: number of further phrases.
     """
 
-    def __init__(self, phrase_sets: Sequence[tuple[str, ...]], generic_share: float = 0.06) -> None:
+    def __init__(
+        self, phrase_sets: Sequence[tuple[str, ...]], generic_share: float = 0.06, others: int = 512
+    ) -> None:
         self.phrases = sorted({phrase for phrases in phrase_sets for phrase in phrases})
         row = {phrase: index for index, phrase in enumerate(self.phrases)}
+        self.queries = np.array(sorted({row[phrases[0]] for phrases in phrase_sets}), np.int64)
         self.choices = [np.array([row[phrase] for phrase in phrases]) for phrases in phrase_sets]
         self.attributed = [
             np.array(
@@ -219,11 +226,12 @@ class Captioner:
             for text in phrases[:1]
         ]
         self.generic_share = generic_share
+        self.others = min(others, len(self.phrases))
 
     def draw(
         self, rng: np.random.Generator, captions: Int64[np.ndarray, " B"]
-    ) -> tuple[list[str], Float32[np.ndarray, "B B"]]:
-        """Texts for a batch of crops, and whether text j is true of crop i.
+    ) -> tuple[list[str], Float32[np.ndarray, "B T"]]:
+        """Texts for a batch of crops, and whether text j is true of crop i; text i was drawn for crop i.
 
         Args:
             rng: source of all choices.
@@ -247,11 +255,13 @@ class Captioner:
                 drawn[index] = pick
                 phrase, frames = self.phrases[pick], FRAMES
             texts.append(frames[int(rng.integers(len(frames)))].format(phrase))
+        beside = np.concatenate([self.queries, rng.choice(len(self.phrases), self.others, replace=False)])
+        texts += [self.phrases[row] for row in beside]
+        every = np.concatenate([drawn, beside])
+        true = np.zeros((len(captions), len(self.phrases) + len(CANONICAL)), bool)
+        for index, caption in enumerate(captions.tolist()):
+            if caption >= 0:
+                true[index, self.choices[caption]] = True
         generic = drawn >= len(self.phrases)
-        nothing = np.zeros(len(drawn), bool)
-        valid = np.stack(
-            [np.isin(drawn, self.choices[row]) if row >= 0 else nothing for row in captions.tolist()]
-        )
-        valid |= (drawn[:, None] == drawn[None, :]) & generic[None, :]
-        np.fill_diagonal(valid, True)
-        return texts, valid.astype(np.float32)
+        true[generic, drawn[generic]] = True
+        return texts, true[:, every].astype(np.float32)

@@ -16,6 +16,8 @@ from hilsplat.world.tiny.crops import CropTable
 from hilsplat.world.tiny.data import LabelledViews, normalised
 
 CHUNK = 256
+COMMON = 20
+"""Of each level so many texts, the commonest, compete in the smaller of the two questions."""
 
 
 def tokenised(tokenizer: Tokenizer, texts: Sequence[str]) -> tuple[Tensor, Tensor]:
@@ -76,8 +78,9 @@ def measure_clip(
 
     Returns:
         by ("exact" or "rough", level): `top1` and `top3` of all texts, `top1_of_level` among the texts of
-        that level, share that beats every canonical phrase (`above_canonical`), `coloured`: top-1 among all
-        texts of colour and class, of the crops that have one, `n`.
+        that level, `top1_of_common` among the 20 commonest texts of each level, of the crops that have one
+        of them, share that beats every canonical phrase (`above_canonical`), `coloured`:
+        top-1 among all texts of colour and class, of the crops that have one, `n`.
     """
     rows = np.arange(len(crops)) if rows is None else rows
     rows = rows[crops.caption[rows] >= 0]
@@ -98,6 +101,9 @@ def measure_clip(
     level, rough = crops.level[rows], crops.rough[rows]
     mine = similarity[np.arange(len(rows)), wanted]
     rank = (similarity > mine[:, None]).sum(axis=1)
+    common = common_texts(wanted, np.where(rough, 0, level))
+    rank_of_common = (similarity[:, common] > mine[:, None]).sum(axis=1)
+    is_common = np.isin(wanted, common)
     report = {}
     for kind, is_rough in (("exact", False), ("rough", True)):
         for at in LEVELS:
@@ -106,16 +112,34 @@ def measure_clip(
                 continue
             same = np.unique(wanted[level == int(at)])
             rank_of_level = (similarity[group][:, same] > mine[group, None]).sum(axis=1)
+            has_common = group & is_common
             has_hue = group & (hue >= 0)
             report[(kind, at.label)] = {
                 "top1": float((rank[group] == 0).mean()),
                 "top3": float((rank[group] < 3).mean()),
                 "top1_of_level": float((rank_of_level == 0).mean()),
+                "top1_of_common": float((rank_of_common[has_common] == 0).mean())
+                if has_common.any()
+                else 0.0,
                 "above_canonical": float((mine[group] > yardstick[group]).mean()),
                 "coloured": float((hue_found == hue)[has_hue].mean()) if has_hue.any() else 0.0,
                 "n": int(group.sum()),
             }
     return report
+
+
+def common_texts(text: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """The texts that most masks of each level have, ascending.
+
+    Args:
+        text: row of each mask's text.
+        level: of each mask; masks of level 0 are not counted.
+    """
+    kept = []
+    for at in LEVELS:
+        rows, counts = np.unique(text[level == int(at)], return_counts=True)
+        kept.append(rows[np.argsort(-counts, kind="stable")[:COMMON]])
+    return np.unique(np.concatenate(kept))
 
 
 def measure_queries(

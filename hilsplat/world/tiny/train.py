@@ -31,7 +31,7 @@ from hilsplat.world.tiny.train_sam import train_sam
 
 logger = logging.getLogger(__name__)
 
-RECIPE_VERSION = 2
+RECIPE_VERSIONS = {"sam": 2, "clip": 3}
 """Raise it when networks, windows or losses change: a training in the cache then begins anew."""
 STAGES = ("render", "sam", "clip")
 AUTOMATIC_VIEWS = 48
@@ -125,12 +125,18 @@ def rendered(cache: Path, settings: TrainingSettings, threads: int) -> Material:
 
 def _state_name(model: str, material: Material, seed: int, more: Mapping[str, Any]) -> str:
     """Names a training by all that its weights depend on, except how long it lasts."""
-    key = {"model": model, "seed": seed, "version": RECIPE_VERSION, **material.described, **more}
+    key = {"model": model, "seed": seed, "version": RECIPE_VERSIONS[model], **material.described, **more}
     return f"{model}-{sha256_of_json(key)[:12]}"
 
 
 def _described(
-    material: Material, settings: TrainingSettings, budget: Budget, seed: int, threads: int, curve: Curve
+    model: str,
+    material: Material,
+    settings: TrainingSettings,
+    budget: Budget,
+    seed: int,
+    threads: int,
+    curve: Curve,
 ) -> dict[str, Any]:
     """The recipe as it goes into a card."""
     return material.described | {
@@ -141,7 +147,7 @@ def _described(
         "threads": threads,
         "device": settings.device,
         "torch": torch.__version__,
-        "version": RECIPE_VERSION,
+        "version": RECIPE_VERSIONS[model],
     }
 
 
@@ -162,7 +168,7 @@ def _make_sam(
                 masks = automatic_masks(temporary, views.spread(AUTOMATIC_VIEWS), threads)
                 automatic[group] = measure_everything(masks, views.spread(AUTOMATIC_VIEWS))
             counts.update({level: f"{value['iou']:.3f}" for level, value in points["all"].items()})
-            recipe = _described(material, settings, budget, seed, threads, curve)
+            recipe = _described("sam", material, settings, budget, seed, threads, curve)
             metrics = {"points": points, "automatic": automatic}
             write_sam_card(temporary, encoder, decoder, material.unseen, recipe, curve, metrics)
 
@@ -193,7 +199,7 @@ def _make_clip(
             vision, text, tokenizer, unseen, other_masks, list_segmented(unseen, other_masks)
         )
         counts.update({level: f"{v['top1']:.3f}" for level, v in metrics["black"]["exact"].items()})
-        recipe = _described(material, settings, budget, seed, threads, curve) | {
+        recipe = _described("clip", material, settings, budget, seed, threads, curve) | {
             "segmenter": digest,
             "masks": len(crops),
             "segmented_masks": int(crops.rough.sum()),

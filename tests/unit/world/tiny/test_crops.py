@@ -62,16 +62,22 @@ def test_crops_of_the_segmenter_are_captioned_by_overlap():
 
 
 def test_captions_are_valid_for_every_crop_they_are_true_of():
-    captioner = Captioner((("ball", "red ball"), ("coin",)), generic_share=0.0)
+    captioner = Captioner((("ball", "red ball"), ("coin",)), generic_share=0.0, others=2)
     texts, valid = captioner.draw(np.random.default_rng(0), np.array([0, 0, 1]))
     assert texts[2].endswith("coin")
     assert valid[:2, :2].tolist() == [[1, 1], [1, 1]]
-    assert valid[2].tolist() == [0, 0, 1]
+    assert valid[2, :3].tolist() == [0, 0, 1]
+    # beside the three captions stand both queries and two of the three phrases
+    assert texts[3:5] == ["ball", "coin"]
+    assert valid.shape == (3, len(texts)) == (3, 7)
+    for column, text in enumerate(texts):
+        assert valid[:, column].tolist() == ([0, 0, 1] if text.endswith("coin") else [1, 1, 0])
 
 
 def test_canonical_phrases_describe_only_the_crops_they_were_drawn_for():
     captioner = Captioner((("ball",),), generic_share=0.5)
     texts, valid = captioner.draw(np.random.default_rng(1), np.zeros(40, int))
+    texts, valid = texts[:40], valid[:, :40]
     generic = np.array([any(phrase in text for phrase in CANONICAL) for text in texts])
     assert 8 < generic.sum() < 32
     # a crop captioned "object" has that caption and, being a ball, all balls' captions

@@ -200,3 +200,7 @@ def test_contrastive_loss_matches_hand_computation():
     same = torch.tensor([[1.0, 0.0], [1.0, 0.0]])
     loss = contrastive_loss(same, same, torch.ones(2, 2), torch.tensor(5.0))
     assert loss.item() == pytest.approx(np.log(2), abs=1e-5)
+    # a third text that is true of neither only competes: log(2 + e) - 1 = 0.5514 by image, 0.3133 by text
+    three = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
+    loss = contrastive_loss(one, three, torch.eye(2, 3), torch.tensor(1.0))
+    assert loss.item() == pytest.approx((0.55144 + 0.31326) / 2, abs=1e-4)
