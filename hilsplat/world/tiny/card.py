@@ -14,7 +14,7 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.world.tiny.clip import CROP_PX, DIMENSIONS
 from hilsplat.world.tiny.data import HEAD_LEVELS, LabelledViews, nested_targets
 from hilsplat.world.tiny.measure_clip import COMMON
-from hilsplat.world.tiny.measure_sam import predict_masks
+from hilsplat.world.tiny.measure_sam import SIZES, predict_masks
 from hilsplat.world.tiny.sam import FRAME_PX, MASK_STRIDE, SamDecoder, SamEncoder
 from hilsplat.world.tiny.steps import Curve
 
@@ -135,6 +135,7 @@ def write_sam_card(
             points.append(
                 f"| {kind} | {level.label} | {found['iou']:.2f} | {found['best']:.2f} |"
                 f" {100 * found['above_75']:.0f} % | {found['correlation']:.2f} | {found['n']:.0f} |"
+                + "".join(f" {found[f'iou_{size}']:.2f} ({found[f'n_{size}']}) |" for size in SIZES)
             )
             found = metrics["automatic"][kind][level.label]
             automatic.append(
@@ -159,10 +160,11 @@ least 100 px of views of {FRAME_PX} x {FRAME_PX}.
 
 One point: a region is drawn first and a pixel in it second, and the mask of that level's head is compared
 with the region. "Best head" takes the best of the three masks; the correlation is that of predicted and
-true IoU.
+true IoU. The last columns are mean IoU (and number) of regions below {SIZES["small"][1]} px, below
+{SIZES["medium"][1]} px and above.
 
-| scenes | level | mean IoU | best head | IoU above 0.75 | correlation | regions |
-| --- | --- | --- | --- | --- | --- | --- |
+| scenes | level | mean IoU | best head | IoU above 0.75 | correlation | regions | small | medium | large |
+| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |
 {chr(10).join(points)}
 
 No prompt: the masks of the pipeline's own stage with its default settings.

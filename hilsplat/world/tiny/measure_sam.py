@@ -22,6 +22,8 @@ from hilsplat.world.tiny.sam import MASK_STRIDE, STRIDE, SamDecoder, SamEncoder,
 
 LEAST_PX = 100
 """Smaller regions are not scored: a handful of pixels says little about a mask."""
+SIZES = {"small": (0, 400), "medium": (400, 1600), "large": (1600, np.inf)}
+"""Sizes of regions, px: from, below."""
 PER_LEVEL = 8
 """Regions scored per view and level."""
 
@@ -66,9 +68,10 @@ def measure_sam(
 
     Returns:
         per level: mean `iou`; `best`, the same for the best of the three heads; share of prompts
-        `above_75` % IoU; `correlation` of predicted and true IoU; `n`.
+        `above_75` % IoU; `correlation` of predicted and true IoU; `n`; and for each of `SIZES` the mean
+        `iou_<size>` (0 where there is none) and `n_<size>`.
     """
-    found: dict[Level, list[tuple[float, float, float]]] = {level: [] for level in LEVELS}
+    found: dict[Level, list[tuple[float, float, float, float]]] = {level: [] for level in LEVELS}
     for view in range(len(views)):
         drawn = draw_regions(np.random.default_rng((seed, 2, view)), views.labels[view], per_level)
         if not drawn:
@@ -82,10 +85,12 @@ def measure_sam(
             level = HEAD_LEVELS[head]
             truth, guess = views.labels[view][level.index] == node, enlarged[row] > 0
             iou = (truth & guess).sum(axis=(1, 2)) / (truth | guess).sum(axis=(1, 2))
-            found[level].append((float(iou[head]), float(iou.max()), float(scores[row, head])))
+            found[level].append(
+                (float(iou[head]), float(iou.max()), float(scores[row, head]), float(truth.sum()))
+            )
     report = {}
     for level, rows in found.items():
-        values = np.array(rows).reshape(-1, 3)
+        values = np.array(rows).reshape(-1, 4)
         spread = len(values) > 2 and values[:, [0, 2]].std(axis=0).min() > 0
         report[level.label] = {
             "iou": float(values[:, 0].mean()) if len(values) else 0.0,
@@ -94,6 +99,12 @@ def measure_sam(
             "correlation": float(np.corrcoef(values[:, 0], values[:, 2])[0, 1]) if spread else 0.0,
             "n": len(values),
         }
+        for size, (least, below) in SIZES.items():
+            of_size = values[(values[:, 3] >= least) & (values[:, 3] < below), 0]
+            report[level.label] |= {
+                f"iou_{size}": float(of_size.mean()) if len(of_size) else 0.0,
+                f"n_{size}": len(of_size),
+            }
     return report
 
 

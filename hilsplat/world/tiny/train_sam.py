@@ -18,6 +18,8 @@ from hilsplat.world.tiny.steps import Budget, Curve
 
 CROP_STAGES = (CropStage(0.4, 128, 16, 24), CropStage(0.4, 192, 8, 36), CropStage(0.2, 256, 4, 48))
 """Windows of a step, drawn anew for each: small ones show more scenes, large ones more of one."""
+LAST_STAGES = (CropStage(0.3, 192, 8, 36), CropStage(0.4, 256, 4, 48), CropStage(0.3, 384, 2, 96))
+"""The same while the learning rate falls: whole views among them, as the segmenter will be shown."""
 TUNING = Tuning(peak=2e-3)
 QUICK_VIEWS = 24
 """Unseen views behind each row of the learning curve."""
@@ -45,6 +47,7 @@ def train_sam(
     state: Path,
     name: str = "sam",
     stages: Sequence[CropStage] = CROP_STAGES,
+    last_stages: Sequence[CropStage] = LAST_STAGES,
     tuning: Tuning = TUNING,
     device: str = "cpu",
 ) -> tuple[SamEncoder, SamDecoder, Curve]:
@@ -58,6 +61,7 @@ def train_sam(
         state: folder of the training's state.
         name: of the state's files.
         stages: windows and prompts of the steps.
+        last_stages: the same while the learning rate falls.
         tuning: how to optimise.
         device: "cpu" or "cuda".
     """
@@ -73,7 +77,11 @@ def train_sam(
 
     def make(step: int) -> SamBatch:
         rng = np.random.default_rng((seed, 1, step))
-        return draw_batch(views, classes, stage_of_draw(rng.random(), stages), rng)
+        # The first step of the fall was prepared before it was known to be one.
+        falling = 0 <= training.progress.decay_from < step
+        return draw_batch(
+            views, classes, stage_of_draw(rng.random(), last_stages if falling else stages), rng
+        )
 
     def loss_of(batch: SamBatch, step: int) -> tuple[Tensor, dict[str, float]]:
         generator = torch.Generator().manual_seed(seed * 1_000_003 + step)

@@ -18,6 +18,7 @@ from hilsplat.world.tiny.train_sam import stage_of_draw, train_sam
 from tests.unit.world.tiny.drawn import drawn_views
 
 SMALL = (CropStage(1.0, 64, 4, 8, 128),)
+WINDOWS = {"stages": SMALL, "last_stages": (CropStage(1.0, 64, 2, 12, 96),)}
 FAST = Tuning(peak=3e-3, warmup=4, average=0.8, measure_every=8, save_every=8)
 
 
@@ -25,7 +26,7 @@ FAST = Tuning(peak=3e-3, warmup=4, average=0.8, measure_every=8, save_every=8)
 def trained(tmp_path_factory):
     views, unseen = drawn_views(6, 64), drawn_views(2, 64, seed=9)
     state = tmp_path_factory.mktemp("state")
-    return train_sam(views, unseen, Budget(steps=24), 0, state, stages=SMALL, tuning=FAST)
+    return train_sam(views, unseen, Budget(steps=24), 0, state, **WINDOWS, tuning=FAST)
 
 
 def test_the_segmenter_learns(trained):
@@ -42,7 +43,7 @@ def weights_of(run) -> np.ndarray:
 def test_a_killed_training_ends_with_the_weights_of_an_uninterrupted_one(tmp_path):
     views = drawn_views(2, 64)
     tuning = Tuning(peak=2e-3, warmup=2, measure_every=100, save_every=2)
-    whole = train_sam(views, views, Budget(steps=6), 3, tmp_path / "a", stages=SMALL, tuning=tuning)
+    whole = train_sam(views, views, Budget(steps=6), 3, tmp_path / "a", **WINDOWS, tuning=tuning)
 
     def killed(views_of_killed, step_of_death=3):
         calls = {"count": 0}
@@ -57,18 +58,18 @@ def test_a_killed_training_ends_with_the_weights_of_an_uninterrupted_one(tmp_pat
         return Mortal(views_of_killed.images, views_of_killed.labels, views_of_killed.nodes)
 
     with pytest.raises(KeyboardInterrupt):
-        train_sam(killed(views), views, Budget(steps=6), 3, tmp_path / "b", stages=SMALL, tuning=tuning)
+        train_sam(killed(views), views, Budget(steps=6), 3, tmp_path / "b", **WINDOWS, tuning=tuning)
     assert (tmp_path / "b" / "sam.safetensors").is_file()
-    resumed = train_sam(views, views, Budget(steps=6), 3, tmp_path / "b", stages=SMALL, tuning=tuning)
+    resumed = train_sam(views, views, Budget(steps=6), 3, tmp_path / "b", **WINDOWS, tuning=tuning)
     assert np.array_equal(weights_of(whole), weights_of(resumed))
 
 
 def test_a_finished_training_goes_on_as_if_it_had_been_longer(tmp_path):
     views = drawn_views(2, 64)
     tuning = Tuning(peak=2e-3, warmup=2, measure_every=100, save_every=100)
-    longer = train_sam(views, views, Budget(steps=8), 3, tmp_path / "a", stages=SMALL, tuning=tuning)
-    train_sam(views, views, Budget(steps=4), 3, tmp_path / "b", stages=SMALL, tuning=tuning)
-    extended = train_sam(views, views, Budget(steps=8), 3, tmp_path / "b", stages=SMALL, tuning=tuning)
+    longer = train_sam(views, views, Budget(steps=8), 3, tmp_path / "a", **WINDOWS, tuning=tuning)
+    train_sam(views, views, Budget(steps=4), 3, tmp_path / "b", **WINDOWS, tuning=tuning)
+    extended = train_sam(views, views, Budget(steps=8), 3, tmp_path / "b", **WINDOWS, tuning=tuning)
     assert np.array_equal(weights_of(longer), weights_of(extended))
 
 
