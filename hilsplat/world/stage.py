@@ -1,9 +1,7 @@
 """The world stage: a synthetic scene as images, and what is true of it for evaluation."""
 
 import logging
-import multiprocessing
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
@@ -14,6 +12,7 @@ from hilsplat.base.artifacts import atomic_folder, require_free_space, write_ind
 from hilsplat.base.errors import SceneError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS
+from hilsplat.base.processes import in_processes
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.hierarchy import write_hierarchy
 from hilsplat.settings import WorldSettings
@@ -142,12 +141,4 @@ def _rendered(
     kind: str, seed: int, settings: WorldSettings, threads: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Image and labels of all views, in their order."""
-    rows = range(settings.views)
-    if threads <= 1:
-        for row in rows:
-            yield _render(kind, seed, settings, row)
-        return
-    # Processes, since Embree's wrapper holds Python's lock; spawned, since forking a process that
-    # has threads may hang.
-    with ProcessPoolExecutor(threads, mp_context=multiprocessing.get_context("spawn")) as pool:
-        yield from pool.map(_render, *zip(*[(kind, seed, settings, row) for row in rows], strict=True))
+    return in_processes(_render, [(kind, seed, settings, row) for row in range(settings.views)], threads)

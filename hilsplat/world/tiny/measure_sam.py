@@ -1,8 +1,6 @@
 """Measure the small segmenter: single points, and the pipeline's own automatic masks."""
 
-from concurrent.futures import ProcessPoolExecutor
-from functools import partial
-from multiprocessing import get_context
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +9,7 @@ from torch.nn import functional
 
 from hilsplat.base.artifacts import sha256_of_bytes
 from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.processes import in_processes
 from hilsplat.base.progress import track
 from hilsplat.segment.candidates import decode_candidates
 from hilsplat.segment.generate import masks_from_candidates
@@ -121,9 +120,9 @@ def automatic_masks(
     """
     if not len(views):
         return []
-    job = partial(_segment, Path(folder), points_per_side)
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        return list(track(pool.map(job, views.images, chunksize=4), "segmenting", total=len(views)))
+    digest = SamModel.load(folder).digest
+    items = [(Path(folder), digest, points_per_side, image) for image in views.images]
+    return list(track(in_processes(_segment, items, workers, chunk=4), "segmenting", total=len(views)))
 
 
 def cached_masks(
@@ -152,29 +151,28 @@ def cached_masks(
     keys = [sha256_of_bytes(digest.encode(), settings.encode(), image.tobytes()) for image in images]
     paths = [Path(cache) / "masks" / f"{key[:24]}.npz" for key in keys]
     missing = [row for row, path in enumerate(paths) if not path.is_file()]
-    job = partial(_segment_into, Path(folder), side)
-    if missing:
-        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-            jobs = pool.map(job, images[missing], [paths[row] for row in missing], chunksize=4)
-            for _ in track(jobs, "segmenting", total=len(missing)):
-                pass
+    items = [(Path(folder), digest, side, images[row], paths[row]) for row in missing]
+    if items:
+        jobs = in_processes(_segment_into, items, workers, chunk=4)
+        for _ in track(jobs, "segmenting", total=len(missing)):
+            pass
     return [HierarchicalMasks.load(path) for path in paths]
 
 
-def _segment_into(folder: Path, points_per_side: int, image: np.ndarray, path: Path) -> None:
-    _segment(folder, points_per_side, image).save(path)
+def _segment_into(folder: Path, digest: str, points_per_side: int, image: np.ndarray, path: Path) -> None:
+    _segment(folder, digest, points_per_side, image).save(path)
 
 
-_OPEN: dict[Path, SamModel] = {}
+@lru_cache(maxsize=1)
+def _opened(folder: Path, digest: str) -> SamModel:
+    """The model, which stays open between calls; `digest` tells models of the same folder apart."""
+    return SamModel.load(folder)
 
 
-def _segment(folder: Path, points_per_side: int, image: np.ndarray) -> HierarchicalMasks:
-    """One view in a worker; the model stays open between calls."""
-    if folder not in _OPEN:
-        _OPEN[folder] = SamModel.load(folder)
-    settings = MasksSettings(points_per_side=points_per_side)
-    candidates = decode_candidates(image, _OPEN[folder], settings)
-    return masks_from_candidates(candidates, image.shape[:2], _OPEN[folder], settings)
+def _segment(folder: Path, digest: str, points_per_side: int, image: np.ndarray) -> HierarchicalMasks:
+    model, settings = _opened(folder, digest), MasksSettings(points_per_side=points_per_side)
+    candidates = decode_candidates(image, model, settings)
+    return masks_from_candidates(candidates, image.shape[:2], model, settings)
 
 
 def measure_everything(masks: list[HierarchicalMasks], views: LabelledViews) -> dict[str, dict[str, float]]:

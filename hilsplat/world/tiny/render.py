@@ -3,9 +3,8 @@
 import json
 import logging
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
-from multiprocessing import get_context
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from hilsplat.base.artifacts import read_npz, sha256_of_bytes, sha256_of_json, write_npz
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.processes import in_processes
 from hilsplat.base.progress import track
 from hilsplat.datasets.hierarchy import AnnotatedNode
 from hilsplat.world.objects.catalogue import (
@@ -96,6 +96,7 @@ def render_training_scene(seed: int, views: int, path: Path) -> None:
     )
 
 
+@cache
 def generator_digest() -> str:
     """Version of the generator and a digest of what it makes: an object of each class, a scene of each kind.
 
@@ -145,10 +146,9 @@ def render_training_views(cache: Path, seeds: Sequence[int], views: int, workers
     missing = [(seed, views, path) for seed, path in zip(seeds, paths, strict=True) if not path.is_file()]
     if missing:
         logger.info("rendering %d of %d training scenes into %s", len(missing), len(paths), folder)
-        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-            jobs = pool.map(render_training_scene, *zip(*missing, strict=True), chunksize=4)
-            for _ in track(jobs, "training scenes", total=len(missing)):
-                pass
+        jobs = in_processes(render_training_scene, missing, workers, chunk=4)
+        for _ in track(jobs, "training scenes", total=len(missing)):
+            pass
     # Filled in place: thousands of views are gigabytes, and joining a list of them would need twice that.
     images = np.empty((len(paths) * views, FRAME_PX, FRAME_PX, 3), np.uint8)
     labels = np.empty((len(paths) * views, len(LEVELS), FRAME_PX, FRAME_PX), np.int16)
