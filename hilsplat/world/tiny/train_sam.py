@@ -18,8 +18,11 @@ from hilsplat.world.tiny.steps import Budget, Curve
 
 CROP_STAGES = (CropStage(0.4, 128, 16, 24), CropStage(0.4, 192, 8, 36), CropStage(0.2, 256, 4, 48))
 """Windows of a step, drawn anew for each: small ones show more scenes, large ones more of one."""
-LAST_STAGES = (CropStage(0.3, 192, 8, 36), CropStage(0.4, 256, 4, 48), CropStage(0.3, 384, 2, 96))
-"""The same while the learning rate falls: whole views among them, as the segmenter will be shown."""
+GROWN_STAGES = (CropStage(0.3, 192, 8, 36), CropStage(0.4, 256, 4, 48), CropStage(0.3, 384, 2, 96))
+"""The same later on: whole views among them, as the segmenter will be shown. In the first training that ended
+with these, the IoU of wholes rose by 0.04 in 700 steps."""
+GROWN_AT = 9500
+"""Step from which windows are the grown ones; they are in any case while the learning rate falls."""
 TUNING = Tuning(peak=2e-3)
 QUICK_VIEWS = 24
 """Unseen views behind each row of the learning curve."""
@@ -47,7 +50,7 @@ def train_sam(
     state: Path,
     name: str = "sam",
     stages: Sequence[CropStage] = CROP_STAGES,
-    last_stages: Sequence[CropStage] = LAST_STAGES,
+    grown_stages: Sequence[CropStage] = GROWN_STAGES,
     tuning: Tuning = TUNING,
     device: str = "cpu",
 ) -> tuple[SamEncoder, SamDecoder, Curve]:
@@ -61,7 +64,7 @@ def train_sam(
         state: folder of the training's state.
         name: of the state's files.
         stages: windows and prompts of the steps.
-        last_stages: the same while the learning rate falls.
+        grown_stages: the same from step `GROWN_AT` on, and while the learning rate falls.
         tuning: how to optimise.
         device: "cpu" or "cuda".
     """
@@ -79,9 +82,8 @@ def train_sam(
         rng = np.random.default_rng((seed, 1, step))
         # The first step of the fall was prepared before it was known to be one.
         falling = 0 <= training.progress.decay_from < step
-        return draw_batch(
-            views, classes, stage_of_draw(rng.random(), last_stages if falling else stages), rng
-        )
+        windows = grown_stages if falling or step >= GROWN_AT else stages
+        return draw_batch(views, classes, stage_of_draw(rng.random(), windows), rng)
 
     def loss_of(batch: SamBatch, step: int) -> tuple[Tensor, dict[str, float]]:
         generator = torch.Generator().manual_seed(seed * 1_000_003 + step)

@@ -18,7 +18,7 @@ from hilsplat.world.tiny.train_sam import stage_of_draw, train_sam
 from tests.unit.world.tiny.drawn import drawn_views
 
 SMALL = (CropStage(1.0, 64, 4, 8, 128),)
-WINDOWS = {"stages": SMALL, "last_stages": (CropStage(1.0, 64, 2, 12, 96),)}
+WINDOWS = {"stages": SMALL, "grown_stages": (CropStage(1.0, 64, 2, 12, 96),)}
 FAST = Tuning(peak=3e-3, warmup=4, average=0.8, measure_every=8, save_every=8)
 
 
