@@ -2,7 +2,7 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Int32, UInt8
 
 from hilsplat.base.errors import EmptyMaskError
 
@@ -40,19 +40,45 @@ def square_crop(
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         raise EmptyMaskError("a mask without pixels cannot be cropped", fix="drop empty masks first")
-    y0, y1, x0, x1 = int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+    tight = np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], np.int32)
+    x0, y0, x1, y1 = box_with_margin(tight, context, (mask.shape[0], mask.shape[1]))
+    fill = background_colour(image, background)
+    return crop_to_square(image[y0:y1, x0:x1], mask[y0:y1, x0:x1], background, fill, size)
+
+
+def box_with_margin(
+    box_xyxy: Int32[np.ndarray, " 4"], context: float, size_hw: tuple[int, int]
+) -> tuple[int, int, int, int]:
+    """A box with a margin on each side, as a share of its longer side, inside the image."""
+    x0, y0, x1, y1 = (int(number) for number in box_xyxy)
     margin = round(context * max(y1 - y0, x1 - x0))
-    y0, x0 = max(0, y0 - margin), max(0, x0 - margin)
-    y1, x1 = min(mask.shape[0], y1 + margin), min(mask.shape[1], x1 + margin)
-    box = image[y0:y1, x0:x1]
-    inside = mask[y0:y1, x0:x1, None]
-    fill = np.zeros(3, np.uint8)
-    if background == "mean":
-        fill = (image.reshape(-1, 3).mean(axis=0) + 0.5).astype(np.uint8)
+    return (
+        max(0, x0 - margin),
+        max(0, y0 - margin),
+        min(size_hw[1], x1 + margin),
+        min(size_hw[0], y1 + margin),
+    )
+
+
+def background_colour(image: UInt8[np.ndarray, "H W 3"], background: str) -> UInt8[np.ndarray, " 3"]:
+    """What stands where a square is not filled: black, or the image's mean colour with `mean`."""
+    if background != "mean":
+        return np.zeros(3, np.uint8)
+    return (image.reshape(-1, 3).mean(axis=0) + 0.5).astype(np.uint8)
+
+
+def crop_to_square(
+    box: UInt8[np.ndarray, "h w 3"],
+    inside: Bool[np.ndarray, "h w"],
+    background: str,
+    fill: UInt8[np.ndarray, " 3"],
+    size: int,
+) -> UInt8[np.ndarray, "size size 3"]:
+    """The second half of `square_crop`, from the part of the image inside the box."""
     if background == "dim":
-        box = np.where(inside, box, (box * DIM + 0.5).astype(np.uint8))
+        box = np.where(inside[..., None], box, (box * DIM + 0.5).astype(np.uint8))
     elif background != "keep":
-        box = np.where(inside, box, fill)
+        box = np.where(inside[..., None], box, fill)
     height, width = box.shape[:2]
     side = max(height, width)
     square = np.empty((side, side, 3), np.uint8)

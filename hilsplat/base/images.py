@@ -21,8 +21,15 @@ __all__ = [
 ]
 
 
+DEEP_MAX = 65535
+"""Largest value of a 16-bit channel; 257 of its steps are one of 8 bits."""
+
+
 def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
-    """Read an image as upright RGB (the EXIF orientation is applied, alpha is dropped).
+    """Read an image as upright RGB.
+
+    The EXIF orientation is applied, alpha is dropped, grey is repeated, CMYK is converted, and of 16
+    bits per channel the upper 8 are kept (rounded).
 
     Raises:
         ImageError: the file is missing, empty, truncated or no image.
@@ -31,7 +38,15 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     try:
         with Image.open(path) as image:
             image.load()
-            return np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
+            upright = ImageOps.exif_transpose(image)
+            if upright.mode.startswith("I"):  # Pillow would clip what exceeds 255
+                values = np.asarray(upright).astype(np.int64)
+                if values.min() < 0 or values.max() > DEEP_MAX:
+                    raise ValueError(f"its grey values, {values.min()} to {values.max()}, are no 16 bits")
+                upright = Image.fromarray(((values + 128) // 257).astype(np.uint8))
+            if upright.mode == "F":
+                raise ValueError("its pixels are floating-point numbers of unknown range")
+            return np.asarray(upright.convert("RGB"))
     except FileNotFoundError as error:
         raise ImageError(f"image {path} is missing") from error
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:

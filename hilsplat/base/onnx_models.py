@@ -6,7 +6,7 @@ network's input is read from the folder, so folder and digest together are the m
 """
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,14 @@ import numpy as np
 import onnxruntime
 
 from hilsplat.base.artifacts import read_json, sha256_of_file, sha256_of_json
+from hilsplat.base.clip_split import whole_clip
 from hilsplat.base.errors import ArtifactError, ModelError
 
 logger = logging.getLogger(__name__)
+
+
+Axes = tuple[int | None, ...]
+"""Axes of an array: their lengths where these are part of the layout, None where any will do."""
 
 
 @dataclass(frozen=True)
@@ -25,34 +30,37 @@ class NetworkSpec:
     """What one network of a model takes and gives.
 
     Attributes:
-        inputs: names and number of axes of the inputs that must be there.
-        outputs: names and number of axes of the outputs that must be there; others are ignored.
+        inputs: names and axes of the inputs that must be there.
+        outputs: names and axes of the outputs that must be there; others are ignored.
         optional: names of inputs that are fed where the network has them.
     """
 
-    inputs: Mapping[str, int]
-    outputs: Mapping[str, int]
+    inputs: Mapping[str, Axes]
+    outputs: Mapping[str, Axes]
     optional: tuple[str, ...] = ()
 
+
+_ANY2, _ANY3, _ANY4 = (None,) * 2, (None,) * 3, (None,) * 4
+_IMAGE: Axes = (None, 3, None, None)
 
 KINDS: dict[str, dict[str, NetworkSpec]] = {
     "sam": {
         "vision_encoder": NetworkSpec(
-            {"pixel_values": 4}, {"image_embeddings": 4, "image_positional_embeddings": 4}
+            {"pixel_values": _IMAGE}, {"image_embeddings": _ANY4, "image_positional_embeddings": _ANY4}
         ),
         "prompt_encoder_mask_decoder": NetworkSpec(
             {
-                "input_points": 4,
-                "input_labels": 3,
-                "image_embeddings": 4,
-                "image_positional_embeddings": 4,
+                "input_points": (None, None, None, 2),
+                "input_labels": _ANY3,
+                "image_embeddings": _ANY4,
+                "image_positional_embeddings": _ANY4,
             },
-            {"iou_scores": 3, "pred_masks": 5},
+            {"iou_scores": (None, None, 3), "pred_masks": (None, None, 3, None, None)},
         ),
     },
     "clip": {
-        "vision_model": NetworkSpec({"pixel_values": 4}, {"image_embeds": 2}),
-        "text_model": NetworkSpec({"input_ids": 2}, {"text_embeds": 2}, optional=("attention_mask",)),
+        "vision_model": NetworkSpec({"pixel_values": _IMAGE}, {"image_embeds": _ANY2}),
+        "text_model": NetworkSpec({"input_ids": _ANY2}, {"text_embeds": _ANY2}, optional=("attention_mask",)),
     },
 }
 """Networks of each kind of model, by `model_type` of its config.json."""
@@ -62,6 +70,12 @@ DESCRIPTIONS = {
     "clip": ("config.json", "preprocessor_config.json", "tokenizer.json"),
 }
 """Files beside the networks, by kind."""
+
+SWITCHES = ("do_resize", "do_rescale", "do_normalize")
+"""Steps of the preprocessing that our code always takes."""
+
+POINTER_BYTES = 1024
+"""Files smaller than this may be the pointers that a clone without Git LFS leaves."""
 
 DTYPES = {
     "tensor(float)": np.float32,
@@ -132,7 +146,7 @@ def open_model_folder(folder: Path, kind: str | None = None, *, fix: str = "") -
             found=", ".join(sorted(path.name for path in folder.iterdir())[:12]) or "an empty folder",
             fix=way_out,
         ) from error
-    found_kind = config.get("model_type")
+    found_kind = config.get("model_type") if isinstance(config, dict) else None
     if found_kind not in KINDS or (kind is not None and found_kind != kind):
         raise ModelError(
             f"model folder {folder} holds another kind of model",
@@ -152,6 +166,8 @@ def open_model_folder(folder: Path, kind: str | None = None, *, fix: str = "") -
     described = [folder / name for name in DESCRIPTIONS[found_kind]]
     missing += [path.name for path in described if not path.is_file()]
     if missing:
+        if found_kind == "clip" and whole_clip(folder):
+            fix = f"cut the whole network into the two that are read: hilsplat models split {folder}"
         found = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
         raise ModelError(
             f"model folder {folder} lacks {', '.join(missing)}",
@@ -177,6 +193,13 @@ def open_model_folder(folder: Path, kind: str | None = None, *, fix: str = "") -
         raise ModelError(
             f"{folder / 'preprocessor_config.json'} cannot be read: {error}", fix="fetch a whole copy"
         ) from error
+    switched_off = [key for key in SWITCHES if preprocessing.get(key) is False]
+    if switched_off:
+        raise ModelError(
+            f"{folder / 'preprocessor_config.json'} switches off {', '.join(switched_off)}",
+            expected="images resized, divided by 255 and normalised, as in the released models",
+            fix="export the model again with its own preprocessor",
+        )
     return ModelFolder(
         folder,
         found_kind,
@@ -218,11 +241,19 @@ class Network:
         options.inter_op_num_threads = 1
         options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
         options.log_severity_level = 3
+        if path.stat().st_size < POINTER_BYTES and path.read_bytes().startswith(b"version https://git-lfs"):
+            raise ModelError(
+                f"network {path} is a Git LFS pointer, not the network",
+                found=f"a text of {path.stat().st_size} bytes",
+                fix="fetch the file itself: git lfs pull, or download it from the model's page",
+            )
         try:
             self.session = onnxruntime.InferenceSession(str(path), options, providers=execution_providers())
         except Exception as error:  # onnxruntime's errors share no public base class
             raise ModelError(
-                f"network {path} cannot be opened: {error}", fix="export it again, or fetch a whole copy"
+                f"network {path} cannot be opened: {error}",
+                found=f"a file of {path.stat().st_size} bytes",
+                fix="export it again, or fetch a whole copy (with its .onnx_data file, where it has one)",
             ) from error
         self.inputs = {item.name: item for item in self.session.get_inputs()}
         self.outputs = {item.name: item for item in self.session.get_outputs()}
@@ -232,23 +263,31 @@ class Network:
         logger.info("network %s runs on %s", path.name, self.providers[0])
 
     def _check(
-        self, what: str, expected: Mapping[str, int], found: dict[str, Any], optional: tuple[str, ...]
+        self, what: str, expected: Mapping[str, Axes], found: dict[str, Any], optional: tuple[str, ...]
     ) -> None:
-        """Compare names and numbers of axes."""
+        """Compare names, axes and types of numbers."""
         wrong = [name for name in expected if name not in found]
         wrong += [name for name in found if name not in expected and name not in optional]
         wrong += [
             name
             for name, axes in expected.items()
-            if name in found and found[name].shape and len(found[name].shape) != axes
+            if name in found and not (_fits(found[name].shape, axes) and found[name].type in DTYPES)
         ]
         if wrong:
             raise ModelError(
                 f"network {self.path} has other {what} than expected: {', '.join(dict.fromkeys(wrong))}",
-                expected=", ".join(f"{name} with {axes} axes" for name, axes in expected.items()),
-                found=", ".join(f"{name} {list(item.shape)}" for name, item in found.items()),
+                expected=", ".join(
+                    f"{name} ({', '.join('any' if axis is None else str(axis) for axis in axes)})"
+                    for name, axes in expected.items()
+                ),
+                found=", ".join(f"{name} {list(item.shape)} {item.type}" for name, item in found.items()),
                 fix="export the model in the layout of the Hugging Face ONNX exports",
             )
+
+    def declared_axis(self, name: str, axis: int) -> int | None:
+        """Length of an output's axis where the network says it."""
+        shape = self.outputs[name].shape
+        return shape[axis] if shape and isinstance(shape[axis], int) else None
 
     def fixed_axis(self, name: str, axis: int) -> int | None:
         """Length of an input's axis where the network fixes it."""
@@ -273,14 +312,24 @@ class Network:
                 fix="check that preprocessor_config.json belongs to this network",
             ) from error
         for (name, axes), output in zip(self.spec.outputs.items(), outputs, strict=True):
-            if output.ndim != axes:
+            if output.ndim != len(axes):
                 raise ModelError(
                     f"network {self.path} gave {name} with {output.ndim} axes",
-                    expected=f"{axes} axes",
+                    expected=f"{len(axes)} axes",
                     found=f"shape {output.shape}",
                     fix="export the model in the layout of the Hugging Face ONNX exports",
                 )
         return [output.astype(np.float32) for output in outputs]
+
+
+def _fits(shape: Sequence[Any], axes: Axes) -> bool:
+    """Whether a declared shape, which may be empty or hold names, can be an array of these axes."""
+    if not shape:
+        return True
+    return len(shape) == len(axes) and all(
+        wanted is None or not isinstance(length, int) or length == wanted
+        for length, wanted in zip(shape, axes, strict=True)
+    )
 
 
 def side_px(size: Any, default: int) -> int:
@@ -315,4 +364,19 @@ def require_three_heads(path: Path, iou_scores: np.ndarray, pred_masks: np.ndarr
             expected="iou_scores (images, prompts, 3) and pred_masks (images, prompts, 3, h, w)",
             found=f"{iou_scores.shape} and {pred_masks.shape}",
             fix="export it with multimask output",
+        )
+
+
+def require_one_space(folder: Path, image_numbers: int | None, text_numbers: int | None) -> None:
+    """Refuse a CLIP whose two networks give vectors of different width; None is a width not known yet.
+
+    Raises:
+        ModelError: the widths differ.
+    """
+    if None not in (image_numbers, text_numbers) and image_numbers != text_numbers:
+        raise ModelError(
+            f"the two networks of {folder} do not belong together",
+            expected=f"text vectors of {image_numbers} numbers, as the image vectors",
+            found=f"{text_numbers} numbers",
+            fix="export both networks, with their projections, from one model",
         )

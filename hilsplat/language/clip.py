@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float16, Float32, UInt8
 from tokenizers import Tokenizer
 
-from hilsplat.base.crops import square_crop
-from hilsplat.base.errors import ModelError
-from hilsplat.base.onnx_models import ModelFolder, input_side_px, open_model_folder
+from hilsplat.base.crops import background_colour, box_with_margin, crop_to_square
+from hilsplat.base.errors import MisalignedArtifactError, ModelError
+from hilsplat.base.onnx_models import ModelFolder, input_side_px, open_model_folder, require_one_space
 from hilsplat.base.parallel import in_order
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ClipSettings
@@ -26,12 +26,19 @@ class ClipModel:
         max_tokens: longest text the text network takes; None where the folder names no limit.
     """
 
-    def __init__(self, model: ModelFolder, threads: int = 1) -> None:
+    def __init__(self, model: ModelFolder, threads: int = 1, template: str = "{}") -> None:
         self.model = model
         self.threads = threads
+        self.template = template
+        self._known_texts: dict[str, np.ndarray] = {}
         self.digest = model.digest
         self.vision = model.network("vision_model")
         self.text = model.network("text_model")
+        require_one_space(
+            model.folder,
+            self.vision.declared_axis("image_embeds", 1),
+            self.text.declared_axis("text_embeds", 1),
+        )
         self.side_px = input_side_px(model)
         # CLIP's own statistics where the folder names none, as in transformers
         preprocessing = model.preprocessing
@@ -58,17 +65,37 @@ class ClipModel:
             self.tokenizer.no_padding()
 
     @staticmethod
-    def load(folder: Path, threads: int = 1) -> "ClipModel":
+    def load(folder: Path, threads: int = 1, template: str = "{}") -> "ClipModel":
         """Open a model folder.
 
         Args:
             folder: in the layout of the Hugging Face ONNX exports.
             threads: batches of crops worked on at once; results do not depend on it.
+            template: sentence that every text is put into, at `{}`.
 
         Raises:
-            ModelError: it is missing, incomplete or no CLIP.
+            ModelError: it is missing, incomplete or no CLIP, or its networks do not belong together.
         """
-        return ClipModel(open_model_folder(folder, "clip"), threads)
+        return ClipModel(open_model_folder(folder, "clip"), threads, template)
+
+    @property
+    def width(self) -> int:
+        """Numbers of a vector."""
+        return self.vision.declared_axis("image_embeds", 1) or self.embed_texts(["object"]).shape[1]
+
+    def require_width(self, numbers: int, what: str) -> None:
+        """Refuse to go on with something that was made for vectors of another width.
+
+        Raises:
+            MisalignedArtifactError: naming both.
+        """
+        if self.width != numbers:
+            raise MisalignedArtifactError(
+                f"{what} does not belong to the CLIP in {self.model.folder}",
+                expected=f"vectors of {self.width} numbers, as this CLIP gives",
+                found=f"{numbers} numbers",
+                fix="take the CLIP it was made with (clip.model), or run the clip stage and all after it",
+            )
 
     def prepare(self, crops: UInt8[np.ndarray, "B side side 3"]) -> Float32[np.ndarray, "B 3 side side"]:
         """Normalise crops, channel first."""
@@ -86,7 +113,7 @@ class ClipModel:
         masks: HierarchicalMasks,
         settings: ClipSettings | None = None,
     ) -> Float16[np.ndarray, "M C"]:
-        """A unit vector per mask of a view, from its crop (`square_crop`), rows as in the masks.
+        """A unit vector per mask of a view, from its crop (`base.crops`), rows as in the masks.
 
         Args:
             image: the view.
@@ -95,40 +122,50 @@ class ClipModel:
         """
         settings = settings or ClipSettings()
 
+        fill = background_colour(image, settings.background)
+
         def embed(start: int) -> np.ndarray:
-            rows = np.arange(start, min(len(masks), start + settings.batch))
-            crops = [
-                square_crop(image, mask, settings.background, settings.context, self.side_px)
-                for mask in masks.dense(rows)
-            ]
+            crops = []
+            for row in range(start, min(len(masks), start + settings.batch)):
+                # only the box is unpacked: a photograph may have 40 million pixels
+                x0, y0, x1, y1 = box = box_with_margin(masks.box_xyxy[row], settings.context, masks.size_hw)
+                inside = masks.window(row, box)
+                crops.append(
+                    crop_to_square(image[y0:y1, x0:x1], inside, settings.background, fill, self.side_px)
+                )
             return self.embed_crops(np.stack(crops))
 
         parts = list(in_order(embed, range(0, len(masks), settings.batch), self.threads))
         if not parts:
-            return np.zeros((0, self.embed_texts(["object"]).shape[1]), dtype=np.float16)
+            return np.zeros((0, self.width), dtype=np.float16)
         return np.concatenate(parts).astype(np.float16)
 
     def embed_texts(self, texts: list[str]) -> Float32[np.ndarray, "T C"]:
-        """Unit vectors of texts, in order.
+        """Unit vectors of texts, in order, each put into the template.
 
-        Texts run one by one: the vector of a query then never depends on the queries beside it.
+        Texts run one by one: the vector of a query then never depends on the queries beside it, and a
+        text that was asked before costs nothing.
 
         Raises:
             ModelError: a text has no token.
         """
-        vectors = []
         for text in texts:
-            encoding = self.tokenizer.encode(text)
-            if not sum(encoding.attention_mask):
-                raise ModelError(f"text {text!r} has no token", fix="give each query at least one word")
-            if encoding.overflowing:
-                logger.warning("text cut at %d tokens: %r", self.max_tokens, text)
-            (vector,) = self.text(
-                input_ids=np.array([encoding.ids], dtype=np.int64),
-                attention_mask=np.array([encoding.attention_mask], dtype=np.int64),
-            )
-            vectors.append(vector)
-        return unit(np.concatenate(vectors))
+            if text not in self._known_texts:
+                self._known_texts[text] = self._embed_text(text)
+        return np.stack([self._known_texts[text] for text in texts])
+
+    def _embed_text(self, text: str) -> Float32[np.ndarray, " C"]:
+        """The unit vector of one text."""
+        if not sum(self.tokenizer.encode(text).attention_mask):
+            raise ModelError(f"text {text!r} has no token", fix="give each query at least one word")
+        encoding = self.tokenizer.encode(self.template.replace("{}", text))
+        if encoding.overflowing:
+            logger.warning("text cut at %d tokens: %r", self.max_tokens, text)
+        (vector,) = self.text(
+            input_ids=np.array([encoding.ids], dtype=np.int64),
+            attention_mask=np.array([encoding.attention_mask], dtype=np.int64),
+        )
+        return unit(vector)[0]
 
 
 def unit(vectors: Float32[np.ndarray, "N C"]) -> Float32[np.ndarray, "N C"]:

@@ -5,8 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
-from hilsplat.base.errors import ModelError
-from hilsplat.base.onnx_models import KINDS, input_side_px, open_model_folder, require_three_heads
+from hilsplat.base.onnx_models import (
+    KINDS,
+    input_side_px,
+    open_model_folder,
+    require_one_space,
+    require_three_heads,
+)
 
 
 def check_model(folder: Path) -> str:
@@ -51,13 +56,7 @@ def check_model(folder: Path) -> str:
         length = text.fixed_axis("input_ids", 1) or 8
         tokens = np.ones((1, length), dtype=np.int64)
         (text_embeds,) = text(input_ids=tokens, attention_mask=tokens)
-        if image_embeds.shape[1] != text_embeds.shape[1]:
-            raise ModelError(
-                f"the two networks of {folder} do not belong together",
-                expected=f"text vectors of {image_embeds.shape[1]} numbers, as the image vectors",
-                found=f"{text_embeds.shape[1]} numbers",
-                fix="export both networks, with their projections, from one model",
-            )
+        require_one_space(model.folder, image_embeds.shape[1], text_embeds.shape[1])
         lines += [
             f"vectors    {image_embeds.shape[1]} numbers",
             f"time       {encode_s:.3f} s for one image",

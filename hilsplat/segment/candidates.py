@@ -3,21 +3,21 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
-from jaxtyping import Float32, Int8, Int32, UInt8
+from jaxtyping import Float32, Int8, Int32, Int64, UInt8
 
 from hilsplat.base import onnx_models
 from hilsplat.base.artifacts import sha256_of_file, sha256_of_json
-from hilsplat.segment import sam
-from hilsplat.segment.sam import HEADS, SamModel, point_grid, stability_of
+from hilsplat.segment import logit_kernels, sam
+from hilsplat.segment.logit_kernels import edge_windows
+from hilsplat.segment.sam import HEADS, Frame, SamModel, point_grid, read_logits
 from hilsplat.settings import MasksSettings
 
 LOOSE = 0.1
 """Masks below this predicted IoU or stability, or below a lower threshold of the settings, are not cached."""
 
 BAND_PX = 3
-"""Low-resolution pixels on either side of a mask's edge whose logits are kept (see `flatten_far`)."""
+"""Low-resolution pixels on either side of a mask's edge whose logits are kept (see `Candidates`)."""
 
 CROP_OVERLAP = 512 / 1500
 """Overlap of the first layer's crops, as a share of the image's shorter side (SAM)."""
@@ -27,23 +27,51 @@ CROP_OVERLAP = 512 / 1500
 class Candidates:
     """K masks as the decoder gave them, before any threshold that a user may want to turn.
 
+    A mask's logits are kept inside a window round it, in steps of `sam.LOGIT_STEP`, and flat
+    (+-127) wherever no edge is within `BAND_PX`: the two bilinear resizings up to the view read logits
+    at most three pixels apart, so every pixel of every mask stays what it was, and what is left is
+    constant almost everywhere and packs small. Outside the window stands -127.
+
     Attributes:
-        logits: low-resolution logits in steps of `sam.LOGIT_STEP`, flat far from a mask's edge.
+        logits: the windows one after the other, row by row.
+        offsets: where each mask's window begins, and where the last one ends.
+        window_xyxy: low-resolution px, end exclusive.
+        low_hw: height and width of the decoder's masks.
         head: row of `HEADS`.
         predicted_iou: as the network gives it, clipped to [0, 1].
-        stability: `sam.stability_of`.
+        stability: `sam.read_logits`.
         crop: row of the view's crop boxes.
     """
 
-    logits: Int8[np.ndarray, "K h w"]
+    logits: Int8[np.ndarray, " R"]
+    offsets: Int64[np.ndarray, " K_and_1"]
+    window_xyxy: Int32[np.ndarray, "K 4"]
+    low_hw: Int32[np.ndarray, " 2"]
     head: UInt8[np.ndarray, " K"]
     predicted_iou: Float32[np.ndarray, " K"]
     stability: Float32[np.ndarray, " K"]
     crop: UInt8[np.ndarray, " K"]
 
+    def __len__(self) -> int:
+        return len(self.head)
+
     def arrays(self) -> dict[str, np.ndarray]:
         """All fields as plain arrays."""
         return dict(vars(self))
+
+    @staticmethod
+    def concatenate(parts: "list[Candidates]") -> "Candidates":
+        """Rows of all parts, at least one, one after the other."""
+        starts = np.cumsum([0, *(len(part.logits) for part in parts)])
+        offsets = [part.offsets[1:] + start for part, start in zip(parts, starts[:-1], strict=True)]
+        return Candidates(
+            offsets=np.concatenate([np.zeros(1, np.int64), *offsets]),
+            low_hw=parts[0].low_hw,
+            **{
+                name: np.concatenate([getattr(part, name) for part in parts])
+                for name in ("logits", "window_xyxy", "head", "predicted_iou", "stability", "crop")
+            },
+        )
 
 
 def crop_boxes(
@@ -64,14 +92,15 @@ def crop_boxes(
         for column in range(per_side):
             for row in range(per_side):
                 left, top = column * (crop_w - overlap), row * (crop_h - overlap)
-                boxes.append((left, top, min(left + crop_w, width), min(top + crop_h, height)))
-                layer_of.append(layer)
+                if left < width and top < height:  # images of a few pixels have fewer crops
+                    boxes.append((left, top, min(left + crop_w, width), min(top + crop_h, height)))
+                    layer_of.append(layer)
     return np.array(boxes, dtype=np.int32), np.array(layer_of, dtype=np.uint8)
 
 
 def candidates_key(image_sha256: str, model: SamModel, settings: MasksSettings) -> str:
     """Cache key of a view's candidates: everything that `decode_candidates` depends on."""
-    code = [sha256_of_file(Path(module.__file__)) for module in (sam, onnx_models)]
+    code = [sha256_of_file(Path(module.__file__)) for module in (sam, onnx_models, logit_kernels)]
     code.append(sha256_of_file(Path(__file__)))
     return sha256_of_json(
         {
@@ -99,7 +128,6 @@ def decode_candidates(
     image: UInt8[np.ndarray, "H W 3"], model: SamModel, settings: MasksSettings
 ) -> Candidates:
     """Prompt the network at every grid point of the image and of its crops."""
-    iou_floor, stability_floor = floors(settings)
     boxes, _ = crop_boxes((image.shape[0], image.shape[1]), settings.crop_layers)
     grid = point_grid(settings.points_per_side)
     batch = model.prompts_per_call(settings.points_per_batch, len(grid))
@@ -113,35 +141,35 @@ def decode_candidates(
             # cannot depend on how a batch was cut.
             padded = np.concatenate([asked, np.repeat(asked[-1:], batch - len(asked), axis=0)])
             scores, logits = model.decode(encoded, padded)
-            scores = np.clip(scores[: len(asked)].reshape(-1), 0, 1)
-            steps = sam.quantise(logits[: len(asked)]).reshape(-1, *logits.shape[2:])
-            stability = stability_of(steps, settings.stability_offset, encoded.frame)
-            keep = (scores >= iou_floor) & (stability >= stability_floor) & (steps > 0).any(axis=(1, 2))
-            head = np.tile(np.arange(len(HEADS), dtype=np.uint8), len(asked))
             parts.append(
-                (
-                    flatten_far(steps[keep]),
-                    head[keep],
-                    scores[keep],
-                    stability[keep],
-                    np.full(keep.sum(), crop, np.uint8),
-                )
+                keep_candidates(scores[: len(asked)], logits[: len(asked)], encoded.frame, crop, settings)
             )
-    return Candidates(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return Candidates.concatenate(parts)
 
 
-def flatten_far(logits: Int8[np.ndarray, "K h w"]) -> Int8[np.ndarray, "K h w"]:
-    """Set logits that lie farther than `BAND_PX` from a change of sign to the extreme of their sign.
-
-    The two bilinear resizings up to the view read logits at most three pixels apart, so every pixel
-    of every mask stays what it was; what is left is constant almost everywhere and packs ten times
-    smaller.
-    """
-    extreme = np.iinfo(np.int8).max
-    window = np.ones((2 * BAND_PX + 1, 2 * BAND_PX + 1), np.uint8)
-    flat = np.where(logits > 0, extreme, -extreme).astype(np.int8)
-    for row, mask in enumerate(logits > 0):
-        inside = mask.astype(np.uint8)
-        band = (cv2.dilate(inside, window) > 0) & (cv2.erode(inside, window) == 0)
-        flat[row][band] = logits[row][band]
-    return flat
+def keep_candidates(
+    scores: Float32[np.ndarray, "P 3"],
+    logits: Float32[np.ndarray, "P 3 h w"],
+    frame: Frame,
+    crop: int,
+    settings: MasksSettings,
+) -> Candidates:
+    """The masks of one decoder call that are above the floors."""
+    iou_floor, stability_floor = floors(settings)
+    predicted_iou = np.clip(scores.reshape(-1), 0, 1)
+    steps, stability, boxes = read_logits(
+        logits.reshape(-1, *logits.shape[2:]), settings.stability_offset, frame
+    )
+    keep = (predicted_iou >= iou_floor) & (stability >= stability_floor) & boxes.any(axis=1)
+    rows = np.flatnonzero(keep)
+    values, offsets, windows = edge_windows(steps, rows, boxes, BAND_PX)
+    return Candidates(
+        values,
+        offsets,
+        windows,
+        np.array(steps.shape[1:], np.int32),
+        np.tile(np.arange(len(HEADS), dtype=np.uint8), len(scores))[rows],
+        predicted_iou[rows],
+        stability[rows],
+        np.full(len(rows), crop, np.uint8),
+    )

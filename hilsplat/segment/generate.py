@@ -6,15 +6,17 @@ no network call. The steps are SAM's automatic generator, kept apart for the thr
 then LangSplat's mask suppression.
 """
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Int32
+from jaxtyping import Bool, Int32, Int64
 
+from hilsplat.base.levels import Level
 from hilsplat.segment import sam
 from hilsplat.segment.candidates import Candidates, crop_boxes
-from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.segment.sam import HEADS, Frame, SamModel, restore
+from hilsplat.segment.kernels import mended_runs, upscaled_runs
+from hilsplat.segment.masks import HierarchicalMasks, take_runs
+from hilsplat.segment.sam import HEADS, Frame, SamModel
 from hilsplat.segment.suppression import suppress_boxes, suppress_masks
+from hilsplat.segment.tree_levels import with_tree_levels
 from hilsplat.settings import MasksSettings
 
 CROP_EDGE_PX = 20
@@ -40,7 +42,7 @@ def masks_from_candidates(
         for crop, crop_box in enumerate(boxes):
             rows = np.flatnonzero(enough & (candidates.head == head) & (candidates.crop == crop))
             frame = _frame(crop_box, model)
-            masks = _upscale(candidates, rows, frame, crop_box, size_hw, int(level))
+            masks = _upscale(candidates, rows, frame, crop_box, size_hw, level)
             keep = suppress_boxes(masks.box_xyxy, masks.predicted_iou, settings.box_nms_iou)
             per_crop.append(masks.take(keep))
             layers.append(np.full(len(keep), layer_of[crop]))
@@ -50,13 +52,16 @@ def masks_from_candidates(
                 suppress_boxes(masks.box_xyxy, layer + masks.predicted_iou / 2, settings.box_nms_iou)
             )
         # Mending costs most, so it comes after the boxes have thinned the masks out, as in SAM.
-        masks, changed = _mend(masks, settings.min_area_px)
+        masks, changed = mend_masks(masks, settings.min_area_px)
         if changed.any():  # mending moved boxes; masks that needed none are better (SAM)
             keep = suppress_boxes(masks.box_xyxy, ~changed + masks.predicted_iou / 2, settings.box_nms_iou)
             masks = masks.take(keep)
         streams.append(masks)
+    pooled = HierarchicalMasks.concatenate(streams, size_hw)
+    if settings.level_source == "tree":
+        return with_tree_levels(pooled, settings)
     return suppress_masks(
-        HierarchicalMasks.concatenate(streams, size_hw),
+        pooled,
         iou_max=settings.nms_iou,
         score_min=settings.nms_score,
         inner=settings.nms_inner,
@@ -72,83 +77,65 @@ def _frame(crop_box: Int32[np.ndarray, " 4"], model: SamModel) -> Frame:
 
 def _upscale(
     candidates: Candidates,
-    rows: np.ndarray,
+    rows: Int64[np.ndarray, " m"],
     frame: Frame,
     crop_box: Int32[np.ndarray, " 4"],
     size_hw: tuple[int, int],
-    level: int,
+    level: Level,
 ) -> HierarchicalMasks:
     """Masks of the given candidates in the view, without empty ones and those cut by the crop's edge."""
-    left, top, right, bottom = (int(number) for number in crop_box)
-    parts = []
-    for row in rows:
-        full = np.zeros((1, *size_hw), dtype=bool)
-        full[0, top:bottom, left:right] = restore(candidates.logits[row], frame)
-        if not full.any():
-            continue
-        mask = HierarchicalMasks.from_dense(
-            full,
-            np.array([level], np.uint8),
-            candidates.predicted_iou[row : row + 1],
-            candidates.stability[row : row + 1],
-        )
-        if not _cut_by_crop(mask.box_xyxy[0], crop_box, size_hw):
-            parts.append(mask)
-    return HierarchicalMasks.concatenate(parts, size_hw)
+    along_y, along_x = (
+        sam.taps(int(candidates.low_hw[axis]), frame.padded_hw[axis], frame.resized_hw[axis], length)
+        for axis, length in enumerate(frame.original_hw)
+    )
+    runs, offsets = upscaled_runs(
+        candidates.logits,
+        candidates.offsets,
+        candidates.window_xyxy,
+        rows,
+        *along_y,
+        *along_x,
+        int(crop_box[1]),
+        int(crop_box[0]),
+        *size_hw,
+    )
+    # a code of one run is a mask without pixels
+    keep = np.flatnonzero(np.diff(offsets) > 1)
+    runs, offsets = take_runs(runs, offsets, keep)
+    masks = HierarchicalMasks.from_runs(
+        runs,
+        offsets,
+        np.full(len(keep), int(level), np.uint8),
+        candidates.predicted_iou[rows[keep]],
+        candidates.stability[rows[keep]],
+        size_hw,
+    )
+    return masks.take(np.flatnonzero(~cut_by_crop(masks.box_xyxy, crop_box, size_hw)))
 
 
-def _mend(masks: HierarchicalMasks, min_area_px: int) -> tuple[HierarchicalMasks, Bool[np.ndarray, " m"]]:
-    """Masks without small holes and islands, those that are small as a whole left out.
+def mend_masks(
+    masks: HierarchicalMasks, min_area_px: int
+) -> tuple[HierarchicalMasks, Bool[np.ndarray, " m"]]:
+    """Fill holes and drop islands below `min_area_px` (8-connected), and masks that are small as a whole.
+
+    The largest island of a mask always stays.
 
     Returns:
         the masks left, and which of them were changed.
     """
-    parts, mended = [], []
-    for row in range(len(masks)):
-        inside, changed = remove_small_regions(masks.dense(np.array([row]))[0], min_area_px)
-        if inside.sum() < min_area_px:
-            continue
-        one = slice(row, row + 1)
-        parts.append(
-            HierarchicalMasks.from_dense(
-                inside[None], masks.level[one], masks.predicted_iou[one], masks.stability[one]
-            )
-        )
-        mended.append(changed)
-    return HierarchicalMasks.concatenate(parts, masks.size_hw), np.array(mended, dtype=bool)
+    runs, offsets, changed = mended_runs(masks.runs, masks.offsets, masks.size_hw[1], min_area_px)
+    mended = HierarchicalMasks.from_runs(
+        runs, offsets, masks.level, masks.predicted_iou, masks.stability, masks.size_hw
+    )
+    large = np.flatnonzero(mended.area_px >= min_area_px)
+    return mended.take(large), changed[large]
 
 
-def _cut_by_crop(
-    box: Int32[np.ndarray, " 4"], crop_box: Int32[np.ndarray, " 4"], size_hw: tuple[int, int]
-) -> bool:
-    """Whether a box touches an edge of its crop that is no edge of the image."""
+def cut_by_crop(
+    boxes: Int32[np.ndarray, "M 4"], crop_box: Int32[np.ndarray, " 4"], size_hw: tuple[int, int]
+) -> Bool[np.ndarray, " M"]:
+    """Which boxes touch an edge of their crop that is no edge of the image."""
     image_box = np.array([0, 0, size_hw[1], size_hw[0]])
-    near_crop = np.abs(box - crop_box) <= CROP_EDGE_PX
-    near_image = np.abs(box - image_box) <= CROP_EDGE_PX
-    return bool((near_crop & ~near_image).any())
-
-
-def remove_small_regions(
-    mask: Bool[np.ndarray, "H W"], min_area_px: int
-) -> tuple[Bool[np.ndarray, "H W"], bool]:
-    """Fill holes and drop islands below `min_area_px` (8-connected); the largest island always stays.
-
-    Returns:
-        the mended mask, and whether anything changed.
-    """
-    holes, hole_area = _regions(~mask)
-    small = np.flatnonzero(hole_area < min_area_px)
-    mended = mask | np.isin(holes, small + 1) if len(small) else mask
-    islands, island_area = _regions(mended)
-    small = np.flatnonzero(island_area < min_area_px)
-    if len(island_area):
-        small = small[small != island_area.argmax()]
-    if len(small):
-        mended = mended & ~np.isin(islands, small + 1)
-    return mended, bool((mended != mask).any())
-
-
-def _regions(mask: Bool[np.ndarray, "H W"]) -> tuple[Int32[np.ndarray, "H W"], Int32[np.ndarray, " n"]]:
-    """Labels 1..n of the 8-connected regions (0 outside) and their areas, px."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-    return labels, stats[1:, cv2.CC_STAT_AREA]
+    near_crop = np.abs(boxes - crop_box) <= CROP_EDGE_PX
+    near_image = np.abs(boxes - image_box) <= CROP_EDGE_PX
+    return (near_crop & ~near_image).any(axis=1)

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int32, UInt8
 
 from hilsplat.base.images import resize_to_fit
 from hilsplat.base.levels import LEVELS
-from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.masks import HierarchicalMasks, runs_of_labels
 
 WORK_SIDE_PX = 640
 """Images are segmented at this longer side; finer texture is no part of anything."""
@@ -77,15 +77,15 @@ def segment_graph(
         full = cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST)
         counts = np.bincount(full.reshape(-1), minlength=len(border))
         large = np.flatnonzero(counts >= min_area_px)
-        for rows in np.array_split(large, len(large) // 16 + 1):  # a few at once: they are unpacked
-            parts.append(
-                HierarchicalMasks.from_dense(
-                    full[None] == rows[:, None, None].astype(np.int32),
-                    np.full(len(rows), int(level), np.uint8),
-                    np.clip(border[rows] / CLEAR_EDGE, 0, 1).astype(np.float32),
-                    life[rows].astype(np.float32),
-                )
+        parts.append(
+            HierarchicalMasks.from_runs(
+                *runs_of_labels(full, large),
+                np.full(len(large), int(level), np.uint8),
+                np.clip(border[large] / CLEAR_EDGE, 0, 1).astype(np.float32),
+                life[large].astype(np.float32),
+                (height, width),
             )
+        )
     masks = HierarchicalMasks.concatenate(parts, (height, width))
     return masks.take(masks.content_order())
 

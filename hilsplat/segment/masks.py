@@ -4,14 +4,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32, Int64, UInt8, UInt32
+from jaxtyping import Bool, Float32, Int, Int32, Int64, UInt8, UInt32
 
 from hilsplat.base.artifacts import read_npz, write_npz
 from hilsplat.base.errors import EmptyMaskError
 from hilsplat.base.levels import NONE, Level
-
-BAND_ELEMENTS = 2**24
-"""Elements (masks x segments) that are held at once for overlaps: 64 MiB as float32."""
+from hilsplat.segment.kernels import areas_and_boxes, paint_runs, shared_pixels, window_of_runs
 
 
 def encode_runs(
@@ -34,6 +32,38 @@ def encode_runs(
         runs.append(lengths.astype(np.uint32))
         offsets[row + 1] = offsets[row] + len(lengths)
     return (np.concatenate(runs) if runs else np.zeros(0, np.uint32)), offsets
+
+
+def take_runs(
+    runs: UInt32[np.ndarray, " R"], offsets: Int64[np.ndarray, " M_and_1"], rows: Int64[np.ndarray, " m"]
+) -> tuple[UInt32[np.ndarray, " r"], Int64[np.ndarray, " m_and_1"]]:
+    """Run lengths and offsets of the given rows, in the given order."""
+    pieces = [runs[offsets[row] : offsets[row + 1]] for row in rows]
+    taken = np.zeros(len(rows) + 1, dtype=np.int64)
+    taken[1:] = np.cumsum([len(piece) for piece in pieces])
+    return (np.concatenate(pieces) if pieces else np.zeros(0, np.uint32)), taken
+
+
+def runs_of_labels(
+    labels: Int[np.ndarray, "H W"], chosen: Int[np.ndarray, " M"]
+) -> tuple[UInt32[np.ndarray, " R"], Int64[np.ndarray, " M_and_1"]]:
+    """Run lengths of the regions of a label map, one mask per chosen label, each present in the map.
+
+    The same as `encode_runs` of `labels == label` for each label, in one pass.
+    """
+    flat = labels.reshape(-1)
+    borders = np.concatenate(([0], np.flatnonzero(flat[1:] != flat[:-1]) + 1, [flat.size]))
+    starts, stops, owner = borders[:-1], borders[1:], flat[borders[:-1]]
+    order = np.argsort(owner, kind="stable")
+    first, last = (np.searchsorted(owner[order], chosen, side=side) for side in ("left", "right"))
+    pieces = []
+    for low, high in zip(first, last, strict=True):
+        mine = order[low:high]
+        edges = np.stack([starts[mine], stops[mine]], axis=1).reshape(-1)
+        lengths = np.diff(edges, prepend=0)
+        pieces.append(lengths if edges[-1] == flat.size else np.append(lengths, flat.size - edges[-1]))
+    offsets = np.cumsum([0, *(len(piece) for piece in pieces)], dtype=np.int64)
+    return np.concatenate([np.zeros(0, np.int64), *pieces]).astype(np.uint32), offsets
 
 
 @dataclass(frozen=True)
@@ -75,17 +105,30 @@ class HierarchicalMasks:
         Raises:
             EmptyMaskError: a mask has no pixel.
         """
-        area_px = masks.sum(axis=(1, 2), dtype=np.int64)
+        runs, offsets = encode_runs(masks)
+        size_hw = (int(masks.shape[1]), int(masks.shape[2]))
+        return HierarchicalMasks.from_runs(runs, offsets, level, predicted_iou, stability, size_hw)
+
+    @staticmethod
+    def from_runs(
+        runs: UInt32[np.ndarray, " R"],
+        offsets: Int64[np.ndarray, " M_and_1"],
+        level: UInt8[np.ndarray, " M"],
+        predicted_iou: Float32[np.ndarray, " M"],
+        stability: Float32[np.ndarray, " M"],
+        size_hw: tuple[int, int],
+    ) -> "HierarchicalMasks":
+        """Masks from their run lengths; areas and boxes follow from these.
+
+        Raises:
+            EmptyMaskError: a mask has no pixel.
+        """
+        area_px, boxes = areas_and_boxes(runs, offsets, size_hw[1])
         if not area_px.all():
             raise EmptyMaskError(
-                f"masks {np.flatnonzero(area_px == 0).tolist()} of {len(masks)} have no pixel",
+                f"masks {np.flatnonzero(area_px == 0).tolist()} of {len(area_px)} have no pixel",
                 fix="drop empty masks before packing",
             )
-        boxes = np.zeros((len(masks), 4), dtype=np.int32)
-        for row, mask in enumerate(masks):
-            ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-            boxes[row] = xs[0], ys[0], xs[-1] + 1, ys[-1] + 1
-        runs, offsets = encode_runs(masks)
         return HierarchicalMasks(
             runs,
             offsets,
@@ -94,7 +137,7 @@ class HierarchicalMasks:
             stability.astype(np.float32),
             area_px,
             boxes,
-            (int(masks.shape[1]), int(masks.shape[2])),
+            size_hw,
         )
 
     def dense(self, rows: Int64[np.ndarray, " m"] | None = None) -> Bool[np.ndarray, "m H W"]:
@@ -107,40 +150,19 @@ class HierarchicalMasks:
             masks[out] = np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
         return masks.reshape(len(rows), height, width)
 
-    def overlaps_px(self) -> Int64[np.ndarray, "M M"]:
-        """Pixels that each pair of masks shares.
+    def window(self, row: int, box_xyxy: tuple[int, int, int, int]) -> Bool[np.ndarray, "h w"]:
+        """One mask inside a box of the view (xyxy, end exclusive)."""
+        runs = self.runs[self.offsets[row] : self.offsets[row + 1]]
+        return window_of_runs(runs, self.size_hw[1], box_xyxy)
 
-        The borders of all runs cut the flattened image into segments that lie wholly inside or
-        outside each mask; there are far fewer of them than pixels. Overlaps are then one product of
-        (masks x segments) matrices, weighted by segment lengths. Floating point counts pixels
-        exactly here, so the result does not depend on the order of summation.
-        """
-        size_px = self.size_hw[0] * self.size_hw[1]
-        exact = np.float32 if size_px < 2**24 else np.float64
-        ends = [
-            np.cumsum(self.runs[start:stop], dtype=np.int64)
-            for start, stop in zip(self.offsets[:-1], self.offsets[1:], strict=True)
-        ]
-        borders = np.unique(np.concatenate([np.array([0, size_px]), *ends]))
-        starts, lengths = borders[:-1], np.diff(borders).astype(exact)
-        shared = np.zeros((len(self), len(self)), dtype=np.int64)
-        step = max(1, BAND_ELEMENTS // max(1, len(self)))
-        for first in range(0, len(starts), step):
-            at = starts[first : first + step]
-            # a mask's runs alternate, beginning outside: an odd number of ended runs means inside
-            inside = np.array([np.searchsorted(end, at, side="right") % 2 == 1 for end in ends], dtype=exact)
-            inside = inside.reshape(len(self), len(at))
-            shared += ((inside * lengths[first : first + step]) @ inside.T).astype(np.int64)
-        return shared
+    def overlaps_px(self) -> Int64[np.ndarray, "M M"]:
+        """Pixels that each pair of masks shares; counted exactly."""
+        return shared_pixels(self.runs, self.offsets, self.box_xyxy, *self.size_hw)
 
     def take(self, rows: Int64[np.ndarray, " m"]) -> "HierarchicalMasks":
         """The given rows, in the given order."""
-        pieces = [self.runs[self.offsets[row] : self.offsets[row + 1]] for row in rows]
-        offsets = np.zeros(len(rows) + 1, dtype=np.int64)
-        offsets[1:] = np.cumsum([len(piece) for piece in pieces])
         return HierarchicalMasks(
-            np.concatenate(pieces) if pieces else np.zeros(0, np.uint32),
-            offsets,
+            *take_runs(self.runs, self.offsets, rows),
             self.level[rows],
             self.predicted_iou[rows],
             self.stability[rows],
@@ -192,18 +214,17 @@ class HierarchicalMasks:
         """Rows of a level, in order."""
         return np.flatnonzero(self.level == int(level))
 
-    def label_map(self, level: Level) -> Int32[np.ndarray, "H W"]:
-        """Paint the level's masks, large to small, so that small ones stay visible.
+    def label_map(self, level: Level | None) -> Int32[np.ndarray, "H W"]:
+        """Paint a level's masks, or all with None, large to small, so that small ones stay visible.
 
         Returns:
             row of the mask at each pixel, -1 where there is none. Of two equally large masks the
             lower row is painted last.
         """
         labels = np.full(self.size_hw, NONE, dtype=np.int32)
-        rows = self.rows_of(level)
+        rows = np.arange(len(self)) if level is None else self.rows_of(level)
         order = rows[np.lexsort((-rows, -self.area_px[rows]))]
-        for row in order:
-            labels[self.dense(np.array([row]))[0]] = row
+        paint_runs(self.runs, self.offsets, order, labels.reshape(-1))
         return labels
 
     def save(self, path: Path) -> None:

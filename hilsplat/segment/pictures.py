@@ -5,9 +5,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Int32, UInt8
 
-from hilsplat.base.artifacts import read_index
+from hilsplat.base.artifacts import read_index, read_npz
+from hilsplat.base.crops import square_crop
+from hilsplat.base.errors import ArtifactError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.scene.scene import Scene
@@ -65,16 +67,105 @@ def masks_picture(
     return np.concatenate(drawn, axis=1)
 
 
-def masks_overview(scene_folder: Path, masks_folder: Path, out_png: Path, view: str | None = None) -> None:
-    """Write a picture of one view: the photograph and its masks at three levels.
+THUMB_PX = 56
+"""Side of a mask in the picture of a tree."""
+
+
+def tree_picture(
+    image: UInt8[np.ndarray, "H W 3"],
+    masks: HierarchicalMasks,
+    parent: Int32[np.ndarray, " M"],
+    max_leaves: int = 12,
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The coverage trees of a view that hold most masks: roots at the left, children to the right.
+
+    A mask is shown as its crop, dimmed outside, framed in the colour that it has in `masks_picture`.
+
+    Args:
+        image: the view.
+        masks: its masks.
+        parent: row of each mask's parent, or `NONE`.
+        max_leaves: rows of the picture; trees that no longer fit are left out.
+    """
+    children: dict[int, list[int]] = {}
+    for row, above in enumerate(parent.tolist()):
+        children.setdefault(above, []).append(row)
+
+    def leaves(row: int) -> int:
+        return sum(map(leaves, children[row])) if row in children else 1
+
+    def nodes(row: int) -> int:
+        return 1 + sum(map(nodes, children.get(row, [])))
+
+    def height(row: int) -> int:
+        return 1 + max(map(height, children.get(row, [])), default=0)
+
+    shown, left = [], max_leaves
+    for root in sorted(children.get(NONE, []), key=lambda row: (-nodes(row), row)):
+        if leaves(root) <= left:
+            shown.append(root)
+            left -= leaves(root)
+    step_x, step_y = 2 * THUMB_PX, THUMB_PX + 6
+    columns = max(map(height, shown), default=1)
+    canvas = np.full((max(1, max_leaves - left) * step_y + 6, columns * step_x, 3), 255, np.uint8)
+    palette = row_colours(len(masks))
+
+    def draw(row: int, depth: int, top: int) -> int:
+        """Draw a subtree from the given leaf on; the height at which its root stands, px."""
+        below, at = [], top
+        for child in children.get(row, []):
+            below.append(draw(child, depth + 1, at))
+            at += leaves(child)
+        y = round(sum(below) / len(below)) if below else 6 + top * step_y
+        x = 6 + depth * step_x
+        for end in below:
+            start = (x + THUMB_PX, y + THUMB_PX // 2)
+            cv2.line(canvas, start, (x + step_x, end + THUMB_PX // 2), (120, 120, 120), 1, cv2.LINE_AA)
+        mask = masks.dense(np.array([row]))[0]
+        canvas[y : y + THUMB_PX, x : x + THUMB_PX] = square_crop(image, mask, "dim", 0.15, THUMB_PX)
+        colour = tuple(int(number) for number in palette[row])
+        cv2.rectangle(canvas, (x, y), (x + THUMB_PX, y + THUMB_PX), colour, 2)
+        return y
+
+    top = 0
+    for root in shown:
+        draw(root, 0, top)
+        top += leaves(root)
+    return canvas
+
+
+def masks_overview(
+    scene_folder: Path,
+    masks_folder: Path,
+    out_png: Path,
+    view: str | None = None,
+    tree_folder: Path | None = None,
+) -> str:
+    """Write a picture of one view: the photograph and its masks at three levels, and its trees.
 
     Args:
         scene_folder: the `Scene` artifact.
         masks_folder: what the masks stage wrote.
-        out_png: file to write.
+        out_png: file to write; the trees go beside it as `<name>_tree.png`.
         view: view name; None takes the middle one of the views that have masks.
+        tree_folder: what the tree stage wrote; None draws no trees.
+
+    Returns:
+        the view's name.
+
+    Raises:
+        ArtifactError: the view has no masks.
     """
     views = list(read_index(masks_folder)["views"])
     chosen = view or views[len(views) // 2]
+    if chosen not in views:
+        raise ArtifactError(
+            f"{masks_folder} has no view {chosen}", expected=f"one of {', '.join(views[:8])}, ..."
+        )
     masks = HierarchicalMasks.load(Path(masks_folder) / f"{chosen}.npz")
-    write_png(out_png, masks_picture(Scene.load(scene_folder).image(chosen), masks))
+    image = Scene.load(scene_folder).image(chosen)
+    write_png(out_png, masks_picture(image, masks))
+    if tree_folder is not None:
+        parent = read_npz(Path(tree_folder) / f"{chosen}.npz")["parent"]
+        write_png(out_png.with_name(f"{out_png.stem}_tree.png"), tree_picture(image, masks, parent))
+    return chosen

@@ -1,19 +1,20 @@
 """Segment Anything by onnxruntime: one image in, three masks per point prompt out.
 
 Preparation and restoring of sizes follow the SamProcessor of the transformers library, because its
-ONNX exports are what we read. The rounding of logits (`quantise`) is ours.
+ONNX exports are what we read. The rounding of logits (`read_logits`) is ours.
 """
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int8, UInt8
+from jaxtyping import Float, Float32, Int8, Int32, Int64, UInt8
 from PIL import Image
 
 from hilsplat.base.levels import Level
 from hilsplat.base.onnx_models import ModelFolder, open_model_folder, require_three_heads, side_px
+from hilsplat.segment.logit_kernels import quantise_logits
 
 HEADS: tuple[Level, Level, Level] = (Level.SUBPART, Level.PART, Level.WHOLE)
 """What the decoder's three outputs mean, in its order: fine to coarse."""
@@ -49,9 +50,12 @@ class Encoded:
 
 
 def resized_size(original_hw: tuple[int, int], longest_edge: int) -> tuple[int, int]:
-    """Height and width whose longer side is `longest_edge`; halves are rounded up, as in SamProcessor."""
+    """Height and width whose longer side is `longest_edge`; halves are rounded up, as in SamProcessor.
+
+    Departs: neither becomes 0, however thin the image is.
+    """
     scale = longest_edge / max(original_hw)
-    return int(original_hw[0] * scale + 0.5), int(original_hw[1] * scale + 0.5)
+    return max(1, int(original_hw[0] * scale + 0.5)), max(1, int(original_hw[1] * scale + 0.5))
 
 
 def point_grid(points_per_side: int) -> Float[np.ndarray, "P 2"]:
@@ -59,11 +63,6 @@ def point_grid(points_per_side: int) -> Float[np.ndarray, "P 2"]:
     centres = (np.arange(points_per_side) + 0.5) / points_per_side
     x, y = np.meshgrid(centres, centres)
     return np.stack([x.reshape(-1), y.reshape(-1)], axis=1)
-
-
-def quantise(logits: Float32[np.ndarray, "*shape"]) -> Int8[np.ndarray, "*shape"]:
-    """Round logits to multiples of `LOGIT_STEP`, clipped to +-127 of them (15.9)."""
-    return np.clip(np.rint(logits / LOGIT_STEP), -127, 127).astype(np.int8)
 
 
 class SamModel:
@@ -153,31 +152,59 @@ def valid_low_resolution(low_hw: tuple[int, int], frame: Frame) -> tuple[int, in
     )
 
 
-def stability_of(logits: Int8[np.ndarray, "K h w"], offset: float, frame: Frame) -> Float32[np.ndarray, " K"]:
-    """IoU of the masks at logit thresholds +offset and -offset; 0 where the larger one is empty.
+def read_logits(
+    logits: Float32[np.ndarray, "K h w"], offset: float, frame: Frame
+) -> tuple[Int8[np.ndarray, "K h w"], Float32[np.ndarray, " K"], Int32[np.ndarray, "K 4"]]:
+    """Round logits, and tell how stable each mask is and where it lies.
 
-    Departs: SAM counts pixels of the full-size mask; we count low-resolution ones, which saves the
-    upscaling of masks that are dropped.
+    Stability is the IoU of the masks at logit thresholds +offset and -offset; 0 where the larger one
+    is empty. Departs: SAM counts pixels of the full-size mask; we count low-resolution ones, which
+    saves the upscaling of masks that are dropped.
+
+    Returns:
+        logits in steps of `LOGIT_STEP`, clipped to +-127 steps; stability; box (xyxy, low-resolution
+        px, end exclusive) of what is above 0, all 0 where nothing is.
     """
     height, width = valid_low_resolution((logits.shape[1], logits.shape[2]), frame)
-    inside = logits[:, :height, :width]
     steps = offset / LOGIT_STEP
-    small = (inside > steps).sum(axis=(1, 2), dtype=np.int64)
-    large = (inside > -steps).sum(axis=(1, 2), dtype=np.int64)
-    return (small / np.maximum(large, 1)).astype(np.float32)
-
-
-def restore(logits: Int8[np.ndarray, "h w"], frame: Frame) -> Bool[np.ndarray, "H W"]:
-    """Upscale one low-resolution mask to the original image and cut it at logit 0.
-
-    Bilinear to the padded input, cropped to the resized image, bilinear to the original size.
-    """
-    padded = cv2.resize(
-        logits.astype(np.float32), (frame.padded_hw[1], frame.padded_hw[0]), interpolation=cv2.INTER_LINEAR
+    rounded, small, large, boxes = quantise_logits(
+        np.ascontiguousarray(logits),
+        np.float32(1 / LOGIT_STEP),
+        math.floor(steps),  # whole steps exceed a number where they exceed its floor
+        math.floor(-steps),
+        height,
+        width,
     )
-    cropped = padded[: frame.resized_hw[0], : frame.resized_hw[1]]
-    if frame.resized_hw != frame.original_hw:
-        cropped = cv2.resize(
-            cropped, (frame.original_hw[1], frame.original_hw[0]), interpolation=cv2.INTER_LINEAR
-        )
-    return cropped > 0
+    return rounded, (small / np.maximum(large, 1)).astype(np.float32), boxes
+
+
+def taps(
+    low: int, padded: int, resized: int, original: int
+) -> tuple[Int64[np.ndarray, " N"], Float32[np.ndarray, "N T"]]:
+    """How each pixel along one axis of the original image is blended from low-resolution pixels.
+
+    Bilinear from `low` to the padded input, cut to the resized image, bilinear to the original size,
+    as SamProcessor does; both steps in one.
+
+    Returns:
+        first low-resolution pixel of each pixel of the image, and the weights from there on.
+    """
+    weights = _bilinear(low, padded)[:resized]
+    if resized != original:
+        weights = _bilinear(resized, original) @ weights
+    touched = weights > 0
+    first, last = touched.argmax(axis=1), low - 1 - touched[:, ::-1].argmax(axis=1)
+    number = int((last - first).max()) + 1
+    first = np.minimum(first, low - number)
+    return first, np.take_along_axis(weights, first[:, None] + np.arange(number), axis=1).astype(np.float32)
+
+
+def _bilinear(source: int, target: int) -> Float[np.ndarray, "target source"]:
+    """Weights of bilinear resizing along one axis; pixel centres correspond, the border is repeated."""
+    at = np.clip((np.arange(target) + 0.5) * source / target - 0.5, 0, source - 1)
+    low = np.minimum(at.astype(np.int64), max(0, source - 2))
+    weights = np.zeros((target, source))
+    rows = np.arange(target)
+    weights[rows, low] = 1 - (at - low)
+    weights[rows, np.minimum(low + 1, source - 1)] += at - low
+    return weights

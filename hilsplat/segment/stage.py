@@ -16,11 +16,13 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.base.parallel import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.scene.scene import Scene
-from hilsplat.segment import graph
+from hilsplat.segment import graph, kernels
+from hilsplat.segment import masks as masks_module
 from hilsplat.segment.candidates import Candidates, candidates_key, decode_candidates
 from hilsplat.segment.generate import masks_from_candidates
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.sam import SamModel
+from hilsplat.segment.tree_levels import with_tree_levels
 from hilsplat.settings import MasksSettings
 
 logger = logging.getLogger(__name__)
@@ -96,11 +98,12 @@ def graph_masks(scene: Scene, view: str, cache: ViewCache, settings: MasksSettin
         {
             "image": sha256_of_file(scene.image_path(view)),
             "settings": [settings.graph_scales, settings.min_area_px],
-            "code": sha256_of_file(Path(graph.__file__)),
+            "code": [sha256_of_file(Path(module.__file__)) for module in (graph, masks_module, kernels)],
         }
     )
     arrays = cache.get(
         key,
         lambda: graph.segment_graph(scene.image(view), settings.graph_scales, settings.min_area_px).arrays(),
     )
-    return HierarchicalMasks.from_arrays(arrays)
+    masks = HierarchicalMasks.from_arrays(arrays)
+    return with_tree_levels(masks, settings) if settings.level_source == "tree" else masks

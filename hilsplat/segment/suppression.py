@@ -6,6 +6,9 @@ from jaxtyping import Bool, Float, Int, Int64
 from hilsplat.base.levels import LEVELS
 from hilsplat.segment.masks import HierarchicalMasks
 
+BOXES_AT_ONCE = 256
+"""Boxes compared with all that follow at once."""
+
 INNER_COVERED = 0.85
 """Share of a mask inside another one above which it counts as contained (LangSplat)."""
 
@@ -15,9 +18,11 @@ INNER_COVERS = 0.5
 
 def box_iou(boxes_a: Int[np.ndarray, "A 4"], boxes_b: Int[np.ndarray, "B 4"]) -> Float[np.ndarray, "A B"]:
     """IoU of boxes (xyxy, px, end exclusive); 0 where both are empty."""
-    low = np.maximum(boxes_a[:, None, :2], boxes_b[None, :, :2])
-    high = np.minimum(boxes_a[:, None, 2:], boxes_b[None, :, 2:])
-    shared = np.prod(np.clip(high - low, 0, None).astype(np.float64), axis=2)
+    shared = np.ones((len(boxes_a), len(boxes_b)))
+    for axis in (0, 1):
+        low = np.maximum(boxes_a[:, None, axis], boxes_b[None, :, axis])
+        high = np.minimum(boxes_a[:, None, axis + 2], boxes_b[None, :, axis + 2])
+        shared *= np.maximum(high - low, 0)
     area_a = np.prod((boxes_a[:, 2:] - boxes_a[:, :2]).astype(np.float64), axis=1)
     area_b = np.prod((boxes_b[:, 2:] - boxes_b[:, :2]).astype(np.float64), axis=1)
     union = area_a[:, None] + area_b[None, :] - shared
@@ -40,10 +45,12 @@ def suppress_boxes(
     order = np.lexsort((*boxes_xyxy.T[::-1], -area, -score))
     boxes = boxes_xyxy[order]
     alive = np.ones(len(boxes), dtype=bool)
-    for place in range(len(boxes)):
-        if alive[place]:
-            rest = np.flatnonzero(alive[place + 1 :]) + place + 1
-            alive[rest] = box_iou(boxes[place : place + 1], boxes[rest])[0] <= iou_max
+    for start in range(0, len(boxes), BOXES_AT_ONCE):
+        block = np.flatnonzero(alive[start : start + BOXES_AT_ONCE]) + start
+        allowed = box_iou(boxes[block], boxes[start:]) <= iou_max
+        for place, row in zip(block, allowed, strict=True):
+            if alive[place]:
+                alive[place + 1 :] &= row[place + 1 - start :]
     return np.sort(order[alive])
 
 

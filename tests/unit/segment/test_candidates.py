@@ -1,36 +1,64 @@
-"""What is cached of the decoder's output gives the same masks as the output itself."""
+"""What is kept of the decoder's output gives the same masks as the output itself."""
 
 import zlib
 
-import cv2
 import numpy as np
 import pytest
 
-from hilsplat.segment.candidates import flatten_far
-from hilsplat.segment.sam import Frame, quantise, restore
+from hilsplat.segment.candidates import Candidates, keep_candidates
+from hilsplat.segment.generate import masks_from_candidates
+from hilsplat.segment.sam import Frame, SamModel, resized_size
+from hilsplat.settings import MasksSettings
+from tests.unit.segment.plain import flatten_far, quantise, restore, smooth_logits, unpacked
+
+EVERYTHING = MasksSettings(
+    predicted_iou_min=0, stability_min=0, min_area_px=1, box_nms_iou=1, nms_iou=1, nms_inner=0
+)
 
 
-def smooth_logits(count: int, seed: int) -> np.ndarray:
-    noise = np.random.default_rng(seed).normal(size=(count, 64, 64)).astype(np.float32)
-    return np.stack([12 * cv2.GaussianBlur(one, (0, 0), 3) * 3 for one in noise])
+def candidates_of(logits: np.ndarray, frame: Frame) -> Candidates:
+    """All heads of all prompts, none dropped."""
+    scores = np.linspace(0.5, 1, len(logits) * 3, dtype=np.float32).reshape(-1, 3)
+    return keep_candidates(scores, logits, frame, 0, EVERYTHING)
 
 
-@pytest.mark.parametrize("original_hw", [(32, 24), (100, 128), (256, 256), (480, 640)])
-def test_flattened_logits_give_the_same_masks(original_hw: tuple[int, int]) -> None:
-    scale = 256 / max(original_hw)
-    resized = (round(original_hw[0] * scale), round(original_hw[1] * scale))
-    frame = Frame(original_hw, resized, (256, 256))
-    for logits in quantise(smooth_logits(20, seed=sum(original_hw))):
-        flat = flatten_far(logits[None])[0]
-        np.testing.assert_array_equal(restore(flat, frame), restore(logits, frame))
+def test_windows_hold_the_band_and_outside_stands_the_lowest_logit() -> None:
+    logits = smooth_logits(12, 48, seed=3)
+    kept = candidates_of(logits.reshape(4, 3, 48, 48), Frame((48, 48), (48, 48), (48, 48)))
+    assert len(kept) == 12
+    np.testing.assert_array_equal(unpacked(kept), [flatten_far(steps) for steps in quantise(logits)])
 
 
-def test_flattened_logits_pack_smaller() -> None:
+@pytest.mark.parametrize(
+    "original_hw", [(32, 24), (100, 128), (256, 256), (480, 640), (728, 986), (300, 3), (1, 200), (64, 1)]
+)
+def test_masks_of_windows_are_the_decoders_masks_enlarged(original_hw: tuple[int, int], disc_sam) -> None:
+    model = SamModel.load(disc_sam)
+    model.longest_edge, model.padded_hw = 256, (256, 256)
+    frame = Frame(original_hw, resized_size(original_hw, 256), (256, 256))
+    logits = smooth_logits(30, 64, seed=sum(original_hw))
+    kept = candidates_of(logits.reshape(10, 3, 64, 64), frame)
+    masks = masks_from_candidates(kept, original_hw, model, EVERYTHING)
+    expected = [restore(steps, frame) for steps in quantise(logits)]
+    expected = [mask for mask in expected if mask.any()]
+    found = list(masks.dense())
+    assert len(found) == len(expected) > 5
+    for mask in found:  # rounding may decide on the border itself
+        assert min((mask != other).mean() for other in expected) < 2e-4
+
+
+def test_windows_pack_small() -> None:
     y, x = np.mgrid[:128, :128]
     ripples = np.sin(x * 7.1) * np.cos(y * 3.3)
-    logits = quantise((30 - np.hypot(x - 60, y - 60) + ripples).astype(np.float32))[None]
-    assert len(zlib.compress(flatten_far(logits), 1)) < len(zlib.compress(logits, 1)) / 3
+    logits = np.tile((30 - np.hypot(x - 60, y - 60) + ripples).astype(np.float32), (1, 3, 1, 1))
+    kept = candidates_of(logits, Frame((128, 128), (128, 128), (128, 128)))
+    assert len(zlib.compress(kept.logits, 1)) < len(zlib.compress(quantise(logits), 1)) / 3
 
 
-def test_a_mask_without_an_edge_is_flat() -> None:
-    np.testing.assert_array_equal(flatten_far(np.full((1, 8, 8), -3, np.int8)), np.full((1, 8, 8), -127))
+def test_a_mask_over_the_whole_picture_has_no_edge() -> None:
+    kept = candidates_of(np.full((1, 3, 8, 8), 3, np.float32), Frame((8, 8), (8, 8), (8, 8)))
+    np.testing.assert_array_equal(unpacked(kept), np.full((3, 8, 8), 127))
+
+
+def test_a_mask_without_a_pixel_is_no_candidate() -> None:
+    assert len(candidates_of(np.full((2, 3, 8, 8), -3, np.float32), Frame((8, 8), (8, 8), (8, 8)))) == 0

@@ -2,12 +2,17 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from hilsplat.base.levels import Level
 from hilsplat.segment.candidates import Candidates, candidates_key, crop_boxes, decode_candidates, floors
-from hilsplat.segment.generate import masks_from_candidates, remove_small_regions
+from hilsplat.segment.generate import masks_from_candidates, mend_masks
+from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.sam import SamModel
 from hilsplat.settings import MasksSettings
+from tests.unit.segment.plain import mend
 
 SETTINGS = MasksSettings(points_per_side=2, points_per_batch=3, stability_min=0.0, min_area_px=1)
 IMAGE = np.zeros((32, 32, 3), dtype=np.uint8)
@@ -68,11 +73,20 @@ def test_masks_do_not_depend_on_the_batch(model, batch):
     np.testing.assert_array_equal(masks.runs, generate(model).runs)
 
 
+def one_row(candidates: Candidates, row: int) -> Candidates:
+    low, high = candidates.offsets[row : row + 2]
+    arrays = candidates.arrays() | {"logits": candidates.logits[low:high]}
+    arrays["offsets"] = np.array([0, high - low])
+    for name in ("window_xyxy", "head", "predicted_iou", "stability", "crop"):
+        arrays[name] = arrays[name][row : row + 1]
+    return Candidates(**arrays)
+
+
 def test_masks_do_not_depend_on_the_order_of_candidates(model):
     settings = SETTINGS.model_copy(update={"points_per_side": 6, "box_nms_iou": 0.5})
     candidates = decode_candidates(IMAGE, model, settings)
     shuffle = np.random.default_rng(0).permutation(len(candidates.head))
-    shuffled = Candidates(**{name: array[shuffle] for name, array in candidates.arrays().items()})
+    shuffled = Candidates.concatenate([one_row(candidates, row) for row in shuffle])
     first = masks_from_candidates(candidates, (32, 32), model, settings)
     second = masks_from_candidates(shuffled, (32, 32), model, settings)
     for name, array in first.arrays().items():
@@ -116,23 +130,45 @@ def test_crops_find_finer_masks_and_drop_those_they_cut(model):
             assert not (cut & ~(np.abs(box - [0, 0, 128, 128]) <= 20)).any()
 
 
+def mended(mask: np.ndarray, min_area_px: int) -> tuple[np.ndarray, np.ndarray]:
+    one = np.ones(1, np.float32)
+    masks, changed = mend_masks(
+        HierarchicalMasks.from_dense(mask[None], np.ones(1, np.uint8), one, one), min_area_px
+    )
+    return masks.dense(), changed
+
+
 def test_small_islands_go_and_small_holes_close():
     mask = np.zeros((8, 8), dtype=bool)
     mask[1:6, 1:6] = True
     mask[3, 3] = False
     mask[7, 7] = True
-    mended, changed = remove_small_regions(mask, min_area_px=4)
+    found, changed = mended(mask, min_area_px=4)
     expected = np.zeros((8, 8), dtype=bool)
     expected[1:6, 1:6] = True
-    assert changed
-    np.testing.assert_array_equal(mended, expected)
+    assert changed.tolist() == [True]
+    np.testing.assert_array_equal(found[0], expected)
 
 
-def test_the_largest_island_stays_however_small():
+def test_a_mask_that_is_small_as_a_whole_goes():
     mask = np.zeros((8, 8), dtype=bool)
     mask[0, 0] = mask[4, 4] = mask[4, 5] = True
-    mended, _ = remove_small_regions(mask, min_area_px=30)
-    assert mended.sum() == 2
+    assert len(mended(mask, min_area_px=30)[0]) == 0
+    found, changed = mended(mask, min_area_px=2)
+    assert (found[0].sum(), changed.tolist()) == (2, [True])
+
+
+@given(hnp.arrays(bool, st.tuples(st.integers(1, 9), st.integers(1, 9))), st.integers(1, 12))
+def test_runs_are_mended_as_pictures_are(mask, min_area_px):
+    if not mask.any():
+        return
+    found, changed = mended(mask, min_area_px)
+    expected = mend(mask, min_area_px)
+    if expected.sum() < min_area_px:
+        assert len(found) == 0
+    else:
+        np.testing.assert_array_equal(found[0], expected)
+        assert changed.tolist() == [(expected != mask).any()]
 
 
 def test_cache_key_covers_what_the_network_sees_and_no_more(model):

@@ -10,10 +10,9 @@ from hilsplat.segment.sam import (
     Frame,
     SamModel,
     point_grid,
-    quantise,
+    read_logits,
     resized_size,
-    restore,
-    stability_of,
+    taps,
     valid_low_resolution,
 )
 
@@ -29,6 +28,7 @@ def test_heads_run_from_fine_to_coarse():
         ((600, 800), (768, 1024)),
         ((1080, 1920), (576, 1024)),
         ((3, 2048), (2, 1024)),
+        ((1, 5000), (1, 1024)),
     ],
 )
 def test_longest_edge_is_kept_and_halves_round_up(original, resized):
@@ -65,37 +65,52 @@ def test_points_are_scaled_to_the_resized_image(disc_sam):
     assert logits[0, 2].max() == pytest.approx(10 - 2**0.5)
 
 
+SQUARE = Frame((4, 4), (4, 4), (4, 4))
+
+
 def test_logits_are_rounded_to_eighths_and_clipped():
-    logits = np.array([0.0, 0.06, 0.07, -0.3, 99.0, -99.0], dtype=np.float32)
-    assert quantise(logits).tolist() == [0, 0, 1, -2, 127, -127]
+    logits = np.array([0.0, 0.06, 0.07, -0.3, 99.0, -99.0, 0.1875, 0.3125], dtype=np.float32)
+    steps, _, _ = read_logits(logits.reshape(1, 1, 8), 1.0, SQUARE)
+    # 0.1875 is 1.5 steps and 0.3125 is 2.5 steps: both go to the even one
+    assert steps[0, 0].tolist() == [0, 0, 1, -2, 127, -127, 2, 2]
 
 
-def test_restored_mask_equals_two_bilinear_steps_of_torch():
-    generator = np.random.default_rng(0)
-    logits = generator.integers(-60, 60, (16, 16)).astype(np.int8)
-    frame = Frame(original_hw=(90, 120), resized_hw=(48, 64), padded_hw=(64, 64))
-    steps = torch.from_numpy(logits.astype(np.float32))[None, None]
-    padded = torch.nn.functional.interpolate(steps, (64, 64), mode="bilinear", align_corners=False)
-    full = torch.nn.functional.interpolate(
-        padded[..., :48, :], (90, 120), mode="bilinear", align_corners=False
-    )
-    expected = full[0, 0].numpy()
-    found = restore(logits, frame)
-    clear = np.abs(expected) > 1e-3  # rounding may decide on the border itself
-    assert clear.mean() > 0.99
-    np.testing.assert_array_equal(found[clear], expected[clear] > 0)
+def test_the_box_holds_what_is_above_zero():
+    logits = np.full((2, 4, 6), -1, np.float32)
+    logits[0, 1, 2] = logits[0, 2, 4] = 1
+    _, _, boxes = read_logits(logits, 1.0, SQUARE)
+    assert boxes.tolist() == [[2, 1, 5, 3], [0, 0, 0, 0]]
+
+
+@pytest.mark.parametrize("length", [1, 7, 48, 90, 500])
+def test_taps_equal_two_bilinear_steps_of_torch(length):
+    resized = min(64, max(1, round(length * 0.6)))
+    first, weights = taps(16, 64, resized, length)
+    whole = np.zeros((length, 16))
+    for row in range(length):
+        whole[row, first[row] : first[row] + weights.shape[1]] = weights[row]
+    eye = torch.eye(16)[None]
+    padded = torch.nn.functional.interpolate(eye, 64, mode="linear", align_corners=False)[..., :resized]
+    if resized != length:
+        padded = torch.nn.functional.interpolate(padded, length, mode="linear", align_corners=False)
+    np.testing.assert_allclose(whole, padded[0].numpy().T, atol=1e-5)  # torch places pixels in float32
 
 
 def test_stability_counts_between_the_two_thresholds_and_leaves_out_padding():
     frame = Frame(original_hw=(2, 4), resized_hw=(16, 32), padded_hw=(32, 32))
-    logits = np.zeros((1, 4, 4), dtype=np.int8)
-    logits[0, 0] = [80, 80, 0, -80]  # 10, 10, 0, -10 in logits
-    logits[0, 1] = [80, 0, 0, -80]
-    logits[0, 2:] = 80  # padding
+    logits = np.zeros((1, 4, 4), dtype=np.float32)
+    logits[0, 0] = [10, 10, 0, -10]
+    logits[0, 1] = [10, 0, 0, -10]
+    logits[0, 2:] = 10  # padding
     assert valid_low_resolution((4, 4), frame) == (2, 4)
-    assert stability_of(logits, 1.0, frame).tolist() == [pytest.approx(3 / 6)]
+    assert read_logits(logits, 1.0, frame)[1].tolist() == [pytest.approx(3 / 6)]
+
+
+def test_a_logit_at_a_threshold_is_not_above_it():
+    logits = np.array([1.0, 1.125, -1.0, -0.875], np.float32).reshape(1, 2, 2)
+    # above 1: 1.125; above -1: 1, 1.125 and -0.875
+    assert read_logits(logits, 1.0, Frame((2, 2), (2, 2), (2, 2)))[1].tolist() == [pytest.approx(1 / 3)]
 
 
 def test_stability_of_nothing_is_zero():
-    frame = Frame((4, 4), (4, 4), (4, 4))
-    assert stability_of(np.full((1, 4, 4), -100, np.int8), 1.0, frame).tolist() == [0.0]
+    assert read_logits(np.full((1, 4, 4), -12.5, np.float32), 1.0, SQUARE)[1].tolist() == [0.0]

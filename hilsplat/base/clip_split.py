@@ -1,0 +1,71 @@
+"""Cutting the one network of an exported CLIP into the two that we read.
+
+Optimum writes a CLIP as `model.onnx`, which wants a picture and a text at once. Its picture vectors
+depend on the picture alone and its text vectors on the text alone, so each half is a subgraph.
+"""
+
+from pathlib import Path
+
+from hilsplat.base.artifacts import atomic_path
+from hilsplat.base.errors import ModelError
+
+WHOLE = "model.onnx"
+"""The network of both halves, at the root of the folder or under `onnx/`."""
+
+HALVES = {
+    "vision_model": (("pixel_values",), ("image_embeds",)),
+    "text_model": (("input_ids", "attention_mask"), ("text_embeds",)),
+}
+"""Inputs and outputs of each half."""
+
+
+def whole_clip(folder: Path) -> Path | None:
+    """The network of both halves, where a folder has one."""
+    places = (Path(folder) / WHOLE, Path(folder) / "onnx" / WHOLE)
+    return next((place for place in places if place.is_file()), None)
+
+
+def split_clip(folder: Path) -> list[Path]:
+    """Write `vision_model.onnx` and `text_model.onnx` beside a CLIP's `model.onnx`.
+
+    Returns:
+        the two files; `model.onnx` stays and is no longer needed.
+
+    Raises:
+        ModelError: there is no `model.onnx`, it cannot be read, or it lacks an input or output.
+    """
+    import onnx
+    from onnx.utils import Extractor
+
+    whole = whole_clip(folder)
+    if whole is None:
+        raise ModelError(
+            f"model folder {folder} has no {WHOLE} to cut",
+            fix="export the model first: optimum-cli export onnx --model NAME FOLDER (docs/models.md)",
+        )
+    try:
+        model = onnx.load(str(whole))
+    except Exception as error:  # protobuf and onnx raise errors without a common base
+        raise ModelError(f"network {whole} cannot be read: {error}", fix="export it again") from error
+    inputs, outputs = ({value.name for value in part} for part in (model.graph.input, model.graph.output))
+    missing = [
+        name
+        for wanted, given in HALVES.values()
+        for name in [*(set(wanted) - inputs), *(set(given) - outputs)]
+    ]
+    if missing:
+        raise ModelError(
+            f"network {whole} is no whole CLIP: it lacks {', '.join(sorted(missing))}",
+            expected="; ".join(f"{' and '.join(a)} -> {b[0]}" for a, b in HALVES.values()),
+            found=f"{', '.join(sorted(inputs))} -> {', '.join(sorted(outputs))}",
+            fix="export it with optimum's task feature-extraction",
+        )
+    # Shapes inside the graph do not matter here, and inferring them fails beyond 2 GiB.
+    extractor = Extractor(model)
+    written = []
+    for name, (wanted, given) in HALVES.items():
+        path = whole.with_name(f"{name}.onnx")
+        with atomic_path(path) as temporary:
+            onnx.save(extractor.extract_model(list(wanted), list(given)), str(temporary))
+        written.append(path)
+    return written

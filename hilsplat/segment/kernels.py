@@ -1,0 +1,369 @@
+"""Compiled loops over run lengths. One file: numba keeps them on disk until its bytes change.
+
+Masks are run lengths over the flattened image (see `masks.encode_runs`), so that nothing here holds a
+picture per mask. Every loop is sequential: results do not depend on threads.
+"""
+
+from typing import no_type_check
+
+import numba
+import numpy as np
+
+BAND_WORDS = 2**17
+"""64-bit words of masks that `shared_pixels` holds at once: 1 MiB stays in a core's cache."""
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _push(out, count, length):
+    """Append a run; the buffer doubles where it is full."""
+    if count == len(out):
+        longer = np.empty(2 * len(out), np.uint32)
+        longer[:count] = out
+        out = longer
+    out[count] = length
+    return out, count + 1
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def upscaled_runs(
+    logits, offsets, windows, rows, first_y, weight_y, first_x, weight_x, top, left, height, width
+):
+    """Run lengths of masks from windows of low-resolution logits, enlarged by weights along each axis.
+
+    Pixel (y, x) of a crop at (top, left) of the image lies in the mask where
+    `sum_ij weight_y[y, i] weight_x[x, j] low[first_y[y] + i, first_x[x] + j] > 0`; low is the lowest
+    logit outside the window. The weights are convex, so a pixel whose logits have one sign has that
+    sign, and only pixels near a change of sign are computed.
+
+    Args:
+        logits, offsets, windows: all windows, as in `candidates.Candidates`.
+        rows: which of them.
+        first_y, weight_y: first low-resolution row and weights of each row of the crop.
+        first_x, weight_x: the same along x.
+        top, left, height, width: place of the crop in the image, and the image's size.
+
+    Returns:
+        runs and offsets (`masks.encode_runs`); a mask without pixels is one run.
+    """
+    num_y, taps_y = weight_y.shape
+    num_x, taps_x = weight_x.shape
+    # first column of the crop that reads each low-resolution column, or one after it
+    low_w = first_x[-1] + taps_x
+    reader = np.searchsorted(first_x, np.arange(low_w + 1))
+    out, count = np.empty(max(1024, 64 * len(rows)), np.uint32), 0
+    out_offsets = np.zeros(len(rows) + 1, np.int64)
+    for place in range(len(rows)):
+        row = rows[place]
+        x0, y0, x1, y1 = windows[row]
+        wide = x1 - x0
+        window = logits[offsets[row] : offsets[row + 1]].reshape(y1 - y0, wide)
+        line = np.full(wide + 2 * taps_x, np.float32(-127))  # a blended row, with the outside on both sides
+        middle = line[taps_x : taps_x + wide]
+        origin = x0 - taps_x  # low-resolution column of line[0]
+        # windows reach into the padding beside the image, which no pixel of the crop reads
+        begin, end = reader[min(max(0, x0 - taps_x + 1), low_w)], reader[min(x1, low_w)]
+        inside, last, last_end = False, 0, 0
+        for y in range(num_y):
+            base = (top + y) * width + left
+            low = first_y[y]
+            if low >= y1 or low + taps_y <= y0 or begin >= end:
+                continue
+            if inside and not (begin == 0 and left == 0 and last_end == base):
+                out, count = _push(out, count, last_end - last)
+                last, inside = last_end, False
+            middle[:] = np.float32(0)
+            for tap in range(taps_y):
+                weight = weight_y[y, tap]
+                source = low + tap - y0
+                if weight == 0:
+                    continue
+                if source < 0 or source >= y1 - y0:
+                    middle -= np.float32(127) * weight
+                else:
+                    for x in range(wide):
+                        middle[x] += weight * np.float32(window[source, x])
+            sign, x = False, begin
+            for at in range(1, len(line) + 1):
+                ends = at == len(line)
+                if not ends and (line[at] > 0) == sign:
+                    continue
+                # up to the first pixel that reads line[at], the sign stays; then, as long as line[at - 1]
+                # is read too, each pixel is computed
+                stop = end if ends else min(end, reader[min(max(0, origin + at), low_w)])
+                mixed = stop if ends else min(stop, reader[min(max(0, origin + at - taps_x + 1), low_w)])
+                mixed = max(x, mixed)
+                if mixed > x and sign != inside:
+                    out, count = _push(out, count, base + x - last)
+                    last, inside = base + x, sign
+                for column in range(mixed, stop):
+                    total = np.float32(0)
+                    for tap in range(taps_x):
+                        total += weight_x[column, tap] * line[first_x[column] + tap - origin]
+                    if (total > 0) != inside:
+                        out, count = _push(out, count, base + column - last)
+                        last, inside = base + column, not inside
+                x = max(x, stop)
+                sign = not sign
+            last_end = base + end
+            if inside and not (end == num_x and left + num_x == width):
+                out, count = _push(out, count, last_end - last)
+                last, inside = last_end, False
+        if inside:
+            out, count = _push(out, count, last_end - last)
+            last, inside = last_end, False
+        if last < height * width:
+            out, count = _push(out, count, height * width - last)
+        out_offsets[place + 1] = count
+    return out[:count].copy(), out_offsets
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def areas_and_boxes(runs, offsets, width):
+    """Pixels and box (xyxy, end exclusive) of each run-length coded mask; both 0 for an empty one."""
+    number = len(offsets) - 1
+    area, boxes = np.zeros(number, np.int64), np.zeros((number, 4), np.int32)
+    for k in range(number):
+        x0, y0, x1, y1 = width, -1, 0, 0
+        at = np.int64(0)
+        for place in range(offsets[k], offsets[k + 1]):
+            stop = at + runs[place]
+            if (place - offsets[k]) % 2 == 1 and stop > at:
+                area[k] += stop - at
+                row, last_row = at // width, (stop - 1) // width
+                if y0 < 0:
+                    y0 = row
+                y1 = last_row + 1
+                if row == last_row:
+                    x0, x1 = min(x0, at - row * width), max(x1, stop - row * width)
+                else:
+                    x0, x1 = 0, width
+            at = stop
+        if y0 >= 0:
+            boxes[k] = x0, y0, x1, y1
+    return area, boxes
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _root(parent, node):
+    while parent[node] != node:
+        parent[node] = parent[parent[node]]
+        node = parent[node]
+    return node
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _region_areas(row, start, stop, value, of, parent, area):
+    """8-connected regions of the segments whose value is `of`: roots in `parent`, areas at the roots."""
+    number = len(row)
+    previous = 0  # first segment of the row above
+    first = 0  # first segment of this row
+    for k in range(number):
+        parent[k] = k
+        area[k] = 0
+    for k in range(number):
+        if k > 0 and row[k] != row[k - 1]:
+            previous, first = first, k
+        if value[k] != of:
+            continue
+        if k > first and value[k - 1] == of:
+            parent[_root(parent, k)] = _root(parent, k - 1)
+        if first == 0:
+            continue
+        at = previous
+        while at < first and stop[at] < start[k]:
+            at += 1
+        previous = at
+        while at < first and start[at] <= stop[k]:
+            if value[at] == of:
+                a, b = _root(parent, at), _root(parent, k)
+                if a != b:
+                    parent[max(a, b)] = min(a, b)
+            at += 1
+    for k in range(number):
+        if value[k] == of:
+            area[_root(parent, k)] += stop[k] - start[k]
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def mended_runs(runs, offsets, width, min_area):
+    """Fill holes and drop islands below `min_area` (8-connected); the largest island always stays.
+
+    Returns:
+        runs and offsets of the mended masks, and which of them changed.
+    """
+    number = len(offsets) - 1
+    out, count = np.empty(max(1024, len(runs)), np.uint32), 0
+    out_offsets = np.zeros(number + 1, np.int64)
+    changed = np.zeros(number, np.bool_)
+    for k in range(number):
+        mine = runs[offsets[k] : offsets[k + 1]]
+        size = np.int64(0)
+        for place in range(len(mine)):
+            size += mine[place]
+        most = len(mine) + size // width + 2
+        row, start, stop = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
+        value = np.empty(most, np.bool_)
+        segments = 0
+        at = np.int64(0)
+        for place in range(len(mine)):  # cut runs at the ends of rows
+            end = at + mine[place]
+            while at < end:
+                line = at // width
+                cut = min(end, (line + 1) * width)
+                row[segments], start[segments], stop[segments] = line, at - line * width, cut - line * width
+                value[segments] = place % 2 == 1
+                segments += 1
+                at = cut
+        row, start, stop, value = row[:segments], start[:segments], stop[:segments], value[:segments]
+        parent, area = np.empty(segments, np.int64), np.empty(segments, np.int64)
+        _region_areas(row, start, stop, value, False, parent, area)
+        filled = value.copy()
+        for segment in range(segments):
+            if not value[segment] and area[_root(parent, segment)] < min_area:
+                filled[segment] = True
+                changed[k] = True
+        _region_areas(row, start, stop, filled, True, parent, area)
+        largest = 0
+        for segment in range(segments):
+            if area[segment] > area[largest]:
+                largest = segment
+        last, now = np.int64(0), False
+        for segment in range(segments):
+            keep = filled[segment]
+            if keep:
+                root = _root(parent, segment)
+                if area[root] < min_area and root != largest:
+                    keep = False
+                    changed[k] = True
+            if keep != now:
+                border = row[segment] * width + start[segment]
+                out, count = _push(out, count, border - last)
+                last, now = border, keep
+        if last < size:
+            out, count = _push(out, count, size - last)
+        out_offsets[k + 1] = count
+    return out[:count].copy(), out_offsets, changed
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _bits_set(word):
+    """Ones of a 64-bit word."""
+    word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _set_bits(words, start, stop):
+    """Set bits start..stop-1 of a row of 64-bit words."""
+    full = np.uint64(0xFFFFFFFFFFFFFFFF)
+    first, last = start >> 6, (stop - 1) >> 6
+    head = full << np.uint64(start & 63)
+    tail = full >> np.uint64(63 - ((stop - 1) & 63))
+    if first == last:
+        words[first] |= head & tail
+        return
+    words[first] |= head
+    for word in range(first + 1, last):
+        words[word] = full
+    words[last] |= tail
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def shared_pixels(runs, offsets, boxes, height, width):
+    """Pixels that each pair of masks shares, int64 (M, M): ones of the conjunction of packed masks.
+
+    Masks are packed in bands of a few image rows; of a pair, only words and rows in both boxes are read.
+    """
+    number = len(offsets) - 1
+    shared = np.zeros((number, number), np.int64)
+    words = (width + 63) // 64
+    band = max(1, min(height, BAND_WORDS // max(1, number * words)))
+    bits = np.zeros((number, band, words), np.uint64)
+    place, at = offsets[:-1].copy(), np.zeros(number, np.int64)  # current run of each mask, its start
+    active = np.empty(number, np.int64)
+    for top in range(0, height, band):
+        bottom = min(height, top + band)
+        num_active = 0
+        for k in range(number):
+            if boxes[k, 1] >= bottom or boxes[k, 3] <= top:
+                continue
+            active[num_active] = k
+            num_active += 1
+            bits[k] = 0
+            while place[k] < offsets[k + 1]:
+                end = at[k] + runs[place[k]]
+                if (place[k] - offsets[k]) % 2 == 1:
+                    start, stop = max(at[k], top * width), min(end, bottom * width)
+                    while start < stop:
+                        line = start // width
+                        cut = min(stop, (line + 1) * width)
+                        _set_bits(bits[k, line - top], start - line * width, cut - line * width)
+                        start = cut
+                if end > bottom * width:
+                    break  # goes on in the next band
+                at[k] = end
+                place[k] += 1
+        for first in range(num_active):
+            i = active[first]
+            for second in range(first, num_active):
+                j = active[second]
+                x0, x1 = max(boxes[i, 0], boxes[j, 0]), min(boxes[i, 2], boxes[j, 2])
+                y0, y1 = max(boxes[i, 1], boxes[j, 1], top), min(boxes[i, 3], boxes[j, 3], bottom)
+                if x0 >= x1 or y0 >= y1:
+                    continue
+                word0, word1 = x0 >> 6, ((x1 - 1) >> 6) + 1
+                total = 0
+                for y in range(y0 - top, y1 - top):
+                    for word in range(word0, word1):
+                        total += _bits_set(bits[i, y, word] & bits[j, y, word])
+                shared[i, j] += total
+    for i in range(number):
+        for j in range(i):
+            shared[i, j] = shared[j, i]
+    return shared
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def paint_runs(runs, offsets, order, canvas):
+    """Write each row number of `order` into the flat canvas where its mask lies; later ones win."""
+    for row in order:
+        at = np.int64(0)
+        for place in range(offsets[row], offsets[row + 1]):
+            stop = at + runs[place]
+            if (place - offsets[row]) % 2 == 1:
+                canvas[at:stop] = row
+            at = stop
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def window_of_runs(runs, width, box):
+    """A mask inside a box (xyxy), as booleans."""
+    x0, y0, x1, y1 = box
+    out = np.zeros((y1 - y0, x1 - x0), np.bool_)
+    at = np.int64(0)
+    for place in range(len(runs)):
+        stop = at + runs[place]
+        if place % 2 == 1:
+            start, end = max(at, y0 * width), min(stop, y1 * width)
+            while start < end:
+                line = start // width
+                cut = min(end, (line + 1) * width)
+                left, right = max(x0, start - line * width), min(x1, cut - line * width)
+                if left < right:
+                    out[line - y0, left - x0 : right - x0] = True
+                start = cut
+        at = stop
+    return out

@@ -1,0 +1,69 @@
+"""Images of every kind become upright RGB of 8 bits."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hilsplat.base.errors import ImageError
+from hilsplat.base.images import read_image
+
+GREY = np.array([[0, 128, 255], [10, 20, 30]], np.uint8)
+
+
+def saved(tmp_path: Path, image: Image.Image, suffix: str, **options: object) -> Path:
+    path = tmp_path / f"image{suffix}"
+    image.save(path, **options)
+    return path
+
+
+@pytest.mark.parametrize("mode", ["L", "LA", "P", "RGB", "RGBA", "1"])
+def test_grey_alpha_and_palettes_become_rgb(tmp_path, mode):
+    values = (GREY > 100).astype(np.uint8) * 255 if mode == "1" else GREY
+    image = Image.fromarray(values).convert(mode)
+    found = read_image(saved(tmp_path, image, ".png"))
+    np.testing.assert_array_equal(found, np.repeat(values[..., None], 3, axis=2))
+
+
+def test_transparent_pixels_keep_their_colour(tmp_path):
+    pixels = np.zeros((2, 2, 4), np.uint8)
+    pixels[..., 0] = 200
+    assert (read_image(saved(tmp_path, Image.fromarray(pixels), ".png"))[..., 0] == 200).all()
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_sixteen_bits_are_scaled_and_not_clipped(tmp_path, suffix):
+    deep = np.array([[0, 257, 32896, 65535, 128, 129]], np.uint16)
+    found = read_image(saved(tmp_path, Image.fromarray(deep), suffix))
+    # 257 steps are one; 128 is nearer to 0 and 129 nearer to 1
+    assert found[0, :, 0].tolist() == [0, 1, 128, 255, 0, 1]
+    assert (found[..., 0] == found[..., 2]).all()
+
+
+def test_sixteen_bit_colour_is_read(tmp_path):
+    import cv2
+
+    deep = np.zeros((2, 3, 3), np.uint16)
+    deep[..., 2] = 40000  # cv2 writes blue, green, red
+    cv2.imwrite(str(tmp_path / "deep.png"), deep)
+    found = read_image(tmp_path / "deep.png")
+    assert found[0, 0].tolist() == [pytest.approx(40000 / 257, abs=1), 0, 0]
+
+
+def test_cmyk_photographs_are_converted(tmp_path):
+    white, cyan = (0, 0, 0, 0), (255, 0, 0, 0)
+    image = Image.new("CMYK", (32, 16), white)
+    image.paste(cyan, (16, 0, 32, 16))
+    found = read_image(saved(tmp_path, image, ".jpg", quality=95)).astype(int)
+    assert np.abs(found[8, 4] - [255, 255, 255]).max() < 12
+    assert np.abs(found[8, 28] - [0, 255, 255]).max() < 12
+
+
+def test_pixels_of_unknown_range_are_refused(tmp_path):
+    path = saved(tmp_path, Image.fromarray(np.ones((2, 2), np.float32)), ".tif")
+    with pytest.raises(ImageError, match=r"image.tif cannot be read(.|\n)*floating-point"):
+        read_image(path)
+    path = saved(tmp_path, Image.fromarray(np.full((2, 2), 70000, np.int32)), ".tif")
+    with pytest.raises(ImageError, match=r"70000, are no 16 bits"):
+        read_image(path)

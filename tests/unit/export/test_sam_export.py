@@ -1,0 +1,142 @@
+"""A SAM exported by optimum gives through our code what transformers gives through its own."""
+
+import numpy as np
+import pytest
+
+from hilsplat.language.model_check import check_model
+from hilsplat.segment.candidates import crop_boxes, decode_candidates
+from hilsplat.segment.generate import masks_from_candidates
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.sam import SamModel, point_grid
+from hilsplat.settings import MasksSettings
+from tests.unit.segment.plain import quantise, restore
+
+TOLERANCE = 1e-4
+EVERYTHING = MasksSettings(
+    points_per_side=3,
+    points_per_batch=4,
+    predicted_iou_min=0,
+    stability_min=0,
+    min_area_px=1,
+    box_nms_iou=1,
+    nms_iou=1,
+    nms_inner=0,
+)
+"""No filter drops anything."""
+
+
+@pytest.fixture(scope="module")
+def ours(sam_parts) -> SamModel:
+    return SamModel.load(sam_parts[2])
+
+
+@pytest.fixture(scope="module")
+def theirs(sam_parts, photograph):
+    """Inputs and outputs of transformers' processor and model for a grid of points."""
+    import torch
+
+    model, processor, _ = sam_parts
+    points = point_grid(3) * (photograph.shape[1], photograph.shape[0])
+    inputs = processor(photograph, input_points=[[[point] for point in points.tolist()]], return_tensors="pt")
+    with torch.no_grad():
+        outputs = model(
+            pixel_values=inputs["pixel_values"],
+            input_points=inputs["input_points"].float(),
+            input_labels=torch.ones(inputs["input_points"].shape[:3], dtype=torch.long),
+            multimask_output=True,
+        )
+    return points, inputs, outputs
+
+
+def test_images_are_prepared_as_by_the_processor(ours, theirs, photograph):
+    pixels, frame = ours.prepare(photograph)
+    np.testing.assert_allclose(pixels, theirs[1]["pixel_values"].numpy(), atol=TOLERANCE)
+    assert frame.resized_hw == tuple(theirs[1]["reshaped_input_sizes"][0].tolist())
+    assert frame.original_hw == tuple(theirs[1]["original_sizes"][0].tolist())
+
+
+def test_embeddings_agree(ours, sam_parts, theirs, photograph):
+    import torch
+
+    model = sam_parts[0]
+    with torch.no_grad():
+        embeddings = model.get_image_embeddings(theirs[1]["pixel_values"])
+        positional = model.get_image_wide_positional_embeddings()
+    encoded = ours.encode(photograph)
+    assert embeddings.std() > 0.1
+    np.testing.assert_allclose(encoded.embeddings, embeddings.numpy(), atol=TOLERANCE)
+    np.testing.assert_allclose(encoded.positional[0], positional.numpy().reshape(16, 8, 8), atol=TOLERANCE)
+
+
+def test_scores_and_low_resolution_masks_agree(ours, theirs, photograph):
+    points, _, outputs = theirs
+    scores, logits = ours.decode(ours.encode(photograph), points)
+    assert outputs.pred_masks.std() > 0.1
+    np.testing.assert_allclose(scores, outputs.iou_scores[0].numpy(), atol=TOLERANCE)
+    np.testing.assert_allclose(logits, outputs.pred_masks[0].numpy(), atol=TOLERANCE)
+
+
+def test_masks_and_boxes_agree_at_full_size(ours, sam_parts, theirs, photograph):
+    _, inputs, outputs = theirs
+    rounded = quantise(outputs.pred_masks[0].numpy())
+    processor = sam_parts[1].image_processor
+    (full,) = processor.post_process_masks(
+        [outputs.pred_masks.new_tensor(rounded.astype(np.float32))],
+        inputs["original_sizes"],
+        inputs["reshaped_input_sizes"],
+    )
+    frame = ours.prepare(photograph)[1]
+    found = np.stack([restore(one, frame) for one in rounded.reshape(-1, *rounded.shape[2:])])
+    expected = full.numpy().reshape(found.shape)
+    assert 0.02 < expected.mean() < 0.98
+    assert (found != expected).mean() < 1e-4  # rounding may decide on the border itself
+    from transformers.models.sam.image_processing_sam import _batched_mask_to_box
+
+    rows = expected.any(axis=(1, 2)) & (found == expected).all(axis=(1, 2))
+    assert rows.sum() > 5
+    number = int(rows.sum())
+    ones = np.ones(number, np.float32)
+    boxes = HierarchicalMasks.from_dense(found[rows], np.ones(number, np.uint8), ones, ones).box_xyxy
+    theirs_xyxy = _batched_mask_to_box(full.reshape(found.shape)[rows]).numpy()
+    # theirs name the last row and column inside, ours the first outside
+    np.testing.assert_array_equal(boxes - [0, 0, 1, 1], theirs_xyxy)
+
+
+def test_the_stage_finds_the_masks_of_every_prompt(ours, theirs, photograph):
+    candidates = decode_candidates(photograph, ours, EVERYTHING)
+    masks = masks_from_candidates(candidates, photograph.shape[:2], ours, EVERYTHING)
+    frame = ours.prepare(photograph)[1]
+    rounded = quantise(theirs[2].pred_masks[0].numpy())
+    scores = np.clip(theirs[2].iou_scores[0].numpy(), 0, 1)
+    for head, level in ((0, 3), (1, 2), (2, 1)):
+        expected = {
+            restore(one, frame).tobytes(): score
+            for one, score in zip(rounded[:, head], scores[:, head], strict=True)
+        }
+        rows = np.flatnonzero(masks.level == level)
+        found = {
+            mask.tobytes(): score
+            for mask, score in zip(masks.dense(rows), masks.predicted_iou[rows], strict=True)
+        }
+        expected.pop(np.zeros(photograph.shape[:2], bool).tobytes(), None)
+        assert found
+        # a logit within 1e-4 of a rounding step may fall to the other side and move one pixel
+        common = found.keys() & expected.keys()
+        assert len(common) >= 0.7 * len(found)
+        for mask in common:
+            assert found[mask] == pytest.approx(expected[mask], abs=TOLERANCE)
+
+
+def test_crops_are_those_of_the_processor(sam_parts, photograph):
+    processor = sam_parts[1].image_processor
+    boxes, *_ = processor.generate_crop_boxes(
+        photograph, target_size=64, crop_n_layers=2, points_per_crop=4, return_tensors="pt"
+    )
+    found, _ = crop_boxes(photograph.shape[:2], 2)
+    np.testing.assert_array_equal(found, boxes.numpy())
+
+
+def test_check_describes_the_export(sam_parts):
+    text = check_model(sam_parts[2])
+    assert "kind       sam" in text
+    assert "image      64 x 64 px" in text

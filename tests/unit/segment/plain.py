@@ -1,0 +1,57 @@
+"""Plain versions of what the segmenter computes in compiled loops: picture by picture, obviously right."""
+
+import cv2
+import numpy as np
+
+from hilsplat.segment.candidates import BAND_PX, Candidates
+from hilsplat.segment.sam import LOGIT_STEP, Frame
+
+
+def quantise(logits: np.ndarray) -> np.ndarray:
+    """Logits in steps, clipped to +-127 of them."""
+    return np.clip(np.rint(logits / LOGIT_STEP), -127, 127).astype(np.int8)
+
+
+def restore(steps: np.ndarray, frame: Frame) -> np.ndarray:
+    """One low-resolution mask at the image's size: two bilinear steps, then what exceeds 0."""
+    padded = cv2.resize(steps.astype(np.float32), frame.padded_hw[::-1], interpolation=cv2.INTER_LINEAR)
+    cropped = padded[: frame.resized_hw[0], : frame.resized_hw[1]]
+    return cv2.resize(cropped, frame.original_hw[::-1], interpolation=cv2.INTER_LINEAR) > 0
+
+
+def flatten_far(steps: np.ndarray) -> np.ndarray:
+    """Logits farther than `BAND_PX` from a change of sign become the extreme of their sign."""
+    inside = (steps > 0).astype(np.uint8)
+    window = np.ones((2 * BAND_PX + 1, 2 * BAND_PX + 1), np.uint8)
+    band = (cv2.dilate(inside, window) > 0) & (cv2.erode(inside, window) == 0)
+    return np.where(band, steps, np.where(steps > 0, 127, -127)).astype(np.int8)
+
+
+def unpacked(candidates: Candidates) -> np.ndarray:
+    """All candidates' logits as whole pictures."""
+    out = np.full((len(candidates), *candidates.low_hw), -127, np.int8)
+    for row, (x0, y0, x1, y1) in enumerate(candidates.window_xyxy):
+        values = candidates.logits[candidates.offsets[row] : candidates.offsets[row + 1]]
+        out[row, y0:y1, x0:x1] = values.reshape(y1 - y0, x1 - x0)
+    return out
+
+
+def mend(mask: np.ndarray, min_area_px: int) -> np.ndarray:
+    """Small holes filled, then small islands dropped but for the largest; 8-connected."""
+    mended = mask.copy()
+    _, holes, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=8)
+    for label in range(1, len(stats)):
+        if stats[label, cv2.CC_STAT_AREA] < min_area_px:
+            mended[holes == label] = True
+    _, islands, stats, _ = cv2.connectedComponentsWithStats(mended.astype(np.uint8), connectivity=8)
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    for label, area in enumerate(areas, start=1):
+        if area < min_area_px and label != 1 + areas.argmax():
+            mended[islands == label] = False
+    return mended
+
+
+def smooth_logits(count: int, side: int, seed: int) -> np.ndarray:
+    """Random hills and valleys, float32 (count, side, side)."""
+    noise = np.random.default_rng(seed).normal(size=(count, side, side)).astype(np.float32)
+    return np.stack([36 * cv2.GaussianBlur(one, (0, 0), 3) for one in noise])
