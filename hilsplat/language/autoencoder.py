@@ -1,4 +1,4 @@
-"""The scene autoencoder: CLIP vectors to a few numbers on the unit sphere, and back."""
+"""The scene autoencoder: CLIP vectors to a few numbers, and back, by a network or linearly."""
 
 import json
 import logging
@@ -24,6 +24,7 @@ from hilsplat.base.artifacts import (
 )
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.progress import stage_log
+from hilsplat.language.linear_code import METADATA_KEY, LinearCode
 from hilsplat.language.mask_rows import Contributions, mask_embeddings
 from hilsplat.language.semantic_tree import SemanticTree
 from hilsplat.settings import AutoencoderSettings
@@ -32,7 +33,6 @@ logger = logging.getLogger(__name__)
 
 ENCODER_WIDTHS = (256, 128, 64, 32)
 DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
-METADATA_KEY = "hilsplat"
 CHUNK_ROWS = 65_536
 """Rows decoded at once: 128 MiB of 512 channels."""
 
@@ -96,6 +96,11 @@ class Autoencoder(nn.Module):
             out[start : start + len(part)] = self.decode(part).numpy()
         return out
 
+    @torch.no_grad()
+    def decode_raw_array(self, latents: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:
+        """What the decoder says before it is scaled to unit length: piecewise linear in the latents."""
+        return self.decoder(torch.from_numpy(np.ascontiguousarray(latents))).numpy()
+
     def save(self, path: Path) -> None:
         """Write a .safetensors file; the same weights give the same bytes."""
         about = json.dumps({"channels": self.channels, "latent": self.latent}, sort_keys=True)
@@ -103,25 +108,30 @@ class Autoencoder(nn.Module):
         with atomic_path(path) as temporary:
             safetensors.torch.save_file(tensors, temporary, metadata={METADATA_KEY: about})
 
-    @staticmethod
-    def load(folder: Path) -> "Autoencoder":
-        """Read `autoencoder.safetensors` of a finished folder.
 
-        Raises:
-            ArtifactError: the file is missing or damaged.
-        """
-        path = autoencoder_file(folder)
-        try:
-            with safe_open(path, framework="pt") as file:
-                about = json.loads(file.metadata()[METADATA_KEY])
-                state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        except (FileNotFoundError, SafetensorError, KeyError, TypeError) as error:
-            raise ArtifactError(
-                f"{path} cannot be read: {error}", fix="run the autoencoder stage again"
-            ) from error
+Code = Autoencoder | LinearCode
+
+
+def load_code(folder: Path) -> Code:
+    """Read the code of a finished folder, network or linear.
+
+    Raises:
+        ArtifactError: the file is missing or damaged.
+    """
+    path = autoencoder_file(folder)
+    try:
+        with safe_open(path, framework="pt") as file:
+            about = json.loads(file.metadata()[METADATA_KEY])
+            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        if about.get("code") == "pca":
+            return LinearCode(state["mean"].numpy(), state["basis"].numpy())
         model = Autoencoder(about["channels"], about["latent"])
-        model.load_state_dict(state)
-        return model.eval()
+    except (FileNotFoundError, SafetensorError, KeyError, TypeError) as error:
+        raise ArtifactError(
+            f"{path} cannot be read: {error}", fix="run the autoencoder stage again"
+        ) from error
+    model.load_state_dict(state)
+    return model.eval()
 
 
 def autoencoder_file(folder: Path) -> Path:
@@ -232,7 +242,11 @@ def run_autoencoder(
     clip = mask_embeddings(clip_folder, contributions)
     target, train = mask_targets(clip, tree, settings.targets)
     with stage_log("autoencoder", read_index(contributions_folder)["scene"]) as counts:
-        model = train_autoencoder(train, settings, seed)
+        model: Code
+        if settings.code == "pca":
+            model = LinearCode.fit(train, settings.latent)
+        else:
+            model = train_autoencoder(train, settings, seed)
         with one_torch_thread():
             latents = model.encode_array(target)
             decoded = model.decode_array(model.encode_array(train))
@@ -245,6 +259,7 @@ def run_autoencoder(
             write_index(
                 folder,
                 {view: {} for view in contributions.views},
+                code=settings.code,
                 channels=model.channels,
                 latent=model.latent,
                 vectors=len(train),

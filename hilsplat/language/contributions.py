@@ -14,6 +14,8 @@ Every loss of the language field, and the 3D semantic tree, need nothing else of
 
 import hashlib
 import logging
+from dataclasses import dataclass
+from functools import cache as cache_calls
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +37,10 @@ from hilsplat.base.code_hash import code_hash
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import stage_log, track
-from hilsplat.language.quadratic import Gram, QuadraticBuilder, StackedWeights
+from hilsplat.language.quadratic import Gram, StackedWeights
+from hilsplat.language.quadratic_builder import QuadraticBuilder, QuadraticCheckpoint
+from hilsplat.language.streams import ArrayStream, MatrixStream
+from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ContributionsSettings
@@ -158,6 +163,27 @@ def labelled_rows(weights: sp.csr_matrix, labels: Int32[np.ndarray, "P 3"]) -> S
     return StackedWeights(weights[rows], valid[rows])
 
 
+@dataclass(frozen=True)
+class _View:
+    """One train view: its masks, and the digest of everything its matrices depend on."""
+
+    name: str
+    masks_path: Path
+    key: str
+
+    def masks(self, camera: Camera) -> HierarchicalMasks:
+        """Read the masks and check their size."""
+        masks = HierarchicalMasks.load(self.masks_path)
+        if masks.size_hw != camera.size_hw:
+            raise MisalignedArtifactError(
+                f"masks of view {self.name} do not fit its camera",
+                expected=f"{camera.size_hw[0]} x {camera.size_hw[1]} (height x width)",
+                found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
+                fix="run the masks stage again",
+            )
+        return masks
+
+
 def run_contributions(
     scene_folder: Path,
     gaussians_ply: Path,
@@ -169,118 +195,114 @@ def run_contributions(
 ) -> None:
     """One pass over the train views: write A, A_half, S, mass, and G or W.
 
-    A killed run finds the finished views' matrices in the cache. W is rasterised again, which is
-    cheaper than keeping it.
+    Views are worked on one by one and their rows go to disk at once; memory holds one view, and G as far
+    as it is summed. A killed run finds finished views' matrices in the cache, and G as it was at most
+    `CHECKPOINT_SECONDS` (and one view) before; W of views that G lacks is rasterised again.
 
     Raises:
         MisalignedArtifactError: masks and images differ in size.
         ArtifactError: no train view has masks.
     """
     scene = Scene.load(scene_folder)
-    views = scene.views("train")
     gaussians = load_ply(gaussians_ply)
     gaussians_sha256 = sha256_of_file(gaussians_ply)
-    store = ViewCache(Path(cache) / "contributions")
-    code = code_hash("hilsplat.language.contributions")
-    parts: list[dict[str, np.ndarray]] = []
-    builder = QuadraticBuilder(len(gaussians), settings.keep, threads)
-    rows: dict[str, list[np.ndarray]] = {"view": [], "mask": [], "level": [], "area_px": []}
     read_index(masks_folder)
-    with stage_log("contributions", scene.name) as counts:
+    about = {
+        "code": code_hash("hilsplat.language.contributions"),
+        "gaussians": gaussians_sha256,
+        "min_weight": settings.min_weight,
+    }
+    views = [_view(scene, name, Path(masks_folder), about) for name in scene.views("train")]
+    store = ViewCache(Path(cache) / "contributions")
+    checkpoint = QuadraticCheckpoint(store.folder / "partial", [view.key for view in views], settings.keep)
+    rows: dict[str, list[np.ndarray]] = {
+        name: [] for name in ("view", "mask", "level", "area_px", "pixels", "half_pixels")
+    }
+    with stage_log("contributions", scene.name) as counts, atomic_folder(out) as folder:
         device = choose_device(settings.device)
-        for number, view in enumerate(track(views, "contributions of views")):
-            camera = scene.cameras[view]
-            masks_path = Path(masks_folder) / f"{view}.npz"
-            masks = HierarchicalMasks.load(masks_path)
-            if masks.size_hw != camera.size_hw:
-                raise MisalignedArtifactError(
-                    f"masks of view {view} do not fit its camera",
-                    expected=f"{camera.size_hw[0]} x {camera.size_hw[1]} (height x width)",
-                    found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
-                    fix="run the masks stage again",
+        builder = QuadraticBuilder(len(gaussians), settings.keep, threads)
+        summed = checkpoint.resume(builder)
+        matrices = {name: MatrixStream(folder / name) for name in MATRICES}
+        with ArrayStream(folder / "mass.npy", np.float32, len(gaussians)) as mass:
+            for number, view in enumerate(track(views, "contributions of views")):
+                camera = scene.cameras[view.name]
+                masks = view.masks(camera)
+
+                @cache_calls
+                def weights(camera: Camera = camera) -> sp.csr_matrix:
+                    raw = pixel_weights(
+                        gaussians, camera, min_weight=settings.min_weight, threads=threads, device=device
+                    )
+                    return normalised_weights(raw)[0]
+
+                part = store.get(
+                    view.key,
+                    lambda view=view, weights=weights, masks=masks: view_contributions(
+                        view.name, weights(), masks
+                    ),
                 )
-            raw = pixel_weights(
-                gaussians, camera, min_weight=settings.min_weight, threads=threads, device=device
-            )
-            weights, _ = normalised_weights(raw)
-            key = sha256_of_json(
-                {
-                    "code": code,
-                    "gaussians": gaussians_sha256,
-                    "masks": sha256_of_file(masks_path),
-                    "camera": sha256_of_bytes(camera.cam_from_world.tobytes(), camera.K.tobytes()),
-                    "view": view,
-                    "min_weight": settings.min_weight,
-                }
-            )
-            parts.append(
-                store.get(
-                    key,
-                    lambda view=view, weights=weights, masks=masks: view_contributions(view, weights, masks),
-                )
-            )
-            builder.add(labelled_rows(weights, label_maps(masks)))
-            rows["view"].append(np.full(len(masks), number, np.int32))
-            rows["mask"].append(np.arange(len(masks), dtype=np.int32))
-            rows["level"].append(masks.level)
-            rows["area_px"].append(masks.area_px)
-        num_masks = sum(len(part) for part in rows["view"])
-        if not num_masks:
+                for name, matrix in matrices.items():
+                    matrix.append(*(part[f"{name}_{what}"] for what in ("data", "indices", "indptr")))
+                mass.append(part["mass"][None])
+                rows["view"].append(np.full(len(masks), number, np.int32))
+                rows["mask"].append(np.arange(len(masks), dtype=np.int32))
+                rows["level"].append(masks.level)
+                rows["area_px"].append(masks.area_px)
+                rows["pixels"].append(part["pixels"])
+                rows["half_pixels"].append(part["half_pixels"])
+                if number >= summed:
+                    builder.add(labelled_rows(weights(), label_maps(masks)))
+                    checkpoint.offer(builder, number + 1)
+        for matrix in matrices.values():
+            matrix.close()
+        if not sum(len(part) for part in rows["view"]):
             raise ArtifactError(
                 f"no train view of {scene.name} has a mask",
                 fix="loosen masks.predicted_iou_min or masks.stability_min, then run the masks stage again",
             )
+        np.save(folder / "means.npy", gaussians.means.detach().numpy().astype(np.float32))
+        write_npz(folder / "rows.npz", **{name: np.concatenate(values) for name, values in rows.items()})
         quadratic = builder.finish()
-        with atomic_folder(out) as folder:
-            for name in MATRICES:
-                _save_stacked(folder / f"{name}.npz", name, parts)
-            write_npz(
-                folder / "mass.npz",
-                mass=np.stack([part["mass"] for part in parts]),
-                means=gaussians.means.detach().numpy().astype(np.float32),
-            )
-            write_npz(
-                folder / "rows.npz",
-                **{name: np.concatenate(values) for name, values in rows.items()},
-                pixels=np.concatenate([part["pixels"] for part in parts]),
-                half_pixels=np.concatenate([part["half_pixels"] for part in parts]),
-            )
-            kept = "G" if isinstance(quadratic, Gram) else "W"
-            quadratic.save(folder / f"{kept}.npz")
-            counts |= {
-                "views": len(views),
-                "masks": num_masks,
-                "kept": kept,
-                "nonzeros": quadratic.nonzeros,
-                "nonzeros of W": builder.weights_nonzeros,
-                "from_cache": store.hits,
-            }
-            write_index(
-                folder,
-                {view: {"masks": len(part)} for view, part in zip(views, rows["view"], strict=True)},
-                scene=scene.name,
-                num_gaussians=len(gaussians),
-                gaussians_sha256=gaussians_sha256,
-                masks_sha256=sha256_of_file(Path(masks_folder) / INDEX),
-                num_masks=num_masks,
-                quadratic=kept,
-                nonzeros={
-                    **{name: int(sum(len(part[f"{name}_data"]) for part in parts)) for name in MATRICES},
-                    "W": builder.weights_nonzeros,
-                    kept: quadratic.nonzeros,
-                },
-            )
+        kept = "G" if isinstance(quadratic, Gram) else "W"
+        quadratic.save(folder / f"{kept}.npz")
+        counts |= {
+            "views": len(views),
+            "masks": sum(len(part) for part in rows["view"]),
+            "kept": kept,
+            "nonzeros": quadratic.nonzeros,
+            "nonzeros of W": builder.weights_nonzeros,
+            "from_cache": store.hits,
+        }
+        write_index(
+            folder,
+            {view.name: {"masks": len(part)} for view, part in zip(views, rows["view"], strict=True)},
+            scene=scene.name,
+            num_gaussians=len(gaussians),
+            gaussians_sha256=gaussians_sha256,
+            masks_sha256=sha256_of_file(Path(masks_folder) / INDEX),
+            num_masks=counts["masks"],
+            quadratic=kept,
+            nonzeros={
+                **{name: matrix.nonzeros for name, matrix in matrices.items()},
+                "W": builder.weights_nonzeros,
+                kept: quadratic.nonzeros,
+            },
+        )
+    checkpoint.forget()
 
 
-def _save_stacked(path: Path, name: str, parts: list[dict[str, np.ndarray]]) -> None:
-    """Write the rows of all views one below the other as one CSR matrix."""
-    lengths = np.concatenate([np.diff(part[f"{name}_indptr"]) for part in parts])
-    write_npz(
-        path,
-        data=np.concatenate([part[f"{name}_data"] for part in parts]),
-        indices=np.concatenate([part[f"{name}_indices"] for part in parts]),
-        indptr=np.concatenate(([0], np.cumsum(lengths, dtype=np.int64))),
+def _view(scene: Scene, name: str, masks_folder: Path, about: dict) -> _View:
+    path = masks_folder / f"{name}.npz"
+    camera = scene.cameras[name]
+    key = sha256_of_json(
+        {
+            **about,
+            "masks": sha256_of_file(path),
+            "camera": sha256_of_bytes(camera.cam_from_world.tobytes(), camera.K.tobytes()),
+            "view": name,
+        }
     )
+    return _View(name, path, key)
 
 
 def _single(matrix: sp.spmatrix) -> sp.csr_matrix:

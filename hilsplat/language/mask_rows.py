@@ -8,9 +8,10 @@ import scipy.sparse as sp
 from jaxtyping import Float32, Int32, Int64, UInt8
 
 from hilsplat.base.artifacts import read_index, read_npy, read_npz
-from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.language.quadratic import Quadratic, load_quadratic
+from hilsplat.language.streams import HEADER_BYTES
 
 
 @dataclass(frozen=True)
@@ -51,19 +52,17 @@ class Contributions:
         return np.flatnonzero(self.level == int(level))
 
     def matrix(self, name: str) -> sp.csr_matrix:
-        """Read `A`, `A_half` or `S` (M x N)."""
-        arrays = read_npz(self.folder / f"{name}.npz")
-        return sp.csr_matrix(
-            (arrays["data"], arrays["indices"], arrays["indptr"]), shape=(len(self), self.num_gaussians)
-        )
+        """`A`, `A_half` or `S` (M x N); read from the file as it is used, not held in memory."""
+        parts = (_mapped(self.folder / name / f"{part}.npy") for part in ("data", "indices", "indptr"))
+        return sp.csr_matrix(tuple(parts), shape=(len(self), self.num_gaussians), copy=False)
 
     def mass(self) -> Float32[np.ndarray, "V N"]:
-        """Visible mass of each Gaussian in each train view, px."""
-        return read_npz(self.folder / "mass.npz")["mass"]
+        """Visible mass of each Gaussian in each train view, px; read as it is used."""
+        return _mapped(self.folder / "mass.npy")
 
     def means(self) -> Float32[np.ndarray, "N 3"]:
         """Centres of the Gaussians, scene units."""
-        return read_npz(self.folder / "mass.npz")["means"]
+        return read_npy(self.folder / "means.npy")
 
     def quadratic(self) -> Quadratic:
         """Read G, or the stacked weights where those are smaller."""
@@ -81,6 +80,24 @@ class Contributions:
             index["gaussians_sha256"],
             **read_npz(folder / "rows.npz"),
         )
+
+
+def _mapped(path: Path) -> np.ndarray:
+    """An array that stays in its file.
+
+    Raises:
+        ArtifactError: the file is missing or damaged.
+    """
+    try:
+        # A file without a single number cannot be mapped.
+        mode = "r" if path.stat().st_size > HEADER_BYTES else None
+        return np.load(path, mmap_mode=mode, allow_pickle=False).view(np.ndarray)
+    except FileNotFoundError as error:
+        raise ArtifactError(f"{path} is missing", fix="run the contributions stage again") from error
+    except (ValueError, OSError) as error:
+        raise ArtifactError(
+            f"{path} cannot be read: {error}", fix="delete the folder and run the contributions stage again"
+        ) from error
 
 
 def mask_embeddings(clip_folder: Path, contributions: Contributions) -> Float32[np.ndarray, "M C"]:

@@ -1,22 +1,41 @@
-"""Answer texts: rank the nodes of the semantic tree, search along a path, or decode the rendered field."""
+"""Answer texts: rank the nodes of the semantic tree, search along a path, or decode the rendered field.
+
+from hilsplat.language.query import LanguageScene
+
+scene = LanguageScene.open("results/photos/desk")
+for hit in scene.query("mug handle", level="auto"):
+    print(hit.score, hit.level.label, hit.centroid, hit.oriented_box.size, hit.best_views)
+scene.query("mug > handle")                     # a handle inside a mug
+scene.node_masks("000.png", [hit.node])         # (H, W) bool
+scene.gaussians_of([hit.node])                  # rows of gaussians.ply
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float32, Int64, UInt8
 
-from hilsplat.base.artifacts import sha256_of_file
-from hilsplat.base.errors import MisalignedArtifactError, SettingsError
+from hilsplat.base.errors import SettingsError
 from hilsplat.base.images import to_uint8
-from hilsplat.base.levels import LEVELS, NONE, Level
-from hilsplat.language.autoencoder import Autoencoder, autoencoder_file
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.language.autoencoder import Code, autoencoder_file, load_code
 from hilsplat.language.contributions import normalised_weights
 from hilsplat.language.field import LanguageField
-from hilsplat.language.relevancy import min_max, relevancy
+from hilsplat.language.field_colours import field_colours
+from hilsplat.language.finished import FinishedScene, require_same
+from hilsplat.language.hits import Hit
+from hilsplat.language.latent_relevancy import LatentRelevancy
+from hilsplat.language.node_search import NodeHits, automatic_level, best_nodes, search_path
+from hilsplat.language.relevancy import relevancy
 from hilsplat.language.semantic_tree import SemanticTree
+from hilsplat.language.tree_nodes import node_means
+from hilsplat.language.view_nodes import ViewNodes
+from hilsplat.language.view_store import ViewStore
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import ContributionsSettings, EvaluateSettings
 from hilsplat.splat.gaussians import Gaussians
@@ -25,55 +44,13 @@ CANONICAL: tuple[str, ...] = EvaluateSettings().canonical
 RELEVANCY_SCALE: float = EvaluateSettings().relevancy_scale
 NODE_SELECT: float = EvaluateSettings().node_select
 
-AUTO_SHARE = 0.9
-"""The automatic level climbs from the best node to its parent while the parent reaches this share of
-the range of all nodes: noisy crops of fine nodes win too often where the text means the whole."""
-
-CACHED_VIEWS = 64
 PATH_SEPARATOR = ">"
 
+MIN_LATENT_SHARE = 0.5
+"""A pixel has a latent at a level where Gaussians with one make up more than this share of it."""
+
 TextEncoder = Callable[[list[str]], np.ndarray]
-
-
-@dataclass(frozen=True)
-class NodeHits:
-    """Nodes that answer a text.
-
-    Attributes:
-        ids: rows of the semantic tree, best first.
-        scores: their relevancies.
-        level: the level that was searched.
-        route: how they were reached: "flat", or on a path "child", "descendant" or "fallback" (the
-            whole level, as the nodes before hold nothing there).
-    """
-
-    ids: Int64[np.ndarray, " n"]
-    scores: Float32[np.ndarray, " n"]
-    level: Level
-    route: str = "flat"
-
-
-@dataclass(frozen=True)
-class Hit:
-    """One ranked answer, for people.
-
-    Attributes:
-        node: row of the semantic tree.
-        level: its level.
-        score: relevancy in (0, 1); 0.5 is no better than a generic phrase.
-        centroid: scene units.
-        box: lower and upper corner, scene units.
-        best_views: up to three train views that show it largest.
-        route: as in `NodeHits`.
-    """
-
-    node: int
-    level: Level
-    score: float
-    centroid: tuple[float, float, float]
-    box: tuple[tuple[float, float, float], tuple[float, float, float]]
-    best_views: tuple[str, ...]
-    route: str
+Answerer = Literal["tree", "field"]
 
 
 @dataclass(frozen=True)
@@ -87,27 +64,62 @@ class LanguageScene:
         language: the field.
         autoencoder: its decoder.
         encode_texts: unit CLIP vectors of texts.
+        pixel_weights: compositing weights of a view (pixels x Gaussians).
         canonical: phrases that a text must beat.
         relevancy_scale: scale of the cosines.
-        threads: for rasterising.
-        pixel_weights: compositing weights of a view (pixels x Gaussians).
+        node_select: share of the range of scores from which nodes are selected.
+        threads: for look-ups.
     """
 
     scene: Scene
     gaussians: Gaussians
     tree: SemanticTree
     language: LanguageField
-    autoencoder: Autoencoder
+    autoencoder: Code
     encode_texts: TextEncoder
     pixel_weights: Callable[[str], sp.csr_matrix]
     canonical: tuple[str, ...] = CANONICAL
     relevancy_scale: float = RELEVANCY_SCALE
     threads: int = 1
-    _views: dict[str, tuple[sp.csr_matrix, np.ndarray]] = field(default_factory=dict, repr=False)
+    node_select: float = NODE_SELECT
+    _views: ViewStore = field(default_factory=ViewStore, repr=False)
     _texts: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
 
     @staticmethod
-    def open(
+    def open(folder: Path | str, variant: str = "default", *, threads: int = 1) -> "LanguageScene":
+        """Open `results/<dataset>/<scene>` with the settings that made it.
+
+        Canonical phrases, scale and selection threshold are those that the variant was evaluated with,
+        read from its provenance.
+
+        Args:
+            folder: of a finished scene.
+            variant: named set of settings whose files answer.
+            threads: for rasterising and look-ups.
+
+        Raises:
+            ArtifactError: the scene is not finished.
+            MisalignedArtifactError: its parts do not belong together.
+        """
+        parts = FinishedScene.locate(Path(folder), variant)
+        settings = parts.evaluate_settings()
+        return LanguageScene.from_parts(
+            parts.scene,
+            parts.gaussians,
+            parts.semantic_tree,
+            parts.language,
+            parts.autoencoder,
+            parts.clip_model,
+            canonical=settings.canonical,
+            template=settings.template,
+            relevancy_scale=settings.relevancy_scale,
+            node_select=settings.node_select,
+            min_weight=parts.contributions_settings().min_weight,
+            threads=threads,
+        )
+
+    @staticmethod
+    def from_parts(
         scene_folder: Path,
         gaussians_ply: Path,
         semantic_tree: Path,
@@ -116,10 +128,13 @@ class LanguageScene:
         clip_model_folder: Path,
         *,
         canonical: Sequence[str] = CANONICAL,
+        template: str = "{}",
         relevancy_scale: float = RELEVANCY_SCALE,
+        node_select: float = NODE_SELECT,
+        min_weight: float = ContributionsSettings().min_weight,
         threads: int = 1,
     ) -> "LanguageScene":
-        """Read a scene's artifacts and check that they belong together.
+        """Read a scene's artifacts one by one and check that they belong together.
 
         Raises:
             MisalignedArtifactError: tree or field were made for other Gaussians, or the field for
@@ -136,14 +151,15 @@ class LanguageScene:
         require_same("semantic tree", scene.name, gaussians_ply, tree.gaussians_sha256)
         require_same("language field", scene.name, gaussians_ply, features.gaussians_sha256)
         require_same("language field", scene.name, autoencoder_file(autoencoder), features.autoencoder_sha256)
-        clip = ClipModel.load(clip_model_folder, threads)
-        min_weight = ContributionsSettings().min_weight
+        clip = ClipModel.load(clip_model_folder, threads, template)
+        code = load_code(autoencoder)
+        clip.require_width(code.channels, f"autoencoder {autoencoder}")
         return LanguageScene(
             scene,
             gaussians,
             tree,
             features,
-            Autoencoder.load(autoencoder),
+            code,
             clip.embed_texts,
             lambda view: pixel_weights(
                 gaussians, scene.cameras[view], min_weight=min_weight, threads=threads
@@ -151,15 +167,113 @@ class LanguageScene:
             tuple(canonical),
             relevancy_scale,
             threads,
+            node_select,
         )
 
-    def view_weights(self, view: str) -> tuple[sp.csr_matrix, Float32[np.ndarray, " P"]]:
-        """W of a view with rows divided by alpha (empty below half coverage), and alpha; kept in memory."""
-        if view not in self._views:
-            if len(self._views) >= CACHED_VIEWS:
-                self._views.pop(next(iter(self._views)))
-            self._views[view] = normalised_weights(self.pixel_weights(view))
-        return self._views[view]
+    # -- answers ----------------------------------------------------------------------------------
+
+    def query(
+        self,
+        text: str,
+        level: str = "auto",
+        *,
+        answerer: Answerer = "tree",
+        threshold: float | None = None,
+        limit: int = 10,
+    ) -> list[Hit]:
+        """Ranked answers to a text, or to a path such as "bear > head > nose"; several for "mugs".
+
+        Args:
+            text: words, or words separated by ">".
+            level: "whole", "part", "subpart" or "auto"; a path brings its own.
+            answerer: "tree": nodes answer with their averaged CLIP vectors; "field": with what the
+                paper's field holds for their Gaussians, decoded.
+            threshold: nodes above this share of the range between the level's worst and best node are
+                hits; None: the scene's own (`node_select`).
+            limit: answers at most.
+
+        Raises:
+            SettingsError: the text is empty or the level is unknown.
+        """
+        hits = self.find(text, level, threshold, answerer)
+        return [
+            Hit.of(self.tree, int(node), float(score), hits.route)
+            for node, score in zip(hits.ids[:limit], hits.scores[:limit], strict=True)
+        ]
+
+    def find(
+        self, text: str, level: str = "auto", threshold: float | None = None, answerer: Answerer = "tree"
+    ) -> NodeHits:
+        """Like `query`, as rows of the tree."""
+        path = tuple(part.strip() for part in text.split(PATH_SEPARATOR))
+        if not all(path):
+            raise SettingsError(
+                f"the query {text!r} holds no text", fix='write words, or "bear > head > nose"'
+            )
+        if len(path) > 1:
+            return self.select_path(path, threshold, answerer)
+        names = {each.label: each for each in LEVELS}
+        if level != "auto" and level not in names:
+            raise SettingsError(
+                f"level {level!r} is unknown", expected=f"auto, {', '.join(names)}", found=level
+            )
+        return self.select_nodes(path[0], level=names.get(level), threshold=threshold, answerer=answerer)
+
+    def select_nodes(
+        self,
+        text: str,
+        *,
+        level: Level | None,
+        threshold: float | None = None,
+        within: Int64[np.ndarray, " c"] | None = None,
+        answerer: Answerer = "tree",
+    ) -> NodeHits:
+        """Nodes whose margin, stretched to [0, 1] over the level's nodes, reaches the threshold.
+
+        Args:
+            text: the query.
+            level: which nodes compete; None chooses it (see `automatic_level`).
+            threshold: share of the range between the worst and the best node.
+            within: only these nodes compete, such as the children of another answer.
+            answerer: as in `query`.
+        """
+        scores = self.node_relevancy([text], answerer)[0]
+        if level is None:
+            level = automatic_level(self.tree, scores, within)
+        candidates = self.tree.nodes_of(level)
+        if within is not None:
+            candidates = np.intersect1d(candidates, within)
+        return best_nodes(scores, candidates, level, self.node_select if threshold is None else threshold)
+
+    def select_path(
+        self, path: tuple[str, ...], threshold: float | None = None, answerer: Answerer = "tree"
+    ) -> NodeHits:
+        """Search each text inside the nodes that answered the one before; see `search_path`.
+
+        Raises:
+            SettingsError: the path is empty or longer than there are levels.
+        """
+        scores = self.node_relevancy(list(path), answerer) if path else np.zeros((0, len(self.tree)))
+        return search_path(self.tree, scores, path, self.node_select if threshold is None else threshold)
+
+    def gaussians_of(self, ids: Sequence[int] | Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " g"]:
+        """Gaussians of any of the nodes."""
+        return np.flatnonzero(np.isin(self.tree.node_of_gaussian, np.asarray(ids)).any(axis=1))
+
+    def node_masks(self, view: str, ids: Sequence[int] | Int64[np.ndarray, " n"]) -> Bool[np.ndarray, "H W"]:
+        """Pixels where Gaussians of the nodes make up more than half of what is seen."""
+        ids = np.asarray(ids, np.int64)
+        height, width = self.scene.cameras[view].size_hw
+        chosen = np.zeros(len(self.tree), np.bool_)
+        chosen[ids] = True
+        levels = np.unique(self.tree.level[ids])
+        if len(levels) == 1:
+            return self._view_nodes(view, Level(int(levels[0]))).mask(chosen).reshape(height, width)
+        member = np.zeros(len(self.tree.node_of_gaussian), np.float32)
+        member[self.gaussians_of(ids)] = 1
+        return (self.view_weights(view)[0] @ member > 0.5).reshape(height, width)
+
+    # -- relevancy --------------------------------------------------------------------------------
 
     def text_vectors(self, texts: Sequence[str]) -> Float32[np.ndarray, "T C"]:
         """Unit CLIP vectors of texts; each text is encoded once."""
@@ -176,250 +290,117 @@ class LanguageScene:
             embeddings, self.text_vectors(texts), self.text_vectors(self.canonical), self.relevancy_scale
         )
 
-    # -- the rendered field, as the paper answers -------------------------------------------------
-
-    def field_relevancy(self, texts: Sequence[str], view: str) -> Float32[np.ndarray, "T 3 H W"]:
-        """Rendered latent -> decoder -> relevancy, at every pixel and level.
-
-        Pixels that the Gaussians do not cover get the least relevancy of the covered ones, so that
-        they are never selected and do not stretch the range.
-        """
-        weights, _ = self.view_weights(view)
-        covered = np.flatnonzero(np.diff(weights.indptr))
-        rows = weights[covered]
-
-        def one_level(index: int) -> np.ndarray:
-            latents = rows @ np.ascontiguousarray(self.language.features[:, index])
-            return self.relevancy(self.autoencoder.decode_array(latents.astype(np.float32)), texts)
-
-        return self._maps(view, covered, one_level, len(texts))
-
-    def field_image(self, view: str, level: Level) -> UInt8[np.ndarray, "H W 3"]:
-        """The field of a level as colours: its three principal directions over all Gaussians.
-
-        Each direction's sign is fixed (largest component positive) and its 2nd to 98th percentile
-        over the Gaussians is stretched to the colour range, so that views share their colours.
-        Uncovered pixels are black.
-        """
-        colours = self._field_colours(level)
-        weights, _ = self.view_weights(view)
-        height, width = self.scene.cameras[view].size_hw
-        return to_uint8((weights @ colours).reshape(height, width, 3))
-
-    def _field_colours(self, level: Level) -> Float32[np.ndarray, "N 3"]:
-        features = self.language.features[:, level.index].astype(np.float64)
-        seen = np.square(features).sum(axis=1) > 0
-        centred = features - features[seen].mean(axis=0) if seen.any() else features
-        covariance = np.einsum("nc,nd->cd", centred[seen], centred[seen])
-        _, directions = np.linalg.eigh(covariance)
-        directions = directions[:, ::-1][:, :3]
-        peak = np.abs(directions).argmax(axis=0)
-        directions = directions * np.sign(directions[peak, np.arange(directions.shape[1])])
-        colours = np.zeros((len(features), 3), np.float32)
-        for channel, values in enumerate((centred @ directions).T):
-            low, high = np.percentile(values[seen], (2, 98)) if seen.any() else (0.0, 1.0)
-            colours[:, channel] = np.clip((values - low) / max(high - low, 1e-9), 0, 1) * seen
-        return colours
-
-    # -- the semantic tree ------------------------------------------------------------------------
-
-    def node_relevancy(self, texts: Sequence[str]) -> Float32[np.ndarray, "T n"]:
+    def node_relevancy(self, texts: Sequence[str], answerer: Answerer = "tree") -> Float32[np.ndarray, "T n"]:
         """Relevancy of every node to every text."""
-        return self.relevancy(self.tree.clip, texts)
+        return self.relevancy(self.tree.clip if answerer == "tree" else self._node_field_vectors, texts)
 
     def node_relevancy_map(self, texts: Sequence[str], view: str) -> Float32[np.ndarray, "T 3 H W"]:
         """Relevancy of the nodes a pixel shows, blended by its weights, at each level.
 
-        Gaussians without a node count as the level's least relevant node.
+        Gaussians without a node count as the level's least relevant node. Pixels that the Gaussians do
+        not cover get the least relevancy of the covered ones, so that they are never selected and do
+        not stretch the range.
         """
         scores = self.node_relevancy(texts)
-        weights, _ = self.view_weights(view)
-        covered = np.flatnonzero(np.diff(weights.indptr))
-        rows = weights[covered]
-
-        def one_level(index: int) -> np.ndarray:
-            nodes = self.tree.nodes_of(LEVELS[index])
-            if not len(nodes):
-                return np.zeros((len(texts), len(covered)), np.float32)
-            own = self.tree.node_of_gaussian[:, index]
-            least = scores[:, nodes].min(axis=1, keepdims=True)
-            return (rows @ np.where(own >= 0, scores[:, own], least).T).T
-
-        return self._maps(view, covered, one_level, len(texts))
-
-    def select_nodes(
-        self,
-        text: str,
-        *,
-        level: Level | None,
-        threshold: float = NODE_SELECT,
-        within: Int64[np.ndarray, " c"] | None = None,
-    ) -> NodeHits:
-        """Nodes whose relevancy, stretched to [0, 1] over the level's nodes, reaches the threshold.
-
-        Args:
-            text: the query.
-            level: which nodes compete; None chooses it (see `automatic_level`).
-            threshold: share of the range between the worst and the best node.
-            within: only these nodes compete, such as the children of another answer.
-        """
-        scores = self.node_relevancy([text])[0]
-        if level is None:
-            level = self.automatic_level(scores, within)
-        candidates = self.tree.nodes_of(level)
-        if within is not None:
-            candidates = np.intersect1d(candidates, within)
-        return _select(scores, candidates, level, threshold, "flat")
-
-    def automatic_level(
-        self, scores: Float[np.ndarray, " n"], within: Int64[np.ndarray, " c"] | None = None
-    ) -> Level:
-        """Level that a text most likely means: climb from the best node while its parent scores as well.
-
-        LangSplat takes the level of the highest score. Averages over many small crops are noisy and
-        there are more of them, so that this picks the finest level far too often. Here a node must
-        beat its parent by more than 1 - `AUTO_SHARE` of the range. The range is that of the cosine
-        margins behind the relevancies, which do not saturate.
-        """
-        candidates = np.arange(len(self.tree)) if within is None else np.asarray(within)
-        if not len(candidates):
-            return Level.WHOLE
-        probability = np.clip(scores.astype(np.float64), 1e-7, 1 - 1e-7)
-        margin = np.log(probability / (1 - probability))
-        reach = margin[candidates].min() + AUTO_SHARE * np.ptp(margin[candidates])
-        node = int(candidates[np.lexsort((candidates, -scores[candidates]))[0]])
-        while (parent := int(self.tree.parent[node])) != NONE:
-            if margin[parent] < reach or parent not in candidates:
-                break
-            node = parent
-        return Level(int(self.tree.level[node]))
-
-    def select_path(self, path: tuple[str, ...], threshold: float = NODE_SELECT) -> NodeHits:
-        """Search each text inside the nodes that answered the one before: ("bear", "head", "nose").
-
-        The i-th text is searched at the i-th level. Falls back from children of the chosen nodes to
-        any descendant of the first text's nodes, then to the whole level.
-
-        Raises:
-            SettingsError: the path is empty or longer than there are levels.
-        """
-        if not 1 <= len(path) <= len(LEVELS):
-            raise SettingsError(
-                f"the path {' > '.join(path)!r} cannot be searched",
-                expected=f"1 to {len(LEVELS)} texts, coarse to fine",
-                found=f"{len(path)}",
-                fix="name the object, then its part, then the part of the part",
-            )
-        scores = self.node_relevancy(list(path))
-        hits = first = _select(scores[0], self.tree.nodes_of(LEVELS[0]), LEVELS[0], threshold, "flat")
-        for index, level in enumerate(LEVELS[1 : len(path)], start=1):
-            nodes = self.tree.nodes_of(level)
-            routes = {
-                "child": np.intersect1d(nodes, self.tree.children_of(hits.ids)),
-                "descendant": np.intersect1d(nodes, self.tree.descendants_of(first.ids)),
-                "fallback": nodes,
-            }
-            route = next((name for name, found in routes.items() if len(found)), "fallback")
-            candidates = routes[route]
-            hits = _select(scores[index], candidates, level, threshold, route)
-        return hits
-
-    def node_masks(self, view: str, ids: Int64[np.ndarray, " n"]) -> Bool[np.ndarray, "H W"]:
-        """Pixels where members of the nodes make up more than half of what is seen."""
-        member = np.isin(self.tree.node_of_gaussian, np.asarray(ids)).any(axis=1)
-        weights, _ = self.view_weights(view)
-        return (weights @ member.astype(np.float32) > 0.5).reshape(self.scene.cameras[view].size_hw)
-
-    def query(
-        self, text: str, level: str = "auto", *, threshold: float = NODE_SELECT, limit: int = 10
-    ) -> list[Hit]:
-        """Ranked answers to a text, or to a path such as "bear > head > nose".
-
-        Args:
-            text: words, or words separated by ">".
-            level: "whole", "part", "subpart" or "auto"; a path brings its own.
-            threshold: as in `select_nodes`.
-            limit: answers at most.
-
-        Raises:
-            SettingsError: the text is empty or the level is unknown.
-        """
-        hits = self.find(text, level, threshold)
-        return [
-            self._hit(int(node), float(score), hits.route)
-            for node, score in zip(hits.ids[:limit], hits.scores[:limit], strict=True)
-        ]
-
-    def find(self, text: str, level: str = "auto", threshold: float = NODE_SELECT) -> NodeHits:
-        """Like `query`, as rows of the tree."""
-        path = tuple(part.strip() for part in text.split(PATH_SEPARATOR))
-        if not all(path):
-            raise SettingsError(
-                f"the query {text!r} holds no text", fix='write words, or "bear > head > nose"'
-            )
-        if len(path) > 1:
-            return self.select_path(path, threshold)
-        names = {each.label: each for each in LEVELS}
-        if level != "auto" and level not in names:
-            raise SettingsError(
-                f"level {level!r} is unknown", expected=f"auto, {', '.join(names)}", found=level
-            )
-        return self.select_nodes(path[0], level=names.get(level), threshold=threshold)
-
-    def _hit(self, node: int, score: float, route: str) -> Hit:
-        area = self.tree.view_area_px[node]
-        order = np.lexsort((np.arange(len(area)), -area))[:3]
-        low, high = self.tree.box[node].tolist()
-        return Hit(
-            node,
-            Level(int(self.tree.level[node])),
-            score,
-            tuple(self.tree.centroid[node].tolist()),
-            (tuple(low), tuple(high)),
-            tuple(self.tree.view_names[row] for row in order if area[row] > 0),
-            route,
-        )
-
-    def _maps(
-        self, view: str, covered: np.ndarray, one_level: Callable[[int], np.ndarray], num_texts: int
-    ) -> Float32[np.ndarray, "T 3 H W"]:
-        """Lay the values of covered pixels into maps; the others get the least of them."""
         height, width = self.scene.cameras[view].size_hw
-        maps = np.zeros((num_texts, len(LEVELS), height * width), np.float32)
-        if len(covered):
-            for index in range(len(LEVELS)):
-                values = one_level(index)
-                maps[:, index] = values.min(axis=1, keepdims=True)
-                maps[:, index, covered] = values
-        return maps.reshape(num_texts, len(LEVELS), height, width)
+        maps = np.zeros((len(texts), len(LEVELS), height * width), np.float32)
+        for level in LEVELS:
+            nodes = self.tree.nodes_of(level)
+            if not len(nodes):
+                continue
+            shown = self._view_nodes(view, level)
+            for row, values in enumerate(scores):
+                maps[row, level.index] = shown.blend(values, float(values[nodes].min()))
+        return maps.reshape(len(texts), len(LEVELS), height, width)
 
+    def field_relevancy(
+        self, texts: Sequence[str], view: str, *, exact: bool = True
+    ) -> Float32[np.ndarray, "T 3 H W"]:
+        """Rendered latent -> decoder -> relevancy, at every pixel and level, as the paper answers.
 
-def require_same(what: str, scene: str, path: Path, expected_sha256: str) -> None:
-    """Refuse artifacts that were made for another file.
+        Pixels that show mostly Gaussians without a latent at the level are as the uncovered ones of
+        `node_relevancy_map`.
 
-    Raises:
-        MisalignedArtifactError: the file's digest is another one.
-    """
-    found = sha256_of_file(path)
-    if found != expected_sha256:
-        raise MisalignedArtifactError(
-            f"the {what} of {scene} was made for another {Path(path).name}",
-            expected=f"sha256 {expected_sha256[:12]}",
-            found=f"sha256 {found[:12]} in {path}",
-            fix=f"rerun the stage that writes the {what}",
+        Args:
+            texts: queries.
+            view: name of the view.
+            exact: decode every pixel; else answer in latent space (see `latent_relevancy`): to rounding
+                for a linear code, within 2e-3 of it at all but few pixels for a network with d = 3.
+        """
+        shown, placed = self._view_latents(view), None if exact else self._placed_latents(view)
+        vectors = self.text_vectors(texts)
+        answer = self._latent_relevancy
+        height, width = self.scene.cameras[view].size_hw
+        maps = np.zeros((len(texts), len(LEVELS), height * width), np.float32)
+        for index, (pixels, latents) in enumerate(shown):
+            if len(pixels):
+                found = (
+                    answer.exact(latents, vectors) if exact else answer.fast(latents, placed[index], vectors)
+                )
+                maps[:, index] = found.min(axis=1, keepdims=True)
+                maps[:, index, pixels] = found
+        return maps.reshape(len(texts), len(LEVELS), height, width)
+
+    def field_image(self, view: str, level: Level) -> UInt8[np.ndarray, "H W 3"]:
+        """The field of a level as colours (see `field_colours`); uncovered pixels are black."""
+        weights, _ = self.view_weights(view)
+        colours = field_colours(self.language.features[:, level.index])
+        return to_uint8((weights @ colours).reshape(*self.scene.cameras[view].size_hw, 3))
+
+    # -- what is kept of a view -------------------------------------------------------------------
+
+    def view_weights(self, view: str) -> tuple[sp.csr_matrix, Float32[np.ndarray, " P"]]:
+        """W of a view with rows divided by alpha (empty below half coverage), and alpha."""
+        return self._views.get(
+            ("weights", view),
+            lambda: normalised_weights(self.pixel_weights(view)),
+            lambda kept: kept[0].data.nbytes + kept[0].indices.nbytes + kept[0].indptr.nbytes,
         )
 
+    def _view_nodes(self, view: str, level: Level) -> ViewNodes:
+        return self._views.get(
+            ("nodes", view, level),
+            lambda: ViewNodes.of(self.view_weights(view)[0], self.tree.node_of_gaussian[:, level.index]),
+            lambda kept: kept.nbytes,
+        )
 
-def _select(
-    scores: Float[np.ndarray, " n"],
-    candidates: Int64[np.ndarray, " c"],
-    level: Level,
-    threshold: float,
-    route: str,
-) -> NodeHits:
-    """Candidates above the threshold of their own range, best first; of equals the lowest row."""
-    if not len(candidates):
-        return NodeHits(np.zeros(0, np.int64), np.zeros(0, np.float32), level, route)
-    chosen = candidates[min_max(scores[candidates]) >= threshold]
-    order = np.lexsort((chosen, -scores[chosen]))
-    return NodeHits(chosen[order].astype(np.int64), scores[chosen][order].astype(np.float32), level, route)
+    def _view_latents(self, view: str) -> list[tuple[np.ndarray, Float32[np.ndarray, "P D"]]]:
+        """Per level the pixels that show mostly Gaussians with a latent, and their rendered latents."""
+
+        def render() -> list[tuple[np.ndarray, np.ndarray]]:
+            weights, _ = self.view_weights(view)
+            shown = []
+            for index in range(len(LEVELS)):
+                own = np.ascontiguousarray(self.language.features[:, index], np.float32)
+                has = (own != 0).any(axis=1).astype(np.float32)
+                pixels = np.flatnonzero(weights @ has > MIN_LATENT_SHARE)
+                shown.append((pixels, (weights[pixels] @ own).astype(np.float32)))
+            return shown
+
+        return self._views.get(
+            ("latents", view), render, lambda kept: sum(a.nbytes + b.nbytes for a, b in kept)
+        )
+
+    def _placed_latents(self, view: str) -> list:
+        """What look-ups of a view need, level by level; made when it is first looked up."""
+        return self._views.get(
+            ("placed", view),
+            lambda: [self._latent_relevancy.prepare(latents) for _, latents in self._view_latents(view)],
+            lambda kept: sum(each.nbytes for each in kept if each),
+        )
+
+    @cached_property
+    def _latent_relevancy(self) -> LatentRelevancy:
+        return LatentRelevancy(
+            self.autoencoder,
+            self.text_vectors(self.canonical),
+            self.relevancy_scale,
+            self.language.features.reshape(-1, self.language.features.shape[2]),
+            self.threads,
+        )
+
+    @cached_property
+    def _node_field_vectors(self) -> Float32[np.ndarray, "n C"]:
+        """Decoded mean latent of each node's Gaussians at its level."""
+        means = node_means(self.tree.node_of_gaussian, self.tree.level, self.language.features)
+        return self.autoencoder.decode_array(means)

@@ -8,6 +8,7 @@ from hilsplat.base.artifacts import read_index
 from hilsplat.base.errors import ArtifactError
 from hilsplat.language.autoencoder import (
     Autoencoder,
+    load_code,
     load_latents,
     mask_targets,
     reconstruction_loss,
@@ -76,7 +77,7 @@ def test_same_seed_same_bytes_on_any_number_of_threads(tmp_path):
 
 def test_a_missing_file_names_its_stage(tmp_path):
     with pytest.raises(ArtifactError, match="run the autoencoder stage again"):
-        Autoencoder.load(tmp_path)
+        load_code(tmp_path)
 
 
 @pytest.fixture
@@ -113,6 +114,6 @@ def test_stage_encodes_every_mask(boxes_with_tree):
     # masks of one node share its code
     node = SemanticTree.load(tree).node_of_mask
     assert np.array_equal(latents[0], latents[np.flatnonzero(node == node[0])[1]])
-    model = Autoencoder.load(out)
+    model = load_code(out)
     decoded = model.decode_array(latents)
     assert (decoded * SemanticTree.load(tree).clip[node]).sum(axis=1).mean() > 0.8

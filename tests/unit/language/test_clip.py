@@ -10,7 +10,7 @@ from onnx import TensorProto, helper, numpy_helper
 from tokenizers import Tokenizer, models, pre_tokenizers
 
 from hilsplat.base.artifacts import read_index, read_npy, sha256_of_path
-from hilsplat.base.errors import MisalignedArtifactError, ModelError
+from hilsplat.base.errors import MisalignedArtifactError, ModelError, SettingsError
 from hilsplat.base.images import write_png
 from hilsplat.base.onnx_models import Network
 from hilsplat.language.clip import ClipModel, unit
@@ -19,7 +19,7 @@ from hilsplat.language.model_check import check_model
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.settings import ClipSettings
+from hilsplat.settings import ClipSettings, parse_section
 
 WORDS = ["red", "green", "blue"]
 
@@ -139,6 +139,35 @@ def test_texts_are_unit_vectors_in_order(colour_clip):
     vectors = ClipModel.load(colour_clip).embed_texts(["blue", "red green", "red red green"])
     expected = [[0, 0, 1], [0.5**0.5, 0.5**0.5, 0], [2 / 5**0.5, 1 / 5**0.5, 0]]
     np.testing.assert_allclose(vectors, expected, atol=1e-6)
+
+
+def test_every_text_is_put_into_the_template(colour_clip):
+    plain = ClipModel.load(colour_clip)
+    asked = ClipModel.load(colour_clip, template="blue {} thing").embed_texts(["red"])
+    np.testing.assert_array_equal(asked, plain.embed_texts(["blue red thing"]))
+    np.testing.assert_allclose(asked, [[0.5**0.5, 0, 0.5**0.5]], atol=1e-6)
+
+
+def test_a_text_that_was_asked_before_runs_no_network(colour_clip, monkeypatch):
+    model = ClipModel.load(colour_clip)
+    first = model.embed_texts(["blue", "red"])
+    monkeypatch.setattr(model, "text", None)
+    np.testing.assert_array_equal(model.embed_texts(["red", "blue", "red"]), first[[1, 0, 1]])
+
+
+@pytest.mark.parametrize("template", ["a photo", "a {} of a {}", "{0}", "{"])
+def test_a_template_names_the_text_once(template):
+    with pytest.raises(SettingsError, match=r"evaluate\.template"):
+        parse_section("evaluate", json.dumps({"template": template}))
+
+
+def test_vectors_of_another_width_are_refused(colour_clip):
+    model = ClipModel.load(colour_clip)
+    model.require_width(3, "autoencoder a")
+    with pytest.raises(
+        MisalignedArtifactError, match=r"autoencoder a does not belong(.|\n)*3 numbers(.|\n)*512"
+    ):
+        model.require_width(512, "autoencoder a")
 
 
 def test_long_texts_are_cut_and_say_so(colour_clip, caplog):

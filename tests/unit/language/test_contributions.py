@@ -9,7 +9,8 @@ import scipy.sparse as sp
 from hilsplat.base.artifacts import sha256_of_path
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
-from hilsplat.language import quadratic as quadratic_module
+from hilsplat.language import contributions as stage
+from hilsplat.language import quadratic_builder
 from hilsplat.language.contributions import (
     label_maps,
     labelled_rows,
@@ -19,13 +20,9 @@ from hilsplat.language.contributions import (
     view_contributions,
 )
 from hilsplat.language.mask_rows import Contributions, mask_embeddings
-from hilsplat.language.quadratic import (
-    GramBuilder,
-    QuadraticBuilder,
-    level_mass,
-    load_quadratic,
-    stack_weights,
-)
+from hilsplat.language.quadratic import level_mass, load_quadratic
+from hilsplat.language.quadratic_builder import GramBuilder, QuadraticBuilder, stack_weights
+from hilsplat.language.streams import ArrayStream
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ContributionsSettings
 from tests.unit.language.two_boxes_world import HEIGHT, REGIONS, WIDTH, two_boxes_weights
@@ -137,7 +134,7 @@ def test_gram_does_not_depend_on_how_the_pixels_are_parted(monkeypatch):
     for name in ("indptr", "indices", "values"):
         assert getattr(one, name).tobytes() == getattr(four, name).tobytes()
     # too many weights to hold: G, whatever its size
-    monkeypatch.setattr(quadratic_module, "MAX_WEIGHTS", parts[0].nonzeros)
+    monkeypatch.setattr(quadratic_builder, "MAX_WEIGHTS", parts[0].nonzeros)
     builder = QuadraticBuilder(40, "auto", threads=1)
     for part in parts:
         builder.add(part)
@@ -191,6 +188,63 @@ def test_a_resumed_run_writes_the_same_bytes(two_boxes_contributions):
     shutil.rmtree(out)
     run_contributions(*arguments, 2)
     assert sha256_of_path(out) == before
+
+
+def test_a_killed_run_goes_on_from_its_checkpoint(two_boxes, monkeypatch):
+    settings = ContributionsSettings(keep="gram")
+    folder = two_boxes.folder
+    arguments = (two_boxes.scene, two_boxes.ply, two_boxes.masks)
+    run_contributions(*arguments, folder / "whole", folder / "other cache", settings, 1)
+    drawn = []
+    weights = stage.pixel_weights
+
+    def counted(gaussians, camera, **more):
+        drawn.append(camera.name)
+        if len(drawn) == 3:
+            raise KeyboardInterrupt
+        return weights(gaussians, camera, **more)
+
+    monkeypatch.setattr(quadratic_builder, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(stage, "pixel_weights", counted)
+    with pytest.raises(KeyboardInterrupt):
+        run_contributions(*arguments, folder / "out", folder / "cache", settings, 1)
+    run_contributions(*arguments, folder / "out", folder / "cache", settings, 1)
+    # the first two views are neither drawn nor summed again
+    assert drawn[3:] == list(two_boxes.views[2:])
+    assert sha256_of_path(folder / "out") == sha256_of_path(folder / "whole")
+    assert not list((folder / "cache").rglob("*.npy"))  # the checkpoint is gone
+
+
+@pytest.mark.parametrize("keep", ["auto", "weights", "gram"])
+def test_a_builder_goes_on_from_its_state(keep, monkeypatch):
+    parts = []
+    for seed in range(3):
+        raw, masks = random_view(seed)
+        parts.append(labelled_rows(normalised_weights(raw)[0], label_maps(masks)))
+    monkeypatch.setattr(quadratic_builder, "CHUNK_WEIGHTS", parts[0].nonzeros + 1)
+    whole, first, second = (QuadraticBuilder(40, keep, threads=1) for _ in range(3))
+    for part in parts:
+        whole.add(part)
+    first.add(parts[0])
+    first.add(parts[1])
+    second.restore(first.state())
+    second.add(parts[2])
+    features = np.random.default_rng(5).normal(size=(40, 3, 4)).astype(np.float32)
+    one, two = whole.finish(), second.finish()
+    assert type(one) is type(two)
+    assert one.product(features).tobytes() == two.product(features).tobytes()
+
+
+def test_streams_are_files_of_numpy(tmp_path):
+    rows = np.arange(12, dtype=np.float32).reshape(4, 3)
+    with ArrayStream(tmp_path / "rows.npy", np.float32, 3) as stream:
+        stream.append(rows[:1])
+        stream.append(rows[1:])
+    assert np.array_equal(np.load(tmp_path / "rows.npy"), rows)
+    assert np.array_equal(np.load(tmp_path / "rows.npy", mmap_mode="r"), rows)
+    with ArrayStream(tmp_path / "none.npy", np.int64) as stream:
+        pass
+    assert np.load(tmp_path / "none.npy").shape == (0,)
 
 
 def test_masks_of_another_size_are_refused(two_boxes):

@@ -8,24 +8,20 @@ import torch
 from hilsplat.base.artifacts import read_json
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.language.autoencoder import run_autoencoder
+from hilsplat.language.contrast import Contrast, ViewRelations, contrastive_terms, distinct
 from hilsplat.language.contributions import painted_indicator
-from hilsplat.language.field import (
-    Contrast,
-    LanguageField,
-    MaskOperator,
-    QuadraticProblem,
-    ViewRelations,
-    conjugate_gradient,
-    contrastive_terms,
-    lbfgs,
-    run_language,
-    solve_field,
-)
+from hilsplat.language.field import LanguageField, run_language
 from hilsplat.language.losses.clustering import clustering_loss
 from hilsplat.language.losses.latent_regression import latent_regression_loss
+from hilsplat.language.mask_operator import MaskOperator
+from hilsplat.language.minimise import lbfgs
+from hilsplat.language.problem import QuadraticProblem, conjugate_gradient
 from hilsplat.language.quadratic import StackedWeights
+from hilsplat.language.reference import rendered_loss, run_reference
 from hilsplat.language.semantic_tree import run_semantic_tree
-from hilsplat.settings import AutoencoderSettings, LanguageSettings, SemanticTreeSettings
+from hilsplat.language.solver import keep_labelled, solve_field
+from hilsplat.settings import AutoencoderSettings, LanguageSettings, ReferenceSettings, SemanticTreeSettings
+from hilsplat.splat.gaussians import Gaussians
 
 PIXELS, GAUSSIANS, CHANNELS = 60, 12, 2
 
@@ -192,6 +188,44 @@ def test_contrastive_weights_lower_their_terms():
     assert set(plain["gradient_norms"]) == {"language", "clustering", "instance", "part"}
 
 
+def test_gaussians_that_masks_hardly_hold_keep_no_latent():
+    features = np.ones((3, 3, 2), np.float32)
+    mass = np.array([[4, 0.1, 4], [4, 2, 0], [0, 0, 0]], np.float32)
+    kept = keep_labelled(features, mass, np.array([4.0, 4.0, 0.0]), 0.5)
+    assert kept[..., 0].tolist() == [[1, 0, 1], [1, 1, 0], [0, 0, 0]]
+    assert np.array_equal(keep_labelled(features, mass, np.array([4.0, 4.0, 0.0]), 0.0), features)
+
+
+def test_pruning_drops_look_alikes_that_are_unrelated():
+    means = np.array([[1, 0], [1, 0.01], [1, 0.02], [0, 1]], np.float32)
+    depth = np.zeros((4, 4), np.int64)
+    assert distinct(means, depth, 0.95).tolist() == [0, 3]
+    depth[0, 1] = depth[1, 0] = 1  # siblings are kept apart; the third is like both
+    assert distinct(means, depth, 0.95).tolist() == [0, 1, 3]
+    assert distinct(means, depth, 1.0).tolist() == [0, 1, 2, 3]
+
+
+def test_the_reference_loss_is_the_solver_s_language_loss():
+    toy = Toy((1.0, 0.0, 0.0))
+    features = torch.from_numpy(toy.features)
+    rendered = torch.from_numpy(toy.W) @ features.reshape(GAUSSIANS, -1)
+    alpha = torch.full((6, 10), 0.8)
+    shown = 0.8 * rendered.reshape(6, 10, -1)  # premultiplied, as the rasteriser gives it
+    labels = toy.labels.astype(np.int32)
+    squared = rendered_loss(shown, alpha, labels, toy.latents, "squared")
+    assert squared.item() == pytest.approx(toy.problem.terms(toy.features)["language"], rel=1e-5)
+    apart = [
+        np.abs(rendered.numpy().reshape(60, 3, 2)[p, i] - toy.latents[labels[p, i]]).sum()
+        for p in range(60)
+        for i in range(3)
+        if labels[p, i] >= 0
+    ]
+    l1 = rendered_loss(shown, alpha, labels, toy.latents, "l1")
+    assert l1.item() == pytest.approx(sum(apart) / (60 * 2), rel=1e-5)
+    thin = rendered_loss(shown, torch.full((6, 10), 0.4), labels, toy.latents, "l1")
+    assert thin.item() == 0  # thinly covered pixels do not count
+
+
 @pytest.fixture
 def boxes_with_latents(two_boxes_contributions):
     world, contributions = two_boxes_contributions
@@ -218,6 +252,43 @@ def test_stage_is_the_same_on_any_number_of_threads(boxes_with_latents):
     assert report["after_lbfgs"]["language"] >= 0
     assert report["gaussians"] == 96
     assert report["gradient_norms"]["part"] > 0
+
+
+def test_the_median_start_and_pruning_are_options_of_the_stage(boxes_with_latents):
+    world, contributions, autoencoder = boxes_with_latents
+    reports = {}
+    for name, more in (("plain", {}), ("median", {"start": "median"}), ("pruned", {"prune_cosine": 0.0})):
+        out = world.folder / name / "language.safetensors"
+        settings = SMALL_MASKS.model_copy(update=more)
+        run_language(contributions, world.tree, autoencoder, out, settings, 0, 1)
+        reports[name] = read_json(out.with_suffix(".report.json"))
+    assert reports["median"]["lifted"] != reports["plain"]["lifted"]
+    assert reports["pruned"]["contrasted_masks"] < reports["plain"]["contrasted_masks"]
+
+
+def test_the_reference_trainer_lowers_its_loss(boxes_with_latents, monkeypatch):
+    world, contributions, autoencoder = boxes_with_latents
+    row, column = np.divmod(np.arange(96), 12)
+    means = torch.from_numpy(np.stack([column - 5.5, row - 3.5, np.full(96, 10.0)], axis=1)).float()
+    flat = Gaussians(
+        means,
+        torch.full((96, 3), -1.5),
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(96, 1),
+        torch.full((96,), 5.0),
+        torch.zeros(96, 1, 3),
+    )
+    monkeypatch.setattr("hilsplat.language.reference.load_ply", lambda path: flat)
+    out = world.folder / "reference" / "language.safetensors"
+    arguments = (world.scene, world.ply, world.masks, contributions, autoencoder, out)
+    settings = ReferenceSettings(steps=60, rate=0.05, log_every=20)
+    run_reference(*arguments, settings, "cpu", 0, 1)
+    curve = read_json(world.folder / "reference" / "language.report.json")["curve"]
+    assert [point["step"] for point in curve] == [20, 40, 60]
+    assert curve[-1]["loss"] < 0.7 * curve[0]["loss"]
+    before = out.read_bytes()
+    run_reference(*arguments, settings, "cpu", 0, 2)
+    assert out.read_bytes() == before
+    assert LanguageField.load(out).features.shape == (96, 3, 3)
 
 
 def test_tree_of_other_masks_is_refused(boxes_with_latents):

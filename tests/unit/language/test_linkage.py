@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from hilsplat.language.linkage import Evidence, mask_evidence, pooled_linkage
+from hilsplat.language.evidence import Evidence, mask_evidence
+from hilsplat.language.linkage import pooled_linkage
 
 
 def dense_evidence(intersection, union):

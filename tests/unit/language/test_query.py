@@ -6,14 +6,19 @@ import numpy as np
 import pytest
 import torch
 
+from hilsplat.base.artifacts import write_json
 from hilsplat.base.errors import MisalignedArtifactError, SettingsError
 from hilsplat.base.levels import Level
-from hilsplat.language.autoencoder import Autoencoder, run_autoencoder
+from hilsplat.base.provenance import provenance_path
+from hilsplat.language.autoencoder import load_code, run_autoencoder
 from hilsplat.language.field import LanguageField, run_language
-from hilsplat.language.query import LanguageScene, require_same
+from hilsplat.language.finished import FinishedScene, require_same
+from hilsplat.language.node_search import automatic_level, best_nodes
+from hilsplat.language.query import LanguageScene
 from hilsplat.language.semantic_tree import SemanticTree, run_semantic_tree
+from hilsplat.language.view_store import ViewStore
 from hilsplat.scene.scene import Scene
-from hilsplat.settings import AutoencoderSettings, LanguageSettings, SemanticTreeSettings
+from hilsplat.settings import AutoencoderSettings, EvaluateSettings, LanguageSettings, SemanticTreeSettings
 from hilsplat.splat.gaussians import Gaussians
 from tests.unit.language.two_boxes_world import (
     HEIGHT,
@@ -56,7 +61,7 @@ def scene(tmp_path_factory) -> LanguageScene:
         Gaussians(zeros, zeros, torch.zeros(NUM_GAUSSIANS, 4), torch.zeros(NUM_GAUSSIANS), zeros[:, None]),
         SemanticTree.load(folder / "st"),
         LanguageField.load(folder / "language.safetensors"),
-        Autoencoder.load(folder / "ae"),
+        load_code(folder / "ae"),
         encode,
         lambda view: two_boxes_weights(int(view[:3])),
     )
@@ -76,18 +81,61 @@ def test_automatic_level_is_the_region_s_own(scene, name):
     assert scene.select_nodes(name, level=None, threshold=0.85).ids.tolist() == [NODE[name]]
 
 
-def test_automatic_level_climbs_to_a_parent_that_scores_as_well(scene):
-    def sigmoid(margin: float) -> float:
-        return 1 / (1 + np.exp(-margin))
+def test_automatic_level_is_that_of_the_best_node_and_of_equals_the_coarsest(scene):
+    scores = np.full(7, 0.2, np.float32)
+    scores[[NODE["A top left"], NODE["A top"], NODE["A"]]] = 0.9, 0.8, 0.7
+    assert automatic_level(scene.tree, scores) == Level.SUBPART
+    scores[NODE["A top"]] = 0.9
+    assert automatic_level(scene.tree, scores) == Level.PART
+    within = np.array([NODE["B"], NODE["A"]])
+    assert automatic_level(scene.tree, scores, within) == Level.WHOLE
 
-    scores = np.full(7, sigmoid(0.0), np.float32)
-    # of the range 0 to 2 a parent needs 0.9, that is 1.8
-    scores[[NODE["A top left"], NODE["A top"], NODE["A"]]] = sigmoid(2.0), sigmoid(1.9), sigmoid(1.7)
-    assert scene.automatic_level(scores) == Level.PART
-    scores[NODE["A"]] = sigmoid(1.85)
-    assert scene.automatic_level(scores) == Level.WHOLE
-    scores[NODE["A top"]] = sigmoid(1.7)
-    assert scene.automatic_level(scores) == Level.SUBPART
+
+def test_selection_is_by_margins_which_do_not_saturate():
+    scores = np.array([0.1, 0.95, 0.98, 0.999])
+    every = np.arange(4)
+    # the relevancies 0.95 to 0.999 all lie above 0.94 of their range; of the margins (-2.2, 2.9, 3.9,
+    # 6.9) only the last lies above 0.85 of theirs
+    assert best_nodes(scores, every, Level.PART, 0.85).ids.tolist() == [3]
+    assert best_nodes(scores, every, Level.PART, 0.5).ids.tolist() == [3, 2, 1]
+    assert best_nodes(np.array([0.4, 0.9, 0.9]), np.arange(3), Level.PART, 0.95).ids.tolist() == [1, 2]
+
+
+def test_a_scene_opens_with_the_settings_it_was_evaluated_with(tmp_path):
+    folder = tmp_path / "results" / "photos" / "bear"
+    variant = folder / "default"
+    for part in ("semantic_tree", "autoencoder", "clip", "masks"):
+        (variant / part).mkdir(parents=True)
+    (folder / "scene").mkdir()
+    for name in ("gaussians.ply", "default/language.safetensors", "default/scores.csv"):
+        (folder / name).touch()
+    assert FinishedScene.locate(folder).evaluate_settings() == EvaluateSettings()
+    settings = {"canonical": ["thing", "surface"], "node_select": 0.9, "a knob of old": 1}
+    write_json(provenance_path(variant / "scores.csv"), {"settings": settings, "inputs": {}})
+    found = FinishedScene.locate(folder).evaluate_settings()
+    assert found.canonical == ("thing", "surface")
+    assert found.node_select == 0.9
+
+
+def test_the_field_answers_through_the_same_interface(scene):
+    hits = scene.query("B", "whole", answerer="field")
+    assert hits[0].node == NODE["B"]
+    (hit,) = scene.query("A > A top", answerer="field")
+    assert (hit.node, hit.route) == (NODE["A top"], "child")
+
+
+def test_the_look_up_of_the_field_is_what_decoding_gives(scene):
+    exact = scene.field_relevancy(["B", "A top"], "004.png")
+    fast = scene.field_relevancy(["B", "A top"], "004.png", exact=False)
+    assert fast == pytest.approx(exact, abs=2e-3)  # a network with d = 4: decoded as well
+
+
+def test_hits_tell_gaussians_and_an_oriented_box(scene):
+    (hit,) = scene.query("A top left", "subpart")
+    rows = scene.gaussians_of([hit.node])
+    assert rows.tolist() == np.flatnonzero(region_mask(5)).tolist()
+    # 2 columns and 4 rows of Gaussians one unit apart, in a plane
+    assert hit.oriented_box.size == pytest.approx((2.88, 1, 0), abs=0.15)
 
 
 def test_only_the_given_nodes_compete(scene):
@@ -168,7 +216,7 @@ def test_field_answers_where_the_region_is(scene):
 def test_uncovered_pixels_get_the_least_relevancy(scene):
     weights = two_boxes_weights(0).tolil()
     weights[0] = 0
-    thin = replace(scene, pixel_weights=lambda view: weights.tocsr(), _views={})
+    thin = replace(scene, pixel_weights=lambda view: weights.tocsr(), _views=ViewStore())
     for maps in (thin.field_relevancy(["A"], "000.png"), thin.node_relevancy_map(["A"], "000.png")):
         assert maps[0, 0, 0, 0] == maps[0, 0].min()
     assert not thin.node_masks("000.png", np.array([NODE["A"]]))[0, 0]

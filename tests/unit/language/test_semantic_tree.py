@@ -20,9 +20,10 @@ from tests.unit.language.two_boxes_world import HEIGHT, NUM_GAUSSIANS, REGIONS, 
 def test_gaussians_join_the_node_with_the_largest_share():
     shares = sp.csr_matrix(np.array([[0.5, 0.1, 0.3], [0.4, 0.1, 0.0], [0.2, 0.0, 0.3]]))
     # nodes: masks 0 and 1 are node 0, mask 2 is node 1
-    node = gaussian_nodes(np.array([0, 0, 1]), 2, shares, 0.25)
+    node, membership = gaussian_nodes(np.array([0, 0, 1]), 2, shares, 0.25)
     # 0.9 against 0.2; 0.2 is too little; a tie goes to the lower node
     assert node.tolist() == [0, -1, 0]
+    assert membership == pytest.approx([0.9, 0, 0.3])
 
 
 def test_subpart_may_hang_directly_under_a_whole():

@@ -1,0 +1,44 @@
+"""Where the sparse algebra of the language stages runs: the CPU's own kernels, or torch on CUDA."""
+
+import logging
+from functools import cache
+from typing import Literal
+
+from hilsplat.base.errors import DeviceError
+
+logger = logging.getLogger(__name__)
+
+ComputeDevice = Literal["cpu", "cuda"]
+
+
+@cache
+def cuda_missing() -> str | None:
+    """Why torch cannot use CUDA here; None where it can."""
+    import torch
+
+    return None if torch.cuda.is_available() else f"torch {torch.__version__} finds no CUDA device"
+
+
+@cache
+def compute_device(wanted: ComputeDevice) -> ComputeDevice:
+    """The device of a stage.
+
+    Args:
+        wanted: `cuda` has to be asked for: its sums agree with the CPU's to rounding, but are not the
+            same bytes.
+
+    Raises:
+        DeviceError: `cuda` was asked for and torch finds no device. There is no falling back.
+    """
+    if wanted == "cpu":
+        return "cpu"
+    problem = cuda_missing()
+    if problem:
+        raise DeviceError(
+            "device: cuda was asked for and cannot be used",
+            expected="a CUDA build of torch that finds a device",
+            found=problem,
+            fix="set device: cpu",
+        )
+    logger.info("sparse algebra on cuda")
+    return "cuda"

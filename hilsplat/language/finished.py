@@ -1,0 +1,123 @@
+"""Where the parts of a finished scene lie, and which settings made them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hilsplat.base.artifacts import read_index, read_json, sha256_of_file
+from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.base.provenance import provenance_path
+from hilsplat.settings import ContributionsSettings, EvaluateSettings, Section
+
+
+@dataclass(frozen=True)
+class FinishedScene:
+    """The parts of one variant of a scene, some of which it may share with another variant.
+
+    Attributes:
+        folder: `results/<dataset>/<scene>`.
+        scene, gaussians, semantic_tree, language, autoencoder, clip, masks: its artifacts.
+        contributions, scores: where these are, or would be; nothing is asked of them but settings.
+    """
+
+    folder: Path
+    scene: Path
+    gaussians: Path
+    semantic_tree: Path
+    language: Path
+    autoencoder: Path
+    clip: Path
+    masks: Path
+    contributions: Path
+    scores: Path
+
+    @staticmethod
+    def locate(folder: Path, variant: str = "default") -> "FinishedScene":
+        """Find the parts of a variant.
+
+        What a stage read is written in its provenance; without one, the parts are expected beside it.
+
+        Raises:
+            ArtifactError: a part is missing, or there is no such variant.
+        """
+        folder = Path(folder)
+        language = folder / variant / "language.safetensors"
+        if not language.exists():
+            language = folder / "default" / "language.safetensors"
+            if variant != "default" and not (folder / variant).exists():
+                raise ArtifactError(
+                    f"{folder} has no variant {variant!r}",
+                    expected=f"one of {', '.join(_variants(folder)) or 'none yet'}",
+                    fix="name it under ablation_variants and run the workflow",
+                )
+        autoencoder = _input_of(language, "autoencoder", folder)
+        clip = _input_of(autoencoder, "clip", folder)
+        parts = {
+            "scene": folder / "scene",
+            "gaussians": folder / "gaussians.ply",
+            "semantic_tree": _input_of(autoencoder, "semantic_tree", folder),
+            "language": language,
+            "autoencoder": autoencoder,
+            "clip": clip,
+            "masks": _input_of(clip, "masks", folder),
+        }
+        for path in parts.values():
+            if not path.exists():
+                raise ArtifactError(
+                    f"{folder} is not finished: {path} is missing", fix=f"snakemake --cores 2 {path}"
+                )
+        contributions = _input_of(language, "contributions", folder)
+        return FinishedScene(
+            folder, **parts, contributions=contributions, scores=folder / variant / "scores.csv"
+        )
+
+    @property
+    def clip_model(self) -> Path:
+        """Folder of the CLIP that embedded the masks, and must embed the texts."""
+        return Path(read_index(self.clip)["model"])
+
+    def evaluate_settings(self) -> EvaluateSettings:
+        """Canonical phrases, scale and selection of the run that made the scene; else the defaults."""
+        return _settings_of(self.scores, EvaluateSettings)
+
+    def contributions_settings(self) -> ContributionsSettings:
+        """How its weights were drawn."""
+        return _settings_of(self.contributions, ContributionsSettings)
+
+
+def _settings_of(artifact: Path, section: type[Section]) -> Any:
+    """Settings in an artifact's provenance; knobs that it does not know take their defaults."""
+    record = provenance_path(artifact)
+    found = read_json(record)["settings"] if record.is_file() else {}
+    return section(**{name: value for name, value in found.items() if name in section.model_fields})
+
+
+def _variants(folder: Path) -> list[str]:
+    return sorted(path.parent.name for path in folder.glob("*/language.safetensors"))
+
+
+def _input_of(artifact: Path, name: str, folder: Path) -> Path:
+    """Where an artifact's input lies: as its provenance says, else beside it."""
+    record = provenance_path(artifact)
+    if record.is_file():
+        path = Path(read_json(record)["inputs"].get(name, {}).get("path", ""))
+        recorded = folder / path.parent.name / path.name
+        if path.name and recorded.exists():
+            return recorded
+    return artifact.parent / name
+
+
+def require_same(what: str, scene: str, path: Path, expected_sha256: str) -> None:
+    """Refuse artifacts that were made for another file.
+
+    Raises:
+        MisalignedArtifactError: the file's digest is another one.
+    """
+    found = sha256_of_file(path)
+    if found != expected_sha256:
+        raise MisalignedArtifactError(
+            f"the {what} of {scene} was made for another {Path(path).name}",
+            expected=f"sha256 {expected_sha256[:12]}",
+            found=f"sha256 {found[:12]} in {path}",
+            fix=f"rerun the stage that writes the {what}",
+        )

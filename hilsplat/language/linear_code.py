@@ -1,0 +1,86 @@
+"""A linear code of CLIP vectors: their mean and principal directions, the alternative to the network."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import safetensors.numpy
+from jaxtyping import Float32
+
+from hilsplat.base.artifacts import atomic_path
+
+METADATA_KEY = "hilsplat"
+
+
+class LinearCode:
+    """e = unit(m + U z): d principal directions about the mean.
+
+    Nothing is trained and nothing is random. Averages of codes are codes of averages, which holds for
+    no network, and a cosine with any vector is a ratio of d numbers, so that relevancy needs no
+    decoding. What it gives up: a network bends its d numbers around the vectors of the scene.
+
+    Args:
+        mean: m.
+        basis: U, orthonormal rows.
+    """
+
+    def __init__(self, mean: Float32[np.ndarray, " C"], basis: Float32[np.ndarray, "D C"]) -> None:
+        self.mean, self.basis = mean, basis
+
+    @property
+    def channels(self) -> int:
+        """C."""
+        return self.basis.shape[1]
+
+    @property
+    def latent(self) -> int:
+        """d."""
+        return self.basis.shape[0]
+
+    @staticmethod
+    def fit(vectors: Float32[np.ndarray, "B C"], latent: int) -> "LinearCode":
+        """Principal directions of the vectors; each direction's largest component is positive.
+
+        Where the vectors span fewer than d directions, the rest is filled with any others.
+        """
+        data = vectors.astype(np.float64)
+        mean = data.mean(axis=0)
+        centred = data - mean
+        _, directions = np.linalg.eigh(np.einsum("bc,bd->cd", centred, centred))
+        basis = directions[:, ::-1][:, :latent].T
+        peak = np.abs(basis).argmax(axis=1)
+        basis = basis * np.sign(basis[np.arange(len(basis)), peak])[:, None]
+        return LinearCode(mean.astype(np.float32), basis.astype(np.float32))
+
+    def encode_array(self, vectors: Float32[np.ndarray, "B C"]) -> Float32[np.ndarray, "B D"]:
+        """Coordinates along the directions."""
+        return ((vectors - self.mean) @ self.basis.T).astype(np.float32)
+
+    def decode_array(self, latents: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:
+        """Vectors of unit length."""
+        vectors = self.mean + latents @ self.basis
+        return (vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)).astype(
+            np.float32
+        )
+
+    def cosine_terms(self, vectors: Float32[np.ndarray, "V C"]) -> tuple:
+        """What cosines with the decoded vectors are made of.
+
+        Returns:
+            m.v and U v of each vector, |m|^2, and U m: with them e.v = (m.v + z.Uv) / |m + U z|.
+        """
+        return (
+            (vectors @ self.mean).astype(np.float32),
+            np.ascontiguousarray(vectors @ self.basis.T, np.float32),
+            float(self.mean @ self.mean),
+            (self.basis @ self.mean).astype(np.float32),
+        )
+
+    def save(self, path: Path) -> None:
+        """Write a .safetensors file; the same code gives the same bytes."""
+        about = {"code": "pca", "channels": self.channels, "latent": self.latent}
+        metadata = {METADATA_KEY: json.dumps(about, sort_keys=True)}
+        with atomic_path(path) as temporary:
+            safetensors.numpy.save_file(
+                {"mean": self.mean, "basis": np.ascontiguousarray(self.basis)}, temporary, metadata=metadata
+            )

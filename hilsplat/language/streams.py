@@ -1,0 +1,78 @@
+"""Arrays that grow on disk, so that a stage never holds what it writes."""
+
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+
+HEADER_BYTES = 128
+
+
+class ArrayStream:
+    """A .npy file that is written row by row; its header is completed when it is closed.
+
+    Args:
+        path: the file.
+        dtype: of the numbers.
+        columns: numbers per row; None for a plain sequence.
+    """
+
+    def __init__(self, path: Path, dtype: type, columns: int | None = None) -> None:
+        self._dtype, self._columns, self._rows = np.dtype(dtype), columns, 0
+        self._stream = Path(path).open("wb")  # noqa: SIM115 (closed by close)
+        self._stream.write(bytes(HEADER_BYTES))
+
+    def __enter__(self) -> "ArrayStream":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __len__(self) -> int:
+        return self._rows
+
+    def append(self, values: np.ndarray) -> None:
+        """Add rows."""
+        values = np.ascontiguousarray(values, self._dtype)
+        self._rows += len(values)
+        self._stream.write(values.data)
+
+    def close(self) -> None:
+        """Complete the header."""
+        shape = (self._rows,) if self._columns is None else (self._rows, self._columns)
+        # Format 1.0 of numpy: magic, length of the text, and the text padded with blanks.
+        text = f"{{'descr': '{self._dtype.str}', 'fortran_order': False, 'shape': {shape}, }}"
+        length = HEADER_BYTES - 10
+        self._stream.seek(0)
+        self._stream.write(b"\x93NUMPY\x01\x00" + length.to_bytes(2, "little"))
+        self._stream.write(text.ljust(length - 1).encode() + b"\n")
+        self._stream.close()
+
+
+class MatrixStream:
+    """A CSR matrix that grows by rows: a folder with `data.npy`, `indices.npy` and `indptr.npy`."""
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(parents=True)
+        self._data = ArrayStream(folder / "data.npy", np.float32)
+        self._indices = ArrayStream(folder / "indices.npy", np.int32)
+        self._indptr = ArrayStream(folder / "indptr.npy", np.int64)
+        self._indptr.append(np.zeros(1))
+
+    @property
+    def nonzeros(self) -> int:
+        """Stored values so far."""
+        return len(self._data)
+
+    def append(self, data: np.ndarray, indices: np.ndarray, indptr: np.ndarray) -> None:
+        """Add the rows of a matrix in CSR form."""
+        self._indptr.append(indptr[1:] + self.nonzeros)
+        self._data.append(data)
+        self._indices.append(indices)
+
+    def close(self) -> None:
+        """Complete the files."""
+        for stream in (self._data, self._indices, self._indptr):
+            stream.close()

@@ -1,0 +1,92 @@
+"""Where a node is: its centroid, its axis-aligned box and its oriented box."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32, Int32, UInt8
+
+from hilsplat.base.levels import Level
+
+BOX_PERCENTILES = (2.0, 98.0)
+"""Of the members' centres: a few stray Gaussians do not blow up a node's box."""
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class OrientedBox:
+    """A box along its own axes.
+
+    Attributes:
+        centre: scene units.
+        axes: three unit vectors at right angles, the longest side's first; right-handed.
+        size: full side along each axis, scene units.
+    """
+
+    centre: Triple
+    axes: tuple[Triple, Triple, Triple]
+    size: Triple
+
+    @staticmethod
+    def from_array(rows: Float[np.ndarray, "5 3"]) -> "OrientedBox":
+        """From its stored form: centre, three axes, sizes."""
+        centre, *axes, size = (tuple(row) for row in np.asarray(rows, np.float64).tolist())
+        return OrientedBox(centre, tuple(axes), size)
+
+    def corners(self) -> Float[np.ndarray, "8 3"]:
+        """The eight corners."""
+        signs = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3, indexing="ij"), axis=-1).reshape(8, 3)
+        return np.asarray(self.centre) + (signs * np.asarray(self.size)) @ np.asarray(self.axes)
+
+
+def oriented_box(
+    points: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"]
+) -> Float32[np.ndarray, "5 3"]:
+    """Box along the principal axes of weighted points, from the 2nd to the 98th percentile of each.
+
+    Returns:
+        centre, three axes (longest side first, right-handed, each one's largest component positive but
+        for the last) and sizes, as `OrientedBox.from_array` reads them.
+    """
+    mean = (weight[:, None] * points).sum(axis=0) / weight.sum()
+    centred = points - mean
+    covariance = np.einsum("n,ni,nj->ij", weight, centred, centred)
+    _, vectors = np.linalg.eigh(covariance)
+    axes = vectors.T
+    low, high = np.percentile(centred @ axes.T, BOX_PERCENTILES, axis=0)
+    order = np.argsort(low - high, kind="stable")
+    axes, low, high = axes[order], low[order], high[order]
+    sign = np.sign(axes[np.arange(3), np.abs(axes).argmax(axis=1)])
+    sign[2] = sign[2] * np.sign(np.linalg.det(axes * sign[:, None]))
+    axes = axes * sign[:, None]
+    low, high = np.where(sign > 0, low, -high), np.where(sign > 0, high, -low)
+    centre = mean + ((low + high) / 2) @ axes
+    return np.concatenate([centre[None], axes, (high - low)[None]]).astype(np.float32)
+
+
+def node_boxes(
+    node_of_gaussian: Int32[np.ndarray, "N 3"],
+    level: UInt8[np.ndarray, " T"],
+    means: Float[np.ndarray, "N 3"],
+    mass: Float[np.ndarray, " N"],
+) -> tuple[Float32[np.ndarray, "T 3"], Float32[np.ndarray, "T 2 3"], Float32[np.ndarray, "T 5 3"]]:
+    """Centroid, axis-aligned and oriented box of every node's members, weighted by visible mass."""
+    centroid = np.zeros((len(level), 3), np.float32)
+    box = np.zeros((len(level), 2, 3), np.float32)
+    oriented = np.zeros((len(level), 5, 3), np.float32)
+    order, starts = {}, {}
+    for index in range(node_of_gaussian.shape[1]):
+        own = node_of_gaussian[:, index]
+        order[index] = np.argsort(own, kind="stable")
+        starts[index] = np.searchsorted(own[order[index]], np.arange(len(level) + 1))
+    for node, each in enumerate(level):
+        index = Level(int(each)).index
+        members = order[index][starts[index][node] : starts[index][node + 1]]
+        if not len(members):  # nesting may leave a node without a Gaussian: it selects nothing, its box is 0
+            continue
+        weight = mass[members] / mass[members].sum()
+        points = means[members]
+        centroid[node] = (weight[:, None] * points).sum(axis=0)
+        box[node] = np.percentile(points, BOX_PERCENTILES, axis=0)
+        oriented[node] = oriented_box(points.astype(np.float64), weight)
+    return centroid, box, oriented

@@ -1,0 +1,152 @@
+"""What a node is made of: its Gaussians, its parent, the masks that show it."""
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float, Float32, Int32, Int64, UInt8
+
+from hilsplat.base.levels import LEVELS, NONE
+
+
+def gaussian_nodes(
+    cluster: Int64[np.ndarray, " M"], num_nodes: int, shares: sp.csr_matrix, min_share: float
+) -> tuple[Int32[np.ndarray, " N"], Float32[np.ndarray, " N"]]:
+    """Give each Gaussian the node in which the largest share of its visible weight lies.
+
+    Args:
+        cluster: node of each mask of one level, -1 for none.
+        num_nodes: number of nodes.
+        shares: weight of each Gaussian in each mask over its weight in all views.
+        min_share: Gaussians whose best node holds no more than this stay without a node.
+
+    Returns:
+        node of each Gaussian, -1 for none (of equal shares the lowest node), and its share there.
+    """
+    inside = np.flatnonzero(cluster >= 0)
+    member = sp.csr_matrix((np.ones(len(inside)), (cluster[inside], inside)), shape=(num_nodes, len(cluster)))
+    per_node = (member @ shares.astype(np.float64)).tocoo()
+    node = np.full(shares.shape[1], NONE, np.int32)
+    membership = np.zeros(shares.shape[1], np.float32)
+    order = np.lexsort((per_node.row, -per_node.data, per_node.col))
+    column = per_node.col[order]
+    first = np.flatnonzero(np.concatenate(([True], column[1:] != column[:-1]))[: len(column)])
+    chosen = order[first]
+    chosen = chosen[per_node.data[chosen] > min_share]
+    node[per_node.col[chosen]] = per_node.row[chosen]
+    membership[per_node.col[chosen]] = per_node.data[chosen]
+    return node, membership
+
+
+def node_parents(
+    node_of_gaussian: Int32[np.ndarray, "N 3"],
+    level: UInt8[np.ndarray, " T"],
+    mass: Float[np.ndarray, " N"],
+    min_coverage: float,
+) -> Int32[np.ndarray, " T"]:
+    """Parent of each node: the coarser node that holds more than `min_coverage` of its visible mass.
+
+    The next coarser level is searched first, then the one above it, so that a subpart may hang
+    directly under a whole. Nodes without such a cover are orphans (-1).
+    """
+    num = len(level)
+    parent = np.full(num, NONE, np.int32)
+    for child_level in LEVELS[1:]:
+        own = node_of_gaussian[:, child_level.index]
+        size = np.bincount(own[own >= 0], mass[own >= 0], minlength=num)
+        for coarser in reversed(LEVELS[: child_level.index]):
+            other = node_of_gaussian[:, coarser.index]
+            both = (own >= 0) & (other >= 0)
+            shared = sp.csr_matrix((mass[both], (own[both], other[both])), shape=(num, num))
+            shared.sum_duplicates()
+            for node in np.flatnonzero((level == int(child_level)) & (parent == NONE)):
+                row = slice(shared.indptr[node], shared.indptr[node + 1])
+                if row.start == row.stop:
+                    continue
+                best = row.start + int(shared.data[row].argmax())
+                if shared.data[best] > min_coverage * size[node]:
+                    parent[node] = shared.indices[best]
+    return parent
+
+
+def mask_fits(
+    node_of_gaussian: Int32[np.ndarray, "N 3"],
+    num_nodes: int,
+    S: sp.csr_matrix,
+    mass: Float32[np.ndarray, "V N"],
+    view: Int32[np.ndarray, " M"],
+    level: UInt8[np.ndarray, " M"],
+    min_fit: float,
+) -> Int32[np.ndarray, " M"]:
+    """Node that each mask shows: the best soft IoU, in the mask's view, of mask and node's Gaussians.
+
+    Returns:
+        node of the mask's level above `min_fit`, else -1.
+    """
+    fits = np.full(len(view), NONE, np.int32)
+    area = np.asarray(S.sum(axis=1, dtype=np.float64)).ravel()
+    for each in LEVELS:
+        node = node_of_gaussian[:, each.index]
+        has = np.flatnonzero(node >= 0)
+        member = sp.csr_matrix((np.ones(len(has)), (has, node[has])), shape=(len(node), num_nodes))
+        rows = np.flatnonzero(level == int(each))
+        inter = (S[rows].astype(np.float64) @ member).tocsr()
+        size = np.asarray(member.T @ mass.T.astype(np.float64))  # [node, view]
+        for place, row in enumerate(rows):
+            span = slice(inter.indptr[place], inter.indptr[place + 1])
+            if span.start == span.stop:
+                continue
+            nodes, shared = inter.indices[span], inter.data[span]
+            iou = shared / (area[row] + size[nodes, view[row]] - shared)
+            best = np.lexsort((nodes, -iou))[0]
+            if iou[best] > min_fit:
+                fits[row] = nodes[best]
+    return fits
+
+
+def nest_nodes(
+    node_of_gaussian: Int32[np.ndarray, "N 3"],
+    level: UInt8[np.ndarray, " T"],
+    parent: Int32[np.ndarray, " T"],
+) -> Int32[np.ndarray, "N 3"]:
+    """Make every child a subset of its parent: the tree is then nested by construction.
+
+    A Gaussian of a child that no node of the parent's level holds joins the parent (and the parent's
+    parent), one that another node holds leaves the child. Coarse levels go first.
+
+    Returns:
+        node of each Gaussian, as before but for those.
+    """
+    nested = node_of_gaussian.copy()
+    index_of = level.astype(np.int64) - 1
+    for child_level in LEVELS[1:]:
+        own = nested[:, child_level.index]
+        members = np.flatnonzero(own >= 0)
+        members = members[parent[own[members]] != NONE]
+        above = parent[own[members]]
+        holds = nested[members, index_of[above]]
+        grand = np.where(parent[above] != NONE, parent[above], NONE)
+        held_above = np.where(grand != NONE, nested[members, index_of[np.maximum(grand, 0)]], NONE)
+        fits_above = (grand == NONE) | (held_above == grand) | (held_above == NONE)
+        joins = (holds == NONE) & fits_above
+        leaves = (holds != above) & ~joins
+        nested[members[joins], index_of[above[joins]]] = above[joins]
+        both = joins & (grand != NONE)
+        nested[members[both], index_of[grand[both]]] = grand[both]
+        nested[members[leaves], child_level.index] = NONE
+    return nested
+
+
+def node_means(
+    node_of_gaussian: Int32[np.ndarray, "N 3"],
+    level: UInt8[np.ndarray, " T"],
+    features: Float32[np.ndarray, "N 3 D"],
+) -> Float32[np.ndarray, "T D"]:
+    """Mean feature of each node's Gaussians at its level."""
+    sums = np.zeros((len(level), features.shape[2]))
+    for each in LEVELS:
+        own = node_of_gaussian[:, each.index]
+        seen = own >= 0
+        counts = np.bincount(own[seen], minlength=len(level))
+        for channel in range(features.shape[2]):
+            total = np.bincount(own[seen], features[seen, each.index, channel], len(level))
+            sums[:, channel] += total / np.maximum(counts, 1)
+    return sums.astype(np.float32)
