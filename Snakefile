@@ -27,6 +27,7 @@ include: "rules/scene.smk"
 include: "rules/splat.smk"
 include: "rules/segment.smk"
 include: "rules/language.smk"
+include: "rules/methods.smk"
 include: "rules/evaluate.smk"
 include: "rules/report.smk"
 

@@ -35,7 +35,11 @@ datasets_app = typer.Typer(
 )
 app.add_typer(world_app, name="world")
 app.add_typer(models_app, name="models")
+cache_app = typer.Typer(help="Caches of finished views.", invoke_without_command=True)
+langsplat_app = typer.Typer(help="LangSplat's files of masks and CLIP vectors.", no_args_is_help=True)
 app.add_typer(datasets_app, name="datasets")
+app.add_typer(cache_app, name="cache")
+app.add_typer(langsplat_app, name="langsplat")
 
 PathIn = Annotated[Path, typer.Option(help="input", show_default=False)]
 PathOut = Annotated[Path, typer.Option(help="output; written atomically", show_default=False)]
@@ -51,21 +55,28 @@ MIN_FREE_MIB = 200.0
 
 STAGE_MODULES: dict[str, str] = {
     "world": "hilsplat.world.stage",
+    "source": "hilsplat.datasets.sources",
     "poses": "hilsplat.scene.poses",
     "gaussians": "hilsplat.splat.fit",
     "masks": "hilsplat.segment.stage",
     "truth_masks": "hilsplat.datasets.truth_masks",
     "tree": "hilsplat.segment.tree_stage",
     "clip": "hilsplat.language.clip_stage",
+    "langsplat": "hilsplat.language.langsplat_files",
     "contributions": "hilsplat.language.contributions",
     "semantic_tree": "hilsplat.language.semantic_tree",
     "autoencoder": "hilsplat.language.autoencoder",
     "language": "hilsplat.language.field",
+    "reference": "hilsplat.language.reference",
+    "method": "hilsplat.methods.stage",
     "evaluate": "hilsplat.evaluate.stage",
-    "tables": "hilsplat.evaluate.tables",
+    "tables": "hilsplat.evaluate.tables.build",
     "efficiency": "hilsplat.evaluate.efficiency",
     "figures": "hilsplat.evaluate.figures",
+    "comparison": "hilsplat.evaluate.comparison",
+    "sweep": "hilsplat.evaluate.sweep_plot",
     "consistency": "hilsplat.evaluate.world_consistency",
+    "tree_truth": "hilsplat.evaluate.tree_truth",
     "models": "hilsplat.world.tiny.train",
 }
 """Module of each stage, whose import closure is the stage's code (see `base.code_hash`)."""
@@ -273,6 +284,21 @@ def tree(masks: PathIn, out: PathOut, settings: Settings = "{}", log: Log = None
         run_tree(masks, out, section)
 
 
+@app.command("show-masks")
+def show_masks(
+    scene: PathIn,
+    masks: PathIn,
+    out: Annotated[Path, typer.Option(help="PNG to write; trees go beside it")] = Path("masks.png"),
+    tree: Annotated[Path | None, typer.Option(help="what the tree stage wrote; draws the trees too")] = None,
+    view: Annotated[str | None, typer.Option(help="view name; default: the middle one")] = None,
+) -> None:
+    """Write a picture of a view's masks at three levels, and of its coverage trees."""
+    start_logging(None)
+    from hilsplat.segment.pictures import masks_overview
+
+    typer.echo(f"wrote {out}, view {masks_overview(scene, masks, out, view, tree)}")
+
+
 @app.command()
 def clip(
     scene: PathIn,
@@ -319,15 +345,16 @@ def semantic_tree(
     clip: PathIn,
     out: PathOut,
     settings: Settings = "{}",
+    threads: Threads = 1,
     log: Log = None,
 ) -> None:
     """Link the masks of all views into nodes at three levels."""
     section = _section("semantic_tree", settings)
     inputs = {"contributions": contributions, "masks": masks, "clip": clip}
-    with stage("semantic_tree", out, log, settings=section, inputs=inputs):
+    with stage("semantic_tree", out, log, settings=section, threads=threads, inputs=inputs):
         from hilsplat.language.semantic_tree import run_semantic_tree
 
-        run_semantic_tree(contributions, masks, clip, out, section)
+        run_semantic_tree(contributions, masks, clip, out, section, threads)
 
 
 @app.command()
@@ -369,6 +396,62 @@ def language(
         run_language(contributions, tree, autoencoder, out, section, seed, threads)
 
 
+@app.command("language-reference")
+def language_reference(
+    scene: PathIn,
+    gaussians: PathIn,
+    masks: PathIn,
+    contributions: PathIn,
+    autoencoder: PathIn,
+    out: PathOut,
+    settings: Settings = "{}",
+    device: Annotated[str, typer.Option(help="what rasterises: auto, cpu or cuda")] = "auto",
+    seed: Seed = 0,
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Train a field by rendering one random view per step: what the solver is compared with; slow."""
+    section = _section("reference", settings)
+    inputs = {
+        "scene": scene,
+        "gaussians": gaussians,
+        "masks": masks,
+        "contributions": contributions,
+        "autoencoder": autoencoder,
+    }
+    with stage("reference", out, log, settings=section, seed=seed, threads=threads, inputs=inputs):
+        from hilsplat.language.reference import run_reference
+
+        run_reference(
+            scene, gaussians, masks, contributions, autoencoder, out, section, device, seed, threads
+        )
+
+
+@app.command()
+def method(
+    scene: PathIn,
+    gaussians: PathIn,
+    masks: PathIn,
+    contributions: PathIn,
+    autoencoder: PathIn,
+    out: PathOut,
+    settings: Settings = "{}",
+    seed: Seed = 0,
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Let a baseline write the language field: langsplat, lifted (settings: name)."""
+    section = _section("method", settings)
+    inputs = {"scene": scene, "gaussians": gaussians, "masks": masks}
+    inputs |= {"contributions": contributions, "autoencoder": autoencoder}
+    with stage("method", out, log, settings=section, seed=seed, threads=threads, inputs=inputs):
+        from hilsplat.methods.method import MethodInputs
+        from hilsplat.methods.stage import run_method
+
+        parts = MethodInputs(scene, gaussians, masks, contributions, autoencoder, threads)
+        run_method(parts, out, section, seed)
+
+
 @app.command()
 def evaluate(
     scene: PathIn,
@@ -382,8 +465,13 @@ def evaluate(
     dataset: Annotated[str, typer.Option(help="data set, for the rows")],
     name: Annotated[str, typer.Option(help="scene, for the rows")],
     truth: Annotated[Path | None, typer.Option(help="annotations of a synthetic scene")] = None,
-    labels: Annotated[str, typer.Option(help="or a labelled scene, as lerf_ovs/figurines")] = "",
+    labels: Annotated[
+        list[str] | None, typer.Option(help="or labels of published data sets, as lerf_ovs/figurines")
+    ] = None,
     data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders")] = Path(),
+    kind: Annotated[
+        str, typer.Option(help="kind of a synthetic scene, tabletop, room or street: what it stands in for")
+    ] = "",
     variant: Annotated[str, typer.Option(help="variant, for the rows")] = "default",
     settings: Settings = "{}",
     threads: Threads = 1,
@@ -402,11 +490,12 @@ def evaluate(
         "masks": masks,
     }
     with stage("evaluate", out, log, settings=section, threads=threads, inputs=inputs):
-        from hilsplat.datasets.registry import open_labelled
+        from hilsplat.evaluate.asked import Asked
         from hilsplat.evaluate.stage import run_evaluate
 
         run_evaluate(
-            labels=open_labelled(labels, data_root) if labels else None,
+            labels=[Asked.open(name, data_root) for name in labels or ()],
+            asked=Asked.of_world(kind),
             scene_folder=scene,
             truth=truth,
             gaussians=gaussians,
@@ -426,21 +515,25 @@ def evaluate(
 
 @app.command()
 def table(
-    name: Annotated[str, typer.Argument(help="table: hierarchy, lerf or ablation")],
-    scores: Annotated[list[Path], typer.Argument(help="scores.csv files of the scenes and variants")],
+    name: Annotated[str, typer.Argument(help="table: hierarchy, lerf, ablation, ... (docs/tables.md)")],
     published: PathIn,
     out: Annotated[Path, typer.Option(help="the CSV; .md, .tex and .html are written beside it")],
+    scores: Annotated[
+        list[Path] | None, typer.Argument(help="scores.csv files of the scenes and variants")
+    ] = None,
     labels: Annotated[str, typer.Option(help="JSON: how the table names a variant")] = "{}",
+    absent: Annotated[list[str] | None, typer.Option(help="what was not measured, and why")] = None,
     log: Log = None,
 ) -> None:
     """Build one table of the paper: reported rows, measured rows, stand-in rows."""
     import json
 
+    scores = scores or []
     inputs = {"published": published, **{f"scores {number}": path for number, path in enumerate(scores)}}
     with stage("tables", out, log, inputs=inputs):
-        from hilsplat.evaluate.tables import run_table
+        from hilsplat.evaluate.tables.build import run_table
 
-        run_table(name, scores, published, json.loads(labels), out)
+        run_table(name, scores, published, json.loads(labels), out, absent or [])
 
 
 @app.command()
@@ -455,6 +548,8 @@ def figures(
     autoencoder: PathIn,
     out: Annotated[Path, typer.Option(help="panel PNG; registration.png and fit.png go beside it")],
     truth: Annotated[Path | None, typer.Option(help="truth folder, where the scene has one")] = None,
+    labels: Annotated[str, typer.Option(help="or a labelled scene, as lerf_ovs/figurines")] = "",
+    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders")] = Path(),
     queries: Annotated[str, typer.Option(help="JSON list of texts, where the scene has no labels")] = "[]",
     settings: Settings = "{}",
     evaluate: Settings = "{}",
@@ -470,6 +565,7 @@ def figures(
     section, protocol = _section("figures", settings), _section("evaluate", evaluate)
     inputs = {"scene": scene, "gaussians": gaussians, "masks": masks, "language": language}
     with stage("figures", out, log, settings=section, threads=threads, inputs=inputs):
+        from hilsplat.datasets.registry import open_labelled
         from hilsplat.evaluate.figures import run_figures
 
         for source, name in (
@@ -492,7 +588,59 @@ def figures(
             evaluate=protocol,
             queries=json.loads(queries),
             threads=threads,
+            labels=open_labelled(labels, data_root) if labels else None,
         )
+
+
+@app.command()
+def comparison(
+    folder: Annotated[Path, typer.Option(help="results/<dataset>/<scene>, finished", show_default=False)],
+    variants: Annotated[str, typer.Option(help="JSON list of variants that are compared")],
+    out: Annotated[Path, typer.Option(help="PNG; views.png, features.png and PDFs are written beside it")],
+    names: Annotated[str, typer.Option(help="JSON: how figures name a variant")] = "{}",
+    truth: Annotated[Path | None, typer.Option(help="truth folder, where the scene has one")] = None,
+    labels: Annotated[str, typer.Option(help="or a labelled scene, as lerf_ovs/figurines")] = "",
+    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders")] = Path(),
+    queries: Annotated[str, typer.Option(help="JSON list of texts, where the scene has no labels")] = "[]",
+    settings: Settings = "{}",
+    evaluate: Settings = "{}",
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Draw queries by method, one query over four views, and features at three levels."""
+    import json
+
+    section, protocol = _section("figures", settings), _section("evaluate", evaluate)
+    with stage("comparison", out, log, settings=section, threads=threads):
+        from hilsplat.datasets.registry import open_labelled
+        from hilsplat.evaluate.comparison import run_comparison
+
+        run_comparison(
+            folder,
+            json.loads(variants),
+            json.loads(names),
+            out,
+            section,
+            protocol,
+            truth=truth,
+            labels=open_labelled(labels, data_root) if labels else None,
+            queries=json.loads(queries),
+            threads=threads,
+        )
+
+
+@app.command()
+def sweep(
+    name: Annotated[str, typer.Argument(help="theta or omega")],
+    table: Annotated[Path, typer.Option(help="the finished CSV of that table")],
+    out: Annotated[Path, typer.Option(help="PNG; the PDF is written beside it")],
+    log: Log = None,
+) -> None:
+    """Plot a sweep from its table: the paper's curves, and ours."""
+    with stage("sweep", out, log, inputs={"table": table}):
+        from hilsplat.evaluate.sweep_plot import run_sweep_plot
+
+        run_sweep_plot(name, table, out)
 
 
 @app.command()
@@ -536,16 +684,44 @@ def query(
     variant: Annotated[str, typer.Option(help="variant whose files answer")] = "default",
     results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
     views: Annotated[int, typer.Option(min=1, max=8, help="views in the panel")] = 3,
-    out: Annotated[Path | None, typer.Option(help="folder of panel.png; default: beside the scene")] = None,
+    answerer: Annotated[str, typer.Option(help="tree, or field: the paper's")] = "tree",
+    out: Annotated[
+        Path | None, typer.Option(help="folder of panel.png and selection.ply; default: beside the scene")
+    ] = None,
     threads: Threads = 2,
 ) -> None:
-    """Ask a finished scene for a text: score, level, position, box, views, and a panel PNG."""
+    """Ask a finished scene for a text: score, level, position, box, views; a panel PNG and a PLY."""
     start_logging(None)
     from hilsplat.evaluate.query_panel import answer
 
     typer.echo(
-        answer(results / scene, text, level=level, variant=variant, views=views, out=out, threads=threads)
+        answer(
+            results / scene,
+            text,
+            level=level,
+            variant=variant,
+            views=views,
+            answerer=answerer,
+            out=out,
+            threads=threads,
+        )
     )
+
+
+@app.command()
+def export(
+    scene: Annotated[str, typer.Argument(help="dataset/scene, such as photos/bear")],
+    variant: Annotated[str, typer.Option(help="variant whose tree is written")] = "default",
+    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    out: Annotated[Path | None, typer.Option(help="folder to write; default: beside the scene")] = None,
+    threads: Threads = 2,
+) -> None:
+    """Write the semantic tree of a finished scene: JSON, a PLY with nodes per Gaussian, a picture."""
+    start_logging(None)
+    from hilsplat.evaluate.tree_picture import export_tree
+
+    folder = results / scene
+    typer.echo(export_tree(folder, variant, out or folder / "export" / variant, threads))
 
 
 @app.command()
@@ -620,6 +796,27 @@ def world_inconsistency(
     typer.echo(table)
 
 
+@world_app.command("tree")
+def world_tree(
+    scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has a tree")],
+    variant: Annotated[str, typer.Option(help="variant whose tree is measured")] = "default",
+    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    out: Annotated[Path | None, typer.Option(help="CSV to write; default: beside the tree")] = None,
+    threads: Threads = 2,
+) -> None:
+    """Measure the 3D semantic tree against the true nodes: matches, purity, parents."""
+    folder = results / scene
+    semantic_tree, truth = folder / variant / "semantic_tree", folder / "world" / "truth"
+    target = out or semantic_tree.with_name("tree_truth.csv")
+    with stage("tree_truth", target, None, inputs={"truth": truth, "semantic_tree": semantic_tree}):
+        from hilsplat.evaluate.tree_truth import run_tree_truth
+
+        table = run_tree_truth(
+            folder / "scene", folder / "gaussians.ply", semantic_tree, truth, target, threads
+        )
+    typer.echo(table)
+
+
 @models_app.command("check")
 def models_check(folder: Annotated[Path, typer.Argument(help="model folder")]) -> None:
     """Say what a model folder holds, and time one image."""
@@ -627,6 +824,16 @@ def models_check(folder: Annotated[Path, typer.Argument(help="model folder")]) -
     from hilsplat.language.model_check import check_model
 
     typer.echo(check_model(folder))
+
+
+@models_app.command("split")
+def models_split(folder: Annotated[Path, typer.Argument(help="folder of an exported CLIP")]) -> None:
+    """Cut the model.onnx of an exported CLIP into the two networks that are read."""
+    start_logging(None)
+    from hilsplat.base.clip_split import split_clip
+
+    for path in split_clip(folder):
+        typer.echo(f"wrote {path}")
 
 
 @models_app.command("train")
@@ -680,21 +887,83 @@ def datasets_check(
         raise typer.Exit(1)
 
 
-@app.command("cache")
-def cache_command(
-    folder: Annotated[Path, typer.Argument(help="cache folder")] = DEFAULT_CACHE,
-    prune_days: Annotated[float, typer.Option(help="delete entries not used for so many days")] = -1.0,
+@datasets_app.command("export")
+def datasets_export(
+    name: Annotated[str, typer.Argument(help="scene with labelled points, such as scannet/scene0000_00")],
+    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders", show_default=False)],
+    out: PathOut,
+    log: Log = None,
 ) -> None:
-    """Show the size of the cache of finished views, and prune it."""
-    import time
+    """Write images and poses of such a scene as a folder that `poses` imports."""
+    with stage("source", out, log):
+        from hilsplat.datasets.sources import export_images
 
-    files = [path for path in folder.rglob("*") if path.is_file()] if folder.is_dir() else []
-    old = [
-        path for path in files if prune_days >= 0 and time.time() - path.stat().st_mtime > prune_days * 86400
-    ]
-    typer.echo(f"{folder}: {len(files)} files, {sum(path.stat().st_size for path in files) / 2**20:.1f} MiB")
-    if old:
-        freed = sum(path.stat().st_size for path in old)
-        for path in old:
-            path.unlink()
-        typer.echo(f"deleted {len(old)} files, {freed / 2**20:.1f} MiB")
+        export_images(name, data_root, out)
+
+
+@cache_app.callback()
+def cache_show(
+    context: typer.Context,
+    folder: Annotated[Path, typer.Option(help="cache folder")] = DEFAULT_CACHE,
+) -> None:
+    """Show the size of the caches of finished views."""
+    start_logging(None)
+    from hilsplat.base.cache import size_table
+
+    context.obj = folder
+    if context.invoked_subcommand is None:
+        typer.echo(size_table(folder))
+
+
+@cache_app.command("prune")
+def cache_prune(
+    context: typer.Context,
+    days: Annotated[
+        float | None, typer.Option(min=0, help="delete what was not used for so many days")
+    ] = None,
+    max_mib: Annotated[
+        float | None, typer.Option(min=0, help="delete the longest unused until so much is left")
+    ] = None,
+    stage: Annotated[
+        list[str] | None, typer.Option(help="masks, clip, contributions; default: all of them")
+    ] = None,
+) -> None:
+    """Delete finished views; they are computed again where a stage needs them."""
+    from hilsplat.base.cache import prune_cache, size_table
+
+    number, freed_mib = prune_cache(context.obj, stage or [], days=days, max_mib=max_mib)
+    typer.echo(f"deleted {number} files, {freed_mib:.1f} MiB\n{size_table(context.obj)}")
+
+
+@langsplat_app.command("read")
+def langsplat_read(
+    scene: PathIn,
+    files: Annotated[Path, typer.Option(help="LangSplat's folder of _s.npy and _f.npy", show_default=False)],
+    masks: Annotated[Path, typer.Option(help="masks artifact to write", show_default=False)],
+    clip: Annotated[Path, typer.Option(help="clip artifact to write", show_default=False)],
+    resize: Annotated[bool, typer.Option(help="take maps of another size, nearest pixel")] = False,
+    settings: Annotated[
+        str, typer.Option(help="the clip section as JSON: the model that embeds texts")
+    ] = "{}",
+    log: Log = None,
+) -> None:
+    """Take masks and CLIP vectors that LangSplat's preprocessing made, in place of masks and clip."""
+    section = _section("clip", settings)
+    inputs = {"scene": scene, "files": files}
+    with stage("langsplat", masks, log, inputs=inputs):
+        from hilsplat.language.langsplat_files import read_masks
+
+        read_masks(scene, files, masks, resize)
+    with stage("langsplat", clip, log, settings=section, inputs={**inputs, "masks": masks}):
+        from hilsplat.language.langsplat_files import read_clip
+
+        read_clip(scene, files, clip, resize, section)
+
+
+@langsplat_app.command("write")
+def langsplat_write(masks: PathIn, clip: PathIn, out: PathOut, log: Log = None) -> None:
+    """Write masks and CLIP vectors as LangSplat's preprocessing does."""
+    with stage("langsplat", out, log, inputs={"masks": masks, "clip": clip}):
+        from hilsplat.language.langsplat_files import write_langsplat
+
+        write_langsplat(masks, clip, out)

@@ -7,6 +7,7 @@ hold it. `workflow/schemas/` is generated from here.
 
 import difflib
 import json
+import re
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -150,6 +151,14 @@ class MasksSettings(Section):
     stability_min: float = knob(
         0.5, "masks below are dropped", ge=0, le=1, origin="SAM: 0.95, LangSplat: 0.85"
     )
+    level_source: Literal["sam", "tree"] = knob(
+        "sam",
+        "level of a mask: sam, the head (or scale) that gave it; tree, its depth among all masks of the view",
+        origin="paper, LangSplat: sam",
+    )
+    level_theta: float = knob(
+        0.9, "share of a mask inside another one that makes it deeper; tree levels only", gt=0.5, lt=1
+    )
     stability_offset: float = knob(1.0, "logit offset of the stability test", gt=0, origin="SAM")
     box_nms_iou: float = knob(0.7, "box IoU above which the worse mask is dropped", gt=0, le=1, origin="SAM")
     min_area_px: int = knob(
@@ -269,11 +278,16 @@ class SemanticTreeSettings(Section):
     parent_coverage: float = knob(
         0.5, "share of a node inside a coarser one that makes it a child", gt=0, lt=1
     )
+    nested: bool = knob(True, "make every child a subset of its parent")
+    device: Literal["cpu", "cuda"] = knob("cpu", "what forms the evidence; cuda: torch, equal to rounding")
 
 
 class AutoencoderSettings(Section):
     """Scene autoencoder of CLIP vectors."""
 
+    code: Literal["network", "pca"] = knob(
+        "network", "network: trained; pca: mean and principal directions", origin="paper: network"
+    )
     latent: int = knob(8, "latent numbers d", ge=1, le=64, origin="paper, LangSplat: 3")
     targets: Literal["node", "mask"] = knob(
         "node",
@@ -306,12 +320,53 @@ class LanguageSettings(Section):
     )
     omega: float = knob(10.0, "similarity degree Omega", gt=1, origin="paper: 10")
     tau: float = knob(0.1, "temperature of L_part", gt=0, origin="paper: not given; VCH: 0.1")
-    ridge: float = knob(0.1, "pull towards the lifted average, in units of the visible mass", ge=0)
+    start: Literal["average", "median"] = knob(
+        "average", "lift of the mask latents to Gaussians: average, or geometric median (robust, like L1)"
+    )
+    ridge: float = knob(0.1, "pull towards the lift, in units of the visible mass", ge=0)
+    min_labelled_share: float = knob(
+        0.3,
+        "a Gaussian of which masks of a level hold less than this share keeps no latent there; 0: all do",
+        ge=0,
+        lt=1,
+        origin="paper, LangSplat: 0",
+    )
     cg_steps: int = knob(10, "conjugate-gradient steps of the quadratic part", ge=0)
     lbfgs_steps: int = knob(30, "L-BFGS steps where L_ins or L_part are on", ge=0)
     min_mask_px: int = knob(50, "smaller masks stay out of L_ins and L_part", unit="px", ge=1)
     max_masks_per_level: int = knob(
         96, "masks of one view and level in L_ins and L_part, largest first", ge=2
+    )
+    prune_cosine: float = knob(
+        1.0,
+        "L_ins and L_part drop a mask whose mean is more alike to a larger one of its view and level; "
+        "1: keep all",
+        ge=0,
+        le=1,
+        origin="paper: pruning, no number",
+    )
+    device: Literal["cpu", "cuda"] = knob("cpu", "what multiplies; cuda: torch, equal to rounding")
+
+
+class ReferenceSettings(Section):
+    """The reference trainer of the field: renders one random view per step, as LangSplat does."""
+
+    steps: int = knob(30_000, "steps, one view each", ge=1, origin="LangSplat, paper")
+    rate: float = knob(0.0025, "step size of Adam", gt=0, origin="LangSplat")
+    loss: Literal["l1", "squared"] = knob(
+        "l1", "l1: LangSplat's masked L1; squared: the language loss of the fast solver", origin="LangSplat"
+    )
+    log_every: int = knob(1000, "steps between two lines of the report's curve", ge=1)
+
+
+class MethodSettings(Section):
+    """Who writes the field: the method of this repository, or a baseline (hilsplat/methods)."""
+
+    name: str = knob("hilsplat", "hilsplat, or a name of hilsplat/methods/registry.py")
+    steps: int = knob(900, "langsplat: steps per level, one view each", ge=1, origin="LangSplat: 30000")
+    rate: float = knob(0.0025, "langsplat: step size of Adam", gt=0, origin="LangSplat")
+    pixel_step: int = knob(
+        2, "langsplat: every so many pixels of rows and columns are compared", ge=1, origin="LangSplat: 1"
     )
 
 
@@ -322,6 +377,12 @@ class EvaluateSettings(Section):
         ("object", "things", "stuff", "texture"),
         "canonical phrases of the relevancy",
         origin="LERF, LangSplat",
+    )
+    template: str = knob(
+        "{}",
+        "sentence that every text and canonical phrase is put into at {}, such as 'a photo of a {}'",
+        origin="LERF, LangSplat: {}",
+        pattern=r"^[^{}]*\{\}[^{}]*$",
     )
     relevancy_scale: float = knob(10.0, "scale of the cosine in the relevancy", gt=0, origin="LangSplat")
     filter_px: int = knob(
@@ -346,10 +407,21 @@ class EvaluateSettings(Section):
         "level of a map where none is given: highest value, or highest mean in its mask",
         origin="LangSplat: max",
     )
-    node_select: float = knob(0.85, "nodes above this share of the best (min-max) are selected", ge=0, le=1)
+    node_select: float = knob(
+        0.95, "nodes above this share of the range of cosine margins are selected", ge=0, le=1
+    )
     min_region_px: int = knob(60, "smaller true regions are not scored", unit="px", ge=1)
     methods: tuple[Literal["tree", "tree-path", "field"], ...] = knob(
         ("tree", "tree-path", "field"), "what answers; each becomes a row"
+    )
+    points: Literal["nearest", "vote", "density", "frozen"] = knob(
+        "nearest",
+        "how labelled points get what Gaussians know: the nearest opaque one, a vote of 5 within 10 cm, the "
+        "densest 8, or each its own (brought Gaussians that are the points)",
+        origin="OpenGaussian: frozen",
+    )
+    consistency_texts: int = knob(
+        4, "texts per level and view whose consistency between views is measured; 0: none", ge=0
     )
 
 
@@ -392,6 +464,8 @@ class StageSettings(Section):
     semantic_tree: SemanticTreeSettings = SemanticTreeSettings()
     autoencoder: AutoencoderSettings = AutoencoderSettings()
     language: LanguageSettings = LanguageSettings()
+    method: MethodSettings = MethodSettings()
+    reference: ReferenceSettings = ReferenceSettings()
     evaluate: EvaluateSettings = EvaluateSettings()
     figures: FiguresSettings = FiguresSettings()
     training: TrainingSettings = TrainingSettings()
@@ -448,6 +522,7 @@ VARIANT_SECTIONS = (
     "semantic_tree",
     "autoencoder",
     "language",
+    "method",
     "evaluate",
 )
 """Sections a variant may override; the stages before them are shared by all variants."""
@@ -465,6 +540,13 @@ UPSTREAM: dict[str, tuple[str, ...]] = {
 """Sections that each variant stage depends on, through its inputs too."""
 
 
+SEEDED = re.compile(r"(?P<variant>.+?)(?:\.seed(?P<seed>[0-9]+))?")
+"""A variant's name, with the number of the seed behind it where it is not the first."""
+
+SEEDED_STAGES = ("autoencoder", "language", "evaluate")
+"""Stages whose results depend on the seed; variants that differ in it share those before."""
+
+
 class RunSettings(StageSettings):
     """The whole configuration: what is run, with which settings."""
 
@@ -477,6 +559,13 @@ class RunSettings(StageSettings):
     data_root: str = knob("", "folder of the real data sets; empty: they are skipped")
     main_variants: tuple[str, ...] = knob(("default",), "variants in the main tables")
     ablation_variants: tuple[str, ...] = knob((), "variants in the ablation table")
+    theta_variants: tuple[str, ...] = knob((), "variants in the sweep over theta")
+    omega_variants: tuple[str, ...] = knob((), "variants in the sweep over Omega")
+    pruning_variants: tuple[str, ...] = knob((), "variants in the table of pruned pairs")
+    sweep_scenes: tuple[str, ...] = knob(
+        (), "names of scenes for ablation, sweeps and pruning; empty: all tabletop and photographed ones"
+    )
+    seeds: int = knob(1, "seeds of autoencoder and field; more than one gives mean and spread", ge=1, le=10)
     variants: dict[str, dict[str, dict[str, Any]]] = knob(
         {}, "named overrides: variant -> section -> knob -> value; 'default' always exists"
     )
@@ -487,9 +576,19 @@ class RunSettings(StageSettings):
     queries: dict[str, tuple[str, ...]] = knob({}, "texts shown in the panel of a scene without labels")
 
     def variant_names(self) -> list[str]:
-        """Variants that a run needs, "default" first."""
-        names = ["default", *self.main_variants, *self.ablation_variants]
-        return list(dict.fromkeys(names))
+        """Variants that a run needs, "default" first; with more than one seed each of them per seed."""
+        lists = (self.main_variants, self.ablation_variants, self.theta_variants)
+        lists += (self.omega_variants, self.pruning_variants)
+        names = dict.fromkeys(["default", *(name for names in lists for name in names)])
+        return [name for first in names for name in self.seeded(first)]
+
+    def seeded(self, variant: str) -> list[str]:
+        """A variant under every seed: its own name, then `<name>.seed1`, ..."""
+        return [variant, *(f"{variant}.seed{number}" for number in range(1, self.seeds))]
+
+    def seed_of(self, variant: str) -> int:
+        """Seed of a variant's networks."""
+        return self.seed + int(SEEDED.fullmatch(variant)["seed"] or 0)
 
     def stages(self, variant: str = "default", scopes: tuple[str, ...] = ()) -> StageSettings:
         """Settings of a variant for a scene.
@@ -501,6 +600,7 @@ class RunSettings(StageSettings):
         Raises:
             SettingsError: the variant is unknown or an override cannot be used.
         """
+        variant = SEEDED.fullmatch(variant)["variant"]
         merged = {name: getattr(self, name).model_dump() for name in SECTIONS}
         layers = [(f"overrides.{scope}", self.overrides.get(scope, {})) for scope in scopes]
         if variant != "default" or variant in self.variants:

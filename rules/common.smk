@@ -13,9 +13,18 @@ from hilsplat.base.artifacts import sha256_of_path
 from hilsplat.base.code_hash import code_hash as code_of
 from hilsplat.base.errors import HilsplatError
 from hilsplat.cli import STAGE_MODULES
-from hilsplat.datasets.published import FRAMES, PROMPTS
+from hilsplat.datasets.sources import (
+    absence,
+    image_files,
+    is_exported,
+    label_files,
+    label_sets,
+    published,
+)
+from hilsplat.evaluate.tables.build import TABLES
+from hilsplat.methods.registry import METHODS, OURS, require_method
 from hilsplat.scene.sheet import read_sheet
-from hilsplat.settings import UPSTREAM, parse_run
+from hilsplat.settings import SEEDED_STAGES, UPSTREAM, parse_run
 
 
 def or_stop(function, *arguments):
@@ -27,16 +36,22 @@ def or_stop(function, *arguments):
 
 
 RUN = or_stop(parse_run, config)
+for name in RUN.variant_names():
+    or_stop(require_method, RUN.stages(name).method.name)
 ALL_SCENES = or_stop(read_sheet, Path(RUN.scenes), RUN.groups, RUN.data_root)
 CHOSEN = [
     row
     for row in ALL_SCENES
     if row.group in RUN.groups and (not RUN.only or row.scene in RUN.only)
 ]
-SCENES = [row for row in CHOSEN if row.world or row.folder]
-for row in CHOSEN:
-    if row not in SCENES:
-        logger.warning(f"{row.name} is skipped: data_root is not set")
+ABSENT = {
+    row.name: reason
+    for row in CHOSEN
+    if (reason := absence(row.source, RUN.data_root)) is not None
+}
+SCENES = [row for row in CHOSEN if row.name not in ABSENT]
+for name, reason in ABSENT.items():
+    logger.warning(f"{name} is skipped: {reason}")
 if not SCENES:
     raise WorkflowError(
         f"no scene to run: groups {list(RUN.groups)}, only {list(RUN.only)}, "
@@ -56,8 +71,17 @@ THREADS = max(1, CORES // min(len(SCENES), CORES))
 
 
 def any_of(names):
-    """Regular expression that matches exactly these names."""
-    return "|".join(sorted({re.escape(name) for name in names}))
+    """Regular expression that matches exactly these names; none where there is no name."""
+    return "|".join(sorted({re.escape(name) for name in names})) or "(?!)"
+
+
+def variants_by_method(baselines):
+    """Variants whose field a baseline writes, or those whose field is ours."""
+    return [
+        name
+        for name in RUN.variant_names()
+        if (RUN.stages(name).method.name != OURS) == baselines
+    ]
 
 
 def row_of(wildcards):
@@ -89,6 +113,11 @@ def code(stage):
     if callable(stage):
         return lambda wildcards: code(stage(wildcards))
     return or_stop(code_of, STAGE_MODULES[stage])
+
+
+def code_of_method(wildcards):
+    """Parameter: digest of the code of the baseline that writes a variant's field."""
+    return or_stop(code_of, METHODS[stages_of(wildcards).method.name])
 
 
 def stage_of_masks(wildcards):
@@ -130,6 +159,9 @@ def shared_variant(stage, wildcards):
         if all(
             getattr(other, section) == getattr(wanted, section)
             for section in UPSTREAM[stage]
+        ) and (
+            stage not in SEEDED_STAGES
+            or RUN.seed_of(name) == RUN.seed_of(wildcards.variant)
         ):
             return name
     return wildcards.variant
@@ -144,11 +176,12 @@ def shared(stage, path):
 
 def photos_of(wildcards):
     """Files that a scene of photographs is made from; one more or one less reruns its poses."""
-    folder = row_of(wildcards).folder
+    row = row_of(wildcards)
+    labels = set(label_files_of(row))
     return sorted(
         str(path)
-        for path in folder.rglob("*")
-        if path.is_file() and not path.name.startswith(".")
+        for path in row.folder.rglob("*")
+        if path.is_file() and not path.name.startswith(".") and str(path) not in labels
     )
 
 
@@ -210,23 +243,38 @@ def memo_digest(folder):
 def images_of(wildcards):
     """Folder that the poses of a scene are found from."""
     row = row_of(wildcards)
-    return (
-        f"results/{row.dataset}/{row.scene}/world/images"
-        if row.world
-        else str(row.folder)
-    )
+    if row.world:
+        return f"results/{row.dataset}/{row.scene}/world/images"
+    if is_exported(row.source):
+        return f"results/{row.dataset}/{row.scene}/source"
+    return str(row.folder)
 
 
 def image_files_of(wildcards):
-    """Input of poses: the rendered folder, or each file of a folder of photographs."""
-    return images_of(wildcards) if row_of(wildcards).world else photos_of(wildcards)
+    """Input of poses: a folder that a rule writes, or each file of a folder of photographs."""
+    row = row_of(wildcards)
+    if row.world or is_exported(row.source):
+        return images_of(wildcards)
+    return photos_of(wildcards)
+
+
+def source_files_of(wildcards):
+    """Input of source: files of a data set that images and poses are written from."""
+    return [str(path) for path in image_files(row_of(wildcards).source, RUN.data_root)]
 
 
 def labels_of(row):
-    """Published labels of a scene as `data set/scene`, or "" where it has none."""
-    dataset, _, scene = row.source.removeprefix("data:").partition("/")
-    is_published = row.source.startswith("data:") and dataset in (*FRAMES, *PROMPTS)
-    return f"{dataset}/{scene}" if is_published else ""
+    """Labels of a scene of a published data set, as `data set/scene`; several may share its images."""
+    return label_sets(row.source, RUN.data_root)
+
+
+def label_files_of(row):
+    """Files that only evaluation reads: an edited one reruns nothing before it."""
+    return [
+        str(path.resolve())
+        for labels in labels_of(row)
+        for path in label_files(labels, RUN.data_root)
+    ]
 
 
 def labelled(rows):
@@ -238,43 +286,89 @@ def truth_option_of(wildcards, input):
     """Parameter: what a scene is scored against."""
     row = row_of(wildcards)
     if row.world:
-        return f"--truth {shlex.quote(str(input.truth))}"
-    root = (
-        row.folder.parent.parent
-    )  # the sheet resolved `data:<data set>/<scene>` below the data root
-    return (
-        f"--labels {shlex.quote(labels_of(row))} --data-root {shlex.quote(str(root))}"
+        return f"--truth {shlex.quote(truth_of(wildcards)[0])} --kind {row.world[0]}"
+    options = [f"--labels {shlex.quote(labels)}" for labels in labels_of(row)]
+    return " ".join([*options, f"--data-root {shlex.quote(str(Path(RUN.data_root)))}"])
+
+
+def data_of(row):
+    """What a scene is to a table: its kind of synthetic scene, or its published data set."""
+    if row.world:
+        return row.world[0]
+    place = published(row.source)
+    return place[0] if place else ""
+
+
+def variants_of(table):
+    """Variants of a table, every seed of each."""
+    listed = getattr(RUN, TABLES[table].variants)
+    return [name for variant in listed for name in RUN.seeded(variant)]
+
+
+def scores_of(table):
+    """Score files that a table is built from; sweeps take the scenes that are named for them."""
+    kind = TABLES[table]
+    rows = [row for row in labelled(SCENES) if data_of(row) in kind.data]
+    if kind.is_sweep and RUN.sweep_scenes:
+        rows = [row for row in rows if row.scene in RUN.sweep_scenes]
+    return [
+        f"results/{row.dataset}/{row.scene}/{variant}/scores.csv"
+        for row in rows
+        for variant in variants_of(table)
+    ]
+
+
+def absent_of(table):
+    """Parameter: options that tell which scenes of a table's data sets were not measured."""
+    told = {}
+    for row in ALL_SCENES:
+        reason = absence(row.source, RUN.data_root)
+        place = published(row.source)
+        if place and place[0] in TABLES[table].data and reason is not None:
+            told.setdefault((row.dataset, reason), []).append(row.scene)
+    return " ".join(
+        f"--absent {shlex.quote(f'{dataset} ({names(scenes)}): {reason}.')}"
+        for (dataset, reason), scenes in told.items()
     )
 
 
-def scores_of(variants):
-    """Score files of all labelled scenes for some variants."""
-    return [
-        f"results/{row.dataset}/{row.scene}/{variant}/scores.csv"
-        for row in labelled(SCENES)
-        for variant in variants
-    ]
-
-
-TABLES = {
-    "hierarchy": RUN.main_variants,
-    "lerf": RUN.main_variants,
-    "ablation": RUN.ablation_variants,
-}
+def names(scenes):
+    """Some names, the first three in full."""
+    more = f" and {len(scenes) - 3} more" if len(scenes) > 3 else ""
+    return ", ".join(scenes[:3]) + more
 
 
 def targets_of_tables():
-    """Tables that the configured scenes can fill; none where no scene has labels."""
-    if not labelled(SCENES):
-        return []
-    return [
-        f"results/tables/{name}.csv" for name, variants in TABLES.items() if variants
-    ]
+    """Every table, measured on whatever scenes there are; the paper's rows are always there."""
+    return [f"results/tables/{name}.csv" for name in TABLES]
 
 
 def targets_of_figures():
-    """The panel of every scene."""
-    return [f"results/figures/{row.dataset}/{row.scene}/panel.png" for row in SCENES]
+    """The panel of every scene, methods side by side in the scenes of the sweeps, plots of the sweeps."""
+    compared = [
+        row for row in SCENES if not RUN.sweep_scenes or row.scene in RUN.sweep_scenes
+    ]
+    return [
+        *(f"results/figures/{row.dataset}/{row.scene}/panel.png" for row in SCENES),
+        *(
+            f"results/figures/{row.dataset}/{row.scene}/comparison.png"
+            for row in compared
+        ),
+        *(f"results/figures/sweep-{name}.png" for name in ("theta", "omega")),
+    ]
+
+
+def figure_truth_of(wildcards):
+    """Parameter of figures: what names the queries and is outlined, where there is something."""
+    row = row_of(wildcards)
+    if row.world:
+        return f"--truth {shlex.quote(truth_of(wildcards)[0])}"
+    on_images = [
+        labels for labels in labels_of(row) if not is_exported(f"data:{labels}")
+    ]
+    if not on_images:
+        return ""
+    return f"--labels {shlex.quote(on_images[-1])} --data-root {shlex.quote(str(Path(RUN.data_root)))}"
 
 
 def queries_of(wildcards):
@@ -286,6 +380,11 @@ def truth_of(wildcards):
     """Input: the annotations of a scene, where it has some."""
     row = row_of(wildcards)
     return [f"results/{row.dataset}/{row.scene}/world/truth"] if row.world else []
+
+
+def truth_or_labels_of(wildcards):
+    """Input of evaluate: the annotations of a synthetic scene, or the label files of a published one."""
+    return truth_of(wildcards) or label_files_of(row_of(wildcards))
 
 
 def print_where_time_went():

@@ -2,7 +2,7 @@
 rule evaluate:
     input:
         scene="results/{dataset}/{scene}/scene",
-        truth=truth_of,  # nothing, for published labels
+        truth=truth_or_labels_of,
         gaussians="results/{dataset}/{scene}/gaussians.ply",
         semantic_tree=shared("semantic_tree", "semantic_tree"),
         language=shared("language", "language.safetensors"),
@@ -11,6 +11,7 @@ rule evaluate:
         masks=shared("masks", "masks"),
     output:
         scores="results/{dataset}/{scene}/{variant}/scores.csv",
+        times="results/{dataset}/{scene}/{variant}/times.csv",
     log:
         "results/{dataset}/{scene}/{variant}/logs/evaluate.log",
     benchmark:
@@ -34,7 +35,7 @@ rule evaluate:
 
 rule table:
     input:
-        scores=lambda wildcards: scores_of(TABLES[wildcards.table]),
+        scores=lambda wildcards: scores_of(wildcards.table),
         published="config/published/{table}.csv",
     output:
         csv="results/tables/{table}.csv",
@@ -58,10 +59,11 @@ rule table:
         mem_mb=1000,
     params:
         labels=json.dumps(dict(RUN.labels)),
+        absent=lambda wildcards: absent_of(wildcards.table),
         code=code("tables"),
     shell:
         "hilsplat table {wildcards.table} --published {input.published} --labels {params.labels:q}"
-        " --out {output.csv} --log {log} {input.scores}"
+        " {params.absent} --out {output.csv} --log {log} {input.scores}"
 
 
 rule tables:

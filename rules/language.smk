@@ -63,7 +63,7 @@ rule semantic_tree:
         "results/{dataset}/{scene}/{variant}/benchmarks/semantic_tree.jsonl"
     conda:
         ENVIRONMENT
-    threads: 1
+    threads: THREADS
     resources:
         mem_mb=3000,
     params:
@@ -71,7 +71,8 @@ rule semantic_tree:
         code=code("semantic_tree"),
     shell:
         "hilsplat semantic-tree --contributions {input.contributions} --masks {input.masks}"
-        " --clip {input.clip} --settings {params.settings:q} --out {output.semantic_tree} --log {log}"
+        " --clip {input.clip} --settings {params.settings:q} --threads {threads}"
+        " --out {output.semantic_tree} --log {log}"
 
 
 rule autoencoder:
@@ -92,7 +93,7 @@ rule autoencoder:
         mem_mb=2000,
     params:
         settings=settings_of("autoencoder"),
-        seed=RUN.seed,
+        seed=lambda wildcards: RUN.seed_of(wildcards.variant),
         code=code("autoencoder"),
     shell:
         "hilsplat autoencoder --clip {input.clip} --semantic-tree {input.semantic_tree}"
@@ -111,6 +112,8 @@ rule language:
         "results/{dataset}/{scene}/{variant}/logs/language.log",
     benchmark:
         "results/{dataset}/{scene}/{variant}/benchmarks/language.jsonl"
+    wildcard_constraints:
+        variant=any_of(variants_by_method(baselines=False)),
     conda:
         ENVIRONMENT
     threads: THREADS
@@ -118,7 +121,7 @@ rule language:
         mem_mb=4000,
     params:
         settings=settings_of("language"),
-        seed=RUN.seed,
+        seed=lambda wildcards: RUN.seed_of(wildcards.variant),
         code=code("language"),
     shell:
         "hilsplat language --contributions {input.contributions} --tree {input.tree}"

@@ -3,7 +3,7 @@ rule figures:
     input:
         scene="results/{dataset}/{scene}/scene",
         fit="results/{dataset}/{scene}/gaussians",
-        truth=truth_of,
+        truth=truth_or_labels_of,
         gaussians="results/{dataset}/{scene}/gaussians.ply",
         masks="results/{dataset}/{scene}/default/masks",
         clip="results/{dataset}/{scene}/default/clip",
@@ -45,7 +45,7 @@ rule figures:
         settings=settings_of("figures"),
         evaluate=settings_of("evaluate"),
         queries=queries_of,
-        truth=lambda wildcards, input: f"--truth {input.truth}" if input.truth else "",
+        truth=figure_truth_of,
         code=code("figures"),
     shell:
         "hilsplat figures --scene {input.scene} {params.truth} --gaussians {input.gaussians}"
@@ -54,3 +54,83 @@ rule figures:
         " --autoencoder {input.autoencoder} --queries {params.queries:q}"
         " --settings {params.settings:q} --evaluate {params.evaluate:q}"
         " --threads {threads} --out {output.panel} --log {log}"
+
+
+rule comparison:
+    input:
+        truth=truth_or_labels_of,
+        scores=lambda wildcards: [
+            f"results/{wildcards.dataset}/{wildcards.scene}/{variant}/scores.csv"
+            for variant in RUN.main_variants
+        ],
+    output:
+        methods=report(
+            "results/figures/{dataset}/{scene}/comparison.png",
+            caption="../workflow/report/comparison.rst",
+            category="Scenes",
+            subcategory="{dataset}/{scene}",
+            labels={"figure": "queries by method"},
+        ),
+        views=report(
+            "results/figures/{dataset}/{scene}/views.png",
+            caption="../workflow/report/views.rst",
+            category="Scenes",
+            subcategory="{dataset}/{scene}",
+            labels={"figure": "one query over views"},
+        ),
+        features=report(
+            "results/figures/{dataset}/{scene}/features.png",
+            caption="../workflow/report/features.rst",
+            category="Scenes",
+            subcategory="{dataset}/{scene}",
+            labels={"figure": "features at three levels"},
+        ),
+    log:
+        "results/figures/{dataset}/{scene}/comparison.log",
+    benchmark:
+        "results/{dataset}/{scene}/benchmarks/comparison.jsonl"
+    conda:
+        ENVIRONMENT
+    threads: THREADS
+    resources:
+        mem_mb=6000,
+    params:
+        folder="results/{dataset}/{scene}",
+        variants=json.dumps(RUN.main_variants),
+        names=json.dumps(dict(RUN.labels)),
+        settings=settings_of("figures"),
+        evaluate=settings_of("evaluate"),
+        queries=queries_of,
+        truth=figure_truth_of,
+        code=code("comparison"),
+    shell:
+        "hilsplat comparison --folder {params.folder} --variants {params.variants:q}"
+        " --names {params.names:q} {params.truth} --queries {params.queries:q}"
+        " --settings {params.settings:q} --evaluate {params.evaluate:q}"
+        " --threads {threads} --out {output.methods} --log {log}"
+
+
+rule sweep_plot:
+    input:
+        table="results/tables/{sweep}.csv",
+    output:
+        plot=report(
+            "results/figures/sweep-{sweep}.png",
+            caption="../workflow/report/sweep.rst",
+            category="Sweeps",
+            labels={"figure": "{sweep}"},
+        ),
+    log:
+        "results/logs/sweep-{sweep}.log",
+    benchmark:
+        "results/benchmarks/sweep-{sweep}.jsonl"
+    wildcard_constraints:
+        sweep="theta|omega",
+    conda:
+        ENVIRONMENT
+    resources:
+        mem_mb=1000,
+    params:
+        code=code("sweep"),
+    shell:
+        "hilsplat sweep {wildcards.sweep} --table {input.table} --out {output.plot} --log {log}"

@@ -1,4 +1,26 @@
 # Camera poses: structure from motion, or import.
+rule source:
+    input:
+        source_files_of,
+    output:
+        directory("results/{dataset}/{scene}/source"),
+    log:
+        "results/{dataset}/{scene}/logs/source.log",
+    benchmark:
+        "results/{dataset}/{scene}/benchmarks/source.jsonl"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        mem_mb=4000,
+    params:
+        name=lambda wildcards: "/".join(published(row_of(wildcards).source)),
+        root=str(Path(RUN.data_root)),
+        code=code("source"),
+    shell:
+        "hilsplat datasets export {params.name:q} --data-root {params.root:q} --out {output} --log {log}"
+
+
 rule poses:
     input:
         image_files_of,

@@ -39,6 +39,9 @@ class Dataset:
         required: places below `folder` that a scene cannot do without, relative.
         open: reads a scene: (the data set's folder, scene) to a `LabelledScene` or its like for points.
         check: reads everything of a scene and reports.
+        protocols: names of the protocols that it is scored under (`evaluate.protocols.cards`), beside
+            those of every labelled image.
+        label_places: glob patterns below `folder` of the files of a scene that only evaluation reads.
     """
 
     name: str
@@ -53,6 +56,8 @@ class Dataset:
     required: Callable[[str], tuple[str, ...]]
     open: Callable[[Path, str], Any]
     check: Callable[[Path, str], SceneReport]
+    protocols: tuple[str, ...] = ()
+    label_places: Callable[[str], tuple[str, ...]] = lambda scene: ()
 
     def missing(self, root: Path, scene: str) -> tuple[str, ...]:
         """Required places of a scene that are not below the data set's folder `root`."""

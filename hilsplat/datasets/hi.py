@@ -198,6 +198,7 @@ def _dataset(name: str, title: str, frame: str) -> Dataset:
         required=lambda scene: (f"label/{scene}", f"../{images}/{scene}/images"),
         open=open_scene,
         check=check_scene,
+        label_places=lambda scene: (f"label/{scene}/*.json",),
     )
 
 

@@ -151,4 +151,6 @@ DATASET = Dataset(
     ),
     open=open_scene,
     check=check_scene,
+    protocols=("lerf-mask/gaussian-grouping",),
+    label_places=lambda scene: (f"{scene}/test_mask/**/*",),
 )

@@ -141,4 +141,6 @@ DATASET = Dataset(
     required=lambda scene: (f"{scene}/images", f"{scene}/sparse", f"label/{scene}"),
     open=open_scene,
     check=check_scene,
+    protocols=("lerf/langsplat-v2", "lerf/paper-filter", "lerf/paper-mean"),
+    label_places=lambda scene: (f"label/{scene}/*.json",),
 )

@@ -156,4 +156,6 @@ DATASET = Dataset(
     required=lambda scene: (f"{scene}/images", f"{scene}/segmentations/classes.txt"),
     open=open_scene,
     check=check_scene,
+    protocols=("3d-ovs/langsplat", "3d-ovs/langsplat-raw", "3d-ovs/langsplat-v2", "3d-ovs/argmax"),
+    label_places=lambda scene: (f"{scene}/segmentations/**/*",),
 )

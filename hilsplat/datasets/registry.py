@@ -9,6 +9,7 @@ from hilsplat.base.errors import SceneError
 from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.hi import HI_3DOVS, HI_LERF
 from hilsplat.datasets.labelled import LabelledScene
+from hilsplat.datasets.labelled_points import PointScene
 from hilsplat.datasets.lerf_mask import DATASET as LERF_MASK
 from hilsplat.datasets.lerf_ovs import DATASET as LERF_OVS
 from hilsplat.datasets.ovs3d import DATASET as OVS_3D
@@ -47,6 +48,25 @@ def open_labelled(name: str, data_root: Path) -> LabelledScene:
             f"{name!r} names no scene with labels on images",
             expected="<data set>/<scene>, such as lerf_ovs/figurines",
             found=f"a data set with labels on {dataset.labels}" if scene else "no scene",
+            fix="list them with: hilsplat datasets list",
+        )
+    return dataset.open(dataset.locate(data_root), scene)
+
+
+def open_labels(name: str, data_root: Path) -> LabelledScene | PointScene:
+    """Open a scene with labels on images or points, named as in "scannet/scene0000_00".
+
+    Raises:
+        SceneError: there is no such data set, no scene is named, or it cannot be read.
+    """
+    dataset_name, _, scene = name.partition("/")
+    dataset = dataset_of(dataset_name)
+    if dataset.labels == "images":
+        return open_labelled(name, data_root)
+    if not scene:
+        raise SceneError(
+            f"{name!r} names no scene",
+            expected="<data set>/<scene>, such as scannet/scene0000_00",
             fix="list them with: hilsplat datasets list",
         )
     return dataset.open(dataset.locate(data_root), scene)

@@ -244,4 +244,6 @@ DATASET = Dataset(
     required=lambda scene: (f"{scene}/habitat/mesh_semantic.ply", f"{scene}/habitat/info_semantic.json"),
     open=open_scene,
     check=check_scene,
+    protocols=("replica/per-scene", "replica/opennerf", "replica/conceptgraphs"),
+    label_places=lambda scene: (f"{scene}/habitat/*",),
 )

@@ -341,6 +341,19 @@ DATASET = Dataset(
     ),
     open=open_scan,
     check=check_scan,
+    protocols=(
+        "scannet/opengaussian-19",
+        "scannet/opengaussian-15",
+        "scannet/opengaussian-10",
+        "scannet200/opengaussian",
+        "scannet200/instances",
+    ),
+    label_places=lambda scan: (
+        LABEL_TABLE,
+        f"scans/{scan}/{scan}_vh_clean_2.labels.ply",
+        f"scans/{scan}/{scan}_vh_clean_2.0.010000.segs.json",
+        f"scans/{scan}/{scan}.aggregation.json",
+    ),
 )
 
 SCANNET200_DATASET = replace(DATASET, name="scannet200", title="ScanNet200")

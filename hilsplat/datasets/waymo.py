@@ -161,4 +161,6 @@ DATASET = Segments(
     ),
     open=open_segment,
     check=check_segment,
+    protocols=("waymo/segmentation",),
+    label_places=lambda segment: (f"*/lidar_segmentation/{segment}.parquet",),
 )

@@ -1,7 +1,7 @@
 """The panel of a scene: photograph, masks, field, and what queries answer."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,21 +12,23 @@ from matplotlib.figure import Figure, FigureBase
 from hilsplat.base.artifacts import read_index
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import stage_log, track
-from hilsplat.datasets.hierarchy import HierarchyAnnotations
+from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.evaluate.metrics.masks import iou
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
 from hilsplat.evaluate.pictures import (
     label_left,
     paint_answer,
     paint_relevancy,
-    save_figure,
+    save_png_and_pdf,
     show,
 )
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import rule_of
 from hilsplat.evaluate.scores import made_from_truth
 from hilsplat.evaluate.stage import masks_label
-from hilsplat.language.query import PATH_SEPARATOR, LanguageScene, NodeHits
+from hilsplat.evaluate.truths import annotated_truths, labelled_truths
+from hilsplat.language.node_search import NodeHits
+from hilsplat.language.query import PATH_SEPARATOR, LanguageScene
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.pictures import paint_level
@@ -70,6 +72,7 @@ def run_figures(
     evaluate: EvaluateSettings,
     queries: Sequence[str] | None,
     threads: int,
+    labels: LabelledScene | None = None,
 ) -> None:
     """Draw the panel.
 
@@ -87,10 +90,11 @@ def run_figures(
         evaluate: how answers are made.
         queries: texts to show where there are no annotations.
         threads: threads for rendering.
+        labels: labels of a published data set, in place of annotations.
     """
     scene = Scene.load(scene_folder)
     with stage_log("figures", scene.name) as counts:
-        answers = LanguageScene.open(
+        answers = LanguageScene.from_parts(
             scene_folder,
             gaussians,
             semantic_tree,
@@ -98,39 +102,50 @@ def run_figures(
             autoencoder,
             Path(read_index(clip_folder)["model"]),
             canonical=evaluate.canonical,
+            template=evaluate.template,
             relevancy_scale=evaluate.relevancy_scale,
             threads=threads,
         )
+        truths = truths_of(scene, truth, labels, evaluate)
         rows = (
-            annotated_rows(scene, HierarchyAnnotations.load(truth), settings, evaluate)
-            if truth is not None
+            annotated_rows(truths, settings)
+            if truths
             else free_rows(answers, queries or (), settings, evaluate)
         )
         figure = draw_panel(answers, masks_folder, rows, evaluate)
-        save_figure(figure, out)
+        save_png_and_pdf(figure, out)
         counts["queries"] = len(rows)
 
 
-def annotated_rows(
-    scene: Scene, annotations: HierarchyAnnotations, settings: FiguresSettings, evaluate: EvaluateSettings
-) -> list[Shown]:
-    """Texts of each level, from large to small regions, in the test views that show them best."""
-    views = [view for view in scene.views("test") if annotations.views.get(view)]
-    found: dict[Level, dict[str, list[tuple[int, Shown]]]] = {level: {} for level in LEVELS}
-    for view in views:
-        truth = ViewTruth.of(annotations, view, scene.cameras[view].size_hw, evaluate.min_region_px)
-        for query in truth.queries:
-            assert query.level is not None
+def truths_of(
+    scene: Scene, truth: Path | None, labels: LabelledScene | None, evaluate: EvaluateSettings
+) -> Mapping[str, Callable[[], ViewTruth]]:
+    """What is true in the views of a scene; nothing where it has neither annotations nor labels."""
+    if labels is not None:
+        return labelled_truths(labels, scene)
+    return annotated_truths(truth, scene, evaluate) if truth is not None else {}
+
+
+def annotated_rows(truths: Mapping[str, Callable[[], ViewTruth]], settings: FiguresSettings) -> list[Shown]:
+    """Texts of each level, from large to small regions, in the annotated views that show them best.
+
+    Labels without levels give texts of one kind.
+    """
+    found: dict[Level | None, dict[str, list[tuple[int, Shown]]]] = {}
+    for view, truth_of in truths.items():
+        truth = truth_of()
+        for query in truth.queries or truth.categories:
             shown = Shown(query.text, query.paths[0], query.level, view, query.truth)
             area = int(np.count_nonzero(query.truth))
-            found[query.level].setdefault(query.text, []).append((area, shown))
+            found.setdefault(query.level, {}).setdefault(query.text, []).append((area, shown))
     rows = []
-    for level in LEVELS:
-        texts = found[level]
+    for level in (*LEVELS, None):
+        texts = found.get(level, {})
         for places in texts.values():
             places.sort(key=lambda place: (-place[0], place[1].view))
         ordered = sorted(texts, key=lambda text: (-texts[text][0][0], text))
-        count = min(settings.queries_per_level, len(ordered))
+        wanted = settings.queries_per_level * (len(LEVELS) if level is None else 1)
+        count = min(wanted, len(ordered))
         for number in range(count):  # the largest, then evenly down the list
             places = texts[ordered[number * len(ordered) // count]]
             rows += [shown for _, shown in places[: settings.views]]

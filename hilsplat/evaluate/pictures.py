@@ -127,3 +127,11 @@ def save_figure(figure: Figure, out: Path, dpi: int = 110) -> None:
     """Write a PNG atomically, without a library version in it."""
     with atomic_path(out) as temporary:
         figure.savefig(temporary, format="png", dpi=dpi, facecolor="white", metadata={"Software": None})
+
+
+def save_png_and_pdf(figure: Figure, out: Path, dpi: int = 110) -> None:
+    """Write a PNG and, beside it, a PDF; the same figure gives the same bytes."""
+    save_figure(figure, out, dpi)
+    with atomic_path(Path(out).with_suffix(".pdf")) as temporary:
+        about = {"Creator": None, "Producer": None, "CreationDate": None}
+        figure.savefig(temporary, format="pdf", dpi=dpi, facecolor="white", metadata=about)

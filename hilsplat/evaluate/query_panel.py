@@ -2,16 +2,13 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from hilsplat.base.artifacts import read_index, read_json
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.base.provenance import provenance_path
 from hilsplat.evaluate.pictures import (
     label_left,
     paint_answer,
@@ -22,23 +19,13 @@ from hilsplat.evaluate.pictures import (
 )
 from hilsplat.evaluate.scores import made_from_truth
 from hilsplat.evaluate.stage import masks_label
-from hilsplat.language.query import PATH_SEPARATOR, Hit, LanguageScene
+from hilsplat.language.finished import FinishedScene
+from hilsplat.language.hits import Hit
+from hilsplat.language.query import PATH_SEPARATOR, LanguageScene
+from hilsplat.language.tree_export import write_selection_ply
 
 LISTED = 10
 """Answers told at most."""
-
-
-@dataclass(frozen=True)
-class Artifacts:
-    """Where the parts of a finished scene lie."""
-
-    scene: Path
-    gaussians: Path
-    semantic_tree: Path
-    language: Path
-    autoencoder: Path
-    clip: Path
-    masks: Path
 
 
 def answer(
@@ -48,10 +35,11 @@ def answer(
     level: str = "auto",
     variant: str = "default",
     views: int = 3,
+    answerer: str = "tree",
     out: Path | None = None,
     threads: int = 1,
 ) -> str:
-    """Ask a scene; write `panel.png` and tell what was found.
+    """Ask a scene; write `panel.png` and `selection.ply`, and tell what was found.
 
     Args:
         folder: `results/<dataset>/<scene>`.
@@ -59,30 +47,29 @@ def answer(
         level: auto, whole, part or subpart.
         variant: whose files answer.
         views: views in the panel.
-        out: folder of the panel; by default `queries/<text>` in the scene's folder.
+        answerer: "tree" or "field", see `LanguageScene.query`.
+        out: folder of both files; by default `queries/<text>` in the scene's folder.
         threads: threads for rendering.
 
     Raises:
         ArtifactError: the scene is not finished.
+        SettingsError: level or answerer are unknown.
     """
     folder = Path(folder)
-    parts = locate(folder, variant)
-    scene = LanguageScene.open(
-        parts.scene,
-        parts.gaussians,
-        parts.semantic_tree,
-        parts.language,
-        parts.autoencoder,
-        Path(read_index(parts.clip)["model"]),
-        threads=threads,
-    )
-    hits = scene.query(text, level, limit=LISTED)
+    if answerer not in ("tree", "field"):
+        raise SettingsError(f"nothing answers as {answerer!r}", expected="tree or field", found=answerer)
+    parts = FinishedScene.locate(folder, variant)
+    scene = LanguageScene.open(folder, variant, threads=threads)
+    hits = scene.query(text, level, answerer=answerer, limit=LISTED)
     panel = (Path(out) if out is not None else folder / "queries" / file_name(text)) / "panel.png"
     shown = views_of(scene, hits, views)
     label = masks_label(parts.masks)
     note = f"; a diagnostic, masks made from the true labels: {label}" if made_from_truth(label) else ""
-    query_panel(scene, text, shown, panel, level=level, note=note)
-    return "\n".join([told(text, hits, scene.scene.unit) + note, f"wrote {panel}"])
+    query_panel(scene, text, shown, panel, level=level, note=note, answerer=answerer)
+    selection = panel.with_name("selection.ply")
+    found = scene.find(text, level, answerer=answerer)
+    write_selection_ply(parts.gaussians, scene.gaussians_of(found.ids), selection)
+    return "\n".join([told(text, hits, scene.scene.unit) + note, f"wrote {panel} and {selection.name}"])
 
 
 def query_panel(
@@ -93,12 +80,13 @@ def query_panel(
     *,
     level: str = "auto",
     note: str = "",
+    answerer: str = "tree",
 ) -> None:
     """Draw a query: per view photograph, answer and relevancy at three levels; the scene from above.
 
-    `note` stands in the title, after what was found.
+    `note` stands in the title, after what was found. With the answerer "field", relevancy is the field's.
     """
-    hits = scene.find(text, level)
+    hits = scene.find(text, level, answerer=answerer)
     last = text.split(PATH_SEPARATOR)[-1].strip()
     size_hw = scene.scene.cameras[views[0]].size_hw
     width_in, columns = 13.0, 5
@@ -114,7 +102,8 @@ def query_panel(
         mask = (
             np.asarray(scene.node_masks(view, hits.ids)) if len(hits.ids) else np.zeros(image.shape[:2], bool)
         )
-        relevancy = np.asarray(scene.node_relevancy_map([last], view))[0]
+        maps = scene.node_relevancy_map if answerer == "tree" else scene.field_relevancy
+        relevancy = np.asarray(maps([last], view))[0]
         low, high = float(relevancy.min()), float(relevancy.max())
         show(axes[0], image, view)
         label_left(axes[0], f"{scene.scene.split[view]} view")
@@ -151,7 +140,7 @@ def told(text: str, hits: Sequence[Hit], unit: str) -> str:
     ]
     for hit in hits:
         position = ", ".join(f"{value:.2f}" for value in hit.centroid)
-        size = " x ".join(f"{high - low:.2f}" for low, high in zip(*hit.box, strict=True))
+        size = " x ".join(f"{side:.2f}" for side in hit.oriented_box.size)
         views = ", ".join(hit.best_views)
         lines.append(
             f"{hit.node:>5}  {Level(hit.level).label:<8} {hit.score:>5.2f}  {position:<24} {size:<20} {views}"
@@ -174,55 +163,3 @@ def file_name(text: str) -> str:
     """A folder name that is safe on every system, such as `bear--nose`."""
     words = [re.sub(r"[^\w.-]+", "-", part.strip()).strip("-.") for part in text.split(PATH_SEPARATOR)]
     return "--".join(word for word in words if word) or "query"
-
-
-def locate(folder: Path, variant: str) -> Artifacts:
-    """Parts of a variant, some of which it may share with another one.
-
-    What a stage read is written in its provenance; without one, the parts are expected beside it.
-
-    Raises:
-        ArtifactError: a part is missing.
-    """
-    folder = Path(folder)
-    language = folder / variant / "language.safetensors"
-    if not language.exists():
-        language = folder / "default" / "language.safetensors"
-        if variant != "default" and not (folder / variant).exists():
-            raise ArtifactError(
-                f"{folder} has no variant {variant!r}",
-                expected=f"one of {', '.join(_variants(folder)) or 'none yet'}",
-                fix="name it under ablation_variants and run the workflow",
-            )
-    autoencoder = _input_of(language, "autoencoder", folder)
-    clip = _input_of(autoencoder, "clip", folder)
-    parts = Artifacts(
-        folder / "scene",
-        folder / "gaussians.ply",
-        _input_of(autoencoder, "semantic_tree", folder),
-        language,
-        autoencoder,
-        clip,
-        _input_of(clip, "masks", folder),
-    )
-    for path in vars(parts).values():
-        if not path.exists():
-            raise ArtifactError(
-                f"{folder} is not finished: {path} is missing", fix=f"snakemake --cores 2 {path}"
-            )
-    return parts
-
-
-def _variants(folder: Path) -> list[str]:
-    return sorted(path.parent.name for path in folder.glob("*/language.safetensors"))
-
-
-def _input_of(artifact: Path, name: str, folder: Path) -> Path:
-    """Where an artifact's input lies: as its provenance says, else beside it."""
-    record = provenance_path(artifact)
-    if record.is_file():
-        path = Path(read_json(record)["inputs"].get(name, {}).get("path", ""))
-        recorded = folder / path.parent.name / path.name
-        if path.name and recorded.exists():
-            return recorded
-    return artifact.parent / name

@@ -1,25 +1,42 @@
 """The evaluate stage: a finished scene and its annotations in, `scores.csv` out."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from hilsplat.base.artifacts import read_index
 from hilsplat.base.progress import stage_log, track
-from hilsplat.datasets.hierarchy import HierarchyAnnotations
-from hilsplat.datasets.labelled import LabelledScene, check_label_size
+from hilsplat.datasets.labelled import LabelledScene
+from hilsplat.datasets.labelled_points import PointScene
+from hilsplat.datasets.world_labels import labelled_points
+from hilsplat.evaluate.alignment import camera_error, scene_from_true
+from hilsplat.evaluate.asked import Asked
+from hilsplat.evaluate.costs import time_queries, write_times
+from hilsplat.evaluate.instance_files import write_instances
+from hilsplat.evaluate.metrics.instances import InstanceMatches
+from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
 from hilsplat.evaluate.protocols.answers import Selections
+from hilsplat.evaluate.protocols.flat_views import FlatProtocols
+from hilsplat.evaluate.protocols.measured import Measured
+from hilsplat.evaluate.protocols.scene_points import measure_scene_points
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
-from hilsplat.evaluate.protocols.views import measure_view
+from hilsplat.evaluate.protocols.views import measure_view, relevancy_departures, rule_of
 from hilsplat.evaluate.scores import Score, write_scores
+from hilsplat.evaluate.truths import annotated_truths, labelled_truths
+from hilsplat.evaluate.world_answers import measure_world_consistency
 from hilsplat.language.query import LanguageScene
+from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import EvaluateSettings
 
 logger = logging.getLogger(__name__)
 
-SHAPE_TOLERANCE = 0.01
-"""Views whose sides were rounded by undistortion or shrinking still fit their labels."""
+MAX_CAMERA_ERROR_M = 0.1
+"""Camera poses that are off by more make scores of points meaningless, which is told."""
+
+TIMED_TEXTS = 3
+"""Queries that are timed, in one view."""
 
 
 def run_evaluate(
@@ -37,16 +54,18 @@ def run_evaluate(
     scene: str,
     variant: str,
     threads: int,
-    labels: LabelledScene | None = None,
+    labels: Sequence[tuple[str, LabelledScene | PointScene, Asked]] = (),
+    asked: Asked | None = None,
 ) -> None:
-    """Score every annotated query in every annotated test view (see `protocols`).
+    """Score every annotated query in every annotated test view, and every labelled point (`protocols`).
 
     With the labels of a published data set every labelled view is scored, held out or not: most of them
-    train on all views.
+    train on all views. Beside `scores.csv` stand `times.csv` (seconds per query) and, where instances are
+    scored, `instances.npz`.
 
     Args:
         scene_folder: scene artifact; its test views were held out of every stage before.
-        truth: annotations in the hierarchy format; None gives a file with a header only.
+        truth: truth folder of a synthetic scene; None and no labels give a file with a header only.
         gaussians: 3DGS PLY.
         semantic_tree: semantic tree artifact.
         language: language field.
@@ -59,23 +78,29 @@ def run_evaluate(
         scene: scene name.
         variant: named set of settings.
         threads: threads for rendering.
-        labels: labels of a published data set, in place of annotations.
+        labels: in place of annotations, labels of published data sets on images or points: the data set,
+            which names its rows, its labels of this scene, and the protocols that it asks for.
+        asked: protocols of annotations beyond those of every labelled image.
 
     Raises:
         MisalignedArtifactError: label images are of another size than the cameras.
         SceneError: a labelled view has no pose, or labels are of another shape than their view.
     """
     scores: list[Score] = []
+    matches: dict[tuple[str, ...], InstanceMatches] = {}
+    seconds: dict[str, float] = {}
     label = masks_label(masks_folder)
+
+    def keep(data: str, view: str, measured: Measured) -> None:
+        names = {"dataset": data, "scene": scene, "variant": variant, "masks": label}
+        scores.append(Score(**names, view=view, **vars(measured)))
+
     with stage_log("evaluate", f"{dataset}/{scene}/{variant}") as counts:
-        if truth is None and labels is None:
+        if truth is None and not labels:
             logger.info("%s/%s has no annotations: nothing to score", dataset, scene)
         else:
             posed = Scene.load(scene_folder)
-            truths = labelled_truths(labels, posed) if labels else annotated_truths(truth, posed, settings)
-            if not truths:
-                logger.warning("no view of %s/%s is annotated: nothing to score", dataset, scene)
-            answers = LanguageScene.open(
+            answers = LanguageScene.from_parts(
                 scene_folder,
                 gaussians,
                 semantic_tree,
@@ -83,59 +108,118 @@ def run_evaluate(
                 autoencoder,
                 Path(read_index(clip_folder)["model"]),
                 canonical=settings.canonical,
+                template=settings.template,
                 relevancy_scale=settings.relevancy_scale,
                 threads=threads,
             )
             selections = Selections(answers, settings.node_select)
-            for view in track(list(truths), "views scored"):
-                size_hw = posed.cameras[view].size_hw
-                for measured in measure_view(answers, selections, truths[view](), view, size_hw, settings):
-                    scores.append(
-                        Score(
-                            dataset=dataset,
-                            scene=scene,
-                            variant=variant,
-                            masks=label,
-                            view=view,
-                            **vars(measured),
-                        )
-                    )
-            counts["views"] = len(truths)
+            parts = list(labels)
+            if truth is not None:
+                parts.append((dataset, TrueAnnotations(truth), asked or Asked()))
+            for data, known, wanted in parts:
+                truths = known_truths(known, posed, settings)
+                counts[f"views of {data}"] = len(truths)
+                for view in track(list(truths), "views scored"):
+                    of_view, size_hw = truths[view](), posed.cameras[view].size_hw
+                    words = relevancy_departures(settings)
+                    also = FlatProtocols(wanted.flat, wanted.level, words) if wanted.flat else None
+                    for row in measure_view(answers, selections, of_view, view, size_hw, settings, also):
+                        keep(data, view, row)
+                    if not seconds and of_view.categories:
+                        texts = [query.text for query in of_view.categories[:TIMED_TEXTS]]
+                        seconds = timed(answers, selections, view, texts, settings)
+                if isinstance(known, TrueAnnotations) and truths and settings.consistency_texts:
+                    found = measure_world_consistency(answers, selections, truths, known.folder, settings)
+                    for view, row in found:
+                        keep(data, view, row)
+                for row in point_rows(answers, known, wanted, settings, threads):
+                    if isinstance(row, Measured):
+                        keep(data, "", row)
+                    else:
+                        matches[data, scene, variant, label, row[0]] = row[1]
         counts["rows"] = len(scores)
+        write_times(out, dataset, scene, variant, seconds)
+        write_instances(out, matches)
         write_scores(out, scores)
 
 
-def annotated_truths(
-    truth: Path, posed: Scene, settings: EvaluateSettings
-) -> dict[str, Callable[[], ViewTruth]]:
-    """What is true in each annotated test view, read when its turn comes."""
-    annotations = HierarchyAnnotations.load(truth)
-    return {
-        view: lambda view=view: ViewTruth.of(
-            annotations, view, posed.cameras[view].size_hw, settings.min_region_px
-        )
-        for view in posed.views("test")
-        if annotations.views.get(view)
-    }
+@dataclass(frozen=True)
+class TrueAnnotations:
+    """The truth folder of a synthetic scene."""
+
+    folder: Path
 
 
-def labelled_truths(labels: LabelledScene, posed: Scene) -> dict[str, Callable[[], ViewTruth]]:
-    """What is true in each labelled view of a published data set, read when its turn comes.
-
-    Raises:
-        SceneError: a labelled view has no pose, or its labels are of another shape.
-    """
-    for sentence in labels.warnings:
-        logger.warning("%s/%s: %s", labels.dataset, labels.scene, sentence)
-    truths: dict[str, Callable[[], ViewTruth]] = {}
-    for stem, view in labels.posed_views(posed.cameras.names).items():
-        size_hw, regions = posed.cameras[view].size_hw, labels.views[stem]
-        for label_hw in sorted({region.size_hw for region in regions}):
-            sentence = check_label_size(f"a label of view {view}", label_hw, size_hw, SHAPE_TOLERANCE)
-            if sentence:
-                logger.warning("%s/%s: %s", labels.dataset, labels.scene, sentence)
-        truths[view] = lambda regions=regions, size_hw=size_hw: ViewTruth.of_regions(regions, size_hw)
+def known_truths(
+    known: LabelledScene | PointScene | TrueAnnotations, posed: Scene, settings: EvaluateSettings
+) -> Mapping[str, Callable[[], ViewTruth]]:
+    """What is true in views; none for labels on points."""
+    if isinstance(known, PointScene):
+        return {}
+    if isinstance(known, LabelledScene):
+        truths = labelled_truths(known, posed)
+    else:
+        truths = annotated_truths(known.folder, posed, settings)
+    if not truths:
+        logger.warning("no view of %s is annotated: nothing to score", posed.name)
     return truths
+
+
+def point_rows(
+    answers: LanguageScene,
+    known: LabelledScene | PointScene | TrueAnnotations,
+    asked: Asked,
+    settings: EvaluateSettings,
+    threads: int,
+) -> Iterator[Measured | tuple[str, InstanceMatches]]:
+    """Rows of labelled points, and the matches of instances; nothing where no protocol asks for points."""
+    if not asked.points or isinstance(known, LabelledScene):
+        return
+    if isinstance(known, PointScene):
+        for sentence in known.warnings:
+            logger.warning("%s: %s", known.name, sentence)
+        points, transform = known.truth, answers.scene.scene_from_source
+    else:
+        kind = "street" if any(card.classes.startswith("waymo") for card in asked.points) else "room"
+        points = labelled_points(known.folder.parent, kind)
+        true, found = Cameras.load(known.folder / "cameras.npz"), answers.scene.cameras
+        transform = scene_from_true(true, found)
+        error = camera_error(true, found, transform)
+        if error > MAX_CAMERA_ERROR_M:
+            logger.warning(
+                "%s: cameras lie %.2f m from the true ones (median); points are asked where nothing is",
+                answers.scene.name,
+                error,
+            )
+    methods = [method for method in settings.methods if method != "tree-path"]
+    yield from measure_scene_points(
+        answers, points, transform, asked.points, methods, settings.points, threads
+    )
+
+
+def timed(
+    answers: LanguageScene,
+    selections: Selections,
+    view: str,
+    texts: Sequence[str],
+    settings: EvaluateSettings,
+) -> dict[str, float]:
+    """Seconds of one query in a view by field and tree (see `costs.time_queries`)."""
+    rule = rule_of(settings)
+    size_hw = answers.scene.cameras[view].size_hw
+
+    def by_field(text: str) -> object:
+        relevancy = answers.field_relevancy([text], view)[0]
+        return relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)
+
+    def by_tree(text: str) -> object:
+        hits = answers.select_nodes(text, level=None, threshold=settings.node_select)
+        return selections.mask(view, hits.ids, size_hw)
+
+    asks = {"field": by_field, "tree": by_tree}
+    return time_queries(
+        answers, {name: ask for name, ask in asks.items() if name in settings.methods}, view, texts
+    )
 
 
 def masks_label(masks_folder: Path) -> str:

@@ -4,7 +4,7 @@ import pytest
 
 from tests.workflow.conftest import Project
 
-AFTER_LANGUAGE = {"language", "evaluate", "table", "figures"}
+AFTER_LANGUAGE = {"language", "evaluate", "table", "figures", "comparison", "sweep_plot"}
 VARIANT_STAGES = {
     "masks",
     "tree",
@@ -12,6 +12,7 @@ VARIANT_STAGES = {
     "contributions",
     "semantic_tree",
     "autoencoder",
+    "method",
 } | AFTER_LANGUAGE
 
 
@@ -32,9 +33,10 @@ def test_a_comment_and_a_docstring_rerun_nothing(copy_of_finished: Project) -> N
 @pytest.mark.parametrize(
     ("module", "expected"),
     [
-        ("hilsplat/language/field.py", AFTER_LANGUAGE),
+        ("hilsplat/language/field.py", AFTER_LANGUAGE | {"method"}),
         ("hilsplat/language/clip_stage.py", VARIANT_STAGES - {"masks", "tree", "contributions"}),
-        ("hilsplat/evaluate/tables.py", {"table"}),
+        ("hilsplat/evaluate/tables/hierarchy.py", {"table", "sweep_plot"}),
+        ("hilsplat/methods/lifted.py", {"method", "evaluate", "table", "comparison", "sweep_plot"}),
     ],
 )
 def test_an_edit_reruns_its_stage_and_what_follows(

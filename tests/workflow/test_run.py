@@ -9,23 +9,40 @@ import pandas as pd
 
 from tests.workflow.conftest import SCENE, Project
 
-TABLES = ("hierarchy", "lerf", "ablation")
+TABLES = ("hierarchy", "lerf", "3dovs", "ablation", "theta", "omega", "frames-hi-lerf", "frames-hi-3dovs")
+TIMED = ("cost", "efficiency", "pruning")
+"""Tables of times, which no two runs share."""
+POINTS = ("replica", "scannet", "waymo")
+"""Tables that the tiny table stands in for nothing in."""
 LAST_BEFORE_EVALUATE = ("masks", "tree", "clip", "contributions", "semantic_tree", "autoencoder", "language")
 
 
 def test_all_tables_and_figures_are_there(finished: Project) -> None:
-    for table in TABLES:
+    for table in (*TABLES, *TIMED, *POINTS):
         for suffix in ("csv", "md", "tex", "html"):
             assert (finished.root / f"results/tables/{table}.{suffix}").stat().st_size > 0, (table, suffix)
-    assert (finished.root / "results/figures/synthetic/tiny/panel.png").stat().st_size > 20_000
+    figures = finished.root / "results/figures"
+    for name in ("panel", "comparison", "views", "features"):
+        for suffix in (".png", ".pdf"):
+            assert (figures / "synthetic/tiny" / f"{name}{suffix}").stat().st_size > 20_000, name
+    assert (figures / "sweep-theta.png").stat().st_size > 5_000
 
 
 def test_tables_hold_measured_rows_beside_reported_ones(finished: Project) -> None:
-    for table in TABLES:
+    for table in (*TABLES, *TIMED):
         rows = pd.read_csv(finished.root / f"results/tables/{table}.csv")
-        kinds = set(rows["kind"])
-        assert "reported" in kinds, table
-        assert any("stand-in" in kind for kind in kinds), table
+        assert set(rows["kind"]) == {"reported", "synthetic stand-in"}, table
+    for table in POINTS:
+        assert set(pd.read_csv(finished.root / f"results/tables/{table}.csv")["kind"]) == {"reported"}, table
+
+
+def test_answers_and_baselines_have_rows_of_their_own(finished: Project) -> None:
+    rows = pd.read_csv(finished.root / "results/tables/hierarchy.csv")
+    names = set(rows.loc[rows["kind"] == "synthetic stand-in", "method"])
+    tree = {"hilsplat (tree)", "hilsplat (tree, path)", "hilsplat (field)"}
+    assert names == {*tree, "hilsplat (paper)", "lifted CLIP, training-free (ours)", "annotations"}
+    level_given = rows[(rows["method"] == "hilsplat (tree)") & (rows["protocol"] == "level given")]
+    assert level_given["View consistency"].between(0, 100).all()
 
 
 def test_scores_cover_every_method_level_and_are_shares(finished: Project) -> None:
@@ -87,7 +104,8 @@ def test_no_stage_before_evaluate_needs_the_truth(copy_of_finished: Project) -> 
 def test_the_report_holds_tables_and_panels(finished: Project) -> None:
     finished.snakemake("--report", "report.html")
     text = (finished.root / "report.html").read_text()
-    for name in ("hierarchy.html", "lerf.html", "ablation.html", "panel.png", "registration.png", "fit.png"):
+    names = ("hierarchy.html", "waymo.html", "panel.png", "registration.png", "fit.png", "comparison.png")
+    for name in (*names, "views.png", "features.png", "sweep-theta.png"):
         assert name in text, name
 
 

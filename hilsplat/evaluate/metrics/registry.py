@@ -54,6 +54,7 @@ METRICS: dict[str, Metric] = {
     "hc_containment_pooled": Metric("hierarchy.hierarchical_consistency", False, SHARE, PARENTS),
     "hc_literal_pooled": Metric("hierarchy.hierarchical_consistency", False, SHARE, PARENTS, None),
     "hc_anchored_pooled": Metric("hierarchy.hierarchical_consistency", False, SHARE, PARENTS),
+    "view_consistency": Metric("masks.iou", True, SHARE, PAIRS),
     "class_iou": Metric("point_classes.class_iou", False, SHARE, CLASSES),
     "class_accuracy": Metric("point_classes.class_accuracy", False, SHARE, CLASSES),
     "miou_present": Metric("point_classes.miou_over_present", False, SHARE, POINTS),

@@ -20,8 +20,10 @@ CANONICAL: tuple[str, ...] = ("object", "things", "stuff", "texture")
 RELEVANCY_SCALE = 10.0
 """Scale of the cosine in the relevancy (LERF, LangSplat)."""
 
-NODE_SELECT = 0.85
-"""Nodes above this share of the best (min-max) answer a text."""
+NODE_SELECT = 0.95
+"""Nodes above this share of the range of the cosine margins behind the relevancies answer a text.
+
+Version 1 of the protocols that select nodes took 0.85 of the range of the relevancies themselves."""
 
 Averaging = Literal["pairs", "classes", "levels", "views", "scenes", "pooled"]
 """How rows become a table's number.
@@ -102,15 +104,15 @@ LERF_LANGSPLAT = ProtocolCard(
 )
 TREE_NODES = ProtocolCard(
     "lerf/tree-nodes",
-    1,
+    2,
     MASK + LOCALIZATION,
     "pairs",
-    "3D nodes above 0.85 of the min-max relevancy of the nodes, rendered; level chosen by the tree",
+    "3D nodes above 0.95 of the range of the nodes' cosine margins, rendered; level chosen by the tree",
     "ours",
 )
 LEVEL_GIVEN = ProtocolCard(
     "hierarchy/level-given",
-    1,
+    2,
     (*MASK, *LOCALIZATION, "best_threshold_iou", *CONSISTENCY),
     "levels",
     "as lerf/langsplat for maps and lerf/tree-nodes for nodes, at the level of the annotation",
@@ -119,7 +121,7 @@ LEVEL_GIVEN = ProtocolCard(
 )
 LEVEL_AUTO = ProtocolCard(
     "hierarchy/level-auto",
-    1,
+    2,
     (*MASK, *LOCALIZATION, *CONSISTENCY),
     "levels",
     "as lerf/langsplat for maps and lerf/tree-nodes for nodes, level chosen by the method",
@@ -128,7 +130,7 @@ LEVEL_AUTO = ProtocolCard(
 )
 PATH = ProtocolCard(
     "hierarchy/path",
-    1,
+    2,
     (*MASK, *LOCALIZATION, *CONSISTENCY),
     "levels",
     "3D nodes that answer the chain of texts from the whole down: more text than the paper gives",
@@ -136,6 +138,14 @@ PATH = ProtocolCard(
 )
 ANNOTATIONS = ProtocolCard(
     "hierarchy/annotations", 1, CONSISTENCY, "views", "the annotations: what perfect masks score", "ours"
+)
+VIEW_CONSISTENCY = ProtocolCard(
+    "world/view-consistency",
+    1,
+    ("view_consistency",),
+    "levels",
+    "as hierarchy/level-given, in a view and its nearest neighbour; IoU over the surface points both show",
+    "ours; exact geometry of the synthetic world",
 )
 LERF_OPENGAUSSIAN = ProtocolCard(
     "lerf/opengaussian",
@@ -195,6 +205,20 @@ def _points(
 ) -> ProtocolCard:
     """A protocol of points."""
     return ProtocolCard(name, 1, metrics, averaging, ARGMAX, source, classes=classes)
+
+
+def card_named(name: str) -> ProtocolCard:
+    """The protocol `benchmark/variant` in its present version.
+
+    Raises:
+        ArtifactError: there is none of that name.
+    """
+    for card in CARDS:
+        if card.name == name:
+            return card
+    raise ArtifactError(
+        f"there is no protocol {name!r}", expected=f"one of {', '.join(card.name for card in CARDS)}"
+    )
 
 
 PER_CLASS = ("class_iou", "class_accuracy")
@@ -309,6 +333,7 @@ CARDS: tuple[ProtocolCard, ...] = (
     LEVEL_AUTO,
     PATH,
     ANNOTATIONS,
+    VIEW_CONSISTENCY,
 )
 
 PROTOCOLS: dict[str, ProtocolCard] = {card.full_name: card for card in CARDS}

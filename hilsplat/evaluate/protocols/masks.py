@@ -1,6 +1,7 @@
 """Score masks or class maps that a method brings itself: LERF-Mask, LERF-OVS in 3D, 3D-OVS by argmax."""
 
-from collections.abc import Iterator, Mapping, Sequence
+import difflib
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -25,6 +26,7 @@ def measure_masks(
     method: str,
     predictions: Mapping[str, Bool[np.ndarray, "h w"] | None],  # h = H and w = W, which is checked
     truths: Mapping[str, Bool[np.ndarray, "H W"]],
+    queries: Collection[str] | None = None,
 ) -> Iterator[Measured]:
     """Rows of one view, one per text of the truth and metric.
 
@@ -32,12 +34,23 @@ def measure_masks(
         card: such as `lerf-mask/gaussian-grouping`; its metrics and what a missing prediction counts.
         method: what made the masks.
         predictions: mask per text, at the size of the truth (`metrics.masks.foreground` resizes); a text
-            that is absent or None has no prediction. Texts that the truth lacks are ignored.
+            that is absent or None has no prediction. Texts that the truth of this view lacks are ignored.
         truths: true region per text.
+        queries: all texts that are asked in the scene, in whatever view; a prediction for another one is
+            refused, as the misspelt text would count 0 silently. None: not checked.
 
     Raises:
-        MisalignedArtifactError: a prediction is of another size than its truth.
+        MisalignedArtifactError: a prediction is of another size than its truth, or for an unknown query.
     """
+    for text in predictions:
+        if queries is not None and text not in queries:
+            near = difflib.get_close_matches(text, list(queries), n=1)
+            raise MisalignedArtifactError(
+                f"there is a prediction for {text!r}, which nobody asks in this scene",
+                expected=f"one of {', '.join(sorted(queries))}",
+                found=text,
+                fix=f"rename it {near[0]!r}" if near else "remove it, or correct its name",
+            )
     for text, truth in truths.items():
         prediction = predictions.get(text)
         if prediction is None:

@@ -19,8 +19,8 @@ import numpy as np
 
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.evaluate.metrics.hierarchy import READINGS, Family, consistency_of_families, mean_over_parents
-from hilsplat.evaluate.metrics.localization import hits_a_box, hits_the_mask, peak_points
-from hilsplat.evaluate.metrics.masks import best_threshold_iou, boundary_iou, iou
+from hilsplat.evaluate.metrics.localization import peak_points
+from hilsplat.evaluate.metrics.masks import best_threshold_iou
 from hilsplat.evaluate.metrics.relevancy_rule import (
     RelevancyRule,
     SmoothedRelevancy,
@@ -41,7 +41,9 @@ from hilsplat.evaluate.protocols.cards import (
     TREE_NODES,
     ProtocolCard,
 )
+from hilsplat.evaluate.protocols.flat_views import FlatProtocols
 from hilsplat.evaluate.protocols.measured import Measured
+from hilsplat.evaluate.protocols.view_rows import mask_rows
 from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
 from hilsplat.settings import EvaluateSettings
 
@@ -81,6 +83,8 @@ def relevancy_departures(settings: EvaluateSettings) -> list[str]:
     words = []
     if settings.canonical != CANONICAL:
         words.append(f"canonical {'+'.join(settings.canonical)}")
+    if settings.template != "{}":
+        words.append(f"texts as {settings.template.replace('{}', '...')}")
     if settings.relevancy_scale != RELEVANCY_SCALE:
         words.append(f"relevancy scale {settings.relevancy_scale:g}")
     return words
@@ -93,7 +97,7 @@ def measure_view(
     view: str,
     size_hw: tuple[int, int],
     settings: EvaluateSettings,
-    also: Sequence[ProtocolCard] = (),
+    also: FlatProtocols | None = None,
 ) -> Iterator[Measured]:
     """All numbers of one view, in no particular order.
 
@@ -104,8 +108,7 @@ def measure_view(
         view: its view.
         size_hw: height and width of the view, px.
         settings: methods, the map rule and what makes a relevancy.
-        also: further protocols for the field's flat queries, each with its own rule, such as
-            `3d-ovs/langsplat`.
+        also: further protocols for texts without levels, such as `3d-ovs/langsplat`.
     """
     masks = PackedMasks(size_hw)
     texts = [query.text for query in truth.categories]
@@ -120,12 +123,17 @@ def measure_view(
             queries = [query for query in truth.queries if query.text == text]
             if fields is not None:
                 yield from _field_rows(fields[row], category, queries, settings, masks)
-                for card in also:
-                    yield from _flat_rows(fields[row], category, card, settings)
+                if also is not None:
+                    yield from also.add("field", fields[row], None, category, queries)
             if nodes is not None and "tree" in settings.methods:
                 yield from _tree_rows(nodes[row], category, queries, settings, selections, view, masks)
+                if also is not None:
+                    answer = selections.mask(view, selections.text(text, None), size_hw)
+                    yield from also.add("tree", nodes[row], answer, category, queries)
             if nodes is not None and "tree-path" in settings.methods:
                 yield from _path_rows(nodes[row], queries, settings, selections, view, masks)
+    if also is not None:
+        yield from also.finish()
     yield from _consistency_rows(truth, masks, settings)
 
 
@@ -133,43 +141,11 @@ def _relevancy(render, texts: Sequence[str], view: str) -> np.ndarray:
     return np.asarray(render(tuple(texts), view), dtype=np.float32)
 
 
-def _rows(
-    method: str,
-    query: Query,
-    protocol: str,
-    mask: np.ndarray,
-    points_xy: np.ndarray,
-    metrics: Sequence[str] = LERF_LANGSPLAT.metrics,
-) -> Iterator[Measured]:
-    """IoU, boundary IoU and localization of one answer."""
-    level = query.level.label if query.level else ""
-    values = {
-        "iou": lambda: iou(mask, query.truth),
-        "boundary_iou": lambda: boundary_iou(mask, query.truth),
-        "localization_box": lambda: float(hits_a_box(points_xy, query.boxes_xyxy)),
-        "localization_mask": lambda: float(hits_the_mask(points_xy, query.truth)),
-    }
-    for metric in metrics:
-        yield Measured(method, query.text, level, metric, protocol, values[metric]())
-
-
 def _best_row(method: str, query: Query, protocol: str, mixed: np.ndarray) -> Measured:
     level = query.level
     assert level is not None
     value = best_threshold_iou(mixed[level.index], query.truth)
     return Measured(method, query.text, level.label, "best_threshold_iou", protocol, value)
-
-
-def _flat_rows(
-    relevancy: np.ndarray, category: Query, card: ProtocolCard, settings: EvaluateSettings
-) -> Iterator[Measured]:
-    """Rows of a protocol with a rule of its own."""
-    assert card.rule is not None, f"{card.full_name} has no rule for maps"
-    smoothed = SmoothedRelevancy.of(relevancy, card.rule)
-    mask, _ = relevancy_mask(smoothed, None, card.rule)
-    points, _ = peak_points(smoothed.filtered, None)
-    protocol = card.labelled(relevancy_departures(settings))
-    yield from _rows("field", category, protocol, mask, points, card.metrics)
 
 
 def _field_rows(
@@ -186,13 +162,13 @@ def _field_rows(
     smoothed = SmoothedRelevancy.of(relevancy, rule)
     auto_mask, _ = relevancy_mask(smoothed, None, rule)
     auto_points, _ = peak_points(smoothed.filtered, None)
-    yield from _rows("field", category, flat, auto_mask, auto_points)
+    yield from mask_rows("field", category, flat, auto_mask, auto_points)
     masks.put(("field", auto, category.text), auto_mask)
     for query in queries:
         given_mask, _ = relevancy_mask(smoothed, query.level, rule)
         given_points, _ = peak_points(smoothed.filtered, query.level)
-        yield from _rows("field", query, given, given_mask, given_points)
-        yield from _rows("field", query, auto, auto_mask, auto_points)
+        yield from mask_rows("field", query, given, given_mask, given_points)
+        yield from mask_rows("field", query, auto, auto_mask, auto_points)
         yield _best_row("field", query, given, smoothed.mixed)
         masks.put(("field", given, query.text, query.level), given_mask)
 
@@ -211,13 +187,13 @@ def _tree_rows(
     size_hw = masks.size_hw
     auto_mask = selections.mask(view, selections.text(category.text, None), size_hw)
     auto_points, _ = peak_points(smoothed.filtered, None)
-    yield from _rows("tree", category, nodes, auto_mask, auto_points)
+    yield from mask_rows("tree", category, nodes, auto_mask, auto_points)
     masks.put(("tree", auto, category.text), auto_mask)
     for query in queries:
         given_mask = selections.mask(view, selections.text(query.text, query.level), size_hw)
         given_points, _ = peak_points(smoothed.filtered, query.level)
-        yield from _rows("tree", query, given, given_mask, given_points)
-        yield from _rows("tree", query, auto, auto_mask, auto_points)
+        yield from mask_rows("tree", query, given, given_mask, given_points)
+        yield from mask_rows("tree", query, auto, auto_mask, auto_points)
         yield _best_row("tree", query, given, smoothed.mixed)
         masks.put(("tree", given, query.text, query.level), given_mask)
 
@@ -247,7 +223,7 @@ def _path_rows(
         level_map = relevancy[query.level.index]
         filtered = mean_filter(np.where(inside, level_map, 0) if inside.any() else level_map, side_px)
         points, _ = peak_points(np.stack([filtered] * len(LEVELS)), query.level)
-        yield from _rows("tree-path", query, protocol, mask, points)
+        yield from mask_rows("tree-path", query, protocol, mask, points)
 
 
 def _consistency_rows(truth: ViewTruth, masks: PackedMasks, settings: EvaluateSettings) -> Iterator[Measured]:

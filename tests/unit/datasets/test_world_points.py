@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 
 from hilsplat.base.artifacts import read_npz
+from hilsplat.base.errors import SceneError
 from hilsplat.base.levels import Level
 from hilsplat.datasets import replica, scannet, waymo
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
+from hilsplat.datasets.point_files import read_ply
+from hilsplat.datasets.world_labels import labelled_points
 from hilsplat.datasets.world_points import (
     LabelledMesh,
     posed_images,
@@ -118,3 +121,32 @@ def test_points_that_a_camera_sees_lie_on_pixels_of_their_class(street, tmp_path
     seen = waymo_labels(ids, [node.text for node in annotations.nodes])[:, 1]
     # Borders differ in pixels as coarse as these (0.85 agree); 4 px aside it is 0.66, mirrored 0.41.
     assert (seen == truth.class_id[rows]).mean() > 0.8
+
+
+def test_a_room_is_labelled_where_a_camera_sees_it(room):
+    mesh, found = LabelledMesh.open(room), labelled_points(room, "room")
+    views = read_ply(room / "truth/mesh.ply", 3)["vertex"]["views"]
+    seen = np.asarray(views) > 0
+    assert 0 < seen.sum() < len(seen)
+    np.testing.assert_array_equal(found["nyu40"].xyz, mesh.xyz[seen])
+    for labelling, ids in (
+        ("nyu40", [scannet_ids(text)[1] for text in mesh.texts]),
+        ("scannet200", [scannet_ids(text)[0] for text in mesh.texts]),
+        ("replica", [replica_id(text) for text in mesh.texts]),
+    ):
+        np.testing.assert_array_equal(found[labelling].class_id, np.array(ids)[mesh.whole[seen]])
+        assert found[labelling].labelling == labelling
+    assert found["nyu40"].xyz is found["replica"].xyz  # one search for neighbours serves all labellings
+
+
+def test_a_street_is_labelled_at_its_lidar_returns(street):
+    scan = read_npz(street / "truth" / "lidar.npz")
+    points = labelled_points(street, "street")["waymo"]
+    texts = [node.text for node in HierarchyAnnotations.load(street / "truth").nodes]
+    np.testing.assert_array_equal(points.class_id, waymo_labels(scan["node_ids"], texts)[:, 1])
+    np.testing.assert_allclose(points.xyz, scan["points"])
+
+
+def test_a_table_has_no_labelled_points(room):
+    with pytest.raises(SceneError, match="expected  room or street"):
+        labelled_points(room, "tabletop")

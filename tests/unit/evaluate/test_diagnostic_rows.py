@@ -8,7 +8,7 @@ from hilsplat.base.artifacts import write_index
 from hilsplat.evaluate.figures import draw_panel
 from hilsplat.evaluate.scores import Score, made_from_truth, write_scores
 from hilsplat.evaluate.stage import masks_label
-from hilsplat.evaluate.tables import run_table
+from hilsplat.evaluate.tables.build import run_table
 from hilsplat.settings import EvaluateSettings
 
 PUBLISHED = Path(__file__).parents[3] / "config" / "published"
@@ -16,7 +16,7 @@ TRUE_MASKS = "truth-perturbed (merge 0.2)"
 
 
 def score(masks: str, value: float, variant: str = "default") -> Score:
-    protocol = "hierarchy/level-given@1"
+    protocol = "hierarchy/level-given@2"
     return Score(
         "synthetic", "one", variant, masks, "tree", "v.png", "cup", "whole", "iou", protocol, value, 1
     )
@@ -36,9 +36,9 @@ def test_a_row_with_true_masks_says_so_beside_its_method_and_its_masks(tmp_path)
     scores = [score("sam-tiny", 0.5), score("sam-tiny", 0.4, "omega-2"), score(TRUE_MASKS, 0.9, "bad-masks")]
     rows, text = hierarchy(tmp_path, scores)
     assert [(row["method"], row["masks"]) for row in rows] == [
-        ("hilsplat", "sam-tiny"),
-        ("omega-2", "sam-tiny"),
-        ("diagnostic, true masks: hilsplat", TRUE_MASKS),
+        ("hilsplat (tree)", "sam-tiny"),
+        ("omega-2, tree", "sam-tiny"),
+        ("diagnostic, true masks: hilsplat, tree", TRUE_MASKS),
     ]
     assert "They are no results" in text
 
@@ -46,7 +46,7 @@ def test_a_row_with_true_masks_says_so_beside_its_method_and_its_masks(tmp_path)
 def test_a_row_with_true_masks_is_ranked_with_nothing(tmp_path):
     scores = [score("sam-tiny", 0.5), score("sam-tiny", 0.4, "omega-2"), score(TRUE_MASKS, 0.9, "bad-masks")]
     _, text = hierarchy(tmp_path, scores)
-    stand_in = text.split("synthetic stand-in (synthetic)")[1]
+    stand_in = text.split("synthetic stand-in (tables")[1]
     assert "**50.0**" in stand_in
     assert " 90.0 " in stand_in
     assert "**90.0**" not in stand_in

@@ -8,9 +8,10 @@ from hilsplat.base.artifacts import write_json
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.base.provenance import provenance_path
-from hilsplat.evaluate.figures import annotated_rows, draw_panel, free_rows
+from hilsplat.evaluate.figures import annotated_rows, draw_panel, free_rows, truths_of
 from hilsplat.evaluate.pictures import ANSWER_RGB, TRUTH_RGB, outline, paint_answer, save_figure
-from hilsplat.evaluate.query_panel import file_name, locate, query_panel, told, views_of
+from hilsplat.evaluate.query_panel import file_name, query_panel, told, views_of
+from hilsplat.language.finished import FinishedScene
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 
 EVALUATE = EvaluateSettings()
@@ -33,10 +34,12 @@ def test_outline_runs_inside_the_mask_but_not_along_the_image_border():
     assert np.argwhere(outline(mask, 1)).tolist() == [[row, 2] for row in range(6)]
 
 
+def truths_of_blocks(block_world):
+    return truths_of(block_world.scene, block_world.folder / "truth", None, EVALUATE)
+
+
 def test_largest_text_of_each_level_is_shown_first(block_world):
-    rows = annotated_rows(
-        block_world.scene, block_world.annotations, FiguresSettings(queries_per_level=1), EVALUATE
-    )
+    rows = annotated_rows(truths_of_blocks(block_world), FiguresSettings(queries_per_level=1))
     assert [(row.text, row.level) for row in rows] == [
         ("bear", Level.WHOLE),
         ("head", Level.PART),
@@ -46,7 +49,7 @@ def test_largest_text_of_each_level_is_shown_first(block_world):
 
 
 def test_panel_with_annotations_is_drawn(block_world, tmp_path):
-    rows = annotated_rows(block_world.scene, block_world.annotations, FiguresSettings(), EVALUATE)
+    rows = annotated_rows(truths_of_blocks(block_world), FiguresSettings())
     assert len(rows) == 5  # two of whole and part, the only one of subpart
     figure = draw_panel(block_world.answers, block_world.folder / "masks", rows, EVALUATE)
     save_figure(figure, tmp_path / "panel.png", dpi=60)
@@ -103,7 +106,7 @@ def test_parts_of_a_variant_are_found_through_provenance(tmp_path):
     language.touch()
     path = "results/photos/bear/default/autoencoder"
     write_json(provenance_path(language), {"inputs": {"autoencoder": {"path": path, "sha256": ""}}})
-    parts = locate(folder, "omega-2")
+    parts = FinishedScene.locate(folder, "omega-2")
     assert parts.language == language
     assert parts.autoencoder == folder / "default" / "autoencoder"
     assert parts.semantic_tree == folder / "default" / "semantic_tree"
@@ -113,10 +116,10 @@ def test_unfinished_scene_names_the_missing_part(tmp_path):
     folder = finished_scene(tmp_path)
     (folder / "gaussians.ply").unlink()
     with pytest.raises(ArtifactError, match=r"snakemake --cores 2 .*gaussians\.ply"):
-        locate(folder, "default")
+        FinishedScene.locate(folder, "default")
 
 
 def test_unknown_variant_names_those_there_are(tmp_path):
     folder = finished_scene(tmp_path)
     with pytest.raises(ArtifactError, match="one of default"):
-        locate(folder, "leftover")
+        FinishedScene.locate(folder, "leftover")

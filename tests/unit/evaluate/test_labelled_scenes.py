@@ -10,6 +10,7 @@ from hilsplat.base.levels import Level
 from hilsplat.datasets.labelled import LabelledRegion, LabelledScene
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.evaluate import stage
+from hilsplat.evaluate.asked import Asked
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.scores import read_scores
 from hilsplat.settings import EvaluateSettings
@@ -38,7 +39,9 @@ def labelled(block_world, views=("001",), levels=True):
 @pytest.fixture
 def rows(block_world, monkeypatch, tmp_path):
     """Function that evaluates the block world and returns its scores."""
-    monkeypatch.setattr(stage, "LanguageScene", SimpleNamespace(open=lambda *_, **__: block_world.answers))
+    monkeypatch.setattr(
+        stage, "LanguageScene", SimpleNamespace(from_parts=lambda *_, **__: block_world.answers)
+    )
     folder = block_world.folder
 
     def evaluate(truth=None, labels=None):
@@ -57,7 +60,7 @@ def rows(block_world, monkeypatch, tmp_path):
             scene="blocks",
             variant="default",
             threads=1,
-            labels=labels,
+            labels=[("lerf", labels, Asked())] if labels else (),
         )
         scores = read_scores([tmp_path / "scores.csv"])
         keys = ["view", "method", "query", "level", "metric", "protocol"]

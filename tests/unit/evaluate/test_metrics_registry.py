@@ -102,6 +102,7 @@ CASES = {
     "pixel_accuracy": lambda prediction, truth: pixel_accuracy(one_hot(prediction), one_hot(truth)),
     **{f"hc_{reading}": of_families(reading, False) for reading in READINGS},
     **{f"hc_{reading}_pooled": of_families(reading, True) for reading in READINGS},
+    "view_consistency": of_masks(iou),  # of two views' masks over the points that both show
     "class_iou": of_counts(lambda counts: first_class(class_iou(counts))),
     "class_accuracy": of_counts(lambda counts: first_class(class_accuracy(counts))),
     "miou_present": of_counts(miou_over_present),

@@ -10,6 +10,7 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.hierarchy import AnnotatedNode, HierarchyAnnotations, write_hierarchy
 from hilsplat.evaluate.protocols.answers import QueryableScene, Selections
 from hilsplat.evaluate.protocols.cards import PROTOCOLS, card_of
+from hilsplat.evaluate.protocols.flat_views import FlatProtocols
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import measure_view
 from hilsplat.evaluate.scores import COLUMNS, Score, read_scores, write_scores
@@ -96,7 +97,7 @@ def test_consistency_rows_match_the_worked_example(tmp_path):
     scene, truth = worked_example(tmp_path)
     values = measured(scene, truth, methods=("tree", "tree-path"))
     for method, protocol in (("tree", "level-given"), ("tree", "level-auto"), ("tree-path", "path")):
-        key = (method, f"hierarchy/{protocol}@1", "", "")
+        key = (method, f"hierarchy/{protocol}@2", "", "")
         assert values[*key, "hc_containment"] == pytest.approx(0.9375)
         assert values[*key, "hc_literal"] == pytest.approx(0.27)
         assert values[*key, "hc_containment_pooled"] == pytest.approx(0.916667, abs=1e-6)
@@ -110,9 +111,9 @@ def test_consistency_rows_match_the_worked_example(tmp_path):
 def test_missing_answer_counts_zero_and_breaks_consistency(tmp_path):
     scene, truth = worked_example(tmp_path, without=("x",))
     values = measured(scene, truth, methods=("tree",))
-    assert values["tree", "hierarchy/level-given@1", "x", "subpart", "iou"] == 0
-    assert values["tree", "hierarchy/level-given@1", "A", "whole", "iou"] == 1
-    assert values["tree", "hierarchy/level-given@1", "", "", "hc_containment"] == pytest.approx(0.4375)
+    assert values["tree", "hierarchy/level-given@2", "x", "subpart", "iou"] == 0
+    assert values["tree", "hierarchy/level-given@2", "A", "whole", "iou"] == 1
+    assert values["tree", "hierarchy/level-given@2", "", "", "hc_containment"] == pytest.approx(0.4375)
 
 
 def test_regions_with_the_same_text_are_united(tmp_path):
@@ -124,7 +125,7 @@ def test_regions_with_the_same_text_are_united(tmp_path):
     assert truth.queries[0].boxes_xyxy.tolist() == [[0, 0, 3, 3], [6, 6, 9, 9]]
     scene = HandMade([mask_of((0, 4), (0, 4))], {("cup", Level.WHOLE): [0], ("cup", None): [0]})
     values = measured(scene, truth, methods=("tree",))
-    assert values["tree", "hierarchy/level-given@1", "cup", "whole", "iou"] == pytest.approx(0.5)
+    assert values["tree", "hierarchy/level-given@2", "cup", "whole", "iou"] == pytest.approx(0.5)
 
 
 def test_text_at_two_levels_is_one_category_and_two_queries(tmp_path):
@@ -172,8 +173,8 @@ def test_automatic_level_of_the_field_follows_the_highest_value(tmp_path):
     scene = HandMade([], {}, {"cup": relevancy})
     values = measured(scene, truth, methods=("field",), filter_px=1, majority=False)
     given, auto, lerf = (
-        f"{name}@1 (filter 1, no majority)"
-        for name in ("hierarchy/level-given", "hierarchy/level-auto", "lerf/langsplat")
+        f"{name} (filter 1, no majority)"
+        for name in ("hierarchy/level-given@2", "hierarchy/level-auto@2", "lerf/langsplat@1")
     )
     key = ("cup", "whole", "iou")
     assert values["field", given, *key] == 1
@@ -200,7 +201,7 @@ def test_other_protocols_are_measured_with_their_own_rules():
             "v.png",
             SIZE,
             EvaluateSettings(methods=("field",), filter_px=1, mix=False, majority=False, relevancy_scale=5),
-            cards,
+            FlatProtocols(cards, None, ["relevancy scale 5"]),
         )
     )
     ious = {row.protocol: row.value for row in rows if row.metric == "iou"}
@@ -223,8 +224,8 @@ def test_path_localization_looks_inside_the_parent(tmp_path):
     answers = {("bear",): [0], ("bear", "nose"): [1], ("nose", Level.PART): [1]}
     scene = HandMade([mask_of(*each) for each in regions], answers, {"nose": relevancy})
     values = measured(scene, truth, methods=("tree", "tree-path"), filter_px=1)
-    assert values["tree", "hierarchy/level-given@1 (filter 1)", "nose", "part", "localization_box"] == 0
-    assert values["tree-path", "hierarchy/path@1 (filter 1)", "nose", "part", "localization_box"] == 1
+    assert values["tree", "hierarchy/level-given@2 (filter 1)", "nose", "part", "localization_box"] == 0
+    assert values["tree-path", "hierarchy/path@2 (filter 1)", "nose", "part", "localization_box"] == 1
 
 
 def test_perfect_tree_of_the_block_world_scores_one(block_world):
@@ -233,7 +234,7 @@ def test_perfect_tree_of_the_block_world_scores_one(block_world):
     truth = ViewTruth.of(block_world.annotations, view, size_hw, settings.min_region_px)
     selections = Selections(block_world.answers, settings.node_select)
     rows = list(measure_view(block_world.answers, selections, truth, view, size_hw, settings))
-    given = [row for row in rows if row.method == "tree" and row.protocol == "hierarchy/level-given@1"]
+    given = [row for row in rows if row.method == "tree" and row.protocol == "hierarchy/level-given@2"]
     ious = {row.query: row.value for row in given if row.metric == "iou"}
     assert ious == dict.fromkeys(("bear", "chest", "head", "lid", "nose"), 1.0)
     assert {row.value for row in given if row.metric in ("localization_box", "hc_containment")} == {1.0}
@@ -242,7 +243,7 @@ def test_perfect_tree_of_the_block_world_scores_one(block_world):
     field = {
         row.query: row.value
         for row in rows
-        if (row.method, row.protocol, row.metric) == ("field", "hierarchy/level-given@1", "iou")
+        if (row.method, row.protocol, row.metric) == ("field", "hierarchy/level-given@2", "iou")
     }
     assert field["bear"] > 0.9  # exact features; the filter rounds the corners
 
@@ -258,7 +259,7 @@ def score(**changes):
         "query": "cup",
         "level": "whole",
         "metric": "iou",
-        "protocol": "hierarchy/level-given@1",
+        "protocol": "hierarchy/level-given@2",
         "value": 0.5,
         "n": 1,
     }

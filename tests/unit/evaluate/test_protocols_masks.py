@@ -115,3 +115,14 @@ def test_flat_truth_has_categories_and_no_levels():
     assert not any(truth.families())
     boxes = {"apple": np.array([[1, 0, 5, 0], [7, 0, 8, 0]])}
     assert ViewTruth.flat({"apple": strip(2, 4)}, boxes).categories[0].boxes_xyxy.shape == (2, 4)
+
+
+def test_a_prediction_for_an_unknown_query_is_refused_with_the_nearest_name():
+    truth, queries = np.ones((2, 2), bool), {"green apple", "jake"}
+    message = r"'gren apple', which nobody asks(.|\n)*rename it 'green apple'"
+    with pytest.raises(MisalignedArtifactError, match=message):
+        list(measure_masks(LERF_MASK, "m", {"gren apple": truth}, {"green apple": truth}, queries))
+    # a text of the scene that this view does not show is no mistake
+    answers = {"jake": truth, "green apple": truth}
+    rows = list(measure_masks(LERF_MASK, "m", answers, {"green apple": truth}, queries))
+    assert {row.query for row in rows} == {"green apple"}

@@ -20,7 +20,7 @@ def opened(block_world, monkeypatch):
         return block_world.answers
 
     for module in (stage, figures):
-        monkeypatch.setattr(module, "LanguageScene", SimpleNamespace(open=open_scene))
+        monkeypatch.setattr(module, "LanguageScene", SimpleNamespace(from_parts=open_scene))
     folder = block_world.folder
     arguments = {
         "scene_folder": folder / "scene",

@@ -8,25 +8,20 @@ from pathlib import Path
 import pytest
 
 from hilsplat.base.errors import ArtifactError
-from hilsplat.evaluate.scores import Score, write_scores
-from hilsplat.evaluate.tables import (
-    BUILDERS,
-    Block,
-    Cell,
-    Row,
-    as_latex,
-    as_markdown,
-    latex_text,
-    read_published,
-    run_table,
-)
+from hilsplat.evaluate.scores import Score, read_scores, write_scores
+from hilsplat.evaluate.tables.build import TABLES, run_table
+from hilsplat.evaluate.tables.latex import as_latex, latex_text
+from hilsplat.evaluate.tables.reported import read_published
+from hilsplat.evaluate.tables.rows import Block, Cell, Row
+from hilsplat.evaluate.tables.sources import Sources
+from hilsplat.evaluate.tables.text import as_markdown
 
 PUBLISHED = Path(__file__).parents[3] / "config" / "published"
 
 
 def score(metric, value, *, scene="one", variant="default", method="tree", protocol=None, **more):
     fields = {"dataset": "synthetic", "view": "v.png", "query": "cup", "level": "whole", "masks": "sam-tiny"}
-    protocol = protocol or "hierarchy/level-given@1"
+    protocol = protocol or "hierarchy/level-given@2"
     return Score(
         **{**fields, **more},
         scene=scene,
@@ -54,11 +49,11 @@ SCORES = [
     score("iou", 0.4, method="field"),
     score("hc_containment", 1.0, method="truth", protocol="hierarchy/annotations@1", query="", level=""),
     # the LERF protocol
-    score("iou", 0.5, protocol="lerf/tree-nodes@1", level=""),
-    score("boundary_iou", 0.25, protocol="lerf/tree-nodes@1", level=""),
-    score("localization_box", 1.0, protocol="lerf/tree-nodes@1", level=""),
-    score("localization_box", 0.0, protocol="lerf/tree-nodes@1", level="", query="d"),
-    score("iou", 0.7, protocol="lerf/tree-nodes@1", level="", scene="two"),
+    score("iou", 0.5, protocol="lerf/tree-nodes@2", level=""),
+    score("boundary_iou", 0.25, protocol="lerf/tree-nodes@2", level=""),
+    score("localization_box", 1.0, protocol="lerf/tree-nodes@2", level=""),
+    score("localization_box", 0.0, protocol="lerf/tree-nodes@2", level="", query="d"),
+    score("iou", 0.7, protocol="lerf/tree-nodes@2", level="", scene="two"),
     # another variant
     score("iou", 0.9, variant="omega-2", method="field"),
 ]
@@ -84,7 +79,7 @@ def measured(rows, **names):
 
 def test_hierarchy_means_go_over_pairs_then_scenes_then_levels(tmp_path):
     rows, _ = built(tmp_path, "hierarchy")
-    row = measured(rows, answer="tree nodes", protocol="level given")
+    row = measured(rows, method="hilsplat (tree)", protocol="level given")
     # L1: (0.7 + 0.3) / 2, L2: 0.5, L3: 0.1; Avg (0.5 + 0.5 + 0.1) / 3; HC: (0.8 + 0.4) / 2
     assert [row[name] for name in ("L1", "L2", "L3", "Avg", "HC containment")] == [
         "50.00",
@@ -101,14 +96,14 @@ def test_hierarchy_means_go_over_pairs_then_scenes_then_levels(tmp_path):
 
 def test_levels_without_pairs_stay_out_of_the_average(tmp_path):
     rows, _ = built(tmp_path, "hierarchy")
-    row = measured(rows, answer="rendered field", method="default")
+    row = measured(rows, method="hilsplat (field)")
     assert (row["L1"], row["L2"], row["L3"], row["Avg"]) == ("40.00", "", "", "40.00")
 
 
 def test_annotations_row_is_shown_once_and_not_ranked(tmp_path):
     rows, forms = built(tmp_path, "hierarchy")
     assert measured(rows, method="annotations")["HC containment"] == "100.00"
-    assert "| annotations | annotations | - | reference | - | - | - | - | - | 100.0 | - |" in forms[".md"]
+    assert "| annotations | - | reference | - | - | - | - | - | 100.0 | - |" in forms[".md"]
 
 
 def test_kinds_are_never_mixed_in_a_block(tmp_path):
@@ -118,7 +113,7 @@ def test_kinds_are_never_mixed_in_a_block(tmp_path):
     assert headings == [
         "## Reported in the paper: Hi-LERF",
         "## Reported in the paper: Hi-3DOVS",
-        "## Measured on a synthetic stand-in (synthetic); not comparable",
+        "## Measured on a synthetic stand-in (tables of the synthetic world); not comparable",
     ]
     assert "not comparable with reported" in forms[".md"]
 
@@ -128,12 +123,12 @@ def test_rows_of_a_real_data_set_are_measured_rows(tmp_path):
     rows, forms = built(tmp_path, "lerf", scores)
     assert measured(rows, data="lerf")["kind"] == "measured"
     assert "## Measured on lerf" in forms[".md"]
-    assert "stand-in" not in forms[".md"]
+    assert "synthetic" not in forms[".md"]
 
 
 def test_lerf_table_has_a_column_per_scene_and_the_mean_of_scenes(tmp_path):
-    rows, _ = built(tmp_path, "lerf", labels={"default": "hilsplat"})
-    row = measured(rows, method="hilsplat", protocol="lerf/tree-nodes@1")
+    rows, _ = built(tmp_path, "lerf", labels={"default": "ours"})
+    row = measured(rows, method="ours (tree)", protocol="lerf/tree-nodes@2")
     assert (row["one mIoU"], row["two mIoU"], row["Average mIoU"]) == ("50.00", "70.00", "60.00")
     assert (row["one mBIoU"], row["Average mBIoU"]) == ("25.00", "25.00")
     assert row["Average localization"] == "50.00"
@@ -142,14 +137,10 @@ def test_lerf_table_has_a_column_per_scene_and_the_mean_of_scenes(tmp_path):
 def test_ablation_rows_take_localization_from_the_flat_protocol(tmp_path):
     labels = {"default": "hilsplat", "omega-2": "Omega 2"}
     rows, _ = built(tmp_path, "ablation", labels=labels)
-    row = measured(rows, method="hilsplat", answer="tree nodes")
-    assert (row["Localization"], row["L1"], row["HC containment"]) == ("50.00", "50.00", "60.00")
-    names = [(row["method"], row["answer"]) for row in rows if row["kind"] != "reported"]
-    assert names == [
-        ("hilsplat", "rendered field"),
-        ("hilsplat", "tree nodes"),
-        ("Omega 2", "rendered field"),
-    ]
+    row = measured(rows, method="hilsplat (tree)")
+    assert (row["LERF localization"], row["L1"], row["Hi-LERF HC"]) == ("50.00", "50.00", "60.00")
+    names = [row["method"] for row in rows if row["kind"] != "reported"]
+    assert names == ["hilsplat (field)", "hilsplat (tree)", "Omega 2"]
 
 
 def test_tables_are_the_same_bytes_whatever_the_order_of_rows(tmp_path):
@@ -205,14 +196,14 @@ def test_notes_stand_below_the_table(tmp_path):
 
 
 def test_unknown_table_names_those_that_exist(tmp_path):
-    with pytest.raises(ArtifactError, match="hierarchy, lerf, ablation"):
+    with pytest.raises(ArtifactError, match="one of lerf, 3dovs, replica"):
         run_table("leftovers", [], PUBLISHED / "lerf.csv", {}, tmp_path / "x.csv")
 
 
 def test_tables_do_not_load_torch_or_opencv(tmp_path):
     arguments = f"'lerf', [], Path({str(PUBLISHED / 'lerf.csv')!r}), {{}}, Path({str(tmp_path / 'l.csv')!r})"
     code = (
-        "import sys; from pathlib import Path; from hilsplat.evaluate.tables import run_table; "
+        "import sys; from pathlib import Path; from hilsplat.evaluate.tables.build import run_table; "
         f"run_table({arguments}); "
         "print([name for name in ('torch', 'cv2', 'matplotlib', 'scipy') if name in sys.modules])"
     )
@@ -223,18 +214,17 @@ def test_tables_do_not_load_torch_or_opencv(tmp_path):
 # --- the paper's values -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", sorted(BUILDERS))
+@pytest.mark.parametrize("name", sorted(TABLES))
 def test_every_table_has_published_values_without_gaps(name):
     entries = read_published(PUBLISHED / f"{name}.csv")
     by_family = {}
     for entry in entries:
         by_family.setdefault((entry["family"], entry["method"]), []).append(entry["column"])
-        assert entry["value"] == "-" or entry["value"].replace("x3", "")[0].isdigit()
+        assert entry["value"] == "-" or entry["value"].removeprefix("frame_")[0].isdigit()
     columns = {}
-    for (family, _), found in by_family.items():
+    for found in by_family.values():
         assert len(found) == len(set(found))
-        key = family if name == "efficiency" else ""  # two tables with other columns
-        assert columns.setdefault(key, found) == found
+        assert columns.setdefault("", found) == found
 
 
 def value(name, method, column):
@@ -252,14 +242,18 @@ def value(name, method, column):
         ("lerf", "LSeg", "Ramen localization", "14.1"),
         ("lerf", "Open3DRF-GS", "Average mBIoU", "44.6"),
         ("ablation", "Initial-2D, 3D-HC, Part", "Hi-LERF HC", "49.3"),
-        ("ablation", "Omega = 1000", "LERF mIoU", "65.2"),
-        ("ablation", "theta = 0.6", "3D-OVS mIoU", "95.4"),
+        ("omega", "Omega = 1000", "LERF mIoU", "65.2"),
+        ("theta", "theta = 0.6", "3D-OVS mIoU", "95.4"),
         ("3dovs", "Gaussian Grouping", "Bed mIoU", "97.3"),
         ("replica", "Gaussian Grouping", "office1 mIoU", "-"),
         ("replica", "Hi-LSplat", "room2 mAcc", "65.01"),
         ("scannet", "Dr. Splat", "10 classes mAcc", "73.5"),
         ("waymo", "Hi-LSplat", "mIoU", "69.5"),
         ("efficiency", "LangSplat", "Training (min)", "25x3"),
+        ("cost", "VCH", "Teatime query (s)", "0.30"),
+        ("pruning", "Hi-LSplat, pruned pairs", "3D-OVS query (s)", "0.17"),
+        ("frames-hi-lerf", "7", "Figurines", "frame_00152"),
+        ("frames-hi-3dovs", "6", "table", "frame_31"),
     ],
 )
 def test_values_are_as_printed(name, method, column, expected):
@@ -300,6 +294,6 @@ def test_swapped_ap_columns_carry_a_note():
 
 
 def test_markdown_and_latex_are_text_of_one_table(tmp_path):
-    table = BUILDERS["waymo"](read_published(PUBLISHED / "waymo.csv"), None, {})
+    table = TABLES["waymo"].build(Sources(read_published(PUBLISHED / "waymo.csv"), read_scores([]), {}))
     assert "| 3DGS-based | LangSplat | 64.2 |" in as_markdown(table)
     assert r"3DGS-based & LangSplat & 64.2 \\" in as_latex(table)

@@ -9,7 +9,7 @@ from tokenizers import Tokenizer
 
 from hilsplat.base.artifacts import read_json
 from hilsplat.base.levels import LEVELS
-from hilsplat.segment.sam import SamModel, point_grid, quantise, restore
+from hilsplat.segment.sam import SamModel, point_grid
 from hilsplat.world.objects.catalogue import GENERATOR_VERSION
 from hilsplat.world.render import label_view, render_view
 from hilsplat.world.scenes.kinds import training_camera
@@ -20,6 +20,7 @@ from hilsplat.world.tiny.data import HEAD_LEVELS, LabelledViews, normalised
 from hilsplat.world.tiny.measure_sam import draw_regions
 from hilsplat.world.tiny.render import phrases_of, scene_of_seed
 from hilsplat.world.tiny.sam import FRAME_PX
+from tests.unit.segment.plain import quantise, restore
 
 MODELS = Path(__file__).resolve().parents[4] / "models"
 NAMES = ("sam-tiny", "clip-tiny")

@@ -1,0 +1,62 @@
+"""The similarity between two reconstructions that share cameras: true poses and those that were found."""
+
+import numpy as np
+from jaxtyping import Float64
+
+from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.scene.cameras import Cameras
+
+MIN_SHARED = 3
+
+
+def scene_from_true(true: Cameras, found: Cameras) -> Float64[np.ndarray, "4 4"]:
+    """Similarity that maps true coordinates to the scene's, from the cameras that both know by name.
+
+    The rotation is the mean of those between the cameras' orientations (orthogonal Procrustes), so that
+    cameras on a straight line leave nothing open; scale and offset are the least squares of the centres.
+
+    Raises:
+        MisalignedArtifactError: fewer than three cameras are shared, or they stand in one place.
+    """
+    shared = [name for name in found.names if name in set(true.names)]
+    if len(shared) < MIN_SHARED:
+        raise MisalignedArtifactError(
+            "true cameras and those of the scene are not of the same images",
+            expected=f"{MIN_SHARED} shared names or more",
+            found=f"{len(shared)}",
+            fix="evaluate the scene with its own truth folder",
+        )
+    turns = sum(found[name].cam_from_world[:3, :3].T @ true[name].cam_from_world[:3, :3] for name in shared)
+    left, _, right = np.linalg.svd(turns)
+    rotation = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    here = np.stack([true[name].centre for name in shared])
+    there = np.stack([found[name].centre for name in shared])
+    here_mean, there_mean = here.mean(axis=0), there.mean(axis=0)
+    turned = (here - here_mean) @ rotation.T
+    spread = np.square(turned).sum()
+    scale = (turned * (there - there_mean)).sum() / spread if spread > 0 else 0.0
+    if scale <= 0:
+        raise MisalignedArtifactError(
+            "the scene's cameras cannot be laid over the true ones",
+            expected="camera centres that spread alike",
+            found="centres in one place, or mirrored",
+            fix="look at registration.png; the poses have probably failed",
+        )
+    transform = np.eye(4)
+    transform[:3, :3] = scale * rotation
+    transform[:3, 3] = there_mean - scale * rotation @ here_mean
+    return transform
+
+
+def camera_error(true: Cameras, found: Cameras, scene_from_true: Float64[np.ndarray, "4 4"]) -> float:
+    """Median distance of found camera centres from the true ones under a similarity, true units."""
+    scale = np.cbrt(np.linalg.det(scene_from_true[:3, :3]))
+    known = set(true.names)
+    apart = [
+        np.linalg.norm(
+            scene_from_true[:3, :3] @ true[name].centre + scene_from_true[:3, 3] - found[name].centre
+        )
+        for name in found.names
+        if name in known
+    ]
+    return float(np.median(apart) / scale)

@@ -1,0 +1,47 @@
+"""Matches of predicted instances, kept beside `scores.csv` so that scans are evaluated together.
+
+The official average precision pools all scans before it draws a curve; a number per scan would not do.
+"""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hilsplat.base.artifacts import read_npz, write_npz
+
+if TYPE_CHECKING:
+    from hilsplat.evaluate.metrics.instances import InstanceMatches
+
+FIELDS = ("class_index", "overlap_index", "confidence", "is_match", "misses", "has_truth")
+
+
+def instances_path(scores: Path) -> Path:
+    """Where the matches of a score file lie."""
+    return Path(scores).with_name("instances.npz")
+
+
+def write_instances(scores: Path, matches: Mapping[tuple[str, ...], "InstanceMatches"]) -> None:
+    """Write the matches of a scene by (data set, scene, variant, masks, method); none removes the file."""
+    path = instances_path(scores)
+    if not matches:
+        path.unlink(missing_ok=True)
+        return
+    arrays = {
+        "/".join([*key, name]): getattr(found, name) for key, found in matches.items() for name in FIELDS
+    }
+    write_npz(path, **arrays)
+
+
+def read_instances(scores: Iterable[Path]) -> dict[tuple[str, ...], "InstanceMatches"]:
+    """Matches beside score files by (data set, scene, variant, masks, method)."""
+    paths = [path for path in map(instances_path, scores) if path.is_file()]
+    if not paths:
+        return {}
+    from hilsplat.evaluate.metrics.instances import InstanceMatches
+
+    found: dict[tuple[str, ...], dict] = {}
+    for path in paths:
+        for name, array in read_npz(path).items():
+            *key, part = name.split("/")
+            found.setdefault(tuple(key), {})[part] = array
+    return {key: InstanceMatches(**arrays) for key, arrays in found.items()}

@@ -1,0 +1,159 @@
+"""Ask a scene for the classes of labelled points: ScanNet, Replica, Waymo and their stand-ins.
+
+| method | class of a point |
+|---|---|
+| `tree` | that of the node its Gaussian belongs to at level whole: the class text of the highest cosine |
+| `field` | that of the latent carried to the point at level whole, decoded |
+
+Instances (ScanNet200) are the tree's nodes at level whole; a field has none.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int32
+
+from hilsplat.base.levels import Level
+from hilsplat.datasets.classes.class_set import ClassSet
+from hilsplat.datasets.labelled_points import LABELLINGS, LabelledPoints
+from hilsplat.evaluate.metrics.instances import CLASS_STRIDE, InstanceMatches, InstanceScan, match_instances
+from hilsplat.evaluate.protocols import carry
+from hilsplat.evaluate.protocols.cards import INSTANCES, ProtocolCard
+from hilsplat.evaluate.protocols.measured import Measured
+from hilsplat.evaluate.protocols.points import measure_points
+from hilsplat.language.query import LanguageScene
+
+VOTE_RADIUS_M = 0.1
+"""OpenGaussian-like votes come from Gaussians within 10 cm."""
+
+LEVEL = Level.WHOLE
+"""Classes of these data sets are things and surfaces, not parts."""
+
+
+@dataclass(frozen=True)
+class PointAnswers:
+    """A scene's answers at some points.
+
+    Attributes:
+        scene: what answers.
+        carried: which Gaussians speak for the points.
+    """
+
+    scene: LanguageScene
+    carried: carry.CarriedPoints
+
+    @staticmethod
+    def at(
+        scene: LanguageScene,
+        points: Float[np.ndarray, "P 3"],
+        mode: carry.Mode,
+        scene_units_per_metre: float,
+        threads: int = 1,
+    ) -> "PointAnswers":
+        """Carry by a mode (`carry`).
+
+        Args:
+            scene: what answers.
+            points: places, scene units.
+            mode: how predictions come to points.
+            scene_units_per_metre: for the radius of a vote.
+            threads: of the search.
+        """
+        gaussians = scene.gaussians
+        means, opacities = (array.detach().numpy() for array in (gaussians.means, gaussians.opacities))
+        if mode == "frozen":
+            carried = carry.frozen(opacities, len(points))
+        elif mode == "nearest":
+            carried = carry.nearest(points, means, opacities, threads)
+        elif mode == "vote":
+            radius = VOTE_RADIUS_M * scene_units_per_metre
+            carried = carry.vote(points, means, opacities, radius, threads=threads)
+        else:
+            scales, quats = (array.detach().numpy() for array in (gaussians.scales, gaussians.quats))
+            carried = carry.density(points, means, opacities, scales, quats, threads=threads)
+        return PointAnswers(scene, carried)
+
+    def classes(self, method: str, texts: Sequence[str]) -> Int32[np.ndarray, " P"]:
+        """Labels 1 .. K of the points; 0 where nothing speaks for a point."""
+        vectors = self.scene.text_vectors(texts)
+        if method == "tree":
+            node = self.scene.tree.node_of_gaussian[:, LEVEL.index]
+            of_node = carry.classify(self.scene.tree.clip.astype(np.float32), vectors)
+            of_gaussian = np.append(of_node, 0)[node]  # -1 is none
+            return self.carried.labels(of_gaussian)
+        latents = self.carried.features(np.ascontiguousarray(self.scene.language.features[:, LEVEL.index]))
+        spoken = np.flatnonzero(latents.any(axis=1))
+        labels = np.zeros(len(latents), dtype=np.int32)
+        if len(spoken):
+            decoded = self.scene.autoencoder.decode_array(latents[spoken].astype(np.float32))
+            labels[spoken] = carry.classify(decoded, vectors)
+        return labels
+
+    def instances(self, truth: LabelledPoints, classes: ClassSet) -> InstanceMatches:
+        """Match the nodes at level whole, each of its best class with that cosine as confidence."""
+        tree = self.scene.tree
+        nodes = tree.nodes_of(LEVEL)
+        cosines = tree.clip[nodes].astype(np.float32) @ self.scene.text_vectors(classes.texts).T
+        node = np.append(tree.node_of_gaussian[:, LEVEL.index], -1)
+        own = self.carried.labels(node[:-1] + 1) - 1
+        labels = classes.labels(truth.class_id)
+        ids = np.array([0, *classes.ids])[labels]
+        scan = InstanceScan(
+            np.where(labels > 0, ids * CLASS_STRIDE + truth.instance_id, 0).astype(np.int64),
+            own[None] == nodes[:, None],
+            np.array(classes.ids)[cosines.argmax(axis=1)] if len(nodes) else np.zeros(0, np.int64),
+            cosines.max(axis=1) if len(nodes) else np.zeros(0, np.float32),
+        )
+        return match_instances(scan, classes.ids)
+
+
+def class_set(name: str) -> tuple[str, ClassSet]:
+    """Labelling and set of classes by the set's name."""
+    for labelling, sets in LABELLINGS.items():
+        for classes in sets:
+            if classes.name == name:
+                return labelling, classes
+    raise KeyError(name)
+
+
+def measure_scene_points(
+    scene: LanguageScene,
+    truth: Mapping[str, LabelledPoints],
+    scene_from_points: Float[np.ndarray, "4 4"],
+    cards: Sequence[ProtocolCard],
+    methods: Sequence[str],
+    mode: carry.Mode,
+    threads: int = 1,
+) -> Iterator[Measured | tuple[str, InstanceMatches]]:
+    """Rows of one scene under protocols of points, and the matches of its instances by method.
+
+    Args:
+        scene: what answers.
+        truth: labelled points by labelling, metres.
+        scene_from_points: similarity from their frame to the scene's.
+        cards: protocols of points; those whose labelling is not there are passed over.
+        methods: "tree" and "field"; others have no answer at points.
+        mode: see `carry`.
+        threads: of the search for neighbours.
+    """
+    scale = float(np.cbrt(np.linalg.det(scene_from_points[:3, :3])))
+    answers: dict[int, PointAnswers] = {}  # labellings of a mesh share its vertices
+    for card in cards:
+        labelling, classes = class_set(card.classes)
+        if labelling not in truth:
+            continue
+        points = truth[labelling]
+        if id(points.xyz) not in answers:
+            places = points.xyz @ scene_from_points[:3, :3].T + scene_from_points[:3, 3]
+            answers[id(points.xyz)] = PointAnswers.at(scene, places, mode, scale, threads)
+        asked = answers[id(points.xyz)]
+        if card is INSTANCES:
+            if "tree" in methods:
+                yield "tree", asked.instances(points, classes)
+            continue
+        labels = asked.carried.truth(points.labels(classes))
+        for method in ("tree", "field"):
+            if method in methods:
+                predicted = asked.classes(method, classes.texts)
+                yield from measure_points(card, method, labels, predicted, classes, asked.carried.mode)

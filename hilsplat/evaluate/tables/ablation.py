@@ -1,0 +1,113 @@
+"""What each part of the method adds, and the sweeps over theta, Omega and pruning."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN, PATH, card_of
+from hilsplat.evaluate.tables.measured import level_cells, measured_blocks, same_row, scene_mean, with_seeds
+from hilsplat.evaluate.tables.reported import reported_block
+from hilsplat.evaluate.tables.rows import Block, Cell, Table
+from hilsplat.evaluate.tables.sources import Sources
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FLAT = ("lerf/langsplat@", "lerf/tree-nodes@")
+OVS = ("3d-ovs/langsplat@",)
+COLUMNS = (
+    "LERF localization",
+    "LERF mIoU",
+    "3D-OVS mIoU",
+    "L1",
+    "L2",
+    "L3",
+    "Hi-LERF mIoU",
+    "Hi-LERF HC",
+    "Avg, best threshold",
+)
+
+COLUMNS_NOTE = (
+    "All in %. Columns of measured rows are named after the paper's; on the stand-in, LERF and 3D-OVS are "
+    "their protocols (lerf/langsplat or lerf/tree-nodes, level chosen; 3d-ovs/langsplat), and Hi-LERF is "
+    "hierarchy/level-given: mIoU is the mean of L1 to L3, HC its containment reading. The level is given, "
+    "so a row tells the parts of the method apart, and not how well levels are chosen."
+)
+
+
+def ablation_table(sources: Sources) -> Table:
+    """The paper's ablation: parts of the method switched on one after the other."""
+    footnotes = (
+        COLUMNS_NOTE,
+        "Initial-2D: levels of the 2D masks. 3D-HC: 3D hierarchical clustering. Instance, Part: contrastive "
+        "losses. Our rows name the losses that are on; d is the number of latents.",
+    )
+    blocks = [reported(sources, "ablation"), *component_blocks(sources)]
+    return sources.finished("ablation", "Ablation", blocks, footnotes)
+
+
+def theta_table(sources: Sources) -> Table:
+    """Sweep over the coverage threshold."""
+    footnotes = (
+        COLUMNS_NOTE,
+        "theta decides which mask of a view lies in which other. It reaches our field through L_ins and "
+        "L_part alone, and the semantic tree not at all: its rows differ by little or nothing.",
+    )
+    blocks = [reported(sources, "coverage threshold"), *component_blocks(sources, ("field",))]
+    return sources.finished("theta", "Influence of the coverage threshold theta", blocks, footnotes)
+
+
+def omega_table(sources: Sources) -> Table:
+    """Sweep over the similarity degree."""
+    footnotes = (COLUMNS_NOTE, "Omega is part of L_ins alone.")
+    blocks = [reported(sources, "similarity degrees"), *component_blocks(sources, ("field",))]
+    return sources.finished("omega", "Influence of the similarity degree Omega", blocks, footnotes)
+
+
+def reported(sources: Sources, what: str) -> Block:
+    """The paper's rows of an ablation."""
+    return reported_block(
+        sources.published, "LERF, 3D-OVS, Hi-LERF", f"Reported in the paper: {what}", families=False
+    )
+
+
+def component_blocks(
+    sources: Sources, methods: tuple[str, ...] = ("field", "tree", "tree-path")
+) -> list[Block]:
+    """One row per variant and answer, all protocols of the ablation side by side."""
+    if sources.scores.empty:
+        return []
+    scores = with_seeds(sources.scores)
+
+    def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
+        return component_cells(scores, part)
+
+    blocks = measured_blocks(
+        sources.scores[sources.scores["method"].isin(methods)],
+        sources.labels,
+        lambda protocol: card_of(protocol) in (LEVEL_GIVEN, PATH),
+        cells_of,
+        lambda _: COLUMNS,
+        frozenset({"Avg, best threshold"}),
+    )
+    return [replace(block, columns=tuple(c for c in COLUMNS if filled(block, c))) for block in blocks]
+
+
+def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> Mapping[str, Cell]:
+    """Numbers of one row from its scores under all protocols."""
+    flat, ovs = same_row(scores, part, FLAT), same_row(scores, part, OVS)
+    levels = level_cells(part)
+    return {
+        "LERF localization": Cell.percent(scene_mean(flat, "localization_box")),
+        "LERF mIoU": Cell.percent(scene_mean(flat, "iou")),
+        "3D-OVS mIoU": Cell.percent(scene_mean(ovs, "iou")),
+        **{name: cell for name, cell in levels.items() if name != "Avg"},
+        "Hi-LERF mIoU": levels["Avg"],
+        "Hi-LERF HC": Cell.percent(scene_mean(part, "hc_containment")),
+        "Avg, best threshold": level_cells(part, "best_threshold_iou")["Avg"],
+    }
+
+
+def filled(block: Block, column: str) -> bool:
+    """Whether any row of a block has a value in a column."""
+    return any(row.cells.get(column, Cell()).text != "-" for row in block.rows)

@@ -1,0 +1,118 @@
+"""Build any table by its name. Imports neither torch nor anything heavy: a table takes about a second."""
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from hilsplat.base.artifacts import write_text
+from hilsplat.base.errors import ArtifactError
+from hilsplat.evaluate.costs import read_costs
+from hilsplat.evaluate.instance_files import read_instances
+from hilsplat.evaluate.scores import read_scores
+from hilsplat.evaluate.tables.ablation import ablation_table, omega_table, theta_table
+from hilsplat.evaluate.tables.cost_tables import cost_table, efficiency_table, pruning_table
+from hilsplat.evaluate.tables.frame_tables import hi_3dovs_frames, hi_lerf_frames
+from hilsplat.evaluate.tables.hierarchy import hierarchy_table
+from hilsplat.evaluate.tables.html_page import as_html
+from hilsplat.evaluate.tables.image_tables import lerf_table, ovs_table
+from hilsplat.evaluate.tables.latex import as_latex
+from hilsplat.evaluate.tables.point_tables import replica_table, scannet_table, waymo_table
+from hilsplat.evaluate.tables.reported import read_published
+from hilsplat.evaluate.tables.rows import Table
+from hilsplat.evaluate.tables.sources import Sources
+from hilsplat.evaluate.tables.text import as_csv, as_markdown
+
+logger = logging.getLogger(__name__)
+
+
+LEVELLED = ("tabletop", "lerf_ovs", "3d_ovs")
+"""Where the ablations are measured: stand-in and images with labels at levels."""
+
+
+@dataclass(frozen=True)
+class TableKind:
+    """How one table of the paper is built.
+
+    Attributes:
+        build: the function.
+        data: what it is measured on: kinds of synthetic scenes, and published data sets.
+        variants: key of the configuration that lists its variants.
+        shows_costs: reads the times of jobs and queries too.
+    """
+
+    build: Callable[[Sources], Table]
+    data: tuple[str, ...]
+    variants: str = "main_variants"
+    shows_costs: bool = False
+
+    @property
+    def is_sweep(self) -> bool:
+        """Measured on the scenes of `sweep_scenes` alone."""
+        return self.variants != "main_variants"
+
+
+TABLES: dict[str, TableKind] = {
+    "lerf": TableKind(lerf_table, ("tabletop", "lerf_ovs", "lerf_mask")),
+    "3dovs": TableKind(ovs_table, ("tabletop", "3d_ovs")),
+    "replica": TableKind(replica_table, ("room", "replica")),
+    "scannet": TableKind(scannet_table, ("room", "scannet")),
+    "waymo": TableKind(waymo_table, ("street", "waymo")),
+    "hierarchy": TableKind(hierarchy_table, ("tabletop", "room", "street", "lerf_ovs", "3d_ovs")),
+    "ablation": TableKind(ablation_table, LEVELLED, "ablation_variants"),
+    "cost": TableKind(cost_table, LEVELLED, shows_costs=True),
+    "pruning": TableKind(pruning_table, LEVELLED, "pruning_variants", shows_costs=True),
+    "efficiency": TableKind(efficiency_table, LEVELLED, shows_costs=True),
+    "theta": TableKind(theta_table, LEVELLED, "theta_variants"),
+    "omega": TableKind(omega_table, LEVELLED, "omega_variants"),
+    "frames-hi-lerf": TableKind(hi_lerf_frames, ("tabletop", "lerf_ovs")),
+    "frames-hi-3dovs": TableKind(hi_3dovs_frames, ("tabletop", "3d_ovs")),
+}
+"""Every table by name, in the order of the report; a new one is a function and a line here."""
+
+
+def run_table(
+    name: str,
+    scores: Sequence[Path],
+    published: Path,
+    labels: Mapping[str, str],
+    out: Path,
+    absent: Sequence[str] = (),
+) -> None:
+    """Build one table and write it as CSV, Markdown, LaTeX and HTML.
+
+    Args:
+        name: a key of `TABLES`.
+        scores: `scores.csv` of every scene and variant that the table shows.
+        published: the paper's values: `config/published/<name>.csv`.
+        labels: variant -> how the table names it; others keep their name.
+        out: the CSV; `.md`, `.tex` and `.html` are written beside it.
+        absent: data sets that were not measured, and why, each a sentence.
+
+    Raises:
+        ArtifactError: the table is unknown, or a file is missing or has other columns.
+    """
+    if name not in TABLES:
+        raise ArtifactError(f"there is no table {name!r}", expected=f"one of {', '.join(TABLES)}")
+    kind = TABLES[name]
+    sources = Sources(
+        read_published(published),
+        read_scores(scores),
+        labels,
+        read_costs(scores) if kind.shows_costs else (),
+        read_instances(scores),
+        absent,
+    )
+    table = kind.build(sources)
+    write_table(table, out)
+    rows = sum(len(block.rows) for block in table.blocks)
+    logger.info("table %s: %d blocks, %d rows", name, len(table.blocks), rows)
+
+
+def write_table(table: Table, out: Path) -> None:
+    """Write all four forms; the same table gives the same bytes."""
+    out = Path(out)
+    write_text(out.with_suffix(".md"), as_markdown(table))
+    write_text(out.with_suffix(".tex"), as_latex(table))
+    write_text(out.with_suffix(".html"), as_html(table))
+    write_text(out, as_csv(table))

@@ -1,0 +1,148 @@
+"""Time and memory: computational cost, efficiency, pruning.
+
+Measured rows tell what the jobs of this machine took. They differ from run to run, so these tables do not
+repeat to the byte as the others do.
+"""
+
+import statistics
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
+
+from hilsplat.evaluate.costs import Cost
+from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
+from hilsplat.evaluate.tables.ablation import component_cells
+from hilsplat.evaluate.tables.measured import ANSWERS, kind_and_title, row_name, with_seeds
+from hilsplat.evaluate.tables.reported import reported_block
+from hilsplat.evaluate.tables.rows import Block, Cell, Row, Table
+from hilsplat.evaluate.tables.sources import Sources
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LOWER = ("(min)", "(GB)", "(s)")
+COST_NOTE = (
+    "Measured rows, on this machine, means over scenes: preparation is masks, trees of the views and CLIP; "
+    "training is contributions, semantic tree, autoencoder and field; neither holds the 3D Gaussians. "
+    "Memory is the largest of the training jobs, in main memory (the paper: GPU). A query is one text in one "
+    "view: text encoding, compositing weights of the view, relevancy and mask."
+)
+
+
+def cost_table(sources: Sources) -> Table:
+    """Training time, memory and seconds per query and scene (paper: computational costs)."""
+    blocks = [reported(sources, "one RTX 3090")]
+    for data, costs in by_dataset(sources.costs).items():
+        scenes = sorted({cost.scene for cost in costs})
+        columns = ["Preparation (min)", "Training (min)", "Memory (GB)"]
+        columns += [f"{scene} query (s)" for scene in scenes]
+        rows = []
+        for variant, method, of_row in by_answer(sources, costs):
+            cells = {
+                **time_cells(of_row),
+                **{f"{cost.scene} query (s)": Cell.number(cost.query_s[method], 2) for cost in of_row},
+            }
+            rows.append(Row({"Method": row_name(variant, method, sources.labels)}, cells))
+        blocks.append(timed(data, rows, columns))
+    return sources.finished("cost", "Computational cost", blocks, (COST_NOTE,))
+
+
+def efficiency_table(sources: Sources) -> Table:
+    """Quality at three levels beside training time and memory (paper: efficiency)."""
+    blocks = [reported(sources, "one RTX 3090")]
+    blocks += quality_blocks(sources, ("Preparation (min)", "Training (min)", "Memory (GB)"))
+    return sources.finished("efficiency", "Efficiency", blocks, (COST_NOTE,))
+
+
+def pruning_table(sources: Sources) -> Table:
+    """Cost and quality with pruned pairs in the contrastive losses (paper: sample pruning)."""
+    blocks = [reported(sources, "sample pruning")]
+    blocks += quality_blocks(sources, ("Training (min)", "Memory (GB)", "Query (s)"), ("field",))
+    footnotes = (
+        COST_NOTE,
+        "The paper removes redundant pairs by similarity of features and gives no rule. What our variant "
+        "removes stands in its settings (variants in config/config.yaml).",
+    )
+    return sources.finished("pruning", "Cost with pruned pairs", blocks, footnotes)
+
+
+def reported(sources: Sources, what: str) -> Block:
+    """The paper's rows, small times and memories ranked best."""
+    block = reported_block(
+        sources.published, "LERF, 3D-OVS, Hi-LERF", f"Reported in the paper: {what}", families=False
+    )
+    lower = frozenset(column for column in block.columns if column.endswith(LOWER))
+    return Block(block.kind, block.data, block.title, block.rows, block.columns, lower)
+
+
+def quality_blocks(
+    sources: Sources, time_columns: tuple[str, ...], methods: tuple[str, ...] = ("field", "tree")
+) -> list[Block]:
+    """mIoU and HC at given levels beside times, per data set with queries at levels."""
+    blocks = []
+    scores = with_seeds(sources.scores) if len(sources.scores) else sources.scores
+    for data, costs in by_dataset(sources.costs).items():
+        rows = []
+        for variant, method, of_row in by_answer(sources, costs):
+            part = given(scores, data, variant, method)
+            if method not in methods or part is None:
+                continue
+            quality = component_cells(scores, part)
+            cells = {name: quality[name] for name in ("Hi-LERF mIoU", "Hi-LERF HC")}
+            query = statistics.fmean(cost.query_s[method] for cost in of_row)
+            cells |= {**time_cells(of_row), "Query (s)": Cell.number(query, 2)}
+            rows.append(Row({"Method": row_name(variant, method, sources.labels)}, cells))
+        blocks.append(timed(data, rows, ["Hi-LERF mIoU", "Hi-LERF HC", *time_columns]))
+    return blocks
+
+
+def given(scores: "pd.DataFrame", data: str, variant: str, method: str) -> "pd.DataFrame | None":
+    """Scores of one row with the level given; None where there are none."""
+    if scores.empty:
+        return None
+    part = scores[
+        (scores["dataset"] == data)
+        & (scores["variant"] == variant)
+        & (scores["seed"] == "0")
+        & (scores["method"] == method)
+        & scores["protocol"].str.startswith(LEVEL_GIVEN.full_name)
+    ]
+    return None if part.empty else part
+
+
+def time_cells(costs: list[Cost]) -> Mapping[str, Cell]:
+    """Means over scenes; memory is the largest."""
+    return {
+        "Preparation (min)": Cell.number(statistics.fmean(cost.prepare_s for cost in costs) / 60, 2),
+        "Training (min)": Cell.number(statistics.fmean(cost.train_s for cost in costs) / 60, 2),
+        "Memory (GB)": Cell.number(max(cost.peak_mib for cost in costs) / 1024, 2),
+    }
+
+
+def timed(data: str, rows: list[Row], columns: list[str]) -> Block:
+    """A block of measured times."""
+    lower = frozenset(column for column in columns if column.endswith(LOWER))
+    return Block(*kind_and_title(data), tuple(rows), tuple(columns), lower)
+
+
+def by_dataset(costs: Iterable[Cost]) -> dict[str, list[Cost]]:
+    """Costs by data set, names in order."""
+    found: dict[str, list[Cost]] = {}
+    for cost in sorted(costs, key=lambda cost: (cost.dataset, cost.scene)):
+        found.setdefault(cost.dataset, []).append(cost)
+    return found
+
+
+def by_answer(sources: Sources, costs: list[Cost]) -> list[tuple[str, str, list[Cost]]]:
+    """(variant, method, costs of the scenes) in the order of rows."""
+    order = ["default", *sources.labels]
+    found: dict[tuple[str, str], list[Cost]] = {}
+    for cost in costs:
+        for method in cost.query_s:
+            found.setdefault((cost.variant, method), []).append(cost)
+
+    def place(key: tuple[str, str]) -> tuple:
+        variant, method = key
+        known = order.index(variant) if variant in order else len(order)
+        return known, variant, list(ANSWERS).index(method)
+
+    return [(*key, found[key]) for key in sorted(found, key=place)]

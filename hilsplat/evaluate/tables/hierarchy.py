@@ -1,0 +1,93 @@
+"""Queries at three levels: Hi-LERF, Hi-3DOVS and their stand-ins."""
+
+from typing import TYPE_CHECKING
+
+from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN, VIEW_CONSISTENCY
+from hilsplat.evaluate.tables.measured import (
+    level_cells,
+    mean_of,
+    measured_blocks,
+    same_row,
+    scene_mean,
+    with_seeds,
+)
+from hilsplat.evaluate.tables.reported import reported_block
+from hilsplat.evaluate.tables.rows import Cell, Table
+from hilsplat.evaluate.tables.sources import Sources
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+COLUMNS = (
+    "L1",
+    "L2",
+    "L3",
+    "Avg",
+    "Acc@0.25",
+    "HC containment",
+    "HC literal",
+    "HC anchored",
+    "View consistency",
+    "Avg, best threshold",
+    "Pairs",
+)
+
+
+def hierarchy_table(sources: Sources) -> Table:
+    """mIoU at three levels, hierarchical consistency, consistency between views."""
+    blocks = []
+    for data in ("Hi-LERF", "Hi-3DOVS"):
+
+        def rename(column: str, data: str = data) -> str | None:
+            if not column.startswith(f"{data} "):
+                return None
+            return column.removeprefix(f"{data} ").replace("HC", "HC (reading not stated)")
+
+        blocks.append(reported_block(sources.published, data, f"Reported in the paper: {data}", rename))
+    scores = with_seeds(sources.scores)
+
+    def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
+        ious = part[part["metric"] == "iou"]
+        share = ious.assign(value=(ious["value"] > 0.25).astype(float))
+        cells = {
+            **level_cells(part),
+            "Acc@0.25": Cell.percent(scene_mean(share, "iou")),
+            "HC containment": Cell.percent(scene_mean(part, "hc_containment")),
+            "HC literal": Cell.percent(scene_mean(part, "hc_literal")),
+            "HC anchored": Cell.percent(scene_mean(part, "hc_anchored")),
+            "Avg, best threshold": level_cells(part, "best_threshold_iou")["Avg"],
+            "Pairs": Cell(str(len(ious)), float(len(ious))) if len(ious) else Cell(),
+        }
+        if part["protocol"].iloc[0].startswith(LEVEL_GIVEN.full_name):
+            cells["View consistency"] = view_consistency(scores, part)
+        return cells
+
+    blocks += measured_blocks(
+        sources.scores,
+        sources.labels,
+        lambda protocol: protocol.startswith("hierarchy/"),
+        cells_of,
+        lambda _: COLUMNS,
+        frozenset({"HC literal", "Avg, best threshold", "Pairs"}),
+    )
+    footnotes = (
+        "mIoU in %: mean over (view, text) pairs of a scene, then over scenes; Avg is the mean of L1 to L3.",
+        "HC containment: share of the child inside the parent (the paper's wording; 100 for perfect "
+        "nesting). HC literal: share of the parent covered by the child (the printed formula; perfect masks "
+        "score low). HC anchored: share of the child inside the annotated parent. The row of the "
+        "annotations gives what perfect masks would score.",
+        "A path of texts asks whole > part > subpart: more information than the paper's protocol gives.",
+        "View consistency: of the surface points that two neighbouring views both show, IoU of those that "
+        "the answer holds in one view and in the other, by exact geometry, level given; mean over texts of "
+        "a level, then over levels. Texts that neither view answers there are left out. It measures "
+        "consistency, not correctness.",
+        "Avg, best threshold: the threshold of every map is chosen with the truth; a diagnostic, no result.",
+    )
+    return sources.finished("hierarchy", "Queries at three levels", blocks, footnotes)
+
+
+def view_consistency(scores: "pd.DataFrame", part: "pd.DataFrame") -> Cell:
+    """Consistency between views of the same row's answers; a dash where it was not measured."""
+    same = same_row(scores, part, (VIEW_CONSISTENCY.full_name,))
+    levels = sorted(set(same["level"]))
+    return Cell.percent(mean_of([scene_mean(same, "view_consistency", level) for level in levels]))

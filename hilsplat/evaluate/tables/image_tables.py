@@ -1,0 +1,91 @@
+"""Tables of labelled images without levels: LERF and 3D-OVS."""
+
+from typing import TYPE_CHECKING
+
+from hilsplat.evaluate.protocols.cards import LERF_MASK, card_of
+from hilsplat.evaluate.tables.measured import class_mean, measured_blocks, scene_mean
+from hilsplat.evaluate.tables.reported import reported_block
+from hilsplat.evaluate.tables.rows import Cell, Table
+from hilsplat.evaluate.tables.sources import Sources
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def lerf_table(sources: Sources) -> Table:
+    """Segmentation and localization per scene (paper: LERF), on LERF-OVS and LERF-Mask."""
+    metrics = {"mIoU": "iou", "mBIoU": "boundary_iou", "localization": "localization_box"}
+
+    def columns_of(of_data: "pd.DataFrame") -> list[str]:
+        scenes = [*sorted(set(of_data["scene"])), "Average"]
+        segmentation = [f"{scene} {name}" for scene in scenes for name in ("mIoU", "mBIoU")]
+        return segmentation + [f"{scene} localization" for scene in scenes]
+
+    blocks = [reported_block(sources.published, "LERF", "Reported in the paper: LERF")]
+    for prefixes in (("lerf/",), (LERF_MASK.name,)):
+        blocks += measured_blocks(
+            sources.scores,
+            sources.labels,
+            lambda protocol, prefixes=prefixes: protocol.startswith(prefixes),
+            lambda part: scene_cells(part, metrics),
+            columns_of,
+            ranked_by_protocol=False,
+        )
+    footnotes = (
+        "All in %. mIoU and mBIoU are means over (view, text) pairs of a scene; Average is the mean of the "
+        "scenes. Localization: the point of highest smoothed relevancy lies in a box of the text.",
+        "lerf/langsplat: mean filter (30 px at a height of 730, scaled), min-max above 0.7, 7 x 7 majority, "
+        "level of the highest relevancy. lerf/tree-nodes: tree nodes, level chosen by the tree.",
+        "lerf-mask/gaussian-grouping: one mask per text and view, mean over the views of a text, then over "
+        "texts; a missing prediction counts 0. On the stand-in the texts are those of whole objects, and "
+        "the answers those of the row's method with the level chosen.",
+        "*: reproduced by the paper's authors; other reported rows come from the methods' own papers.",
+    )
+    return sources.finished("lerf", "Segmentation and localization", blocks, footnotes)
+
+
+def ovs_table(sources: Sources) -> Table:
+    """Segmentation per scene (paper: 3D-OVS), thresholded as LangSplat does and by argmax."""
+
+    def columns_of(of_data: "pd.DataFrame") -> list[str]:
+        scenes = sorted(set(of_data["scene"]))
+        return [*(f"{scene} mIoU" for scene in scenes), "Overall mIoU", "Overall accuracy"]
+
+    def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
+        cells = scene_cells(part, {"mIoU": "iou"})
+        overall = cells.pop("Average mIoU")
+        accuracy = Cell.percent(scene_mean(part, "pixel_accuracy"))
+        return {**cells, "Overall mIoU": overall, "Overall accuracy": accuracy}
+
+    blocks = [reported_block(sources.published, "3D-OVS", "Reported in the paper: 3D-OVS")]
+    blocks += measured_blocks(
+        sources.scores,
+        sources.labels,
+        lambda protocol: protocol.startswith("3d-ovs/"),
+        cells_of,
+        columns_of,
+    )
+    footnotes = (
+        "mIoU in %: mean over (view, text) pairs of a scene; Overall is the mean of the scenes.",
+        "3d-ovs/langsplat: min-max relevancy above 0.7, unfiltered, level of the highest mean in its mask "
+        "(LangSplat's supplement; its code is not released). 3d-ovs/langsplat-raw takes the printed 0.4 "
+        "literally. 3d-ovs/langsplat-v2: LangSplatV2's code.",
+        "3d-ovs/argmax: every pixel gets the text of the highest cosine, at an eighth of the image's size; "
+        "accuracy is the share of pixels with the right text. Brackets name the level it is read from.",
+        "On the stand-in the texts are those of whole objects in view; what surrounds them has no text, and "
+        "the argmax protocol is scored on the pixels that have one.",
+        "*: reproduced by the paper's authors.",
+    )
+    return sources.finished("3dovs", "3D-OVS: segmentation", blocks, footnotes)
+
+
+def scene_cells(part: "pd.DataFrame", metrics: dict[str, str]) -> dict[str, Cell]:
+    """Columns `<scene> <name>` and `Average <name>`, in the averaging order of the protocol."""
+    by_class = card_of(part["protocol"].iloc[0]).averaging == "classes"
+    mean = class_mean if by_class else scene_mean
+    cells = {}
+    for name, metric in metrics.items():
+        for scene, of_scene in part.groupby("scene", sort=True):
+            cells[f"{scene} {name}"] = Cell.percent(mean(of_scene, metric))
+        cells[f"Average {name}"] = Cell.percent(mean(part, metric))
+    return cells

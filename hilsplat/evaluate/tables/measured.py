@@ -1,0 +1,206 @@
+"""Rows from scores: one block per data set, one row per variant, method, masks and protocol."""
+
+import re
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from hilsplat.base.levels import LEVELS
+from hilsplat.evaluate.protocols.cards import ANNOTATIONS, LEVEL_AUTO, LEVEL_GIVEN, PATH
+from hilsplat.evaluate.scores import made_from_truth
+from hilsplat.evaluate.tables.rows import Block, Cell, Row
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SYNTHETIC = "synthetic"
+"""Data sets whose name begins so are stand-ins."""
+
+SEED = re.compile(r"(?P<variant>.+)\.seed(?P<seed>[0-9]+)")
+"""A variant's name with another seed; rows of all seeds of a variant are one row."""
+
+ANSWERS = {"field": "field", "tree": "tree", "tree-path": "tree, path", "truth": "annotations"}
+"""How rows name what answered, in their order."""
+
+PROTOCOLS = {
+    LEVEL_GIVEN.full_name: "level given",
+    LEVEL_AUTO.full_name: "level chosen",
+    PATH.full_name: "path of texts",
+    ANNOTATIONS.full_name: "reference",
+}
+"""How tables name protocols; others keep their name."""
+
+STAND_INS = {
+    "synthetic": "tables of the synthetic world",
+    "synthetic-rooms": "rooms of the synthetic world",
+    "synthetic-streets": "streets of the synthetic world",
+}
+"""Headings of the stand-ins."""
+
+TRUE_MASKS = "diagnostic, true masks: "
+"""Before the method's name in rows whose masks were made from true labels."""
+
+
+def measured_blocks(
+    scores: "pd.DataFrame",
+    labels: Mapping[str, str],
+    protocols: Callable[[str], bool],
+    cells_of: Callable[["pd.DataFrame"], dict[str, Cell]],
+    columns_of: Callable[["pd.DataFrame"], Sequence[str]],
+    unranked: frozenset[str] = frozenset(),
+    ranked_by_protocol: bool = True,
+    lower_is_better: frozenset[str] = frozenset(),
+) -> list[Block]:
+    """One block per data set; one row per variant, method, masks and protocol.
+
+    Args:
+        scores: rows of `scores.csv`.
+        labels: variant -> name.
+        protocols: says which protocols make a row.
+        cells_of: values of a row, from the scores of one variant, method, masks, protocol and seed.
+        columns_of: value columns, from the scores of a data set.
+        unranked: columns in which nothing is best.
+        ranked_by_protocol: rows of different protocols are not ranked against each other.
+        lower_is_better: columns in which the smallest value is best.
+    """
+    if scores.empty:
+        return []
+    blocks = []
+    order = ["default", *labels]
+    scores = with_seeds(scores)
+    for data, of_data in scores.groupby("dataset", sort=True):
+        rows = []
+        wanted = of_data[of_data["protocol"].map(protocols)]
+        keys = ["variant", "masks", "method", "protocol"]
+        for (variant, masks, method, protocol), part in wanted.groupby(keys, sort=True):
+            names = {
+                "Method": row_name(variant, method, labels),
+                "Masks": masks if method != "truth" else "-",
+                "Protocol": PROTOCOLS.get(protocol, protocol),
+            }
+            if method != "truth" and made_from_truth(masks):
+                names["Method"] = TRUE_MASKS + names["Method"]
+            seeds = [cells_of(of_seed) for _, of_seed in part.groupby("seed", sort=True)]
+            if len(seeds) > 1:
+                names["Seeds"] = str(len(seeds))
+            place = (
+                made_from_truth(masks),
+                list(PROTOCOLS).index(protocol) if protocol in PROTOCOLS else -1,
+                order.index(variant) if variant in order else len(order),
+                variant,
+                list(ANSWERS).index(method) if method in ANSWERS else len(ANSWERS),
+                masks,
+                protocol,
+            )
+            group = protocol if ranked_by_protocol else ""
+            ranked = method != "truth" and not made_from_truth(masks)
+            rows.append((place, Row(names, mean_over_seeds(seeds), group if ranked else None)))
+        distinct = without_repeats([row for _, row in sorted(rows, key=lambda item: item[0])])
+        if distinct:
+            columns = tuple(columns_of(wanted))
+            blocks.append(
+                Block(*kind_and_title(str(data)), distinct, columns, lower_is_better, unranked=unranked)
+            )
+    return blocks
+
+
+def with_seeds(scores: "pd.DataFrame") -> "pd.DataFrame":
+    """The seed in a column of its own; the first seed is "0"."""
+    parts = scores["variant"].str.extract(f"^{SEED.pattern}$")
+    variant = parts["variant"].fillna(scores["variant"])
+    return scores.assign(variant=variant, seed=parts["seed"].fillna("0"))
+
+
+def mean_over_seeds(seeds: Sequence[Mapping[str, Cell]]) -> dict[str, Cell]:
+    """Mean of each cell and its standard deviation (n - 1) over seeds; one seed as it is."""
+    if len(seeds) == 1:
+        return dict(seeds[0])
+    cells = {}
+    for column, first in seeds[0].items():
+        values = [cells[column].value for cells in seeds if cells.get(column, Cell()).value is not None]
+        if len(values) < 2 or first.text.isdigit():  # counts do not depend on the seed
+            cells[column] = first
+            continue
+        mean, spread = statistics.fmean(values), statistics.stdev(values)
+        cells[column] = Cell(f"{mean:.1f} ± {spread:.1f}", mean, first.note, spread)
+    return cells
+
+
+def without_repeats(rows: Sequence[Row]) -> tuple[Row, ...]:
+    """Rows that show the same are one: the annotations' own row is the same for every variant."""
+    seen: dict[tuple, Row] = {}
+    for row in rows:
+        key = (*row.names.values(), *(cell.text for cell in row.cells.values()))
+        seen.setdefault(key, row)
+    return tuple(seen.values())
+
+
+def row_name(variant: str, method: str, labels: Mapping[str, str]) -> str:
+    """Name of a row by what answered.
+
+    The default variant answers by field and tree, `hilsplat (field)` and `hilsplat (tree)`; another
+    variant's label is that of its field.
+    """
+    if method == "truth":
+        return "annotations"
+    label, answer = labels.get(variant, variant), ANSWERS.get(method, method)
+    if variant == "default":
+        return f"{labels.get('default', 'hilsplat')} ({answer})"
+    return label if method == "field" else f"{label}, {answer}"
+
+
+def kind_and_title(dataset: str) -> tuple[str, str, str]:
+    """Kind, data set and heading of measured rows."""
+    if dataset.startswith(SYNTHETIC):
+        what = STAND_INS.get(dataset, dataset)
+        return "synthetic stand-in", dataset, f"Measured on a synthetic stand-in ({what}); not comparable"
+    return "measured", dataset, f"Measured on {dataset}"
+
+
+def scene_mean(part: "pd.DataFrame", metric: str, level: str | None = None) -> float:
+    """Mean over the rows of each scene, then over scenes; nan where there is none."""
+    rows = part[part["metric"] == metric]
+    if level is not None:
+        rows = rows[rows["level"] == level]
+    if rows.empty:
+        return float("nan")
+    return float(rows.groupby("scene", sort=True)["value"].mean().mean())
+
+
+def class_mean(part: "pd.DataFrame", metric: str) -> float:
+    """Mean over the views of each text, over the texts of a scene, then over scenes."""
+    rows = part[part["metric"] == metric]
+    if rows.empty:
+        return float("nan")
+    of_text = rows.groupby(["scene", "query"], sort=True)["value"].mean()
+    return float(of_text.groupby(level="scene", sort=True).mean().mean())
+
+
+def level_cells(part: "pd.DataFrame", metric: str = "iou") -> dict[str, Cell]:
+    """L1, L2, L3 and Avg, the mean of the levels that have pairs."""
+    values = [scene_mean(part, metric, level.label) for level in LEVELS]
+    names = [f"L{int(level)}" for level in LEVELS]
+    average = Cell.percent(mean_of(values))
+    return {**dict(zip(names, map(Cell.percent, values), strict=True)), "Avg": average}
+
+
+def mean_of(values: Sequence[float]) -> float:
+    """Mean of what is there; nan where nothing is."""
+    present = [value for value in values if value == value]
+    return sum(present) / len(present) if present else float("nan")
+
+
+def same_row(scores: "pd.DataFrame", part: "pd.DataFrame", protocols: tuple[str, ...]) -> "pd.DataFrame":
+    """Scores of other protocols by the same variant, seed, method and masks on the same data set.
+
+    Args:
+        scores: scores with seeds (`with_seeds`).
+        part: the scores of one row.
+        protocols: how the protocols' names begin.
+    """
+    first = part.iloc[0]
+    keys = ("dataset", "variant", "seed", "masks", "method")
+    same = scores["protocol"].str.startswith(protocols)
+    for key in keys:
+        same &= scores[key] == first[key]
+    return scores[same]

@@ -1,0 +1,194 @@
+"""Tables of labelled points: Replica, ScanNet with ScanNet200, Waymo."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from hilsplat.evaluate.protocols.cards import INSTANCES, card_of
+from hilsplat.evaluate.protocols.measured import Measured
+from hilsplat.evaluate.scores import made_from_truth
+from hilsplat.evaluate.tables.measured import (
+    ANSWERS,
+    TRUE_MASKS,
+    kind_and_title,
+    mean_over_seeds,
+    measured_blocks,
+    row_name,
+    scene_mean,
+    with_seeds,
+)
+from hilsplat.evaluate.tables.reported import reported_block
+from hilsplat.evaluate.tables.rows import Block, Cell, Row, Table
+from hilsplat.evaluate.tables.sources import Sources
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SCANNET_COLUMNS: Mapping[str, str] = {
+    "scannet/opengaussian-19": "19 classes",
+    "scannet/opengaussian-15": "15 classes",
+    "scannet/opengaussian-10": "10 classes",
+    "scannet200/opengaussian": "ScanNet200",
+}
+"""Protocol -> the paper's column."""
+
+AP_COLUMNS = {"ap": "ScanNet200 AP", "ap25": "ScanNet200 AP@25", "ap50": "ScanNet200 AP@50"}
+
+MODE_NOTE = (
+    "Points get their class from the Gaussians by the mode named after 'points:' (nearest: the nearest "
+    "Gaussian of opacity 0.1 or more; frozen: the Gaussian that the point became). Classes are queried by "
+    "their names alone; the highest cosine wins. Where the name is not in the CLIP model's vocabulary, it "
+    "still competes."
+)
+
+
+def replica_table(sources: Sources) -> Table:
+    """mIoU and mAcc per scene (paper: Replica, semantic segmentation)."""
+
+    def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
+        cells = {}
+        for name, metric in (("mIoU", "miou_present"), ("mAcc", "macc_present")):
+            for scene, of_scene in part.groupby("scene", sort=True):
+                cells[f"{scene} {name}"] = Cell.percent(scene_mean(of_scene, metric))
+            cells[f"Mean {name}"] = Cell.percent(scene_mean(part, metric))
+        return cells
+
+    def columns_of(of_data: "pd.DataFrame") -> list[str]:
+        scenes = [*sorted(set(of_data["scene"])), "Mean"]
+        return [f"{scene} {name}" for scene in scenes for name in ("mIoU", "mAcc")]
+
+    blocks = [reported_block(sources.published, "Replica", "Reported in the paper: Replica")]
+    blocks += measured_blocks(
+        sources.scores,
+        sources.labels,
+        lambda protocol: protocol.startswith("replica/per-scene"),
+        cells_of,
+        columns_of,
+    )
+    footnotes = (
+        "All in %. Mean over the classes present in a scene, vertices of other classes ignored. The paper "
+        "speaks of 48 classes and names no code: this is our reading.",
+        MODE_NOTE,
+        "*: reproduced by the paper's authors.",
+    )
+    return sources.finished("replica", "Replica: semantic segmentation of points", blocks, footnotes)
+
+
+def scannet_table(sources: Sources) -> Table:
+    """ScanNet with 19, 15 and 10 classes, ScanNet200 with 200, instances of ScanNet200: one row a method."""
+    blocks = [reported_block(sources.published, "ScanNet", "Reported in the paper: ScanNet, ScanNet200")]
+    scores = with_seeds(sources.scores)
+    names = tuple(SCANNET_COLUMNS)
+    wanted = scores[scores["protocol"].str.startswith(names)] if len(scores) else scores
+    order = ["default", *sources.labels]
+    columns = [f"{name} {metric}" for name in SCANNET_COLUMNS.values() for metric in ("mIoU", "mAcc")]
+    columns += AP_COLUMNS.values()
+    for data, of_data in wanted.groupby("dataset", sort=True):
+        rows = []
+        for (variant, masks, method), part in of_data.groupby(["variant", "masks", "method"], sort=True):
+            modes = {label.partition("(")[2].rstrip(")") for label in part["protocol"]}
+            for mode in sorted(modes):
+                of_mode = part[part["protocol"].str.endswith(f"({mode})")]
+                title = row_name(variant, method, sources.labels)
+                if made_from_truth(masks):
+                    title = TRUE_MASKS + title
+                seeds = [
+                    {**semantic_cells(of_seed), **instance_cells(sources, of_seed)}
+                    for _, of_seed in of_mode.groupby("seed", sort=True)
+                ]
+                shown = {"Method": title, "Masks": masks, "Protocol": mode}
+                if len(seeds) > 1:
+                    shown["Seeds"] = str(len(seeds))
+                place = (
+                    made_from_truth(masks),
+                    order.index(variant) if variant in order else len(order),
+                    variant,
+                    list(ANSWERS).index(method) if method in ANSWERS else len(ANSWERS),
+                    masks,
+                    mode,
+                )
+                ranked = None if made_from_truth(masks) else mode
+                rows.append((place, Row(shown, mean_over_seeds(seeds), ranked)))
+        ordered = tuple(row for _, row in sorted(rows, key=lambda item: item[0]))
+        blocks.append(Block(*kind_and_title(str(data)), ordered, tuple(columns)))
+    footnotes = (
+        "All in %. 19, 15 and 10 classes and ScanNet200 follow OpenGaussian's code: mean over the classes "
+        "present in a scene, then over scenes; vertices of other classes are ignored.",
+        MODE_NOTE,
+        "AP, AP@25, AP@50: ScanNet's official instance evaluation over all scans together; an instance is a "
+        "node of the tree at level whole, its class the best of 198, its confidence that cosine. A field has "
+        "no instances.",
+        "*: reproduced by the paper's authors.",
+    )
+    return sources.finished("scannet", "ScanNet and ScanNet200: segmentation of points", blocks, footnotes)
+
+
+def semantic_cells(part: "pd.DataFrame") -> dict[str, Cell]:
+    """mIoU and mAcc of each set of classes."""
+    cells = {}
+    for protocol, name in SCANNET_COLUMNS.items():
+        of_protocol = part[part["protocol"].str.startswith(protocol)]
+        for metric, key in (("mIoU", "miou_present"), ("mAcc", "macc_present")):
+            cells[f"{name} {metric}"] = Cell.percent(scene_mean(of_protocol, key))
+    return cells
+
+
+def instance_cells(sources: Sources, part: "pd.DataFrame") -> dict[str, Cell]:
+    """AP of all scans of a row together; dashes where the method has no instances."""
+    first = part.iloc[0]
+    variant = first["variant"] if first["seed"] == "0" else f"{first['variant']}.seed{first['seed']}"
+    key = (first["dataset"], variant, first["masks"], first["method"])
+    scans = {
+        scene: matches
+        for (dataset, scene, *rest), matches in sources.instances.items()
+        if (dataset, *rest) == key
+    }
+    if not scans:
+        return {}
+    from hilsplat.evaluate.protocols.points import measure_instances
+
+    rows = measure_instances(first["method"], scans, "nearest", INSTANCES)
+    return {AP_COLUMNS[row.metric]: Cell.percent(row.value) for row in rows}
+
+
+def waymo_table(sources: Sources) -> Table:
+    """mIoU over 22 classes, counts of all scenes pooled (paper: Waymo)."""
+
+    def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
+        from hilsplat.datasets.classes.waymo import WAYMO_22
+        from hilsplat.evaluate.protocols.points import pooled_points
+
+        means = pooled_points(card_of(part["protocol"].iloc[0]), measured_scenes(part), WAYMO_22)
+        classes = part[part["metric"] == "class_iou"]["query"].nunique()
+        return {
+            "mIoU": Cell.percent(means["miou_absent_as_one"]),
+            "mIoU, present classes": Cell.percent(means["miou_present"]),
+            "Classes present": Cell(str(classes), float(classes)),
+        }
+
+    blocks = [reported_block(sources.published, "Waymo", "Reported in the paper: Waymo")]
+    blocks += measured_blocks(
+        sources.scores,
+        sources.labels,
+        lambda protocol: protocol.startswith("waymo/"),
+        cells_of,
+        lambda _: ("mIoU", "mIoU, present classes", "Classes present"),
+        unranked=frozenset({"Classes present"}),
+    )
+    footnotes = (
+        "All in %. mIoU: Waymo's official metric over 22 classes, in which a class without a point counts "
+        "100; present classes leaves those out. Counts of all scenes are pooled.",
+        MODE_NOTE,
+        "*: reproduced by the paper's authors.",
+    )
+    return sources.finished("waymo", "Waymo: segmentation of lidar points", blocks, footnotes)
+
+
+def measured_scenes(part: "pd.DataFrame") -> list[list[Measured]]:
+    """Score rows as measured ones, one list per scene."""
+    return [
+        [
+            Measured(row.method, row.query, row.level, row.metric, row.protocol, row.value, row.n)
+            for row in of_scene.itertuples()
+        ]
+        for _, of_scene in part.groupby("scene", sort=True)
+    ]

@@ -1,0 +1,69 @@
+"""The paper's own rows, as `config/published/` transcribes them."""
+
+import csv
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+
+from hilsplat.base.errors import ArtifactError
+from hilsplat.evaluate.tables.rows import Block, Cell, Row
+
+PUBLISHED_COLUMNS = ("method", "family", "column", "value", "note")
+
+
+def read_published(path: Path) -> list[dict[str, str]]:
+    """Rows of a published table: method, family, column, value, note.
+
+    Raises:
+        ArtifactError: the file is missing or has other columns.
+    """
+    try:
+        with Path(path).open(encoding="utf-8", newline="") as stream:
+            reader = csv.DictReader(stream)
+            rows = list(reader)
+    except FileNotFoundError as error:
+        raise ArtifactError(f"{path} is missing", fix="restore it from the repository") from error
+    if tuple(reader.fieldnames or ()) != PUBLISHED_COLUMNS:
+        raise ArtifactError(
+            f"{path} has other columns",
+            expected=", ".join(PUBLISHED_COLUMNS),
+            found=", ".join(reader.fieldnames or ()),
+        )
+    return rows
+
+
+def reported_block(
+    published: Iterable[Mapping[str, str]],
+    data: str,
+    title: str,
+    rename: Callable[[str], str | None] = lambda column: column,
+    families: bool = True,
+) -> Block:
+    """The paper's rows.
+
+    Args:
+        published: rows of a published table.
+        data: data set.
+        title: heading.
+        rename: maps the paper's columns to ours, and those to leave out to None.
+        families: show the family of each method.
+    """
+    rows: dict[tuple[str, str], dict[str, Cell]] = {}
+    columns: dict[str, None] = {}
+    for entry in published:
+        column = rename(entry["column"])
+        if column is None:
+            continue
+        columns[column] = None
+        cells = rows.setdefault((entry["family"], entry["method"]), {})
+        cells[column] = Cell.printed(entry["value"], entry["note"])
+    return Block(
+        "reported",
+        data,
+        title,
+        tuple(
+            Row({"Family": family, "Method": method} if families else {"Method": method}, cells)
+            for (family, method), cells in rows.items()
+            if any(cell.text != "-" for cell in cells.values())
+        ),
+        tuple(columns),
+    )

@@ -1,0 +1,127 @@
+"""What a table is made of: cells, rows, blocks of one kind, footnotes."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One value of a table.
+
+    Attributes:
+        text: as it is shown.
+        value: as a number, where it is one; ranking needs it.
+        note: footnote, empty where there is none.
+        spread: standard deviation over seeds; None where there is one seed.
+    """
+
+    text: str = "-"
+    value: float | None = None
+    note: str = ""
+    spread: float | None = None
+
+    @staticmethod
+    def percent(value: float) -> "Cell":
+        """A share in [0, 1] as a percentage with one decimal; nan is a dash."""
+        return Cell() if value != value else Cell(f"{100 * value:.1f}", 100 * value)
+
+    @staticmethod
+    def number(value: float, digits: int = 1) -> "Cell":
+        """A number with some decimals; nan is a dash."""
+        return Cell() if value != value else Cell(f"{value:.{digits}f}", value)
+
+    @staticmethod
+    def printed(text: str, note: str = "") -> "Cell":
+        """A value as the paper prints it."""
+        number = re.fullmatch(r"-?\d+(\.\d+)?", text)
+        return Cell(text, float(text) if number else None, note)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method: names on the left, values by column, and what it may be ranked with."""
+
+    names: Mapping[str, str]
+    cells: Mapping[str, Cell]
+    ranked_with: str | None = ""
+
+
+@dataclass(frozen=True)
+class Block:
+    """Rows of one kind and one data set.
+
+    Attributes:
+        kind: `reported`, `measured` or `synthetic stand-in`.
+        data: data set.
+        title: heading.
+        rows: in the order of display.
+        columns: value columns, in the order of display.
+        lower_is_better: columns in which the smallest value is best.
+        unranked: columns in which nothing is best.
+    """
+
+    kind: str
+    data: str
+    title: str
+    rows: tuple[Row, ...]
+    columns: tuple[str, ...]
+    lower_is_better: frozenset[str] = frozenset()
+    unranked: frozenset[str] = frozenset()
+
+    def ranks(self) -> dict[tuple[int, str], int]:
+        """(row, column) -> 1, 2, 3 for the three best values of rows that are ranked together.
+
+        Equal values share a rank. A single row is not ranked.
+        """
+        ranks: dict[tuple[int, str], int] = {}
+        for column in self.columns:
+            if column in self.unranked:
+                continue
+            groups: dict[str, dict[int, float]] = {}
+            for number, row in enumerate(self.rows):
+                cell = row.cells.get(column, Cell())
+                if row.ranked_with is not None and cell.value is not None:
+                    # What is shown is what is compared, so equal texts get equal marks.
+                    shown = float(cell.text.partition(" ")[0])
+                    groups.setdefault(row.ranked_with, {})[number] = shown
+            for values in groups.values():
+                if len(values) < 2:
+                    continue
+                best = sorted(set(values.values()), reverse=column not in self.lower_is_better)[:3]
+                for number, value in values.items():
+                    if value in best:
+                        ranks[number, column] = best.index(value) + 1
+        return ranks
+
+
+@dataclass(frozen=True)
+class Table:
+    """A titled table of blocks with footnotes below."""
+
+    name: str
+    title: str
+    blocks: tuple[Block, ...]
+    footnotes: tuple[str, ...] = field(default=())
+
+    def numbered_notes(self) -> dict[str, int]:
+        """Cell notes, numbered in the order of reading."""
+        notes: dict[str, int] = {}
+        for block in self.blocks:
+            for row in block.rows:
+                for column in block.columns:
+                    note = row.cells.get(column, Cell()).note
+                    if note:
+                        notes.setdefault(note, len(notes) + 1)
+        return notes
+
+
+def shown_columns(block: Block) -> tuple[list[str], list[str]]:
+    """Name and value columns of a block; those without any entry are left out."""
+    names = list(dict.fromkeys(name for row in block.rows for name in row.names))
+    values = [
+        column
+        for column in block.columns
+        if any(row.cells.get(column, Cell()).text != "-" for row in block.rows)
+    ]
+    return names, values

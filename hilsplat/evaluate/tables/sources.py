@@ -1,0 +1,63 @@
+"""What a table is built from, and what is said below it."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from hilsplat.evaluate.scores import made_from_truth
+from hilsplat.evaluate.tables.rows import Block, Table
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from hilsplat.evaluate.costs import Cost
+    from hilsplat.evaluate.metrics.instances import InstanceMatches
+
+STAND_IN_NOTE = (
+    "Rows of a synthetic stand-in are measured on generated scenes with the models named under Masks. "
+    "They show how the parts of the method compare with each other and are not comparable with reported "
+    "rows."
+)
+
+TRUE_MASKS_NOTE = (
+    "Rows that begin with 'diagnostic, true masks' were given masks made from the true labels, with the "
+    "faults named under Masks. They are no results and are ranked with nothing; they tell errors of the "
+    "method from errors of the segmenter."
+)
+
+SEEDS_NOTE = "Values with ± are mean and standard deviation over seeds of autoencoder and field."
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Everything that some table reads.
+
+    Attributes:
+        published: the paper's values (`reported.read_published`).
+        scores: rows of all score files.
+        labels: variant -> how tables name it.
+        costs: time and memory of scenes and variants, where the table shows them.
+        instances: matches per (data set, scene, variant, masks, method), where scans have instances.
+        absent: data sets that were not measured, and why, each a sentence.
+    """
+
+    published: Sequence[Mapping[str, str]]
+    scores: "pd.DataFrame"
+    labels: Mapping[str, str]
+    costs: Sequence["Cost"] = ()
+    instances: Mapping[tuple[str, ...], "InstanceMatches"] = field(default_factory=dict)
+    absent: Sequence[str] = ()
+
+    def finished(self, name: str, title: str, blocks: Iterable[Block], footnotes: Sequence[str]) -> Table:
+        """A table with the warnings that its rows need."""
+        blocks = tuple(block for block in blocks if block.rows)
+        warnings = []
+        rows = [row for block in blocks for row in block.rows]
+        if any(block.kind == "synthetic stand-in" for block in blocks):
+            warnings.append(STAND_IN_NOTE)
+        if any(made_from_truth(row.names.get("Masks", "")) for row in rows):
+            warnings.append(TRUE_MASKS_NOTE)
+        if any("Seeds" in row.names for row in rows):
+            warnings.append(SEEDS_NOTE)
+        absent = [f"Not measured: {sentence}" for sentence in self.absent]
+        return Table(name, title, blocks, (*warnings, *footnotes, *absent))

@@ -1,0 +1,97 @@
+"""What a baseline is: something that writes a language field from the artifacts that ours is solved from.
+
+Everything before (Gaussians, masks, CLIP vectors, the scene's code) and after it (queries, protocols,
+tables) is shared, so that a row tells what the method does and nothing else.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float32, Int32
+
+from hilsplat.language.autoencoder import load_latents
+from hilsplat.language.contributions import label_maps, normalised_weights
+from hilsplat.language.mask_rows import Contributions
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.settings import ContributionsSettings, MethodSettings
+from hilsplat.splat.ply import load_ply
+from hilsplat.splat.rasterise.api import pixel_weights
+
+
+@dataclass(frozen=True)
+class MethodInputs:
+    """Artifacts of a scene, read when asked for.
+
+    Attributes:
+        scene_folder: scene artifact; only its train views may be used.
+        gaussians_ply: 3DGS PLY, frozen.
+        masks_folder: masks of the train views.
+        contributions_folder: weights of each Gaussian in each mask.
+        autoencoder_folder: the scene's code of CLIP vectors.
+        threads: for rasterising; results must not depend on it.
+    """
+
+    scene_folder: Path
+    gaussians_ply: Path
+    masks_folder: Path
+    contributions_folder: Path
+    autoencoder_folder: Path
+    threads: int = 1
+
+    @cached_property
+    def contributions(self) -> Contributions:
+        """One row per mask of all train views."""
+        return Contributions.load(self.contributions_folder)
+
+    @cached_property
+    def latents(self) -> Float32[np.ndarray, "M D"]:
+        """Code of each mask's CLIP vector, rows as in the contributions."""
+        return load_latents(self.autoencoder_folder, self.contributions)
+
+    def view_weights(self, view: str) -> sp.csr_matrix:
+        """Compositing weights of a view (pixels x Gaussians), rows summing to 1, empty where uncovered."""
+        gaussians, scene = self._loaded
+        weights = pixel_weights(
+            gaussians,
+            scene.cameras[view],
+            min_weight=ContributionsSettings().min_weight,
+            threads=self.threads,
+        )
+        return normalised_weights(weights)[0]
+
+    def view_labels(self, view: str) -> Int32[np.ndarray, "P 3"]:
+        """Row of the view's painted mask at each pixel and level, -1 where there is none."""
+        return label_maps(HierarchicalMasks.load(Path(self.masks_folder) / f"{view}.npz"))
+
+    def view_size_hw(self, view: str) -> tuple[int, int]:
+        """Height and width of a view, px."""
+        return self._loaded[1].cameras[view].size_hw
+
+    @cached_property
+    def _loaded(self) -> tuple:
+        return load_ply(self.gaussians_ply), Scene.load(self.scene_folder)
+
+
+Fit = Callable[[MethodInputs, MethodSettings, int], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Method:
+    """One baseline.
+
+    Attributes:
+        name: key in the registry, and value of `method.name` in a variant.
+        title: as tables may write it.
+        source: repository or text it follows, and where it departs.
+        fit: (inputs, settings, seed) to the features of every Gaussian and level, (N, 3, D).
+    """
+
+    name: str
+    title: str
+    source: str
+    fit: Fit

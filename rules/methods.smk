@@ -1,0 +1,31 @@
+# Baselines: another method writes the field of a variant (variants with method.name, hilsplat/methods).
+rule method:
+    input:
+        scene="results/{dataset}/{scene}/scene",
+        gaussians="results/{dataset}/{scene}/gaussians.ply",
+        masks=shared("masks", "masks"),
+        contributions=shared("contributions", "contributions"),
+        autoencoder=shared("autoencoder", "autoencoder"),
+    output:
+        language="results/{dataset}/{scene}/{variant}/language.safetensors",
+    log:
+        "results/{dataset}/{scene}/{variant}/logs/language.log",
+    benchmark:
+        "results/{dataset}/{scene}/{variant}/benchmarks/language.jsonl"
+    wildcard_constraints:
+        variant=any_of(variants_by_method(baselines=True)),
+    conda:
+        ENVIRONMENT
+    threads: THREADS
+    resources:
+        mem_mb=6000,
+    params:
+        settings=settings_of("method"),
+        seed=lambda wildcards: RUN.seed_of(wildcards.variant),
+        code=code("method"),
+        baseline=code_of_method,
+    shell:
+        "hilsplat method --scene {input.scene} --gaussians {input.gaussians} --masks {input.masks}"
+        " --contributions {input.contributions} --autoencoder {input.autoencoder}"
+        " --settings {params.settings:q} --seed {params.seed} --threads {threads}"
+        " --out {output.language} --log {log}"

@@ -1,0 +1,117 @@
+"""What the workflow asks of published data sets at its start: what is absent, which files label a scene."""
+
+from pathlib import Path
+
+import pytest
+
+from hilsplat.base.errors import SceneError
+from hilsplat.datasets.registry import open_labels
+from hilsplat.datasets.sources import (
+    absence,
+    export_images,
+    image_files,
+    is_exported,
+    label_files,
+    label_sets,
+    published,
+)
+
+
+def touch(*paths: Path) -> None:
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"x")
+
+
+@pytest.fixture
+def root(tmp_path) -> Path:
+    """LERF-OVS and Hi-LERF of one scene, 3D-OVS of one, ScanNet of one."""
+    touch(
+        tmp_path / "lerf_ovs/figurines/images/frame_00041.jpg",
+        tmp_path / "lerf_ovs/figurines/sparse/0/cameras.bin",
+        tmp_path / "lerf_ovs/label/figurines/frame_00041.json",
+        tmp_path / "hi_lerf/label/figurines/frame_00041.json",
+        tmp_path / "3d_ovs/bed/images/00.jpg",
+        tmp_path / "3d_ovs/bed/sparse/0/cameras.bin",
+        tmp_path / "3d_ovs/bed/segmentations/classes.txt",
+        tmp_path / "3d_ovs/bed/segmentations/00/banana.png",
+    )
+    return tmp_path
+
+
+def test_only_known_data_sets_are_published_ones():
+    assert published("data:lerf_ovs/figurines") == ("lerf_ovs", "figurines")
+    assert published("data:desk/mine") is None
+    assert published("world:tabletop:201") is None
+    assert published("lerf_ovs/figurines") is None
+
+
+def test_what_is_there_is_not_absent(root):
+    assert absence("data:lerf_ovs/figurines", str(root)) is None
+    assert absence("world:tabletop:201", "") is None
+
+
+def test_without_a_data_root_everything_is_absent():
+    assert absence("data:lerf_ovs/figurines", "") == "data_root is not set"
+
+
+def test_a_missing_folder_of_no_known_data_set_is_named(root):
+    assert absence("data:desk/mine", str(root)) == f"{root / 'desk/mine'} is missing"
+
+
+def test_a_half_extracted_archive_names_what_it_lacks(root):
+    (root / "lerf_ovs/figurines/sparse/0/cameras.bin").unlink()
+    (root / "lerf_ovs/figurines/sparse/0").rmdir()
+    (root / "lerf_ovs/figurines/sparse").rmdir()
+    reason = absence("data:lerf_ovs/figurines", str(root))
+    assert "incomplete" in reason
+    assert "sparse" in reason
+    assert "\n" not in reason
+
+
+def test_a_data_set_one_level_too_deep_says_so(root, tmp_path):
+    deeper = tmp_path / "lerf_ovs/lerf_ovs"
+    deeper.mkdir()
+    for part in ("figurines", "label"):
+        (tmp_path / "lerf_ovs" / part).rename(deeper / part)
+    assert "one level too deep" in absence("data:lerf_ovs/figurines", str(root))
+
+
+def test_a_data_root_that_is_one_folder_too_high_says_so(root, tmp_path):
+    assert "one level deeper" in absence("data:lerf_ovs/figurines", str(tmp_path.parent))
+
+
+def test_a_scene_is_scored_against_all_labels_on_its_images(root):
+    assert label_sets("data:lerf_ovs/figurines", str(root)) == ("lerf_ovs/figurines", "hi_lerf/figurines")
+    assert label_sets("data:3d_ovs/bed", str(root)) == ("3d_ovs/bed",)
+    assert label_sets("data:lerf_ovs/ramen", str(root)) == ()
+
+
+def test_label_files_are_those_that_only_evaluation_reads(root):
+    assert label_files("lerf_ovs/figurines", str(root)) == (
+        root / "lerf_ovs/label/figurines/frame_00041.json",
+    )
+    assert label_files("3d_ovs/bed", str(root)) == (
+        root / "3d_ovs/bed/segmentations/00/banana.png",
+        root / "3d_ovs/bed/segmentations/classes.txt",
+    )
+
+
+def test_scenes_with_labelled_points_are_exported_first(root):
+    scan = root / "scannet/scans/scene0000_00"
+    touch(scan / "color/0.jpg", scan / "pose/0.txt", scan / "scene0000_00.aggregation.json")
+    assert is_exported("data:scannet/scene0000_00")
+    assert not is_exported("data:lerf_ovs/figurines")
+    files = image_files("data:scannet/scene0000_00", str(root))
+    assert files == (scan / "color/0.jpg", scan / "pose/0.txt")  # labels are read by evaluation alone
+
+
+def test_images_that_lie_in_a_folder_need_no_export(root, monkeypatch):
+    monkeypatch.setattr("hilsplat.datasets.registry.open_labels", lambda *_: object())
+    with pytest.raises(SceneError, match="needs no export"):
+        export_images("lerf_ovs/figurines", root, root / "out")
+
+
+def test_labels_need_a_scene():
+    with pytest.raises(SceneError, match="names no scene"):
+        open_labels("scannet", Path())

@@ -1,0 +1,131 @@
+"""Baselines: small matrices worked by hand, and the example of the documentation as it stands there."""
+
+import inspect
+import re
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.methods import registry, stage
+from hilsplat.methods.langsplat import ViewRows, grid_pixels, l1_step, train_level
+from hilsplat.methods.lifted import lift
+from hilsplat.methods.method import Method
+from hilsplat.methods.registry import METHODS, OURS, method_of, require_method
+from hilsplat.settings import MethodSettings
+
+EXTENDING = Path(__file__).parents[3] / "docs" / "extending.md"
+
+
+def test_a_gaussian_gets_the_average_of_its_masks_weighed_by_their_share_of_it():
+    weights = sp.csr_matrix(np.array([[3.0, 0, 0], [1.0, 2.0, 0]], np.float32))
+    latents = np.array([[1.0, 0.0], [0.0, 1.0]], np.float32)
+    # Gaussian 0: (3 * (1, 0) + 1 * (0, 1)) / 4; Gaussian 1 lies in mask 1 alone; Gaussian 2 in none
+    assert lift(weights, latents).tolist() == [[0.75, 0.25], [0.0, 1.0], [0.0, 0.0]]
+
+
+def test_l1_gradient_matches_finite_differences():
+    rng = np.random.default_rng(0)
+    weights = sp.csr_matrix(rng.random((5, 4)).astype(np.float32))
+    rows = ViewRows(weights, rng.random((5, 2)).astype(np.float32))
+    features = rng.random((4, 2)).astype(np.float32)
+    _, gradient = l1_step(features, rows)
+    for place in [(0, 0), (2, 1), (3, 0)]:
+        up, down = features.copy(), features.copy()
+        up[place] += 1e-3
+        down[place] -= 1e-3
+        slope = (l1_step(up, rows)[0] - l1_step(down, rows)[0]) / 2e-3
+        assert gradient[place] == pytest.approx(slope, abs=2e-3)
+
+
+def test_l1_finds_the_median_of_what_a_gaussian_shows():
+    # one Gaussian alone in three pixels with codes 0, 1 and 10: the squared optimum would be 11/3
+    rows = ViewRows(sp.csr_matrix(np.ones((3, 1), np.float32)), np.array([[0.0], [1.0], [10.0]], np.float32))
+    settings = MethodSettings(name="langsplat", steps=2000, rate=0.005)
+    assert train_level([rows], 1, 1, settings, seed=0)[0, 0] == pytest.approx(1.0, abs=0.02)
+
+
+def test_training_is_the_same_for_the_same_seed_and_another_for_another():
+    rng = np.random.default_rng(1)
+    views = [
+        ViewRows(sp.csr_matrix(rng.random((6, 3)).astype(np.float32)), rng.random((6, 2)).astype(np.float32))
+        for _ in range(4)
+    ]
+    settings = MethodSettings(name="langsplat", steps=7)
+    first, again, other = (train_level(views, 3, 2, settings, seed) for seed in (0, 0, 3))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def test_grid_takes_every_second_pixel_of_every_second_row():
+    assert grid_pixels((3, 4), 2).tolist() == [0, 2, 8, 10]
+
+
+@pytest.mark.parametrize("name", sorted(METHODS))
+def test_every_baseline_is_named_after_its_file_and_says_where_it_comes_from(name):
+    method = method_of(name)
+    assert method.name == name == METHODS[name].rpartition(".")[2]
+    assert len(method.source) > 20
+
+
+def test_unknown_methods_name_those_that_exist():
+    with pytest.raises(SettingsError, match="one of hilsplat, langsplat, lifted"):
+        require_method("langsplatt")
+    require_method(OURS)
+    with pytest.raises(SettingsError, match="is no baseline"):
+        method_of(OURS)
+
+
+class Contributions:
+    num_gaussians = 2
+    gaussians_sha256 = "0" * 64
+
+
+def inputs_of(folder):
+    """Inputs of a scene with two Gaussians and codes of one number."""
+    (folder / "autoencoder").mkdir()
+    (folder / "autoencoder" / "autoencoder.safetensors").write_bytes(b"code")
+    return types.SimpleNamespace(
+        scene_folder=folder / "scene",
+        autoencoder_folder=folder / "autoencoder",
+        contributions=Contributions(),
+        latents=np.zeros((3, 1), np.float32),
+    )
+
+
+@pytest.mark.parametrize("features", [np.zeros((2, 3, 2)), np.full((2, 3, 1), np.nan)])
+def test_a_method_that_returns_no_field_is_refused(tmp_path, monkeypatch, features):
+    broken = Method("lifted", "broken", "none", lambda inputs, settings, seed: features)
+    monkeypatch.setattr(stage, "method_of", lambda name: broken)
+    with pytest.raises(ArtifactError, match="method lifted returned no language field"):
+        run_method = inspect.unwrap(stage.run_method)  # the inputs here are no MethodInputs
+        run_method(inputs_of(tmp_path), tmp_path / "language.safetensors", MethodSettings(name="lifted"), 0)
+
+
+def test_the_method_of_the_documentation_runs_as_it_is_written(tmp_path, monkeypatch):
+    """The code block of docs/extending.md becomes a module, one line the registry, and it writes a field."""
+    code = re.search(r"```python\n(# hilsplat/methods/nearest_mask\.py.*?)```", EXTENDING.read_text(), re.S)
+    line = re.search(r'```python\n(    "nearest_mask": .*?)\n```', EXTENDING.read_text(), re.S)
+    module = types.ModuleType("hilsplat.methods.nearest_mask")
+    exec(compile(code[1], "nearest_mask.py", "exec"), module.__dict__)
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    name, place = (part.strip(' ",') for part in line[1].split(":"))
+    monkeypatch.setitem(registry.METHODS, name, place)
+
+    means = sp.csr_matrix(np.array([[0.9, 0.1], [0.2, 0.3]], np.float32))
+    contributions = types.SimpleNamespace(
+        num_gaussians=2,
+        matrix=lambda _: means,
+        pixels=np.array([1, 4]),
+        rows_of=lambda level: np.array([0, 1]),
+    )
+    inputs = types.SimpleNamespace(
+        contributions=contributions, latents=np.array([[1.0, 0.0], [0.0, 1.0]], np.float32)
+    )
+    features = method_of("nearest_mask").fit(inputs, MethodSettings(name="nearest_mask"), 0)
+    # Gaussian 0: 0.9 px in mask 0, 0.8 px in mask 1; Gaussian 1: 0.1 px and 1.2 px
+    assert features[:, 0].tolist() == [[1.0, 0.0], [0.0, 1.0]]

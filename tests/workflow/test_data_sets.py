@@ -1,0 +1,99 @@
+"""Published data sets in the workflow: absent ones are told, labels are inputs of evaluation alone."""
+
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.workflow.conftest import Project, copy_project
+
+LABEL_OF = {
+    "lerf/figurines": "data/lerf_ovs/label/figurines/frame_00041.json",
+    "3d_ovs/bed": "data/3d_ovs/bed/segmentations/00/banana.png",
+}
+
+
+def touch(*paths: Path) -> None:
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"")
+
+
+@pytest.fixture(scope="module")
+def planned(project, tmp_path_factory) -> str:
+    """Dry run of the paper's configuration where one scene of LERF, one of 3D-OVS and a scan are there."""
+    copy = copy_project(project, tmp_path_factory.mktemp("data") / "project", results=False)
+    data = copy.root / "data"
+    touch(
+        data / "lerf_ovs/figurines/images/frame_00041.jpg",
+        data / "lerf_ovs/figurines/sparse/0/images.bin",
+        data / "lerf_ovs/label/figurines/frame_00041.json",
+        data / "3d_ovs/bed/images/00.jpg",
+        data / "3d_ovs/bed/sparse/0/images.bin",
+        data / "3d_ovs/bed/segmentations/classes.txt",
+        data / "3d_ovs/bed/segmentations/00/banana.png",
+        data / "replica/replica/room_0/habitat/mesh_semantic.ply",
+    )
+    scan = data / "scannet/scans/scene0000_00"
+    names = (
+        "_vh_clean_2.ply",
+        "_vh_clean_2.labels.ply",
+        "_vh_clean_2.0.010000.segs.json",
+        ".aggregation.json",
+    )
+    touch(scan / "color/0.jpg", scan / "pose/0.txt", scan / "intrinsic/intrinsic_color.txt")
+    touch(*(scan / f"scene0000_00{name}" for name in names))
+    return run(copy, "data_root=data")
+
+
+def run(project: Project, *config: str) -> str:
+    command = [sys.executable, "-m", "snakemake", "-n", "--configfile", "config/paper.yaml"]
+    result = project.run(*command, "--config", *config, check=False)
+    return result.stdout + result.stderr
+
+
+def blocks(planned: str) -> Iterator[tuple[str, str]]:
+    """(rule, what the dry run prints of the job)."""
+    for part in re.split(r"^(?=(?:local)?rule )", planned, flags=re.M):
+        if found := re.match(r"(?:local)?rule (\w+):", part):
+            yield found[1], part
+
+
+@pytest.mark.parametrize("label", LABEL_OF.values())
+def test_labels_are_inputs_of_evaluation_and_figures_alone(planned, label):
+    readers = {rule for rule, text in blocks(planned) if label in text.partition("output:")[0]}
+    assert readers == {"evaluate", "figures", "comparison"}
+
+
+def test_a_scan_is_exported_before_its_poses_are_imported(planned):
+    exported = [text for rule, text in blocks(planned) if rule == "source"]
+    assert len(exported) == 1
+    assert "color/0.jpg" in exported[0]
+    assert "aggregation.json" not in exported[0]
+
+
+def test_what_is_absent_is_named_with_the_reason(planned):
+    assert "lerf/ramen is skipped: scene ramen of LERF-OVS is incomplete" in planned
+    assert re.search(r"replica/room_0 is skipped: .*one level too deep", planned)
+
+
+def test_tables_tell_what_was_not_measured(planned):
+    tables = [text for rule, text in blocks(planned) if rule == "table"]
+    assert len(tables) == 14
+
+
+def test_without_a_data_root_the_run_says_so_and_stops(project, tmp_path):
+    copy = copy_project(project, tmp_path / "project", results=False)
+    printed = run(copy, "groups=[lerf,scannet]")
+    assert "scannet/scene0000_00 is skipped: data_root is not set" in printed
+    assert "no scene to run" in printed
+
+
+def test_tables_of_a_run_without_data_carry_the_line(project, tmp_path):
+    copy = copy_project(project, tmp_path / "project", results=False)
+    command = [sys.executable, "-m", "snakemake", "-n", "-p", "results/tables/replica.csv"]
+    printed = copy.run(*command, "--configfile", "config/ci.yaml").stdout
+    assert "hilsplat table replica" in printed
+    assert "--absent 'replica (office_0, office_1, office_2 and 5 more): data_root is not set.'" in printed
