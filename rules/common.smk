@@ -12,7 +12,7 @@ from snakemake.logging import logger
 from hilsplat.base.artifacts import sha256_of_path
 from hilsplat.base.code_hash import code_hash as code_of
 from hilsplat.base.errors import HilsplatError
-from hilsplat.cli import STAGE_MODULES
+from hilsplat.cli.stage_modules import STAGE_MODULES
 from hilsplat.datasets.sources import (
     absence,
     image_files,
@@ -117,7 +117,7 @@ def code(stage):
 
 def code_of_method(wildcards):
     """Parameter: digest of the code of the baseline that writes a variant's field."""
-    return or_stop(code_of, METHODS[stages_of(wildcards).method.name])
+    return code("method") + or_stop(code_of, METHODS[stages_of(wildcards).method.name])
 
 
 def stage_of_masks(wildcards):

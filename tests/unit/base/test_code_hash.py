@@ -56,12 +56,14 @@ def test_a_missing_module_is_named(tmp_path: Path) -> None:
 
 
 def test_every_stage_has_a_module_and_no_module_is_imported_by_string(project: Path) -> None:
-    from hilsplat.cli import STAGE_MODULES
+    from hilsplat.cli.stage_modules import STAGE_MODULES
 
     for stage, module in STAGE_MODULES.items():
         assert code_hash(module), stage
     texts = {path: path.read_text() for path in (project / "hilsplat").rglob("*.py")}
-    assert [path for path, text in texts.items() if "import_module" in text or "__import__(" in text] == []
+    by_string = [path for path, text in texts.items() if "import_module" in text or "__import__(" in text]
+    # baselines, whose modules the workflow and the provenance hash by name
+    assert by_string == [project / "hilsplat/methods/registry.py"]
 
 
 def test_package_inits_are_empty(project: Path) -> None:

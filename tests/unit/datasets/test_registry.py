@@ -4,7 +4,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hilsplat.base.errors import SceneError
-from hilsplat.cli import app
+from hilsplat.cli.main import app
 from hilsplat.datasets.published import FRAMES, LABEL_SIZES_WH, PAIRS, PROMPTS
 from hilsplat.datasets.registry import DATASETS, dataset_of
 from hilsplat.datasets.write_labelled import write_lerf_ovs

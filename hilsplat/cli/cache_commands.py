@@ -1,0 +1,46 @@
+"""The caches of finished views."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilsplat.cli.apps import cache_app
+from hilsplat.cli.stage import (
+    DEFAULT_CACHE,
+    start_logging,
+)
+
+
+@cache_app.callback()
+def cache_show(
+    context: typer.Context,
+    folder: Annotated[Path, typer.Option(help="cache folder")] = DEFAULT_CACHE,
+) -> None:
+    """Show the size of the caches of finished views."""
+    start_logging(None)
+    from hilsplat.base.cache import size_table
+
+    context.obj = folder
+    if context.invoked_subcommand is None:
+        typer.echo(size_table(folder))
+
+
+@cache_app.command("prune")
+def cache_prune(
+    context: typer.Context,
+    days: Annotated[
+        float | None, typer.Option(min=0, help="delete what was not used for so many days")
+    ] = None,
+    max_mib: Annotated[
+        float | None, typer.Option(min=0, help="delete the longest unused until so much is left")
+    ] = None,
+    stage: Annotated[
+        list[str] | None, typer.Option(help="masks, clip, contributions; default: all of them")
+    ] = None,
+) -> None:
+    """Delete finished views; they are computed again where a stage needs them."""
+    from hilsplat.base.cache import prune_cache, size_table
+
+    number, freed_mib = prune_cache(context.obj, stage or [], days=days, max_mib=max_mib)
+    typer.echo(f"deleted {number} files, {freed_mib:.1f} MiB\n{size_table(context.obj)}")

@@ -1,0 +1,58 @@
+"""Benchmarks: what they are, whether they are there, world scenes in their layouts."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilsplat.cli.apps import datasets_app
+from hilsplat.cli.stage import (
+    Log,
+    PathOut,
+    stage,
+    start_logging,
+)
+
+
+@datasets_app.command("list")
+def datasets_list(
+    data_root: Annotated[Path | None, typer.Option(help="folder of the data sets' folders")] = None,
+) -> None:
+    """List data sets: citation, licence, layout and, with --data-root, which scenes are there."""
+    start_logging(None)
+    from hilsplat.datasets.overview import overview
+
+    typer.echo(overview(data_root))
+
+
+@datasets_app.command("check")
+def datasets_check(
+    name: Annotated[str, typer.Argument(help="data set, such as lerf_ovs")],
+    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders", show_default=False)],
+    scene: Annotated[
+        list[str] | None, typer.Option(help="scene to read; default: all that are there")
+    ] = None,
+) -> None:
+    """Read every label of a data set, scene by scene, and say what was found and what is odd."""
+    start_logging(None)
+    from hilsplat.datasets.overview import check
+    from hilsplat.datasets.registry import dataset_of
+
+    report, num_failed = check(dataset_of(name), data_root, scene or ())
+    typer.echo(report)
+    if num_failed:
+        raise typer.Exit(1)
+
+
+@datasets_app.command("export")
+def datasets_export(
+    name: Annotated[str, typer.Argument(help="scene with labelled points, such as scannet/scene0000_00")],
+    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders", show_default=False)],
+    out: PathOut,
+    log: Log = None,
+) -> None:
+    """Write images and poses of such a scene as a folder that `poses` imports."""
+    with stage("source", out, log):
+        from hilsplat.datasets.sources import export_images
+
+        export_images(name, data_root, out)

@@ -1,0 +1,221 @@
+"""Scores, tables and figures."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilsplat.cli.apps import app
+from hilsplat.cli.stage import (
+    Log,
+    PathIn,
+    PathOut,
+    Settings,
+    Threads,
+    section_of,
+    stage,
+    start_logging,
+)
+
+
+@app.command()
+def evaluate(
+    scene: PathIn,
+    gaussians: PathIn,
+    semantic_tree: PathIn,
+    language: PathIn,
+    autoencoder: PathIn,
+    clip: PathIn,
+    masks: PathIn,
+    out: PathOut,
+    dataset: Annotated[str, typer.Option(help="data set, for the rows")],
+    name: Annotated[str, typer.Option(help="scene, for the rows")],
+    truth: Annotated[Path | None, typer.Option(help="annotations of a synthetic scene")] = None,
+    labels: Annotated[
+        list[str] | None, typer.Option(help="or labels of published data sets, as lerf_ovs/figurines")
+    ] = None,
+    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders")] = Path(),
+    kind: Annotated[
+        str, typer.Option(help="kind of a synthetic scene, tabletop, room or street: what it stands in for")
+    ] = "",
+    variant: Annotated[str, typer.Option(help="variant, for the rows")] = "default",
+    settings: Settings = "{}",
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Ask every annotated text in every test view, or every labelled one, and score the answers."""
+    section = section_of("evaluate", settings)
+    inputs = {
+        "scene": scene,
+        **({"truth": truth} if truth else {}),
+        "gaussians": gaussians,
+        "semantic_tree": semantic_tree,
+        "language": language,
+        "autoencoder": autoencoder,
+        "clip": clip,
+        "masks": masks,
+    }
+    with stage("evaluate", out, log, settings=section, threads=threads, inputs=inputs):
+        from hilsplat.evaluate.asked import Asked
+        from hilsplat.evaluate.stage import run_evaluate
+
+        run_evaluate(
+            labels=[Asked.open(name, data_root) for name in labels or ()],
+            asked=Asked.of_world(kind),
+            scene_folder=scene,
+            truth=truth,
+            gaussians=gaussians,
+            semantic_tree=semantic_tree,
+            language=language,
+            autoencoder=autoencoder,
+            clip_folder=clip,
+            masks_folder=masks,
+            out=out,
+            settings=section,
+            dataset=dataset,
+            scene=name,
+            variant=variant,
+            threads=threads,
+        )
+
+
+@app.command()
+def table(
+    name: Annotated[str, typer.Argument(help="table: hierarchy, lerf, ablation, ... (docs/tables.md)")],
+    published: PathIn,
+    out: Annotated[Path, typer.Option(help="the CSV; .md, .tex and .html are written beside it")],
+    scores: Annotated[
+        list[Path] | None, typer.Argument(help="scores.csv files of the scenes and variants")
+    ] = None,
+    labels: Annotated[str, typer.Option(help="JSON: how the table names a variant")] = "{}",
+    absent: Annotated[list[str] | None, typer.Option(help="what was not measured, and why")] = None,
+    log: Log = None,
+) -> None:
+    """Build one table of the paper: reported rows, measured rows, stand-in rows."""
+    import json
+
+    scores = scores or []
+    inputs = {"published": published, **{f"scores {number}": path for number, path in enumerate(scores)}}
+    with stage("tables", out, log, inputs=inputs):
+        from hilsplat.evaluate.tables.build import run_table
+
+        run_table(name, scores, published, json.loads(labels), out, absent or [])
+
+
+@app.command()
+def figures(
+    scene: PathIn,
+    gaussians: PathIn,
+    fit: Annotated[Path, typer.Option(help="report folder of the fit")],
+    masks: PathIn,
+    clip: PathIn,
+    semantic_tree: PathIn,
+    language: PathIn,
+    autoencoder: PathIn,
+    out: Annotated[Path, typer.Option(help="panel PNG; registration.png and fit.png go beside it")],
+    truth: Annotated[Path | None, typer.Option(help="truth folder, where the scene has one")] = None,
+    labels: Annotated[str, typer.Option(help="or a labelled scene, as lerf_ovs/figurines")] = "",
+    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders")] = Path(),
+    queries: Annotated[str, typer.Option(help="JSON list of texts, where the scene has no labels")] = "[]",
+    settings: Settings = "{}",
+    evaluate: Settings = "{}",
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Draw a scene's panel: photograph, masks, field, relevancy, answers, truth."""
+    import json
+    import shutil
+
+    from hilsplat.base.artifacts import atomic_path
+
+    section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
+    inputs = {"scene": scene, "gaussians": gaussians, "masks": masks, "language": language}
+    with stage("figures", out, log, settings=section, threads=threads, inputs=inputs):
+        from hilsplat.datasets.registry import open_labelled
+        from hilsplat.evaluate.figures import run_figures
+
+        for source, name in (
+            (scene / "registration.png", "registration.png"),
+            (fit / "test_views.png", "fit.png"),
+        ):
+            with atomic_path(out.with_name(name)) as temporary:
+                shutil.copyfile(source, temporary)
+        run_figures(
+            scene_folder=scene,
+            truth=truth,
+            masks_folder=masks,
+            gaussians=gaussians,
+            semantic_tree=semantic_tree,
+            language=language,
+            autoencoder=autoencoder,
+            clip_folder=clip,
+            out=out,
+            settings=section,
+            evaluate=protocol,
+            queries=json.loads(queries),
+            threads=threads,
+            labels=open_labelled(labels, data_root) if labels else None,
+        )
+
+
+@app.command()
+def comparison(
+    folder: Annotated[Path, typer.Option(help="results/<dataset>/<scene>, finished", show_default=False)],
+    variants: Annotated[str, typer.Option(help="JSON list of variants that are compared")],
+    out: Annotated[Path, typer.Option(help="PNG; views.png, features.png and PDFs are written beside it")],
+    names: Annotated[str, typer.Option(help="JSON: how figures name a variant")] = "{}",
+    truth: Annotated[Path | None, typer.Option(help="truth folder, where the scene has one")] = None,
+    labels: Annotated[str, typer.Option(help="or a labelled scene, as lerf_ovs/figurines")] = "",
+    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders")] = Path(),
+    queries: Annotated[str, typer.Option(help="JSON list of texts, where the scene has no labels")] = "[]",
+    settings: Settings = "{}",
+    evaluate: Settings = "{}",
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Draw queries by method, one query over four views, and features at three levels."""
+    import json
+
+    section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
+    with stage("comparison", out, log, settings=section, threads=threads):
+        from hilsplat.datasets.registry import open_labelled
+        from hilsplat.evaluate.comparison import run_comparison
+
+        run_comparison(
+            folder,
+            json.loads(variants),
+            json.loads(names),
+            out,
+            section,
+            protocol,
+            truth=truth,
+            labels=open_labelled(labels, data_root) if labels else None,
+            queries=json.loads(queries),
+            threads=threads,
+        )
+
+
+@app.command()
+def sweep(
+    name: Annotated[str, typer.Argument(help="theta or omega")],
+    table: Annotated[Path, typer.Option(help="the finished CSV of that table")],
+    out: Annotated[Path, typer.Option(help="PNG; the PDF is written beside it")],
+    log: Log = None,
+) -> None:
+    """Plot a sweep from its table: the paper's curves, and ours."""
+    with stage("sweep", out, log, inputs={"table": table}):
+        from hilsplat.evaluate.sweep_plot import run_sweep_plot
+
+        run_sweep_plot(name, table, out)
+
+
+@app.command()
+def efficiency(
+    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    out: Annotated[Path, typer.Option(help="the CSV; .md beside it")] = Path("results/efficiency.csv"),
+) -> None:
+    """Print where the time went, from the benchmark files of a run."""
+    start_logging(None)
+    from hilsplat.evaluate.efficiency import run_efficiency
+
+    typer.echo(run_efficiency(results, out))

@@ -1,0 +1,48 @@
+"""The `hilsplat` command: one subcommand per stage, plus new, query, export, world, models, datasets, cache.
+
+A command here is thin: it reads its settings, takes the lock of its output, calls one function of the
+package and writes the provenance. Heavy libraries are imported by the functions, not by these files.
+"""
+
+import logging
+import os
+import sys
+from typing import Annotated
+
+# Linear algebra libraries sum in another order for another number of threads. Stages that use
+# several cores do so through numba or pools of our own, whose results do not depend on it.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[_name] = "1"
+
+import typer  # noqa: E402
+
+from hilsplat.base.errors import HilsplatError  # noqa: E402
+from hilsplat.cli.apps import app  # noqa: E402
+
+# In the order in which `hilsplat --help` lists their commands.
+# isort: off
+from hilsplat.cli import scene_commands, segment_commands, language_commands  # noqa: E402, F401
+from hilsplat.cli import evaluate_commands, user_commands, cache_commands  # noqa: E402, F401
+from hilsplat.cli import world_commands, model_commands, dataset_commands  # noqa: E402, F401
+# isort: on
+
+
+def main() -> None:
+    """Run the command; a mistake a user can fix is told in a sentence, without a traceback."""
+    try:
+        app()
+    except HilsplatError as error:
+        logging.getLogger("hilsplat").error("%s", error)
+        sys.exit(1)
+
+
+@app.callback(invoke_without_command=True)
+def version(
+    show: Annotated[bool, typer.Option("--version", help="print the version and exit")] = False,
+) -> None:
+    """Print the version, where asked."""
+    if show:
+        from hilsplat.base.provenance import library_versions
+
+        typer.echo(f"hilsplat {library_versions()['hilsplat']}")
+        raise typer.Exit

@@ -1,0 +1,83 @@
+"""Photographs to Gaussians: new, poses, gaussians."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilsplat.cli.apps import app
+from hilsplat.cli.stage import (
+    DEFAULT_CACHE,
+    Cache,
+    Log,
+    PathIn,
+    PathOut,
+    Seed,
+    Settings,
+    Threads,
+    section_of,
+    stage,
+    start_logging,
+)
+
+
+@app.command()
+def new(
+    name: Annotated[str, typer.Argument(help="name of the scene: letters, digits, . _ -")],
+    photos: Annotated[Path, typer.Argument(help="folder of photographs")],
+    sheet: Annotated[Path, typer.Option(help="scene sheet")] = Path("config/scenes.tsv"),
+) -> None:
+    """Add a folder of photographs to the scene sheet and tell what was found."""
+    start_logging(None)
+    from hilsplat.scene.photos import add_scene
+
+    report = add_scene(sheet, name, photos)
+    typer.echo(str(report))
+    typer.echo(
+        f"\nadded photos/{name} to {sheet}. Next:\n"
+        f"  snakemake --cores 2 --config 'groups=[photos]' 'only=[{name}]'\n"
+        f"  hilsplat query photos/{name} 'bear nose'"
+    )
+
+
+@app.command()
+def poses(
+    images: PathIn,
+    out: PathOut,
+    name: Annotated[str, typer.Option(help="dataset/scene, for messages")] = "scene",
+    unit: Annotated[str, typer.Option(help="what one length unit is: metre or arbitrary")] = "arbitrary",
+    render: Annotated[bool, typer.Option(help="the images are renders: an ideal pinhole lens")] = False,
+    settings: Settings = "{}",
+    seed: Seed = 0,
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Find the cameras of photographs (or import a COLMAP model or transforms.json)."""
+    section = section_of("poses", settings)
+    with stage("poses", out, log, settings=section, seed=seed, threads=threads, inputs={"images": images}):
+        from hilsplat.scene.poses import run_poses
+
+        run_poses(images, out, name, unit, render, section, seed, threads)
+
+
+@app.command()
+def gaussians(
+    scene: PathIn,
+    out: PathOut,
+    report: Annotated[Path, typer.Option(help="folder of the fit's report")],
+    settings: Settings = "{}",
+    brought: Annotated[
+        Path | None, typer.Option(help="somebody's 3DGS PLY in the source's coordinates; skips the fit")
+    ] = None,
+    cache: Cache = DEFAULT_CACHE,
+    seed: Seed = 0,
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Fit 3D Gaussians to the training views, or take somebody's; the JSON beside them holds coordinates."""
+    section = section_of("gaussians", settings)
+    inputs = {"scene": scene, **({"brought": brought} if brought else {})}
+    with stage("gaussians", out, log, settings=section, seed=seed, threads=threads, inputs=inputs):
+        from hilsplat.splat.fit import run_gaussians
+
+        run_gaussians(scene, out, report, cache, section, seed, threads, brought)

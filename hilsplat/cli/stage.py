@@ -1,0 +1,97 @@
+"""What surrounds every command: options, log, lock, disk space, provenance."""
+
+import logging
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hilsplat.base.artifacts import output_lock, require_free_space
+from hilsplat.base.errors import HilsplatError
+from hilsplat.cli.stage_modules import STAGE_MODULES
+
+PathIn = Annotated[Path, typer.Option(help="input", show_default=False)]
+PathOut = Annotated[Path, typer.Option(help="output; written atomically", show_default=False)]
+Settings = Annotated[str, typer.Option(help="the stage's settings as JSON; missing keys take their defaults")]
+Threads = Annotated[int, typer.Option(min=1, help="threads; results do not depend on it")]
+Seed = Annotated[int, typer.Option(min=0, help="seed of everything random")]
+Log = Annotated[Path | None, typer.Option(help="also write the log to this file")]
+Cache = Annotated[Path, typer.Option(help="folder of finished views, for resuming")]
+
+DEFAULT_CACHE = Path("results/.cache")
+MIN_FREE_MIB = 200.0
+"""A stage does not begin with less free space than this."""
+
+
+def start_logging(log: Path | None) -> None:
+    """Send log records to the terminal (short) and, where given, to a file (with times)."""
+    root = logging.getLogger()
+    root.setLevel(logging.INFO)
+    root.handlers.clear()
+    terminal = logging.StreamHandler(sys.stderr)
+    terminal.setFormatter(logging.Formatter("%(message)s"))
+    root.addHandler(terminal)
+    if log is not None:
+        log.parent.mkdir(parents=True, exist_ok=True)
+        file = logging.FileHandler(log, mode="w", encoding="utf-8")
+        file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        root.addHandler(file)
+    for noisy in ("matplotlib", "numba", "PIL", "fontTools"):
+        logging.getLogger(noisy).setLevel(logging.WARNING)
+
+
+@contextmanager
+def stage(
+    name: str,
+    out: Path,
+    log: Path | None,
+    *,
+    settings: Any = None,
+    seed: int | None = None,
+    threads: int = 1,
+    inputs: dict[str, Path] | None = None,
+    also: tuple[str, ...] = (),
+) -> Iterator[None]:
+    """Everything around a stage's one function call: log, lock, disk space, provenance.
+
+    `also` names modules that the stage runs and does not import.
+    """
+    from hilsplat.base.code_hash import code_hash
+    from hilsplat.base.provenance import write_provenance
+
+    start_logging(log)
+    os.environ["NUMBA_NUM_THREADS"] = str(max(threads, int(os.environ.get("NUMBA_NUM_THREADS", "1"))))
+    try:
+        for what, path in (inputs or {}).items():
+            if not path.exists():
+                raise HilsplatError(
+                    f"{name}: input {what} is missing: {path}", fix="run the stage that writes it"
+                )
+        require_free_space(out.parent, MIN_FREE_MIB)
+        with output_lock(out):
+            yield
+            write_provenance(
+                out,
+                stage=name,
+                code="-".join(code_hash(module) for module in (STAGE_MODULES[name], *also)),
+                command=["hilsplat", *sys.argv[1:]],
+                settings=settings.model_dump(mode="json") if settings is not None else {},
+                seed=seed,
+                inputs=inputs or {},
+            )
+    except HilsplatError:
+        raise
+    except Exception:  # a mistake of ours: the traceback belongs into the log
+        logging.getLogger("hilsplat").exception("%s failed on %s", name, out)
+        sys.exit(1)
+
+
+def section_of(name: str, text: str) -> Any:
+    """One section of the settings, from JSON."""
+    from hilsplat.settings import parse_section
+
+    return parse_section(name, text)

@@ -1,0 +1,114 @@
+"""The synthetic world: make a scene, look at it, compare with its truth."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilsplat.cli.apps import world_app
+from hilsplat.cli.stage import (
+    Log,
+    PathOut,
+    Settings,
+    Threads,
+    section_of,
+    stage,
+    start_logging,
+)
+
+
+@world_app.command("make")
+def world_make(
+    source: Annotated[str, typer.Option(help="what to make, as world:KIND:SEED")],
+    out: PathOut,
+    settings: Settings = "{}",
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Make a synthetic scene: images, and the truth that only evaluate reads."""
+    section = section_of("world", settings)
+    with stage("world", out, log, settings=section, threads=threads):
+        from hilsplat.world.stage import run_world
+
+        run_world(source, section, out, threads)
+
+
+@world_app.command("show")
+def world_show(
+    scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that was made")],
+    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    out: Annotated[Path | None, typer.Option(help="PNG to write; default: beside the scene")] = None,
+) -> None:
+    """Write a contact sheet: views, labels by level, the tree with its texts."""
+    start_logging(None)
+    from hilsplat.world.sheet import show_world
+
+    target = out or results / scene / "world.png"
+    show_world(results / scene / "world", target)
+    typer.echo(f"wrote {target}")
+
+
+@world_app.command("classes")
+def world_classes(
+    out: Annotated[Path, typer.Option(help="PNG to write")] = Path("world_classes.png"),
+) -> None:
+    """Write a picture of one object of each class of the table."""
+    start_logging(None)
+    from hilsplat.world.gallery import draw_classes
+
+    draw_classes(out)
+    typer.echo(f"wrote {out}")
+
+
+@world_app.command("gallery")
+def world_gallery(
+    kind: Annotated[str, typer.Argument(help="kind of scene: tabletop, room or street")],
+    seeds: Annotated[list[int], typer.Argument(help="seeds of the scenes")],
+    out: Annotated[Path | None, typer.Option(help="PNG to write; default: world_KIND.png")] = None,
+) -> None:
+    """Write a picture of some scenes, a view of each with its true labels by level."""
+    start_logging(None)
+    from hilsplat.world.gallery import draw_scenes
+
+    target = out or Path(f"world_{kind}.png")
+    draw_scenes(kind, seeds, target)
+    typer.echo(f"wrote {target}")
+
+
+@world_app.command("inconsistency")
+def world_inconsistency(
+    scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has masks")],
+    variant: Annotated[str, typer.Option(help="variant whose masks are measured")] = "default",
+    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    neighbours: Annotated[int, typer.Option(min=1, help="nearest views that each view is compared with")] = 2,
+    out: Annotated[Path | None, typer.Option(help="CSV to write; default: beside the masks")] = None,
+) -> None:
+    """Measure how often a surface point gets other masks in the next view, with exact geometry."""
+    truth, masks_folder = results / scene / "world" / "truth", results / scene / variant / "masks"
+    target = out or masks_folder.with_name("consistency.csv")
+    with stage("consistency", target, None, inputs={"truth": truth, "masks": masks_folder}):
+        from hilsplat.evaluate.world_consistency import run_consistency
+
+        table = run_consistency(truth, masks_folder, target, neighbours)
+    typer.echo(table)
+
+
+@world_app.command("tree")
+def world_tree(
+    scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has a tree")],
+    variant: Annotated[str, typer.Option(help="variant whose tree is measured")] = "default",
+    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    out: Annotated[Path | None, typer.Option(help="CSV to write; default: beside the tree")] = None,
+    threads: Threads = 2,
+) -> None:
+    """Measure the 3D semantic tree against the true nodes: matches, purity, parents."""
+    folder = results / scene
+    semantic_tree, truth = folder / variant / "semantic_tree", folder / "world" / "truth"
+    target = out or semantic_tree.with_name("tree_truth.csv")
+    with stage("tree_truth", target, None, inputs={"truth": truth, "semantic_tree": semantic_tree}):
+        from hilsplat.evaluate.tree_truth import run_tree_truth
+
+        table = run_tree_truth(
+            folder / "scene", folder / "gaussians.ply", semantic_tree, truth, target, threads
+        )
+    typer.echo(table)
