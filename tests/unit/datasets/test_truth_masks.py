@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from hilsplat import cli
 from hilsplat.base.artifacts import read_index, read_json, sha256_of_path, write_index, write_json
 from hilsplat.base.errors import ArtifactError, HilsplatError, MisalignedArtifactError, SettingsError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.provenance import provenance_path
+from hilsplat.cli import segment_commands
+from hilsplat.cli import stage as around
 from hilsplat.datasets.hierarchy import AnnotatedNode, write_hierarchy
 from hilsplat.datasets.truth_masks import FAULTS, faults_label, run_truth_masks
 from hilsplat.scene.cameras import Cameras
@@ -144,8 +145,8 @@ def test_probabilities_stay_probabilities():
 @pytest.fixture
 def command(world, monkeypatch):
     """The subcommand `hilsplat masks`, without its hold on the log."""
-    monkeypatch.setattr(cli, "start_logging", lambda log: None)
-    return lambda **options: cli.masks(scene=world / "scene", out=world / "out", **options)
+    monkeypatch.setattr(around, "start_logging", lambda log: None)
+    return lambda **options: segment_commands.masks(scene=world / "scene", out=world / "out", **options)
 
 
 def test_the_command_wants_the_truth_and_records_it(world, command):

@@ -109,22 +109,15 @@ def test_the_stage_finds_the_masks_of_every_prompt(ours, theirs, photograph):
     rounded = quantise(theirs[2].pred_masks[0].numpy())
     scores = np.clip(theirs[2].iou_scores[0].numpy(), 0, 1)
     for head, level in ((0, 3), (1, 2), (2, 1)):
-        expected = {
-            restore(one, frame).tobytes(): score
-            for one, score in zip(rounded[:, head], scores[:, head], strict=True)
-        }
+        expected = np.stack([restore(one, frame) for one in rounded[:, head]])
         rows = np.flatnonzero(masks.level == level)
-        found = {
-            mask.tobytes(): score
-            for mask, score in zip(masks.dense(rows), masks.predicted_iou[rows], strict=True)
-        }
-        expected.pop(np.zeros(photograph.shape[:2], bool).tobytes(), None)
-        assert found
-        # a logit within 1e-4 of a rounding step may fall to the other side and move one pixel
-        common = found.keys() & expected.keys()
-        assert len(common) >= 0.7 * len(found)
-        for mask in common:
-            assert found[mask] == pytest.approx(expected[mask], abs=TOLERANCE)
+        found = masks.dense(rows)
+        assert len(found)
+        # a logit within 1e-4 of a rounding step may fall to the other side and move a pixel
+        apart = (found[:, None] != expected[None]).mean(axis=(2, 3))
+        nearest = apart.argmin(axis=1)
+        assert apart.min(axis=1).max() < 0.003
+        np.testing.assert_allclose(masks.predicted_iou[rows], scores[nearest, head], atol=TOLERANCE)
 
 
 def test_crops_are_those_of_the_processor(sam_parts, photograph):
