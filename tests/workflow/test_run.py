@@ -114,6 +114,7 @@ def test_the_paper_configuration_plans_every_stage_of_lerf(fresh: Callable[[], P
     for scene in ("figurines", "ramen", "teatime", "waldo_kitchen"):
         for part in ("images", "sparse/0"):
             (project.root / "data/lerf_ovs" / scene / part).mkdir(parents=True)
+        (project.root / "data/lerf_ovs/label" / scene).mkdir(parents=True)
         (project.root / "data/lerf_ovs" / scene / "images/frame_00001.jpg").write_bytes(b"")
     command = [sys.executable, "-m", "snakemake", "-n", "--configfile", "config/paper.yaml"]
     planned = project.run(*command, "--config", "data_root=data").stdout
