@@ -33,7 +33,13 @@ from hilsplat.language.linkage import pooled_linkage
 from hilsplat.language.mask_rows import Contributions, mask_embeddings
 from hilsplat.language.tree_boxes import node_boxes
 from hilsplat.language.tree_export import readable_nodes
-from hilsplat.language.tree_nodes import gaussian_nodes, mask_fits, nest_nodes, node_parents
+from hilsplat.language.tree_nodes import (
+    gaussian_nodes,
+    mask_fits,
+    nest_nodes,
+    node_parents,
+    renumbered_without_empty,
+)
 from hilsplat.settings import SemanticTreeSettings
 
 logger = logging.getLogger(__name__)
@@ -182,6 +188,11 @@ def build_tree(
     parent = node_parents(node_of_gaussian, levels, total_mass, settings.parent_coverage)
     if settings.nested:
         node_of_gaussian = nest_nodes(node_of_gaussian, levels, parent)
+        renumber = renumbered_without_empty(node_of_gaussian, num)
+        kept = np.flatnonzero(renumber[:num] != NONE)
+        node_of_gaussian, cluster_of_mask = renumber[node_of_gaussian], renumber[cluster_of_mask]
+        levels, parent, num = levels[kept], renumber[parent[kept]], len(kept)
+        quality = [quality[node] for node in kept]
     view_area = np.zeros((num, len(contributions.views)), np.float64)
     own = np.flatnonzero(cluster_of_mask >= 0)
     np.add.at(view_area, (cluster_of_mask[own], contributions.view[own]), contributions.area_px[own])

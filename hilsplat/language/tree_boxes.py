@@ -70,7 +70,10 @@ def node_boxes(
     means: Float[np.ndarray, "N 3"],
     mass: Float[np.ndarray, " N"],
 ) -> tuple[Float32[np.ndarray, "T 3"], Float32[np.ndarray, "T 2 3"], Float32[np.ndarray, "T 5 3"]]:
-    """Centroid, axis-aligned and oriented box of every node's members, weighted by visible mass."""
+    """Centroid, axis-aligned and oriented box of every node's members, weighted by visible mass.
+
+    Every node has a member (`tree_nodes.renumbered_without_empty`).
+    """
     centroid = np.zeros((len(level), 3), np.float32)
     box = np.zeros((len(level), 2, 3), np.float32)
     oriented = np.zeros((len(level), 5, 3), np.float32)
@@ -82,8 +85,6 @@ def node_boxes(
     for node, each in enumerate(level):
         index = Level(int(each)).index
         members = order[index][starts[index][node] : starts[index][node + 1]]
-        if not len(members):  # nesting may leave a node without a Gaussian: it selects nothing, its box is 0
-            continue
         weight = mass[members] / mass[members].sum()
         points = means[members]
         centroid[node] = (weight[:, None] * points).sum(axis=0)

@@ -135,6 +135,22 @@ def nest_nodes(
     return nested
 
 
+def renumbered_without_empty(
+    node_of_gaussian: Int32[np.ndarray, "N 3"], num_nodes: int
+) -> Int32[np.ndarray, " T1"]:
+    """New id of each node, in the old order, NONE for a node that holds no Gaussian and selects nothing.
+
+    Nesting may take a node's last Gaussian; its children are then empty too, so no parent is lost.
+
+    Returns:
+        one more entry than nodes: the last is NONE, so that NONE stays NONE where ids are looked up.
+    """
+    used = np.unique(node_of_gaussian[node_of_gaussian >= 0])
+    renumber = np.full(num_nodes + 1, NONE, np.int32)
+    renumber[used] = np.arange(len(used))
+    return renumber
+
+
 def node_means(
     node_of_gaussian: Int32[np.ndarray, "N 3"],
     level: UInt8[np.ndarray, " T"],

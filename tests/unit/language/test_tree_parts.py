@@ -9,7 +9,7 @@ from plyfile import PlyData
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.language.tree_boxes import OrientedBox, oriented_box
 from hilsplat.language.tree_export import write_selection_ply, write_tree_ply
-from hilsplat.language.tree_nodes import nest_nodes
+from hilsplat.language.tree_nodes import nest_nodes, renumbered_without_empty
 from hilsplat.language.view_nodes import ViewNodes
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply, save_ply
@@ -104,3 +104,14 @@ def test_a_tree_of_other_gaussians_is_not_exported(ply, tmp_path):
 def test_a_selection_holds_the_chosen_gaussians(ply, tmp_path):
     write_selection_ply(ply, np.array([1, 3]), tmp_path / "selection.ply")
     assert load_ply(tmp_path / "selection.ply").means[:, 0].tolist() == [3, 9]
+
+
+def test_a_node_that_nesting_emptied_is_dropped_and_the_others_keep_their_order():
+    # wholes 0 and 1, parts 2 and 3; part 2 belongs to whole 0 and lies wholly inside whole 1
+    before = np.array([[0, -1, -1], [1, 2, -1], [1, 3, -1]], np.int32)
+    level, parent = np.array([1, 1, 2, 2], np.uint8), np.array([-1, -1, 0, 1], np.int32)
+    after = nest_nodes(before, level, parent)
+    renumber = renumbered_without_empty(after, len(level))
+    assert renumber.tolist() == [0, 1, -1, 2, -1]
+    assert renumber[after].tolist() == [[0, -1, -1], [1, -1, -1], [1, 2, -1]]
+    assert renumber[parent[[0, 1, 3]]].tolist() == [-1, -1, 1]
