@@ -344,12 +344,18 @@ def targets_of_tables():
 
 
 def targets_of_figures():
-    """The panel of every scene, methods side by side in the scenes of the sweeps, plots of the sweeps."""
+    """The panel of every scene, masks against the truth where it is known, methods side by side in the
+    scenes of the sweeps, plots of the sweeps."""
     compared = [
         row for row in SCENES if not RUN.sweep_scenes or row.scene in RUN.sweep_scenes
     ]
     return [
         *(f"results/figures/{row.dataset}/{row.scene}/panel.png" for row in SCENES),
+        *(
+            f"results/figures/{row.dataset}/{row.scene}/masks.png"
+            for row in SCENES
+            if row.world
+        ),
         *(
             f"results/figures/{row.dataset}/{row.scene}/comparison.png"
             for row in compared

@@ -56,6 +56,35 @@ rule figures:
         " --threads {threads} --out {output.panel} --log {log}"
 
 
+rule mask_truth:
+    input:
+        scene="results/{dataset}/{scene}/scene",
+        truth=truth_of,
+        masks="results/{dataset}/{scene}/default/masks",
+    output:
+        picture=report(
+            "results/figures/{dataset}/{scene}/masks.png",
+            caption="../workflow/report/masks.rst",
+            category="Scenes",
+            subcategory="{dataset}/{scene}",
+            labels={"figure": "masks against the truth"},
+        ),
+        table="results/figures/{dataset}/{scene}/masks.csv",
+    log:
+        "results/figures/{dataset}/{scene}/masks.log",
+    benchmark:
+        "results/{dataset}/{scene}/benchmarks/mask_truth.jsonl"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        mem_mb=1500,
+    params:
+        code=code("mask_truth"),
+    shell:
+        "hilsplat world masks {wildcards.dataset}/{wildcards.scene} --out {output.picture} --log {log}"
+
+
 rule comparison:
     input:
         truth=truth_or_labels_of,

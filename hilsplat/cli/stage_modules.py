@@ -23,6 +23,7 @@ STAGE_MODULES: dict[str, str] = {
     "comparison": "hilsplat.evaluate.comparison",
     "sweep": "hilsplat.evaluate.sweep_plot",
     "consistency": "hilsplat.evaluate.world_consistency",
+    "mask_truth": "hilsplat.evaluate.mask_truth",
     "tree_truth": "hilsplat.evaluate.tree_truth",
     "models": "hilsplat.world.tiny.train",
 }

@@ -93,6 +93,27 @@ def world_inconsistency(
     typer.echo(table)
 
 
+@world_app.command("masks")
+def world_masks(
+    scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has masks")],
+    variant: Annotated[str, typer.Option(help="variant whose masks are measured")] = "default",
+    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    out: Annotated[
+        Path | None, typer.Option(help="PNG to write, a CSV and a PDF beside it; default: beside the masks")
+    ] = None,
+    log: Log = None,
+) -> None:
+    """Measure the masks against the true regions by level, and picture where they fail."""
+    folder = results / scene
+    truth, masks_folder = folder / "world" / "truth", folder / variant / "masks"
+    target = out or masks_folder.with_name("masks_truth.png")
+    with stage("mask_truth", target, log, inputs={"truth": truth, "masks": masks_folder}):
+        from hilsplat.evaluate.mask_truth import run_mask_truth
+
+        table = run_mask_truth(folder / "scene", truth, masks_folder, target)
+    typer.echo(table)
+
+
 @world_app.command("tree")
 def world_tree(
     scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has a tree")],

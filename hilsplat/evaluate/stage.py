@@ -16,7 +16,7 @@ from hilsplat.evaluate.costs import time_queries, write_times
 from hilsplat.evaluate.instance_files import write_instances
 from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
-from hilsplat.evaluate.protocols.answers import Selections
+from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
 from hilsplat.evaluate.protocols.measured import Measured
 from hilsplat.evaluate.protocols.scene_points import measure_scene_points
@@ -119,17 +119,24 @@ def run_evaluate(
             for data, known, wanted in parts:
                 truths = known_truths(known, posed, settings)
                 counts[f"views of {data}"] = len(truths)
+                kept: dict[str, PackedMasks] = {}
                 for view in track(list(truths), "views scored"):
                     of_view, size_hw = truths[view](), posed.cameras[view].size_hw
                     words = relevancy_departures(settings)
                     also = FlatProtocols(wanted.flat, wanted.level, words) if wanted.flat else None
-                    for row in measure_view(answers, selections, of_view, view, size_hw, settings, also):
+                    kept[view] = PackedMasks(size_hw)
+                    rows = measure_view(
+                        answers, selections, of_view, view, size_hw, settings, also, kept[view]
+                    )
+                    for row in rows:
                         keep(data, view, row)
                     if not seconds and of_view.categories:
                         texts = [query.text for query in of_view.categories[:TIMED_TEXTS]]
                         seconds = timed(answers, selections, view, texts, settings)
                 if isinstance(known, TrueAnnotations) and truths and settings.consistency_texts:
-                    found = measure_world_consistency(answers, selections, truths, known.folder, settings)
+                    found = measure_world_consistency(
+                        answers, selections, truths, kept, known.folder, settings
+                    )
                     for view, row in found:
                         keep(data, view, row)
                 for row in point_rows(answers, known, wanted, settings, threads):

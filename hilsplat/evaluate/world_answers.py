@@ -10,11 +10,11 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.evaluate.consistency import SharedPoints, neighbours, shared_points, thinned
 from hilsplat.evaluate.metrics.masks import iou
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
-from hilsplat.evaluate.protocols.answers import Selections
+from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
 from hilsplat.evaluate.protocols.cards import VIEW_CONSISTENCY
 from hilsplat.evaluate.protocols.measured import Measured
 from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
-from hilsplat.evaluate.protocols.views import label_of, rule_of
+from hilsplat.evaluate.protocols.views import given_key, label_of, rule_of
 from hilsplat.language.query import LanguageScene
 from hilsplat.scene.cameras import Cameras
 from hilsplat.settings import EvaluateSettings
@@ -29,6 +29,7 @@ def measure_world_consistency(
     answers: LanguageScene,
     selections: Selections,
     truths: Mapping[str, Callable[[], ViewTruth]],
+    answered: Mapping[str, PackedMasks],
     truth: Path,
     settings: EvaluateSettings,
 ) -> Iterator[tuple[str, Measured]]:
@@ -40,6 +41,7 @@ def measure_world_consistency(
         answers: the scene.
         selections: its chosen nodes.
         truths: annotated views.
+        answered: answers that were given in them (`views.measure_view`).
         truth: truth folder of a synthetic scene.
         settings: methods, the map rule, how many texts.
     """
@@ -57,7 +59,7 @@ def measure_world_consistency(
             shared_points(true[pair[0]], mesh.depth(true[pair[0]]), true[pair[1]], mesh.depth(true[pair[1]]))
         )
         queries = spread(truths[view]().queries, settings.consistency_texts)
-        mask_of = answers_of(answers, selections, pair, queries, settings)
+        mask_of = answers_of(answers, selections, answered, pair, queries, settings)
         for row in consistency_rows(pair, points, queries, mask_of, settings):
             yield view, row
 
@@ -76,22 +78,31 @@ def spread(queries: Sequence[Query], per_level: int) -> list[Query]:
 def answers_of(
     answers: LanguageScene,
     selections: Selections,
+    answered: Mapping[str, PackedMasks],
     pair: tuple[str, str],
     queries: Sequence[Query],
     settings: EvaluateSettings,
 ) -> MaskOf:
-    """Answers to some texts in two views, level given."""
-    texts = list(dict.fromkeys(query.text for query in queries))
+    """Answers to some texts in two views, level given; most of those in annotated views are known already."""
+
+    def is_kept(view: str, query: Query) -> bool:
+        return view in answered and given_key("field", query, settings) in answered[view]
+
     rule = rule_of(settings)
-    maps = {}
-    if "field" in settings.methods and texts:
-        maps = {view: answers.field_relevancy(texts, view) for view in pair}
+    maps: dict[str, dict[str, np.ndarray]] = {}
+    for view in pair if "field" in settings.methods else ():
+        missing = [query.text for query in queries if not is_kept(view, query)]
+        if missing:
+            texts = list(dict.fromkeys(missing))
+            maps[view] = dict(zip(texts, answers.field_relevancy(texts, view), strict=True))
 
     def mask_of(method: str, view: str, query: Query) -> Bool[np.ndarray, "H W"]:
         if method == "tree":
             size_hw = answers.scene.cameras[view].size_hw
             return selections.mask(view, selections.text(query.text, query.level), size_hw)
-        smoothed = SmoothedRelevancy.of(maps[view][texts.index(query.text)], rule)
+        if is_kept(view, query):
+            return answered[view].get(given_key(method, query, settings))
+        smoothed = SmoothedRelevancy.of(maps[view][query.text], rule)
         return relevancy_mask(smoothed, query.level, rule)[0]
 
     return mask_of

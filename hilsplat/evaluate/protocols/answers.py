@@ -28,7 +28,7 @@ class QueryableScene(Protocol):
 
 
 class PackedMasks:
-    """Predicted masks of one view, one bit a pixel, kept for hierarchical consistency."""
+    """Predicted masks of one view, one bit a pixel, kept for what is measured between levels and views."""
 
     def __init__(self, size_hw: tuple[int, int]) -> None:
         self.size_hw = size_hw
@@ -37,6 +37,9 @@ class PackedMasks:
     def put(self, key: tuple, mask: np.ndarray) -> None:
         """Keep a mask."""
         self.bits[key] = np.packbits(mask)
+
+    def __contains__(self, key: tuple) -> bool:
+        return key in self.bits
 
     def get(self, key: tuple) -> np.ndarray:
         """Unpack a mask."""

@@ -47,8 +47,8 @@ from hilsplat.evaluate.protocols.view_rows import mask_rows
 from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
 from hilsplat.settings import EvaluateSettings
 
-RELEVANCY_CHUNK_MIB = 128
-"""Relevancy maps of so many texts are held at once."""
+RELEVANCY_CHUNK_MIB = 512
+"""Maps of so many texts are held at once: every chunk decodes the view anew."""
 
 
 def rule_of(settings: EvaluateSettings) -> RelevancyRule:
@@ -78,6 +78,11 @@ def label_of(card: ProtocolCard, method: str, settings: EvaluateSettings) -> str
     return card.labelled([*words, *relevancy_departures(settings)])
 
 
+def given_key(method: str, query: Query, settings: EvaluateSettings) -> tuple:
+    """Under which key the answer at the query's level is kept."""
+    return (method, label_of(LEVEL_GIVEN, method, settings), query.text, query.level)
+
+
 def relevancy_departures(settings: EvaluateSettings) -> list[str]:
     """What the settings change of the relevancy itself, whatever is made of it."""
     words = []
@@ -98,6 +103,7 @@ def measure_view(
     size_hw: tuple[int, int],
     settings: EvaluateSettings,
     also: FlatProtocols | None = None,
+    masks: PackedMasks | None = None,
 ) -> Iterator[Measured]:
     """All numbers of one view, in no particular order.
 
@@ -109,8 +115,9 @@ def measure_view(
         size_hw: height and width of the view, px.
         settings: methods, the map rule and what makes a relevancy.
         also: further protocols for texts without levels, such as `3d-ovs/langsplat`.
+        masks: keeps the answers, for what is measured between views.
     """
-    masks = PackedMasks(size_hw)
+    masks = PackedMasks(size_hw) if masks is None else masks
     texts = [query.text for query in truth.categories]
     per_chunk = max(1, int(RELEVANCY_CHUNK_MIB * 2**20 / (2 * 3 * 4 * size_hw[0] * size_hw[1])))
     for start in range(0, len(texts), per_chunk):
@@ -170,7 +177,7 @@ def _field_rows(
         yield from mask_rows("field", query, given, given_mask, given_points)
         yield from mask_rows("field", query, auto, auto_mask, auto_points)
         yield _best_row("field", query, given, smoothed.mixed)
-        masks.put(("field", given, query.text, query.level), given_mask)
+        masks.put(given_key("field", query, settings), given_mask)
 
 
 def _tree_rows(
@@ -195,7 +202,7 @@ def _tree_rows(
         yield from mask_rows("tree", query, given, given_mask, given_points)
         yield from mask_rows("tree", query, auto, auto_mask, auto_points)
         yield _best_row("tree", query, given, smoothed.mixed)
-        masks.put(("tree", given, query.text, query.level), given_mask)
+        masks.put(given_key("tree", query, settings), given_mask)
 
 
 def _path_rows(

@@ -14,6 +14,7 @@ from hilsplat.base.progress import track
 from hilsplat.segment.candidates import decode_candidates
 from hilsplat.segment.generate import masks_from_candidates
 from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.overlaps import region_ious
 from hilsplat.segment.sam import SamModel
 from hilsplat.settings import MasksSettings
 from hilsplat.world.tiny.data import HEAD_LEVELS, LabelledViews, normalised
@@ -186,16 +187,9 @@ def measure_everything(masks: list[HierarchicalMasks], views: LabelledViews) -> 
     for level in LEVELS:
         best, fits, count = [], 0, 0
         for view, found in enumerate(masks):
-            labels = views.labels[view][level.index]
             rows = found.rows_of(level)
-            guesses = found.dense(rows).reshape(len(rows), labels.size)
-            ids, areas = np.unique(labels, return_counts=True)
-            keep = ids >= 0
-            truths = labels.reshape(1, -1) == ids[keep][:, None]
-            shared = truths.astype(np.float32) @ guesses.T.astype(np.float32)
-            union = areas[keep][:, None] + guesses.sum(axis=1)[None] - shared
-            iou = shared / np.maximum(union, 1)
-            scored = areas[keep] >= LEAST_PX
+            _, areas, iou = region_ious(views.labels[view][level.index], found.dense(rows))
+            scored = areas >= LEAST_PX
             best += (iou[scored].max(axis=1) if len(rows) else np.zeros(int(scored.sum()))).tolist()
             if len(iou):
                 fits += int((iou.max(axis=0) >= 0.5).sum())

@@ -1,0 +1,29 @@
+"""How well masks fit the regions of a label image."""
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int, Int64
+
+
+def region_ious(
+    labels: Int[np.ndarray, "H W"], masks: Bool[np.ndarray, "M H W"]
+) -> tuple[Int64[np.ndarray, " R"], Int64[np.ndarray, " R"], Float32[np.ndarray, "R M"]]:
+    """IoU of every region with every mask.
+
+    Args:
+        labels: id per pixel, negative where there is no region.
+        masks: may overlap.
+
+    Returns:
+        ids of the regions in ascending order, their areas in pixels, and the IoUs.
+    """
+    flat = labels.reshape(-1)
+    ids, index = np.unique(flat, return_inverse=True)
+    first = int(np.searchsorted(ids, 0))
+    areas = np.bincount(index, minlength=len(ids))
+    guesses = masks.reshape(len(masks), flat.size)
+    shared = np.stack(
+        [np.bincount(index, weights=guess, minlength=len(ids)) for guess in guesses] or [np.zeros(len(ids))]
+    )[: len(masks)].T
+    union = areas[:, None] + guesses.sum(axis=1)[None] - shared
+    found = (shared / np.maximum(union, 1)).astype(np.float32)
+    return ids[first:].astype(np.int64), areas[first:].astype(np.int64), found[first:]
