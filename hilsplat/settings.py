@@ -124,8 +124,11 @@ class GaussiansSettings(Section):
     mcmc_scale_weight: float = knob(
         0.01, "mcmc: weight of the mean scale, in units of the cameras' extent", ge=0, origin="MCMC"
     )
-    initial: Literal["points", "random"] = knob(
-        "points", "first Gaussians: at the sparse points, or at random points that cameras see"
+    initial: Literal["points", "random", "frozen"] = knob(
+        "points",
+        "first Gaussians: at the sparse points, or at random points that cameras see; frozen: one at each "
+        "sparse point, which stays there, and no others (with evaluate.points: frozen)",
+        origin="OpenGaussian on ScanNet: frozen",
     )
     checkpoint_every: int = knob(1000, "steps between checkpoints", ge=1)
     device: Literal["auto", "cpu", "cuda"] = knob(
@@ -417,7 +420,7 @@ class EvaluateSettings(Section):
     points: Literal["nearest", "vote", "density", "frozen"] = knob(
         "nearest",
         "how labelled points get what Gaussians know: the nearest opaque one, a vote of 5 within 10 cm, the "
-        "densest 8, or each its own (brought Gaussians that are the points)",
+        "densest 8, or each its own (gaussians.initial: frozen, or brought Gaussians that are the points)",
         origin="OpenGaussian: frozen",
     )
     consistency_texts: int = knob(

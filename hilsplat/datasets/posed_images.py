@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from plyfile import PlyData, PlyElement
 
 from hilsplat.base.artifacts import atomic_folder, write_text
 from hilsplat.base.errors import SceneError
@@ -63,14 +64,18 @@ def cam_from_world_of(world_from_cam: Float[np.ndarray, "4 4"], where: str) -> F
     return np.linalg.inv(world_from_cam)
 
 
-def write_posed_images(folder: Path, images: Sequence[PosedImage]) -> None:
+def write_posed_images(
+    folder: Path, images: Sequence[PosedImage], points: Float[np.ndarray, "P 3"] | None = None
+) -> None:
     """Write `images/` and `transforms.json` (OpenGL axes, intrinsics per frame): a source for `poses`.
 
-    Images are copied byte by byte; lenses stay as they are, `poses` undistorts.
+    Images are copied byte by byte; lenses stay as they are, `poses` undistorts. Points, where there are
+    any, go to `points.ply`: the sparse points of the scene, in their order.
 
     Args:
         folder: written whole or not at all; what was there is replaced.
         images: at least one, names all different.
+        points: places that the data set knows, metres.
 
     Raises:
         SceneError: two images share a name, or there is none.
@@ -93,7 +98,14 @@ def write_posed_images(folder: Path, images: Sequence[PosedImage]) -> None:
             else:
                 shutil.copyfile(image.image, target)
             frames.append(_frame(image))
-        write_text(temporary / "transforms.json", json.dumps({"frames": frames}, indent=1) + "\n")
+        content: dict[str, object] = {"frames": frames}
+        if points is not None:
+            content["ply_file_path"] = "points.ply"
+            table = np.empty(len(points), [(axis, "<f4") for axis in "xyz"])
+            for axis, values in zip("xyz", np.asarray(points).T, strict=True):
+                table[axis] = values
+            PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(temporary / "points.ply")
+        write_text(temporary / "transforms.json", json.dumps(content, indent=1) + "\n")
 
 
 def _frame(image: PosedImage) -> dict[str, object]:

@@ -107,10 +107,13 @@ def is_exported(source: str) -> bool:
 def export_images(name: str, data_root: Path, out: Path) -> int:
     """Write images and poses of a scene with labelled points as a folder that `poses` imports.
 
+    The vertices of a labelled mesh go with them, without their labels: Gaussians start there, and may be
+    frozen there. Lidar points do not, as the sky and all that is far has none.
+
     Args:
         name: `data set/scene`.
         data_root: folder of the data sets.
-        out: folder with `images/` and `transforms.json`.
+        out: folder with `images/`, `transforms.json` and perhaps `points.ply`.
 
     Returns:
         the number of images.
@@ -128,7 +131,8 @@ def export_images(name: str, data_root: Path, out: Path) -> int:
             f"{name} needs no export: its images lie in a folder",
             fix="name the folder as source in the scene sheet",
         )
-    write_posed_images(out, scene.images)
+    meshes = [points for points in scene.truth.values() if points.faces is not None]
+    write_posed_images(out, scene.images, meshes[0].xyz if meshes else None)
     return len(scene.images)
 
 

@@ -56,16 +56,19 @@ def fit_step(
     target = to_float(view.image)
     loss, grad = photometric_loss(shown, target, ssim_weight=settings.ssim_weight, threads=threads)
     gradients = seen.gradients(grad, -(grad @ behind))
-    if settings.strategy == "mcmc":
+    is_frozen = settings.initial == "frozen"
+    rate = 0.0 if is_frozen else extent * means_rate(settings, progress)
+    if settings.strategy == "mcmc" and not is_frozen:
         add_regularisers(state.adam, gradients, settings, extent)
     elif state.step < int(settings.densify_until * settings.iterations):
         state.gradients.add(gradients.means_px, seen.drawn, view.camera.size_hw)
-    state.adam.step(gradients, settings, extent * means_rate(settings, progress), threads)
+    state.adam.step(gradients, settings, rate, threads)
     state.step += 1
     if state.step % CURVE_EVERY == 0:
         error = float(np.square(shown - target).mean(dtype=np.float64))
         state.curve.append((state.step, loss, -10 * np.log10(max(error, 1e-12)), len(state.adam)))
-    control_density(state, settings, progress, extent, threads)
+    if not is_frozen:
+        control_density(state, settings, progress, extent, threads)
 
 
 def control_density(
@@ -133,7 +136,8 @@ def fit_gaussians(
             )
         if checkpoint and state.step % settings.checkpoint_every == 0 and state.step < settings.iterations:
             state.save(checkpoint, key)
-    prune(state.adam, settings, extent)
+    if settings.initial != "frozen":
+        prune(state.adam, settings, extent)
     tensors = {name: torch.from_numpy(values) for name, values in state.adam.parameters.items()}
     if checkpoint:
         checkpoint.unlink(missing_ok=True)
@@ -182,7 +186,7 @@ def run_gaussians(
             )
             origin = {
                 "kind": "fitted",
-                "strategy": settings.strategy,
+                "strategy": "frozen" if settings.initial == "frozen" else settings.strategy,
                 "iterations": settings.iterations,
                 "seed": seed,
             }

@@ -5,6 +5,7 @@ import logging
 import numpy as np
 from scipy.spatial import cKDTree
 
+from hilsplat.base.errors import SceneError
 from hilsplat.base.images import to_float
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
@@ -29,18 +30,30 @@ def first_gaussians(
     """Round Gaussians at the sparse points, as wide as the mean distance to their 3 nearest (3DGS).
 
     With fewer than MIN_POINTS sparse points, random grey ones in front of random cameras are added;
-    with `settings.initial` "random" they take the place of all.
+    with `settings.initial` "random" they take the place of all, with "frozen" every sparse point
+    becomes one Gaussian, however many there are.
+
+    Raises:
+        SceneError: points that are to be frozen are missing or not finite.
     """
     xyz, rgb = scene.points_xyz.astype(np.float64), to_float(scene.points_rgb)
     finite = np.isfinite(xyz).all(axis=1)
+    is_random, is_frozen = settings.initial == "random", settings.initial == "frozen"
+    if is_frozen and not (len(xyz) and finite.all()):
+        raise SceneError(
+            f"the points of {scene.name} cannot each become a Gaussian (gaussians.initial: frozen)",
+            expected="at least one point, all finite",
+            found=f"{len(xyz)} points, {int((~finite).sum())} not finite",
+            fix="name the points as ply_file_path in transforms.json, or set gaussians.initial to points",
+        )
     xyz, rgb = xyz[finite], rgb[finite]
-    known, is_random = xyz, settings.initial == "random"
+    known = xyz
     if is_random:
         xyz, rgb = xyz[:0], rgb[:0]
-    if len(xyz) > settings.max_gaussians:
+    if len(xyz) > settings.max_gaussians and not is_frozen:
         rows = np.sort(generator.choice(len(xyz), settings.max_gaussians, replace=False))
         xyz, rgb = xyz[rows], rgb[rows]
-    if is_random or len(xyz) < MIN_POINTS:
+    if is_random or (len(xyz) < MIN_POINTS and not is_frozen):
         if not is_random:
             logger.warning("%s has %d sparse points; random points are added", scene.name, len(xyz))
         number = min(RANDOM_POINTS if is_random else ADDED_POINTS, settings.max_gaussians - len(xyz))

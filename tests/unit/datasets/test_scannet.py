@@ -16,6 +16,7 @@ from hilsplat.datasets.posed_images import PosedImage, write_posed_images
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.scannet import LABEL_TABLE, check_scan, open_scan, read_label_table
 from hilsplat.datasets.scannet_write import write_label_table, write_scan
+from hilsplat.datasets.sources import export_images
 from hilsplat.scene.importers import find_known_poses, read_transforms
 
 SCAN = "scene0000_00"
@@ -276,6 +277,14 @@ def test_the_importer_reads_the_same_cameras(root, tmp_path):
         assert (view.camera.height, view.camera.width) == image.size_hw
     with pytest.raises(SceneError, match=r"twice: 0\.jpg"):
         write_posed_images(folder, [images[0], images[0]])
+
+
+def test_the_mesh_becomes_the_sparse_points_in_its_order(root, tmp_path):
+    export_images(f"scannet/{SCAN}", root.parent, tmp_path / "source")
+    views, (xyz, _) = read_transforms(find_known_poses(tmp_path / "source"))
+    truth = open_scan(root, SCAN)
+    assert len(views) == len(truth.images)
+    np.testing.assert_array_equal(xyz, truth.truth["nyu40"].xyz.astype(np.float32))
 
 
 def test_validation_scans_are_the_benchmarks():

@@ -99,6 +99,28 @@ def test_random_start_holds_as_many_points_as_asked_in_sight_of_cameras(scene):
     assert seen.all()
 
 
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_frozen_gaussians_stay_the_points(scene, strategy):
+    points = np.random.default_rng(0).normal(0, 0.3, (150, 3)).astype(np.float32)
+    bare = replace(scene, points_xyz=points, points_rgb=np.full((150, 3), 128, np.uint8))
+    few = {"initial": "frozen", "max_gaussians": 100, "iterations": 60, "strategy": strategy}
+    settings = SETTINGS.model_copy(update={**few, "densify_every": 10, "opacity_reset_every": 20})
+    gaussians, curve = fit.fit_gaussians(bare, settings, seed=0)
+    assert np.array_equal(gaussians.means.numpy(), points)
+    assert curve[-1, 2] > curve[0, 2]  # colours, sizes and opacities are fitted all the same
+    assert len(set(gaussians.opacities.numpy().round(3))) > 50
+
+
+def test_frozen_points_must_be_there(scene):
+    broken = scene.points_xyz.copy()
+    broken[0] = np.nan
+    settings = SETTINGS.model_copy(update={"initial": "frozen"})
+    for xyz in (broken, broken[:0]):
+        bare = replace(scene, points_xyz=xyz, points_rgb=scene.points_rgb[: len(xyz)])
+        with pytest.raises(SceneError, match=r"gaussians\.initial: frozen"):
+            fit.fit_gaussians(bare, settings, seed=0)
+
+
 def test_rate_of_the_means_falls_exponentially():
     settings = GaussiansSettings(means_rate=1e-2, means_rate_last=1e-4)
     assert means_rate(settings, 0.0) == pytest.approx(1e-2)
