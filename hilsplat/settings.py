@@ -558,7 +558,9 @@ class RunSettings(StageSettings):
     seed: int = knob(0, "seed of everything random", ge=0)
     scenes: str = knob("config/scenes.tsv", "scene sheet, relative to the project")
     groups: tuple[str, ...] = knob(("benchmark",), "groups of the scene sheet that are run")
-    only: tuple[str, ...] = knob((), "names of scenes, to run fewer than the groups hold")
+    only: tuple[str, ...] = knob(
+        (), "names of scenes, to run these alone: table-1, or synthetic/table-1; of any group if need be"
+    )
     data_root: str = knob("", "folder of the real data sets; empty: they are skipped")
     main_variants: tuple[str, ...] = knob(("default",), "variants in the main tables")
     ablation_variants: tuple[str, ...] = knob((), "variants in the ablation table")

@@ -23,7 +23,7 @@ from hilsplat.datasets.sources import (
 )
 from hilsplat.evaluate.tables.build import TABLES
 from hilsplat.methods.registry import METHODS, OURS, require_method
-from hilsplat.scene.sheet import read_sheet
+from hilsplat.scene.sheet import choose_scenes, read_sheet
 from hilsplat.settings import SEEDED_STAGES, UPSTREAM, parse_run
 
 
@@ -39,11 +39,9 @@ RUN = or_stop(parse_run, config)
 for name in RUN.variant_names():
     or_stop(require_method, RUN.stages(name).method.name)
 ALL_SCENES = or_stop(read_sheet, Path(RUN.scenes), RUN.groups, RUN.data_root)
-CHOSEN = [
-    row
-    for row in ALL_SCENES
-    if row.group in RUN.groups and (not RUN.only or row.scene in RUN.only)
-]
+CHOSEN = or_stop(choose_scenes, ALL_SCENES, RUN.groups, RUN.only)
+if more := {row.group for row in CHOSEN} - set(RUN.groups):  # their sources are checked too
+    or_stop(read_sheet, Path(RUN.scenes), {*RUN.groups, *more}, RUN.data_root)
 ABSENT = {
     row.name: reason
     for row in CHOSEN

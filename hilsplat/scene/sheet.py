@@ -5,7 +5,7 @@ The workflow imports this module at start-up, so nothing heavy is imported at it
 
 import re
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -165,6 +165,37 @@ def read_sheet(
         line_of[key] = line
         rows.append(row)
     return rows
+
+
+def choose_scenes(
+    rows: Sequence[SceneRow], groups: Collection[str], only: Sequence[str]
+) -> tuple[SceneRow, ...]:
+    """Scenes of a run: those of the groups or, where some are named, those alone, in the sheet's order.
+
+    Args:
+        rows: the sheet.
+        groups: groups of the run.
+        only: names such as `table-1` or `synthetic/table-1`; none for all scenes of the groups. A
+            short name means scenes of the groups; only where these have none of that name, any.
+
+    Raises:
+        SceneError: a name is in no row.
+    """
+    in_groups = [row for row in rows if row.group in groups]
+    if not only:
+        return tuple(in_groups)
+    chosen: set[str] = set()
+    for name in only:
+        found = [row.name for row in in_groups if name in (row.scene, row.name)]
+        found = found or [row.name for row in rows if name in (row.scene, row.name)]
+        if not found:
+            raise SceneError(
+                f"only names {name!r}, and no scene is called so",
+                expected=", ".join(row.name for row in in_groups or rows),
+                fix="correct the name, or add a row to the scene sheet",
+            )
+        chosen.update(found)
+    return tuple(row for row in rows if row.name in chosen)
 
 
 def content_lines(path: Path) -> list[tuple[int, str]]:

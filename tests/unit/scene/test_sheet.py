@@ -6,7 +6,7 @@ from PIL import Image
 
 from hilsplat.base.errors import SceneError
 from hilsplat.scene.photos import add_scene, inspect_photos
-from hilsplat.scene.sheet import read_sheet
+from hilsplat.scene.sheet import choose_scenes, read_sheet
 
 HEADER = "dataset\tscene\tgroup\tsource\tunit\n"
 
@@ -38,6 +38,27 @@ def test_rows_are_read_in_order_and_comments_are_passed_over(tmp_path):
     first, second = read_sheet(sheet)
     assert (first.name, first.world, first.folder) == ("world/tabletop-201", ("tabletop", 201), None)
     assert (second.name, second.world, second.folder) == ("photos/desk", None, tmp_path / "desk")
+
+
+def test_named_scenes_are_chosen_alone_and_from_any_group(tmp_path):
+    sheet = write_sheet(
+        tmp_path,
+        ("a", "one", "benchmark", "world:tabletop:201", "metre"),
+        ("a", "two", "benchmark", "world:tabletop:202", "metre"),
+        ("a", "three", "development", "world:tabletop:101", "metre"),
+        ("b", "two", "development", "world:tabletop:102", "metre"),
+    )
+    rows = read_sheet(sheet)
+
+    def chosen(*only):
+        return [row.name for row in choose_scenes(rows, ["benchmark"], only)]
+
+    assert chosen() == ["a/one", "a/two"]
+    assert chosen("two") == ["a/two"]  # of the groups, as they have one
+    assert chosen("b/two") == ["b/two"]
+    assert chosen("three", "a/one") == ["a/one", "a/three"]
+    with pytest.raises(SceneError, match=r"only names 'tow'(.|\n)*a/one, a/two"):
+        chosen("tow")
 
 
 @pytest.mark.parametrize(
