@@ -24,7 +24,7 @@ from hilsplat.datasets.sources import (
 from hilsplat.evaluate.tables.build import TABLES
 from hilsplat.methods.registry import METHODS, OURS, require_method
 from hilsplat.scene.sheet import choose_scenes, read_sheet
-from hilsplat.settings import SEEDED_STAGES, UPSTREAM, parse_run
+from hilsplat.configuration import SEEDED_STAGES, UPSTREAM, parse_run
 
 
 def or_stop(function, *arguments):

@@ -92,6 +92,6 @@ def stage(
 
 def section_of(name: str, text: str) -> Any:
     """One section of the settings, from JSON."""
-    from hilsplat.settings import parse_section
+    from hilsplat.configuration import parse_section
 
     return parse_section(name, text)

@@ -69,6 +69,6 @@ def settings(
     """Print every knob: default, unit, range, origin."""
     import json
 
-    from hilsplat.settings import config_schema, knob_table
+    from hilsplat.configuration import config_schema, knob_table
 
     typer.echo(json.dumps(config_schema(), indent=1) if schema else knob_table())

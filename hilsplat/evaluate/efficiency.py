@@ -12,7 +12,7 @@ from pathlib import Path
 
 from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import ArtifactError
-from hilsplat.settings import SECTIONS
+from hilsplat.configuration import SECTIONS
 
 STAGE_ORDER = tuple(SECTIONS)
 """Stages in the order of the settings, which is that of the data."""

@@ -8,7 +8,7 @@ import yaml
 from snakemake.utils import update_config
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.settings import SECTIONS, config_schema, parse_run, parse_section
+from hilsplat.configuration import SECTIONS, config_schema, parse_run, parse_section
 
 
 def load(project: Path, name: str) -> dict:

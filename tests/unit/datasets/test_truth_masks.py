@@ -136,7 +136,7 @@ def test_an_unfinished_truth_is_refused(world):
 
 
 def test_probabilities_stay_probabilities():
-    from hilsplat.settings import parse_section
+    from hilsplat.configuration import parse_section
 
     with pytest.raises(SettingsError, match=r"perturb\.missing\.2: Input should be less than or equal to 1"):
         parse_section("perturb", '{"missing": [0, 0, 2]}')

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from hilsplat.configuration import RunSettings
 from hilsplat.evaluate.instance_files import write_instances
 from hilsplat.evaluate.metrics.instances import InstanceScan, match_instances
 from hilsplat.evaluate.tables.build import TABLES, run_table
-from hilsplat.settings import RunSettings
 from tests.unit.evaluate.test_tables import PUBLISHED, built, measured, score
 
 MODE = "(points: nearest)"

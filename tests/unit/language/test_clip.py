@@ -13,13 +13,14 @@ from hilsplat.base.artifacts import read_index, read_npy, sha256_of_path
 from hilsplat.base.errors import MisalignedArtifactError, ModelError, SettingsError
 from hilsplat.base.images import write_png
 from hilsplat.base.onnx_models import Network
+from hilsplat.configuration import parse_section
 from hilsplat.language.clip import ClipModel, unit
 from hilsplat.language.clip_stage import run_clip
 from hilsplat.language.model_check import check_model
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.settings import ClipSettings, parse_section
+from hilsplat.settings import ClipSettings
 
 WORDS = ["red", "green", "blue"]
 

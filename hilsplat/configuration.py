@@ -1,0 +1,257 @@
+"""The configuration of a run: every stage's section, variants, seeds, scenes and tables."""
+
+import difflib
+import json
+import re
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from hilsplat.base.errors import SettingsError
+from hilsplat.settings import (
+    AutoencoderSettings,
+    ClipSettings,
+    ContributionsSettings,
+    EvaluateSettings,
+    FiguresSettings,
+    GaussiansSettings,
+    LanguageSettings,
+    MasksSettings,
+    MethodSettings,
+    PerturbSettings,
+    PosesSettings,
+    ReferenceSettings,
+    Section,
+    SemanticTreeSettings,
+    TrainingSettings,
+    TreeSettings,
+    WorldSettings,
+    knob,
+)
+
+
+class StageSettings(Section):
+    """All sections, one per stage."""
+
+    world: WorldSettings = WorldSettings()
+    poses: PosesSettings = PosesSettings()
+    gaussians: GaussiansSettings = GaussiansSettings()
+    masks: MasksSettings = MasksSettings()
+    perturb: PerturbSettings = PerturbSettings()
+    tree: TreeSettings = TreeSettings()
+    clip: ClipSettings = ClipSettings()
+    contributions: ContributionsSettings = ContributionsSettings()
+    semantic_tree: SemanticTreeSettings = SemanticTreeSettings()
+    autoencoder: AutoencoderSettings = AutoencoderSettings()
+    language: LanguageSettings = LanguageSettings()
+    method: MethodSettings = MethodSettings()
+    reference: ReferenceSettings = ReferenceSettings()
+    evaluate: EvaluateSettings = EvaluateSettings()
+    figures: FiguresSettings = FiguresSettings()
+    training: TrainingSettings = TrainingSettings()
+
+
+SECTIONS: dict[str, type[Section]] = {
+    name: field.annotation  # type: ignore[misc]
+    for name, field in StageSettings.model_fields.items()
+}
+
+
+def parse_section(name: str, text: str) -> Any:
+    """Read one section from JSON, as a rule hands it to a stage.
+
+    Raises:
+        SettingsError: a key is unknown, or a value is of the wrong type or out of range.
+    """
+    try:
+        return SECTIONS[name].model_validate_json(text or "{}")
+    except ValidationError as error:
+        raise settings_error(error, name, SECTIONS[name]) from error
+
+
+def settings_error(error: ValidationError, where: str, model: type[BaseModel]) -> SettingsError:
+    """Turn pydantic's report into one line per key: place, problem, what is allowed."""
+    lines = []
+    for problem in error.errors():
+        path = [str(part) for part in problem["loc"]]
+        place = ".".join([where, *path] if where else path)
+        if problem["type"] == "extra_forbidden":
+            known = _known_keys(model, path[:-1])
+            near = difflib.get_close_matches(path[-1], known, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"
+            lines.append(f"{place}: unknown key; {hint}")
+        else:
+            found = json.dumps(problem.get("input"), default=str)
+            lines.append(f"{place}: {problem['msg']}; found {found}")
+    return SettingsError("settings cannot be used:\n  " + "\n  ".join(lines))
+
+
+def _known_keys(model: Any, path: list[str]) -> list[str]:
+    """Keys allowed at a place of the configuration."""
+    for part in path:
+        model = model.model_fields[part].annotation
+    return sorted(model.model_fields)
+
+
+VARIANT_SECTIONS = (
+    "masks",
+    "perturb",
+    "tree",
+    "clip",
+    "contributions",
+    "semantic_tree",
+    "autoencoder",
+    "language",
+    "method",
+    "evaluate",
+)
+"""Sections a variant may override; the stages before them are shared by all variants."""
+
+UPSTREAM: dict[str, tuple[str, ...]] = {
+    "masks": ("masks", "perturb"),
+    "tree": ("masks", "perturb", "tree"),
+    "clip": ("masks", "perturb", "clip"),
+    "contributions": ("masks", "perturb", "contributions"),
+    "semantic_tree": ("masks", "perturb", "clip", "contributions", "semantic_tree"),
+    "autoencoder": ("masks", "perturb", "clip", "contributions", "semantic_tree", "autoencoder"),
+    "language": VARIANT_SECTIONS[:-1],
+    "evaluate": VARIANT_SECTIONS,
+}
+"""Sections that each variant stage depends on, through its inputs too."""
+
+
+SEEDED = re.compile(r"(?P<variant>.+?)(?:\.seed(?P<seed>[0-9]+))?")
+"""A variant's name, with the number of the seed behind it where it is not the first."""
+
+SEEDED_STAGES = ("autoencoder", "language", "evaluate")
+"""Stages whose results depend on the seed; variants that differ in it share those before."""
+
+
+class RunSettings(StageSettings):
+    """The whole configuration: what is run, with which settings."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    seed: int = knob(0, "seed of everything random", ge=0)
+    scenes: str = knob("config/scenes.tsv", "scene sheet, relative to the project")
+    groups: tuple[str, ...] = knob(("benchmark",), "groups of the scene sheet that are run")
+    only: tuple[str, ...] = knob(
+        (), "names of scenes, to run these alone: table-1, or synthetic/table-1; of any group if need be"
+    )
+    data_root: str = knob("", "folder of the real data sets; empty: they are skipped")
+    main_variants: tuple[str, ...] = knob(("default",), "variants in the main tables")
+    ablation_variants: tuple[str, ...] = knob((), "variants in the ablation table")
+    theta_variants: tuple[str, ...] = knob((), "variants in the sweep over theta")
+    omega_variants: tuple[str, ...] = knob((), "variants in the sweep over Omega")
+    pruning_variants: tuple[str, ...] = knob((), "variants in the table of pruned pairs")
+    sweep_scenes: tuple[str, ...] = knob(
+        (), "names of scenes for ablation, sweeps and pruning; empty: all tabletop and photographed ones"
+    )
+    seeds: int = knob(1, "seeds of autoencoder and field; more than one gives mean and spread", ge=1, le=10)
+    variants: dict[str, dict[str, dict[str, Any]]] = knob(
+        {}, "named overrides: variant -> section -> knob -> value; 'default' always exists"
+    )
+    labels: dict[str, str] = knob({}, "how tables name a variant")
+    overrides: dict[str, dict[str, dict[str, Any]]] = knob(
+        {}, "settings of a whole group or of one scene: group or dataset/scene -> section -> knob -> value"
+    )
+    queries: dict[str, tuple[str, ...]] = knob({}, "texts shown in the panel of a scene without labels")
+
+    def variant_names(self) -> list[str]:
+        """Variants that a run needs, "default" first; with more than one seed each of them per seed."""
+        lists = (self.main_variants, self.ablation_variants, self.theta_variants)
+        lists += (self.omega_variants, self.pruning_variants)
+        names = dict.fromkeys(["default", *(name for names in lists for name in names)])
+        return [name for first in names for name in self.seeded(first)]
+
+    def seeded(self, variant: str) -> list[str]:
+        """A variant under every seed: its own name, then `<name>.seed1`, ..."""
+        return [variant, *(f"{variant}.seed{number}" for number in range(1, self.seeds))]
+
+    def seed_of(self, variant: str) -> int:
+        """Seed of a variant's networks."""
+        return self.seed + int(SEEDED.fullmatch(variant)["seed"] or 0)
+
+    def stages(self, variant: str = "default", scopes: tuple[str, ...] = ()) -> StageSettings:
+        """Settings of a variant for a scene.
+
+        Args:
+            variant: name of a variant.
+            scopes: keys of `overrides` that apply, general first (group, then dataset/scene).
+
+        Raises:
+            SettingsError: the variant is unknown or an override cannot be used.
+        """
+        variant = SEEDED.fullmatch(variant)["variant"]
+        merged = {name: getattr(self, name).model_dump() for name in SECTIONS}
+        layers = [(f"overrides.{scope}", self.overrides.get(scope, {})) for scope in scopes]
+        if variant != "default" or variant in self.variants:
+            if variant not in self.variants:
+                raise SettingsError(
+                    f"variant {variant!r} is not defined",
+                    expected=f"one of default, {', '.join(self.variants)}",
+                )
+            layers.append((f"variants.{variant}", self.variants[variant]))
+        for where, layer in layers:
+            for section, values in layer.items():
+                if section not in SECTIONS:
+                    raise SettingsError(
+                        f"{where}.{section}: unknown section", expected=f"one of {', '.join(SECTIONS)}"
+                    )
+                if where.startswith("variants.") and section not in VARIANT_SECTIONS:
+                    raise SettingsError(
+                        f"{where}.{section}: a variant cannot change this section, all variants share it",
+                        expected=f"one of {', '.join(VARIANT_SECTIONS)}",
+                        fix="use overrides: for a group or a scene, or a configuration file of its own",
+                    )
+                merged[section].update(values)
+                try:
+                    SECTIONS[section].model_validate(merged[section])
+                except ValidationError as error:
+                    raise settings_error(error, f"{where}.{section}", SECTIONS[section]) from error
+        return StageSettings.model_validate(merged)
+
+
+def parse_run(config: dict[str, Any]) -> RunSettings:
+    """Validate a whole configuration, variants and overrides included.
+
+    Raises:
+        SettingsError: naming each key that cannot be used.
+    """
+    try:
+        run = RunSettings.model_validate(config)
+    except ValidationError as error:
+        raise settings_error(error, "", RunSettings) from error
+    for variant in dict.fromkeys([*run.variant_names(), *run.variants]):
+        run.stages(variant)
+    for scope in run.overrides:
+        run.stages(scopes=(scope,))
+    return run
+
+
+def config_schema() -> dict[str, Any]:
+    """JSON schema of the configuration, for editors and for `snakemake`'s users."""
+    schema = RunSettings.model_json_schema()
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+
+
+def knob_table() -> str:
+    """Every knob as text: name, default, range, unit, origin, meaning."""
+    lines = []
+    models = {"": RunSettings, **SECTIONS}
+    for section, model in models.items():
+        for name, field in model.model_fields.items():
+            if not section and name in SECTIONS:
+                continue
+            extra = field.json_schema_extra or {}
+            limits = ", ".join(
+                f"{symbol} {getattr(limit, attribute)}"
+                for limit in field.metadata
+                for attribute, symbol in (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
+                if hasattr(limit, attribute)
+            )
+            facts = [limits, extra.get("unit", ""), f"origin: {extra.get('origin', 'ours')}"]
+            place = f"{section}.{name}" if section else name
+            lines.append(f"{place} = {field.default!r}  ({'; '.join(fact for fact in facts if fact)})")
+            lines.append(f"    {field.description}")
+    return "\n".join(lines)
