@@ -16,7 +16,8 @@ from hilsplat.base.errors import ImageError, SceneError
 from hilsplat.base.files import list_images
 from hilsplat.base.levels import Level
 from hilsplat.datasets.dataset import SceneReport
-from hilsplat.scene.importers import KnownView, find_known_poses, known_views
+from hilsplat.scene.known_poses import KnownView, find_known_poses
+from hilsplat.scene.known_views import known_views
 
 ROUNDING_PX = 1.0
 """A label is a scaled copy of its image where the sides differ by no more than rounding."""
@@ -75,7 +76,7 @@ class LabelledScene:
         dataset: name of the data set.
         scene: name of the scene.
         images: image file by view, all images of the scene.
-        poses: folder that `scene.importers` finds poses in; None where the scene has none.
+        poses: folder that `scene.known_poses` finds poses in; None where the scene has none.
         views: labelled regions by view, in order of the labels.
         prompts: all texts of the scene, sorted.
         warnings: what was read otherwise than written, each a sentence.

@@ -25,7 +25,8 @@ from hilsplat.scene.features import (
     prepare_images,
     register_images,
 )
-from hilsplat.scene.importers import find_known_poses, import_poses
+from hilsplat.scene.importers import import_poses
+from hilsplat.scene.known_poses import find_known_poses
 from hilsplat.scene.model import pose_matrix, reprojection_errors, sparse_points
 from hilsplat.scene.sheet import MIN_PHOTOS, photo_folder
 from hilsplat.settings import PosesSettings

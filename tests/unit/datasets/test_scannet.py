@@ -17,7 +17,8 @@ from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.scannet import LABEL_TABLE, check_scan, open_scan, read_label_table
 from hilsplat.datasets.scannet_write import write_label_table, write_scan
 from hilsplat.datasets.sources import export_images
-from hilsplat.scene.importers import find_known_poses, read_transforms
+from hilsplat.scene.known_poses import find_known_poses
+from hilsplat.scene.known_views import read_transforms
 
 SCAN = "scene0000_00"
 CATEGORIES = {

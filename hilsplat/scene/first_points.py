@@ -1,0 +1,87 @@
+"""Sparse points of views whose poses are known: triangulated, or random where that fails."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from hilsplat.scene.assemble import PosedView
+from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.features import (
+    MIN_INLIERS,
+    extract_features,
+    match_features,
+)
+from hilsplat.scene.model import sparse_points
+from hilsplat.settings import PosesSettings
+
+MIN_TRIANGULATED = 100
+"""With fewer triangulated points, random ones in front of the cameras start the fit instead."""
+
+NUM_RANDOM_POINTS = 20_000
+
+
+def triangulate(
+    views: Sequence[PosedView], work: Path, settings: PosesSettings, seed: int, threads: int
+) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
+    """Sparse points of pinhole views with known poses: features, matches, triangulation; poses stay."""
+    if len(views) < 2:
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)
+    folder, database = views[0].image.parent, work / "triangulation.db"
+    pycolmap.Database.open(database).close()
+    for view in views:
+        options = pycolmap.ImageReaderOptions()
+        options.camera_model = view.camera.model_name
+        options.camera_params = ", ".join(repr(float(value)) for value in view.camera.params)
+        pycolmap.import_images(database, folder, pycolmap.CameraMode.PER_IMAGE, [view.view], options)
+    extract_features(database, folder, [view.view for view in views], settings, threads)
+    match_features(database, len(views), settings, seed, threads)
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as opened:
+        for view in views:
+            entry = opened.read_image_with_name(view.view)
+            model.add_camera_with_trivial_rig(opened.read_camera(entry.camera_id))
+            image = pycolmap.Image(name=view.view, camera_id=entry.camera_id, image_id=entry.image_id)
+            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.cam_from_source[:3]))
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+    options.min_num_matches = MIN_INLIERS
+    target = work / "triangulated"
+    target.mkdir()
+    model = pycolmap.triangulate_points(model, database, folder, target, options=options)
+    return sparse_points(model)
+
+
+def random_points(
+    views: Sequence[PosedView], seed: int
+) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
+    """Random points that cameras see, to start a fit where triangulation found none.
+
+    Each lies on the ray of a random pixel of a random view, at a depth between 0.3 and 2 times the
+    distance from the camera to the point nearest to all optical axes; grey.
+    """
+    generator = np.random.default_rng(seed)
+    centres = np.stack([view.centre for view in views])
+    looks = np.stack([view.cam_from_source[2, :3] for view in views])
+    # Least squares for the point nearest to all axes, with a weak pull to one camera spread ahead.
+    spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()) or 1.0
+    across = np.eye(3)[None] - looks[:, :, None] * looks[:, None, :]
+    prior = 1e-3
+    ahead = (centres + spread * looks).mean(axis=0)
+    focus = np.linalg.solve(
+        across.mean(axis=0) + prior * np.eye(3),
+        np.einsum("vij,vj->i", across, centres) / len(views) + prior * ahead,
+    )
+    rows = generator.integers(len(views), size=NUM_RANDOM_POINTS)
+    depth = np.maximum(np.linalg.norm(centres - focus, axis=1), 1e-3 * spread)[rows]
+    depth = depth * generator.uniform(0.3, 2.0, NUM_RANDOM_POINTS)
+    xyz = np.empty((NUM_RANDOM_POINTS, 3))
+    for row, view in enumerate(views):
+        chosen = rows == row
+        pixels = generator.random((int(chosen.sum()), 2)) * [view.camera.width, view.camera.height]
+        K = view.camera.calibration_matrix()
+        rays = np.concatenate([(pixels - K[:2, 2]) / np.diag(K)[:2], np.ones((len(pixels), 1))], axis=1)
+        xyz[chosen] = centres[row] + (rays * depth[chosen, None]) @ view.cam_from_source[:3, :3]
+    return xyz, np.full(xyz.shape, 128, dtype=np.uint8)

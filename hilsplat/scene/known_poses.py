@@ -1,0 +1,83 @@
+"""Where a folder keeps known poses, and what each view of it is."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from hilsplat.base.errors import SceneError
+from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.llff import POSES_BOUNDS
+
+MODEL_FOLDERS = ("sparse/0", "sparse")
+MODEL_FILES = ("cameras", "images", "points3D")
+TRANSFORMS = ("transforms.json", "transforms_train.json")
+
+
+@dataclass(frozen=True)
+class KnownPoses:
+    """Where a folder keeps its poses.
+
+    Attributes:
+        root: the folder.
+        kind: "colmap", "transforms" or "llff".
+        files: the model folder, the transforms files (training first, then testing), or LLFF's file.
+    """
+
+    root: Path
+    kind: str
+    files: tuple[Path, ...]
+
+
+@dataclass(frozen=True)
+class KnownView:
+    """One posed view as its source describes it, before its image was read.
+
+    Attributes:
+        name: name in the source.
+        image: its file; None where it is missing.
+        camera: its lens, for the size that the source states.
+        cam_from_source: world-to-camera transform, OpenCV axes.
+        is_test: the source holds it out for testing.
+    """
+
+    name: str
+    image: Path | None
+    camera: pycolmap.Camera
+    cam_from_source: Float64[np.ndarray, "4 4"]
+    is_test: bool = False
+
+
+def find_known_poses(folder: Path) -> KnownPoses | None:
+    """Look for a COLMAP model, transforms files, LLFF's file, in this order; None where there is none.
+
+    Raises:
+        SceneError: there is a `sparse/` folder without a complete model in it.
+    """
+    folder = Path(folder)
+    for place in MODEL_FOLDERS:
+        if _is_model(folder / place):
+            return KnownPoses(folder, "colmap", (folder / place,))
+    for name in TRANSFORMS:
+        if (folder / name).is_file():
+            files = [folder / name]
+            if name == "transforms_train.json" and (folder / "transforms_test.json").is_file():
+                files.append(folder / "transforms_test.json")
+            return KnownPoses(folder, "transforms", tuple(files))
+    if (folder / POSES_BOUNDS).is_file():
+        return KnownPoses(folder, "llff", (folder / POSES_BOUNDS,))
+    if (folder / "sparse").is_dir():
+        raise SceneError(
+            f"{folder / 'sparse'} holds no complete COLMAP model",
+            expected="cameras, images and points3D, all .bin or all .txt, in sparse/0/ or sparse/",
+            found=", ".join(sorted(path.name for path in (folder / "sparse").rglob("*"))) or "nothing",
+            fix="complete the model, or rename sparse/ to have the poses computed",
+        )
+    return None
+
+
+def _is_model(folder: Path) -> bool:
+    return any(
+        all((folder / f"{name}{suffix}").is_file() for name in MODEL_FILES) for suffix in (".bin", ".txt")
+    )

@@ -1,0 +1,201 @@
+"""Read posed views: COLMAP models, transforms.json (nerfstudio, Blender), poses_bounds.npy (LLFF)."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from hilsplat.base.errors import SceneError
+from hilsplat.base.files import IMAGE_SUFFIXES, list_images
+from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.known_poses import KnownPoses, KnownView
+from hilsplat.scene.llff import llff_views
+from hilsplat.scene.model import pose_matrix, reprojection_errors, sparse_points
+
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def known_views(known: KnownPoses) -> list[KnownView]:
+    """Posed views of a folder, whatever it keeps them in.
+
+    Raises:
+        SceneError: they cannot be read.
+    """
+    if known.kind == "colmap":
+        return read_colmap(known)[0]
+    if known.kind == "transforms":
+        return read_transforms(known)[0]
+    folder = known.root / "images"
+    images = list_images(folder if folder.is_dir() else known.root)
+    return [
+        KnownView(image.name, image, camera, pose)
+        for image, camera, pose in llff_views(known.files[0], images)
+    ]
+
+
+def read_colmap(
+    known: KnownPoses,
+) -> tuple[list[KnownView], tuple[np.ndarray, np.ndarray], dict[str, dict[str, Any]]]:
+    """Read a COLMAP model: views, points, and observations and reprojection error per view.
+
+    Raises:
+        SceneError: the model cannot be read.
+    """
+    folder = known.files[0]
+    try:
+        model = pycolmap.Reconstruction(folder)
+    except (ValueError, RuntimeError, IndexError) as error:
+        raise SceneError(
+            f"the COLMAP model in {folder} cannot be read: {error}", fix="export it again with COLMAP"
+        ) from error
+    views = []
+    for image_id in sorted(model.reg_image_ids(), key=lambda row: model.images[row].name):
+        image = model.images[image_id]
+        views.append(
+            KnownView(
+                image.name,
+                _find_image(known.root, image.name),
+                pycolmap.Camera(image.camera.todict()),
+                pose_matrix(image.cam_from_world()),
+            )
+        )
+    errors = {
+        name: {
+            "observations": len(of_view),
+            "reprojection_error_px": round(float(of_view.mean()), 4) if len(of_view) else None,
+        }
+        for name, of_view in reprojection_errors(model).items()
+    }
+    return views, sparse_points(model), errors
+
+
+def _find_image(root: Path, name: str) -> Path | None:
+    """File of an image named in a source: as named, or with a suffix, in the folder or its images/."""
+    for base in (root / "images", root):
+        candidate = base / name
+        if candidate.is_file():
+            return candidate
+        for suffix in sorted(IMAGE_SUFFIXES):
+            if (with_suffix := candidate.with_name(candidate.name + suffix)).is_file():
+                return with_suffix
+    return None
+
+
+def read_transforms(
+    known: KnownPoses,
+) -> tuple[list[KnownView], tuple[np.ndarray, np.ndarray] | None]:
+    """Read transforms files: camera-to-world in OpenGL axes, intrinsics for all or per frame.
+
+    Returns the views and, where the file names a `ply_file_path`, its points.
+
+    Raises:
+        SceneError: a file is no JSON, or a key is missing or unusable.
+    """
+    views: list[KnownView] = []
+    points = None
+    for file in known.files:
+        try:
+            content = json.loads(file.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise SceneError(f"{file} is not valid JSON: {error}", fix="export it again") from error
+        if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
+            raise SceneError(f"{file} has no list `frames`", fix="export it again")
+        for number, frame in enumerate(content["frames"]):
+            views.append(_read_frame(known, file, number, {**content, **frame}))
+        if points is None and isinstance(content.get("ply_file_path"), str):
+            points = _read_ply_points(known.root / content["ply_file_path"])
+    return views, points
+
+
+def _read_frame(known: KnownPoses, file: Path, number: int, frame: Mapping[str, Any]) -> KnownView:
+    """One frame of a transforms file; its own keys come before those of the whole file."""
+    where = f"{file}, frame {number}"
+    try:
+        name = str(frame["file_path"]).removeprefix("./")
+        source_from_cam = np.array(frame["transform_matrix"], dtype=np.float64)
+    except (KeyError, ValueError, TypeError) as error:
+        raise SceneError(
+            f"{where}: file_path or transform_matrix cannot be used: {error!r}", fix="export it again"
+        ) from error
+    rotation = source_from_cam[:3, :3] if source_from_cam.shape in ((4, 4), (3, 4)) else np.zeros((3, 3))
+    if not np.isfinite(source_from_cam).all() or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
+        raise SceneError(
+            f"{where} ({name}): transform_matrix is no rigid pose",
+            expected="a 4 x 4 camera-to-world matrix with a rotation in it",
+            found=f"shape {source_from_cam.shape}",
+            fix="export it again without scaling the cameras",
+        )
+    pose = np.eye(4)
+    pose[:3] = source_from_cam[:3]
+    image = _find_image(known.root, name)
+    camera = _frame_camera(where, frame, image)
+    is_test = file.name == "transforms_test.json"
+    return KnownView(name, image, camera, np.linalg.inv(pose @ OPENGL_TO_OPENCV), is_test)
+
+
+def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> pycolmap.Camera:
+    """The lens of a frame: PINHOLE, or OPENCV where it has distortion (k1, k2, p1, p2)."""
+    try:
+        width, height = frame.get("w"), frame.get("h")
+        if width is None or height is None:
+            if image is None:
+                width = height = 2  # never used: the view has no image and is left out
+            else:
+                with Image.open(image) as opened:
+                    width, height = opened.size
+        width, height = int(width), int(height)
+        if "fl_x" in frame:
+            focal_x = float(frame["fl_x"])
+        else:
+            focal_x = width / 2 / math.tan(float(frame["camera_angle_x"]) / 2)
+        focal_y = float(frame.get("fl_y", focal_x))
+        centre = [float(frame.get("cx", width / 2)), float(frame.get("cy", height / 2))]
+        lens = [float(frame.get(key, 0.0)) for key in ("k1", "k2", "p1", "p2")]
+        further = [float(frame.get(key, 0.0)) for key in ("k3", "k4")]
+    except KeyError as error:
+        raise SceneError(
+            f"{where} has no focal length",
+            expected="fl_x (px) or camera_angle_x (radian)",
+            fix="export it again",
+        ) from error
+    except (TypeError, ValueError, OSError) as error:
+        raise SceneError(f"{where}: intrinsics cannot be used: {error}", fix="export it again") from error
+    model = str(frame.get("camera_model", "OPENCV"))
+    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE") or any(further):
+        raise SceneError(
+            f"{where}: lens {model} with k3, k4 = {further} is not supported",
+            expected="PINHOLE or OPENCV with k1, k2, p1, p2",
+            fix="undistort the images first",
+        )
+    if not (focal_x > 0 and focal_y > 0 and width > 0 and height > 0):
+        raise SceneError(f"{where}: focal length and size must be positive", fix="export it again")
+    params = [focal_x, focal_y, *centre]
+    return pycolmap.Camera(
+        model="OPENCV" if any(lens) else "PINHOLE",
+        width=width,
+        height=height,
+        params=[*params, *lens] if any(lens) else params,
+    )
+
+
+def _read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Points and colours of a PLY file (grey where it has no colours)."""
+    from plyfile import PlyData, PlyParseError
+
+    try:
+        vertex = PlyData.read(path)["vertex"].data
+        xyz = np.stack([vertex[axis] for axis in ("x", "y", "z")], axis=1).astype(np.float64)
+    except (OSError, PlyParseError, KeyError, ValueError) as error:
+        raise SceneError(
+            f"the points of {path} cannot be read: {error}",
+            fix="put the file there, or remove ply_file_path from the file to have points computed",
+        ) from error
+    if {"red", "green", "blue"} <= set(vertex.dtype.names):
+        rgb = np.stack([vertex[colour] for colour in ("red", "green", "blue")], axis=1).astype(np.uint8)
+    else:
+        rgb = np.full(xyz.shape, 128, dtype=np.uint8)
+    return xyz, rgb
