@@ -3,8 +3,6 @@
 Times differ from run to run and stand apart from `scores.csv`, whose bytes must not change.
 """
 
-import csv
-import io
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -12,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hilsplat.base.artifacts import read_json, write_text
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.artifacts import read_json
 from hilsplat.base.provenance import provenance_path
+from hilsplat.base.tables import read_csv, write_csv
 from hilsplat.evaluate.efficiency import Job, read_benchmark
 
 if TYPE_CHECKING:
@@ -85,12 +83,8 @@ def time_queries(
 
 def write_times(scores: Path, dataset: str, scene: str, variant: str, seconds: Mapping[str, float]) -> None:
     """Write `times.csv` beside a score file."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(TIME_COLUMNS)
-    for method, value in sorted(seconds.items()):
-        writer.writerow([dataset, scene, variant, method, f"{value:.4f}"])
-    write_text(times_path(scores), stream.getvalue())
+    rows = [[dataset, scene, variant, method, f"{value:.4f}"] for method, value in sorted(seconds.items())]
+    write_csv(times_path(scores), TIME_COLUMNS, rows)
 
 
 def read_times(scores: Path) -> list[dict[str, str]]:
@@ -99,21 +93,7 @@ def read_times(scores: Path) -> list[dict[str, str]]:
     Raises:
         ArtifactError: the file is missing or has other columns.
     """
-    path = times_path(scores)
-    try:
-        with path.open(encoding="utf-8", newline="") as stream:
-            reader = csv.DictReader(stream)
-            rows = list(reader)
-    except FileNotFoundError as error:
-        raise ArtifactError(f"{path} is missing", fix="run the evaluate stage again") from error
-    if tuple(reader.fieldnames or ()) != TIME_COLUMNS:
-        raise ArtifactError(
-            f"{path} has other columns",
-            expected=", ".join(TIME_COLUMNS),
-            found=", ".join(reader.fieldnames or ()),
-            fix="delete it and run evaluate again",
-        )
-    return rows
+    return read_csv(times_path(scores), TIME_COLUMNS, "run the evaluate stage again")
 
 
 def read_costs(scores: Iterable[Path]) -> list[Cost]:

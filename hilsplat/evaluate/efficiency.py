@@ -3,8 +3,6 @@
 Times differ from run to run, so this table stands apart from those that must not change.
 """
 
-import csv
-import io
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -12,6 +10,7 @@ from pathlib import Path
 
 from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import ArtifactError
+from hilsplat.base.tables import write_csv
 from hilsplat.configuration import SECTIONS
 
 STAGE_ORDER = tuple(SECTIONS)
@@ -60,13 +59,15 @@ def run_efficiency(results: Path, out: Path) -> str:
     jobs = [job for path in files for job in read_benchmark(path, Path(results))]
     jobs.sort(key=lambda job: (_order(job.stage), job.dataset, job.scene, job.variant))
     text = stage_table(jobs)
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(["stage", "dataset", "scene", "variant", "seconds", "cpu_seconds", "peak_mib"])
-    for job in jobs:
-        numbers = (f"{job.elapsed_s:.2f}", f"{job.cpu_s:.2f}", f"{job.peak_mib:.0f}")
-        writer.writerow([job.stage, job.dataset, job.scene, job.variant, *numbers])
-    write_text(Path(out), stream.getvalue())
+    columns = ("stage", "dataset", "scene", "variant", "seconds", "cpu_seconds", "peak_mib")
+    rows = [
+        [
+            *(job.stage, job.dataset, job.scene, job.variant),
+            *(f"{job.elapsed_s:.2f}", f"{job.cpu_s:.2f}", f"{job.peak_mib:.0f}"),
+        ]
+        for job in jobs
+    ]
+    write_csv(Path(out), columns, rows)
     write_text(Path(out).with_suffix(".md"), text)
     return text
 

@@ -1,7 +1,5 @@
 """How well the masks of a synthetic scene's views fit the true regions: a diagnostic, no table reads it."""
 
-import csv
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +10,11 @@ from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
-from hilsplat.base.artifacts import read_index, write_text
+from hilsplat.base.artifacts import read_index
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import stage_log, track
+from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.evaluate.pictures import grey, save_png_and_pdf, show
 from hilsplat.evaluate.stage import masks_label
@@ -98,13 +97,10 @@ def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, o
         }
         counts["views"] = len(fits)
         rows = [table_row(scene.name, masks_label(masks_folder), level, fits) for level in LEVELS]
-        stream = io.StringIO()
-        csv.writer(stream, lineterminator="\n").writerows([COLUMNS, *rows])
         figure = draw_fits(scene, truth, Path(masks_folder), fits, middling_and_worst(fits))
         save_png_and_pdf(figure, out)
-        write_text(Path(out).with_suffix(".csv"), stream.getvalue())
-    lines = ["| " + " | ".join(COLUMNS) + " |", "|---|---|---" + "|---:" * (len(COLUMNS) - 3) + "|"]
-    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
+        write_csv(Path(out).with_suffix(".csv"), COLUMNS, rows)
+    return markdown_table(COLUMNS, rows, 3)
 
 
 def table_row(scene: str, masks: str, level: Level, fits: Mapping[str, dict[Level, ViewFit]]) -> list[str]:

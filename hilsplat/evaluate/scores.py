@@ -1,14 +1,12 @@
 """Rows of `scores.csv`: one number each, in long form."""
 
-import csv
-import io
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import ArtifactError
+from hilsplat.base.tables import write_csv
 from hilsplat.evaluate.metrics.registry import METRICS
 from hilsplat.evaluate.protocols.cards import card_of
 
@@ -59,9 +57,6 @@ COLUMNS: tuple[str, ...] = tuple(field.name for field in fields(Score))
 
 def write_scores(path: Path, scores: Iterable[Score]) -> None:
     """Write rows, sorted, values with six decimals: the same rows give the same bytes."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(COLUMNS)
     rows = []
     for score in scores:
         assert score.metric in METRICS, score.metric
@@ -69,8 +64,7 @@ def write_scores(path: Path, scores: Iterable[Score]) -> None:
         row = asdict(score)
         row["value"] = f"{score.value:.6f}"
         rows.append([str(row[name]) for name in COLUMNS])
-    writer.writerows(sorted(rows))
-    write_text(path, stream.getvalue())
+    write_csv(path, COLUMNS, sorted(rows))
 
 
 def read_scores(paths: Iterable[Path]) -> "pd.DataFrame":

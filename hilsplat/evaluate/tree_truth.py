@@ -1,7 +1,5 @@
 """How well the 3D semantic tree matches the nodes of a synthetic world, counted in Gaussians."""
 
-import csv
-import io
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +9,8 @@ import scipy.sparse as sp
 from jaxtyping import Float, Int32
 from scipy.optimize import linear_sum_assignment
 
-from hilsplat.base.artifacts import write_text
 from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.language.contributions import normalised_weights
 from hilsplat.language.semantic_tree import SemanticTree
@@ -157,8 +155,5 @@ def run_tree_truth(
         [scene.name, level.label, *(str(v) if isinstance(v, int) else f"{v:.4f}" for v in vars(one).values())]
         for level, one in measured.items()
     ]
-    stream = io.StringIO()
-    csv.writer(stream, lineterminator="\n").writerows([COLUMNS, *rows])
-    write_text(out, stream.getvalue())
-    lines = ["| " + " | ".join(COLUMNS) + " |", "|---|---" + "|---:" * (len(COLUMNS) - 2) + "|"]
-    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
+    write_csv(out, COLUMNS, rows)
+    return markdown_table(COLUMNS, rows, 2)

@@ -1,7 +1,5 @@
 """View consistency of masks on a synthetic scene, measured with its exact geometry."""
 
-import csv
-import io
 import logging
 from functools import lru_cache
 from pathlib import Path
@@ -9,9 +7,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from hilsplat.base.artifacts import read_index, write_text
+from hilsplat.base.artifacts import read_index
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.evaluate.consistency import Agreement, measure_consistency, neighbours
 from hilsplat.evaluate.stage import masks_label
@@ -90,13 +89,8 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
     ):
         measured = measure_consistency(cameras, pairs, depth_of, source)
         rows += [_row(index["scene"], name, level, measured[level]) for level in LEVELS]
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerows([COLUMNS, *rows])
-    write_text(out, stream.getvalue())
-    lines = ["| " + " | ".join(COLUMNS) + " |", "|---|---|---" + "|---:" * (len(COLUMNS) - 3) + "|"]
-    lines += ["| " + " | ".join(row) + " |" for row in rows]
-    return "\n".join(lines)
+    write_csv(out, COLUMNS, rows)
+    return markdown_table(COLUMNS, rows, 3)
 
 
 def true_masks(annotations: HierarchyAnnotations, view: str, level: Level) -> Bool[np.ndarray, "M H W"]:

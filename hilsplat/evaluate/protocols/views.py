@@ -13,7 +13,7 @@ A path holds one more piece of information than a flat query and is not the pape
 or empty prediction counts 0.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -118,6 +118,11 @@ def measure_view(
         masks: keeps the answers, for what is measured between views.
     """
     masks = PackedMasks(size_hw) if masks is None else masks
+    rule = rule_of(settings)
+
+    def select(text: str, level: Level | None) -> np.ndarray:
+        return selections.mask(view, selections.text(text, level), size_hw)
+
     texts = [query.text for query in truth.categories]
     per_chunk = max(1, int(RELEVANCY_CHUNK_MIB * 2**20 / (2 * 3 * 4 * size_hw[0] * size_hw[1])))
     for start in range(0, len(texts), per_chunk):
@@ -129,14 +134,26 @@ def measure_view(
             category = truth.categories[start + row]
             queries = [query for query in truth.queries if query.text == text]
             if fields is not None:
-                yield from _field_rows(fields[row], category, queries, settings, masks)
+                smoothed = SmoothedRelevancy.of(fields[row], rule)
+                yield from _answer_rows(
+                    "field",
+                    LERF_LANGSPLAT,
+                    smoothed,
+                    lambda _, level, smoothed=smoothed: relevancy_mask(smoothed, level, rule)[0],
+                    category,
+                    queries,
+                    settings,
+                    masks,
+                )
                 if also is not None:
                     yield from also.add("field", fields[row], None, category, queries)
             if nodes is not None and "tree" in settings.methods:
-                yield from _tree_rows(nodes[row], category, queries, settings, selections, view, masks)
+                smoothed = SmoothedRelevancy.of(nodes[row], rule)
+                yield from _answer_rows(
+                    "tree", TREE_NODES, smoothed, select, category, queries, settings, masks
+                )
                 if also is not None:
-                    answer = selections.mask(view, selections.text(text, None), size_hw)
-                    yield from also.add("tree", nodes[row], answer, category, queries)
+                    yield from also.add("tree", nodes[row], select(text, None), category, queries)
             if nodes is not None and "tree-path" in settings.methods:
                 yield from _path_rows(nodes[row], queries, settings, selections, view, masks)
     if also is not None:
@@ -155,54 +172,40 @@ def _best_row(method: str, query: Query, protocol: str, mixed: np.ndarray) -> Me
     return Measured(method, query.text, level.label, "best_threshold_iou", protocol, value)
 
 
-def _field_rows(
-    relevancy: np.ndarray,
+def _answer_rows(
+    method: str,
+    flat: ProtocolCard,
+    smoothed: SmoothedRelevancy,
+    answer: Callable[[str, Level | None], np.ndarray],
     category: Query,
     queries: Sequence[Query],
     settings: EvaluateSettings,
     masks: PackedMasks,
 ) -> Iterator[Measured]:
-    flat, given, auto = (
-        label_of(card, "field", settings) for card in (LERF_LANGSPLAT, LEVEL_GIVEN, LEVEL_AUTO)
-    )
-    rule = rule_of(settings)
-    smoothed = SmoothedRelevancy.of(relevancy, rule)
-    auto_mask, _ = relevancy_mask(smoothed, None, rule)
-    auto_points, _ = peak_points(smoothed.filtered, None)
-    yield from mask_rows("field", category, flat, auto_mask, auto_points)
-    masks.put(("field", auto, category.text), auto_mask)
-    for query in queries:
-        given_mask, _ = relevancy_mask(smoothed, query.level, rule)
-        given_points, _ = peak_points(smoothed.filtered, query.level)
-        yield from mask_rows("field", query, given, given_mask, given_points)
-        yield from mask_rows("field", query, auto, auto_mask, auto_points)
-        yield _best_row("field", query, given, smoothed.mixed)
-        masks.put(given_key("field", query, settings), given_mask)
+    """Rows of one text by field or tree.
 
-
-def _tree_rows(
-    relevancy: np.ndarray,
-    category: Query,
-    queries: Sequence[Query],
-    settings: EvaluateSettings,
-    selections: Selections,
-    view: str,
-    masks: PackedMasks,
-) -> Iterator[Measured]:
-    nodes, given, auto = (label_of(card, "tree", settings) for card in (TREE_NODES, LEVEL_GIVEN, LEVEL_AUTO))
-    smoothed = SmoothedRelevancy.of(relevancy, rule_of(settings))
-    size_hw = masks.size_hw
-    auto_mask = selections.mask(view, selections.text(category.text, None), size_hw)
+    Args:
+        method: "field" or "tree".
+        flat: protocol of texts whose levels are united.
+        smoothed: the text's relevancy.
+        answer: (text, level or None for automatic) -> mask.
+        category: the text with all levels united.
+        queries: the same per level.
+        settings: as in `measure_view`.
+        masks: keeps the answers.
+    """
+    united, given, auto = (label_of(card, method, settings) for card in (flat, LEVEL_GIVEN, LEVEL_AUTO))
+    auto_mask = answer(category.text, None)
     auto_points, _ = peak_points(smoothed.filtered, None)
-    yield from mask_rows("tree", category, nodes, auto_mask, auto_points)
-    masks.put(("tree", auto, category.text), auto_mask)
+    yield from mask_rows(method, category, united, auto_mask, auto_points)
+    masks.put((method, auto, category.text), auto_mask)
     for query in queries:
-        given_mask = selections.mask(view, selections.text(query.text, query.level), size_hw)
+        given_mask = answer(query.text, query.level)
         given_points, _ = peak_points(smoothed.filtered, query.level)
-        yield from mask_rows("tree", query, given, given_mask, given_points)
-        yield from mask_rows("tree", query, auto, auto_mask, auto_points)
-        yield _best_row("tree", query, given, smoothed.mixed)
-        masks.put(given_key("tree", query, settings), given_mask)
+        yield from mask_rows(method, query, given, given_mask, given_points)
+        yield from mask_rows(method, query, auto, auto_mask, auto_points)
+        yield _best_row(method, query, given, smoothed.mixed)
+        masks.put(given_key(method, query, settings), given_mask)
 
 
 def _path_rows(

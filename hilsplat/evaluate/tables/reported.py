@@ -1,10 +1,9 @@
 """The paper's own rows, as `config/published/` transcribes them."""
 
-import csv
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.tables import read_csv
 from hilsplat.evaluate.tables.rows import Block, Cell, Row
 
 PUBLISHED_COLUMNS = ("method", "family", "column", "value", "note")
@@ -16,19 +15,7 @@ def read_published(path: Path) -> list[dict[str, str]]:
     Raises:
         ArtifactError: the file is missing or has other columns.
     """
-    try:
-        with Path(path).open(encoding="utf-8", newline="") as stream:
-            reader = csv.DictReader(stream)
-            rows = list(reader)
-    except FileNotFoundError as error:
-        raise ArtifactError(f"{path} is missing", fix="restore it from the repository") from error
-    if tuple(reader.fieldnames or ()) != PUBLISHED_COLUMNS:
-        raise ArtifactError(
-            f"{path} has other columns",
-            expected=", ".join(PUBLISHED_COLUMNS),
-            found=", ".join(reader.fieldnames or ()),
-        )
-    return rows
+    return read_csv(path, PUBLISHED_COLUMNS, "restore it from the repository")
 
 
 def reported_block(

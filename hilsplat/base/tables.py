@@ -1,0 +1,50 @@
+"""Small tables: CSV files with known columns, and the same as Markdown."""
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from hilsplat.base.artifacts import write_text
+from hilsplat.base.errors import ArtifactError
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write a header and rows; the same rows give the same bytes."""
+    stream = io.StringIO()
+    csv.writer(stream, lineterminator="\n").writerows([columns, *rows])
+    write_text(path, stream.getvalue())
+
+
+def read_csv(path: Path, columns: Sequence[str], fix: str) -> list[dict[str, str]]:
+    """Rows of a CSV file by column.
+
+    Args:
+        path: the file.
+        columns: that it must have, in their order.
+        fix: what to do where the file is missing or another one.
+
+    Raises:
+        ArtifactError: the file is missing or has other columns.
+    """
+    try:
+        with Path(path).open(encoding="utf-8", newline="") as stream:
+            reader = csv.DictReader(stream)
+            rows = list(reader)
+    except FileNotFoundError as error:
+        raise ArtifactError(f"{path} is missing", fix=fix) from error
+    if tuple(reader.fieldnames or ()) != tuple(columns):
+        raise ArtifactError(
+            f"{path} has other columns",
+            expected=", ".join(columns),
+            found=", ".join(reader.fieldnames or ()),
+            fix=fix,
+        )
+    return rows
+
+
+def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[object]], words: int) -> str:
+    """A table as Markdown; the first `words` columns are words, the others numbers."""
+    numbers = len(columns) - words
+    lines = [columns, ["---"] * words + ["---:"] * numbers, *rows]
+    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
