@@ -11,6 +11,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +150,29 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
         raise ArtifactError(
             f"{path} cannot be read: {error}", fix="delete it and run its stage again"
         ) from error
+
+
+def read_into(maker: Callable[..., Any], path: Path, **more: Any) -> Any:
+    """Make something of the arrays of an .npz, by name.
+
+    Args:
+        maker: a dataclass; its fields are the arrays and `more`.
+        path: the file.
+        more: fields that are not in the file.
+
+    Raises:
+        ArtifactError: the file is missing or damaged, or another version of the program wrote it.
+    """
+    arrays = read_npz(path)
+    expected = {field.name for field in fields(maker) if field.init} - set(more)
+    if set(arrays) != expected:
+        raise ArtifactError(
+            f"{path} is of another version",
+            expected=", ".join(sorted(expected)),
+            found=", ".join(sorted(arrays)),
+            fix="run its stage again",
+        )
+    return maker(**arrays, **more)
 
 
 def write_npy(path: Path, array: np.ndarray) -> None:

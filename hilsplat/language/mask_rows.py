@@ -7,7 +7,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float32, Int32, Int64, UInt8
 
-from hilsplat.base.artifacts import read_index, read_npy, read_npz
+from hilsplat.base.artifacts import read_index, read_into, read_npy
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.language.quadratic import Quadratic, load_quadratic
@@ -70,15 +70,20 @@ class Contributions:
 
     @staticmethod
     def load(folder: Path) -> "Contributions":
-        """Read the rows of a finished contributions folder."""
+        """Read the rows of a finished contributions folder.
+
+        Raises:
+            ArtifactError: it is missing, damaged or of another version.
+        """
         folder = Path(folder)
         index = read_index(folder)
-        return Contributions(
-            folder,
-            tuple(index["views"]),
-            index["num_gaussians"],
-            index["gaussians_sha256"],
-            **read_npz(folder / "rows.npz"),
+        return read_into(
+            Contributions,
+            folder / "rows.npz",
+            folder=folder,
+            views=tuple(index["views"]),
+            num_gaussians=index["num_gaussians"],
+            gaussians_sha256=index["gaussians_sha256"],
         )
 
 

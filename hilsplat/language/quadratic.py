@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float32
 
-from hilsplat.base.artifacts import read_npz, write_npz
+from hilsplat.base.artifacts import read_into, read_npz, write_npz
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
 
@@ -122,7 +122,7 @@ def load_quadratic(folder: Path) -> Quadratic:
         ArtifactError: neither is there.
     """
     if (folder / "G.npz").is_file():
-        return Gram(**read_npz(folder / "G.npz"))
+        return read_into(Gram, folder / "G.npz")
     if (folder / "W.npz").is_file():
         arrays = read_npz(folder / "W.npz")
         shape = (len(arrays["indptr"]) - 1, int(arrays["columns"][0]))

@@ -18,7 +18,7 @@ from hilsplat.base.artifacts import (
     INDEX,
     atomic_folder,
     read_index,
-    read_npz,
+    read_into,
     sha256_of_file,
     write_index,
     write_json,
@@ -104,11 +104,16 @@ class SemanticTree:
 
     @staticmethod
     def load(folder: Path) -> "SemanticTree":
-        """Read a finished semantic tree."""
+        """Read a finished semantic tree.
+
+        Raises:
+            ArtifactError: it is missing, damaged or of another version.
+        """
         folder = Path(folder)
         index = read_index(folder)
-        return SemanticTree(
-            **read_npz(folder / "tree.npz"),
+        return read_into(
+            SemanticTree,
+            folder / "tree.npz",
             view_names=tuple(index["views"]),
             gaussians_sha256=index["gaussians_sha256"],
         )

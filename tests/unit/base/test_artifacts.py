@@ -1,6 +1,7 @@
 """Files are whole or absent; digests and caches follow content."""
 
 import errno
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -96,3 +97,17 @@ def test_folder_digest_follows_names_and_bytes(tmp_path: Path) -> None:
     first = artifacts.sha256_of_path(folder)
     (folder / "a").rename(folder / "b")
     assert artifacts.sha256_of_path(folder) != first
+
+
+def test_arrays_of_another_version_are_told_from_ours(tmp_path):
+    @dataclass
+    class Pair:
+        left: np.ndarray
+        right: np.ndarray
+        name: str
+
+    artifacts.write_npz(tmp_path / "old.npz", left=np.zeros(2), middle=np.ones(1))
+    with pytest.raises(ArtifactError, match=r"another version(.|\n)*left, right(.|\n)*left, middle"):
+        artifacts.read_into(Pair, tmp_path / "old.npz", name="a")
+    artifacts.write_npz(tmp_path / "new.npz", left=np.zeros(2), right=np.ones(1))
+    assert artifacts.read_into(Pair, tmp_path / "new.npz", name="a").name == "a"
