@@ -9,6 +9,8 @@ from hilsplat.base.levels import Level
 from hilsplat.datasets import replica, scannet, waymo
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.datasets.point_files import read_ply
+from hilsplat.datasets.registry import open_labels
+from hilsplat.datasets.sources import export_images
 from hilsplat.datasets.world_labels import labelled_points
 from hilsplat.datasets.world_points import (
     LabelledMesh,
@@ -20,7 +22,11 @@ from hilsplat.datasets.world_points import (
     write_room_as_scannet,
     write_street_as_waymo,
 )
-from hilsplat.settings import WorldSettings
+from hilsplat.scene.importers import import_poses
+from hilsplat.scene.known_poses import find_known_poses
+from hilsplat.scene.scene import Scene
+from hilsplat.settings import GaussiansSettings, PosesSettings, WorldSettings
+from hilsplat.splat.fit import fit_gaussians
 from hilsplat.world.stage import run_world
 
 SETTINGS = WorldSettings(views=3, image_px=48, samples=1, objects=2)
@@ -61,6 +67,28 @@ def test_room_as_scannet_reads_back_equal(room, tmp_path):
         np.testing.assert_array_equal(scene.truth[labelling].class_id, expected)
     assert {1, 2, 8, 22} <= set(scene.truth["nyu40"].class_id.tolist())  # wall, floor, door, ceiling
     same_images(scene.images, posed_images(room))
+
+
+def test_gaussians_frozen_at_the_vertices_of_a_scan_are_its_points(room, tmp_path):
+    data, source = tmp_path / "data", tmp_path / "source"
+    write_room_as_scannet(room, data / "scannet", "scene0000_00")
+    assert export_images("scannet/scene0000_00", data, source) == 3
+    import_poses(
+        find_known_poses(source),
+        tmp_path / "scene",
+        tmp_path,
+        "scannet/scene0000_00",
+        "metre",
+        PosesSettings(test_every=0),
+        0,
+        1,
+    )
+    scene = Scene.load(tmp_path / "scene")
+    settings = GaussiansSettings(initial="frozen", iterations=2, max_gaussians=100)
+    gaussians, _ = fit_gaussians(scene, settings, seed=0)
+    truth = open_labels("scannet/scene0000_00", data).truth["nyu40"]
+    places = truth.xyz @ scene.scene_from_source[:3, :3].T + scene.scene_from_source[:3, 3]
+    np.testing.assert_allclose(gaussians.means.numpy(), places, atol=1e-5)
 
 
 def test_room_as_replica_reads_back_equal(room, tmp_path):
