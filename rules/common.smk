@@ -40,7 +40,9 @@ for name in RUN.variant_names():
     or_stop(require_method, RUN.stages(name).method.name)
 ALL_SCENES = or_stop(read_sheet, Path(RUN.scenes), RUN.groups, RUN.data_root)
 CHOSEN = or_stop(choose_scenes, ALL_SCENES, RUN.groups, RUN.only)
-if more := {row.group for row in CHOSEN} - set(RUN.groups):  # their sources are checked too
+if more := {row.group for row in CHOSEN} - set(
+    RUN.groups
+):  # their sources are checked too
     or_stop(read_sheet, Path(RUN.scenes), {*RUN.groups, *more}, RUN.data_root)
 ABSENT = {
     row.name: reason
@@ -323,11 +325,14 @@ def absent_of(table):
         reason = absence(row.source, RUN.data_root)
         place = published(row.source)
         if place and place[0] in TABLES[table].data and reason is not None:
-            told.setdefault((row.dataset, reason), []).append(row.scene)
-    return " ".join(
-        f"--absent {shlex.quote(f'{dataset} ({names(scenes)}): {reason}.')}"
-        for (dataset, reason), scenes in told.items()
-    )
+            told.setdefault(row.dataset, []).append((row.scene, reason))
+    sentences = []
+    for dataset, scenes in told.items():
+        reasons = {reason for _, reason in scenes}
+        others = "" if len(reasons) == 1 else " The others likewise, each with its own."
+        listed = names([scene for scene, _ in scenes])
+        sentences.append(f"{dataset} ({listed}): {scenes[0][1]}.{others}")
+    return " ".join(f"--absent {shlex.quote(sentence)}" for sentence in sentences)
 
 
 def names(scenes):
