@@ -155,7 +155,9 @@ class RunSettings(StageSettings):
     overrides: dict[str, dict[str, dict[str, Any]]] = knob(
         {}, "settings of a whole group or of one scene: group or dataset/scene -> section -> knob -> value"
     )
-    queries: dict[str, tuple[str, ...]] = knob({}, "texts shown in the panel of a scene without labels")
+    queries: dict[str, tuple[str, ...]] = knob(
+        {}, "texts shown in the panel of a scene without labels on images, by dataset/scene or by data set"
+    )
 
     def variant_names(self) -> list[str]:
         """Variants that a run needs, "default" first; with more than one seed each of them per seed."""

@@ -381,8 +381,10 @@ def figure_truth_of(wildcards):
 
 
 def queries_of(wildcards):
-    """Parameter: texts for the panel of a scene without labels, as JSON."""
-    return json.dumps(RUN.queries.get(f"{wildcards.dataset}/{wildcards.scene}", ()))
+    """Parameter: texts for the panel of a scene without labels on images, as JSON."""
+    of_dataset = RUN.queries.get(wildcards.dataset, ())
+    name = f"{wildcards.dataset}/{wildcards.scene}"
+    return json.dumps(RUN.queries.get(name, of_dataset))
 
 
 def truth_of(wildcards):
