@@ -329,7 +329,7 @@ def absent_of(table):
     sentences = []
     for dataset, scenes in told.items():
         reasons = {reason for _, reason in scenes}
-        others = "" if len(reasons) == 1 else " The others likewise, each with its own."
+        others = "" if len(reasons) == 1 else " The others cannot be read either."
         listed = names([scene for scene, _ in scenes])
         sentences.append(f"{dataset} ({listed}): {scenes[0][1]}.{others}")
     return " ".join(f"--absent {shlex.quote(sentence)}" for sentence in sentences)

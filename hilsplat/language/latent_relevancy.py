@@ -53,6 +53,7 @@ class LatentRelevancy:
         out = np.empty((len(texts), len(latents)), np.float32)
 
         def decode(span: slice) -> None:
+            torch.set_num_threads(1)  # holds for one thread of the pool; they share the cores already
             decoded = self._code.decode_array(np.ascontiguousarray(latents[span], np.float32))
             out[:, span] = relevancy(decoded, texts, self._canonical, self._scale)
 
@@ -114,8 +115,7 @@ class LatentRelevancy:
             for span in spans:
                 work(span)
             return
-        # The parts share the threads: torch keeps to one inside each of them.
-        with ThreadPoolExecutor(self._threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        with ThreadPoolExecutor(self._threads) as pool:
             list(pool.map(work, spans))
 
 

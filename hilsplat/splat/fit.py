@@ -60,7 +60,7 @@ def fit_step(
     rate = 0.0 if is_frozen else extent * means_rate(settings, progress)
     if settings.strategy == "mcmc" and not is_frozen:
         add_regularisers(state.adam, gradients, settings, extent)
-    elif state.step < int(settings.densify_until * settings.iterations):
+    elif not is_frozen and state.step < int(settings.densify_until * settings.iterations):
         state.gradients.add(gradients.means_px, seen.drawn, view.camera.size_hw)
     state.adam.step(gradients, settings, rate, threads)
     state.step += 1
