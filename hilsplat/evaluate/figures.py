@@ -25,12 +25,11 @@ from hilsplat.evaluate.pictures import (
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import rule_of
 from hilsplat.evaluate.scores import made_from_truth
-from hilsplat.evaluate.stage import masks_label
 from hilsplat.evaluate.truths import annotated_truths, labelled_truths
 from hilsplat.language.node_search import NodeHits
 from hilsplat.language.query import PATH_SEPARATOR, LanguageScene
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.masks import HierarchicalMasks, masks_label
 from hilsplat.segment.pictures import paint_level
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 

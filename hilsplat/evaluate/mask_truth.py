@@ -17,9 +17,8 @@ from hilsplat.base.progress import stage_log, track
 from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.evaluate.pictures import grey, save_png_and_pdf, show
-from hilsplat.evaluate.stage import masks_label
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.masks import HierarchicalMasks, masks_label
 from hilsplat.segment.overlaps import region_ious
 from hilsplat.segment.pictures import paint_level
 

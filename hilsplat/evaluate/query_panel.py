@@ -18,11 +18,11 @@ from hilsplat.evaluate.pictures import (
     show_from_above,
 )
 from hilsplat.evaluate.scores import made_from_truth
-from hilsplat.evaluate.stage import masks_label
 from hilsplat.language.finished import FinishedScene
 from hilsplat.language.hits import Hit
 from hilsplat.language.query import PATH_SEPARATOR, LanguageScene
 from hilsplat.language.tree_export import write_selection_ply
+from hilsplat.segment.masks import masks_label
 
 LISTED = 10
 """Answers told at most."""

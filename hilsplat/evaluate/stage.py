@@ -28,6 +28,7 @@ from hilsplat.evaluate.world_answers import measure_world_consistency
 from hilsplat.language.query import LanguageScene
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
+from hilsplat.segment.masks import masks_label
 from hilsplat.settings import EvaluateSettings
 
 logger = logging.getLogger(__name__)
@@ -227,15 +228,3 @@ def timed(
     return time_queries(
         answers, {name: ask for name, ask in asks.items() if name in settings.methods}, view, texts
     )
-
-
-def masks_label(masks_folder: Path) -> str:
-    """What made the masks, as rows name it.
-
-    The model folder's name, or the segmenter without one; masks made from true labels bring a label that
-    also tells their faults.
-    """
-    index = read_index(masks_folder)
-    if "label" in index:
-        return str(index["label"])
-    return Path(index["model"]).name if index["model"] else index["segmenter"]

@@ -13,9 +13,8 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.evaluate.consistency import Agreement, measure_consistency, neighbours
-from hilsplat.evaluate.stage import masks_label
 from hilsplat.scene.cameras import Cameras
-from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.masks import HierarchicalMasks, masks_label
 from hilsplat.world.mesh import TrueMesh
 
 logger = logging.getLogger(__name__)
