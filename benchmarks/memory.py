@@ -34,19 +34,19 @@ def _measure(num_gaussians: int, size_hw: tuple[int, int], channels: int) -> tup
         grad = np.ones((*size_hw, channels), np.float32), np.ones(size_hw, np.float32)
         # a first peak that is forgotten: the process begins with what it holds now
         Path("/proc/self/clear_refs").write_text("5")
-        before = _status_mib("VmRSS")
+        before = status_mib("VmRSS")
         view = project_gaussians(parameters, camera, 3, 1)
         values = np.concatenate([view.colours, features], axis=1) if channels > 3 else view.colours
         image, alpha = blend_forward(view, values, 1)
-        forward = _status_mib("VmHWM") - before
+        forward = status_mib("VmHWM") - before
         blend_gradients(parameters, view, values, image, alpha, *grad, 1)
-        return forward, _status_mib("VmHWM") - before
+        return forward, status_mib("VmHWM") - before
 
     passes(1000, (32, 32))  # loads the kernels
     return passes(num_gaussians, size_hw)
 
 
-def _status_mib(name: str) -> float:
+def status_mib(name: str) -> float:
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(f"{name}:"):
             return int(line.split()[1]) / 1024

@@ -1,0 +1,227 @@
+"""A scene of the size of a large capture, made up, and the time and memory of each stage of the method.
+
+    python -m benchmarks.large_scene /tmp/large                        # 1M Gaussians, 250 views of 986 x 728
+    python -m benchmarks.large_scene /tmp/small --gaussians 100000 --views 48 --width 800 --height 600
+
+makes a floor with 400 balls on it, a ring of cameras, masks of each view at three levels (balls, their
+halves, their eighths; the largest of each level) with a CLIP vector each, and then runs tree, contributions,
+semantic tree, autoencoder and field one after the other, each in a process of its own. What is there already
+is not made again; times and peaks are printed and written to `times.md`.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks.memory import status_mib
+from hilsplat.base.artifacts import atomic_folder, write_index, write_npy
+from hilsplat.base.levels import LEVELS
+from hilsplat.base.progress import track
+from hilsplat.base.tables import markdown_table
+from hilsplat.language.autoencoder import run_autoencoder
+from hilsplat.language.contributions import run_contributions
+from hilsplat.language.field import run_language
+from hilsplat.language.semantic_tree import run_semantic_tree
+from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.tree_stage import run_tree
+from hilsplat.settings import (
+    AutoencoderSettings,
+    ContributionsSettings,
+    LanguageSettings,
+    SemanticTreeSettings,
+    TreeSettings,
+)
+from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.ply import save_ply
+from hilsplat.splat.rasterise.api import pixel_weights
+
+ROWS = 20
+"""Balls stand in so many rows and columns, a metre apart."""
+RADIUS = 0.38
+CHANNELS = 512
+MIN_AREA_PX = 50
+STAGES = ("tree", "contributions", "semantic_tree", "autoencoder", "language")
+
+
+def made_gaussians(number: int) -> tuple[Gaussians, np.ndarray]:
+    """Balls (seven tenths of all) and floor; whose ball, half and eighth each is (N, 3), -1 on the floor."""
+    rng = np.random.default_rng(0)
+    on_balls = number * 7 // 10
+    ball = rng.integers(0, ROWS * ROWS, on_balls)
+    way = rng.normal(size=(on_balls, 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    centre = np.stack([ball % ROWS - ROWS / 2, ball // ROWS - ROWS / 2, np.full(on_balls, RADIUS)], axis=1)
+    on_floor = number - on_balls
+    place = rng.uniform(-ROWS * 0.6, ROWS * 0.6, (on_floor, 2))
+    floor = np.concatenate([place, np.zeros((on_floor, 1))], axis=1)
+    half = 2 * ball + (way[:, 2] > 0)
+    eighth = 4 * half + 2 * (way[:, 0] > 0) + (way[:, 1] > 0)
+    labels = np.full((number, len(LEVELS)), -1, np.int32)
+    labels[:on_balls] = np.stack([ball, half, eighth], axis=1)
+    spacing = np.sqrt((ROWS * ROWS * 4 * np.pi * RADIUS**2 + (1.2 * ROWS) ** 2) / number)
+    arrays = (
+        np.concatenate([centre + RADIUS * way, floor]),
+        np.log(spacing) + 0.4 * rng.normal(size=(number, 3)),
+        rng.normal(size=(number, 4)),
+        rng.normal(0.5, 1.5, size=number),
+        0.3 * rng.normal(size=(number, 1, 3)),
+    )
+    return Gaussians(*(torch.tensor(values, dtype=torch.float32) for values in arrays)), labels
+
+
+def ring_of_cameras(number: int, size_hw: tuple[int, int]) -> Cameras:
+    """Cameras at two heights round the balls, looking at points near the middle."""
+    rng = np.random.default_rng(1)
+    poses = np.tile(np.eye(4), (number, 1, 1))
+    for index in range(number):
+        angle = 2 * np.pi * index / number
+        at = np.array([np.cos(angle), np.sin(angle), 0]) * ROWS * 0.55 + [0, 0, (3.0, 5.5)[index % 2]]
+        forward = np.append(rng.uniform(-ROWS / 6, ROWS / 6, 2), 0) - at
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0, 0, 1])
+        right /= np.linalg.norm(right)
+        turn = np.stack([right, np.cross(forward, right), forward])
+        poses[index, :3, :3], poses[index, :3, 3] = turn, -turn @ at
+    focal = 0.9 * size_hw[1]
+    K = np.array([[focal, 0, size_hw[1] / 2], [0, focal, size_hw[0] / 2], [0, 0, 1]])
+    names = tuple(f"{index:04d}.png" for index in range(number))
+    return Cameras(names, poses, np.tile(K, (number, 1, 1)), np.tile(np.int32(size_hw), (number, 1)))
+
+
+def make(out: Path, number: int, views: int, size_hw: tuple[int, int], masks: int, threads: int) -> None:
+    """Write scene, Gaussians, masks and CLIP vectors."""
+    rng = np.random.default_rng(2)
+    gaussians, labels = made_gaussians(number)
+    save_ply(out / "gaussians.ply", gaussians)
+    cameras = ring_of_cameras(views, size_hw)
+    nothing = np.zeros((0, 3), np.float32)
+    with atomic_folder(out / "scene") as folder:
+        split = dict.fromkeys(cameras.names, "train")
+        Scene(
+            folder, "made/large", "metre", cameras, split, nothing, nothing.astype(np.uint8), np.eye(4)
+        ).save()
+    things = [rng.normal(size=(ROWS * ROWS * pieces, CHANNELS)) for pieces in (1, 2, 8)]
+    index_of_masks, index_of_clip, nonzeros = {}, {}, 0
+    with atomic_folder(out / "masks") as masks_folder, atomic_folder(out / "clip") as clip_folder:
+        for name in track(list(cameras.names), "masks of views"):
+            weights = pixel_weights(gaussians, cameras[name], min_weight=1 / 255, threads=threads)
+            nonzeros += weights.nnz
+            front = front_gaussian(weights)
+            dense, level, vectors = [], [], []
+            for which in LEVELS:
+                label = np.where(front >= 0, labels[front, which.index], -1)
+                area = np.bincount(label[label >= 0], minlength=len(things[which.index]))
+                kept = np.argsort(-area, kind="stable")[: masks // len(LEVELS)]
+                for thing in kept[area[kept] >= MIN_AREA_PX]:
+                    dense.append((label == thing).reshape(size_hw))
+                    level.append(which)
+                    vectors.append(things[which.index][thing] + 0.7 * rng.normal(size=CHANNELS))
+            ones = np.ones(len(dense), np.float32)
+            found = HierarchicalMasks.from_dense(np.stack(dense), np.array(level, np.uint8), ones, ones)
+            found.save(masks_folder / f"{name}.npz")
+            unit = np.stack(vectors)
+            unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+            write_npy(clip_folder / f"{name}.npy", unit.astype(np.float16))
+            index_of_masks[name] = {which.label: len(found.rows_of(which)) for which in LEVELS}
+            index_of_clip[name] = {"masks": len(found)}
+        print(f"{nonzeros / views / size_hw[0] / size_hw[1]:.1f} Gaussians a pixel")
+        write_index(masks_folder, index_of_masks, scene="made/large", segmenter="made", model="")
+        write_index(clip_folder, index_of_clip, scene="made/large", dim=CHANNELS, model="")
+
+
+def front_gaussian(weights) -> np.ndarray:
+    """The Gaussian of the largest weight of each pixel; -1 where there is none."""
+    front = np.full(weights.shape[0], -1, np.int64)
+    counts = np.diff(weights.indptr)
+    pixel = np.repeat(np.arange(len(counts)), counts)
+    order = np.lexsort((weights.data, pixel))
+    filled = counts > 0
+    front[filled] = weights.indices[order[weights.indptr[1:][filled] - 1]]
+    return front
+
+
+def stages(out: Path, threads: int) -> dict[str, Callable[[], None]]:
+    """What is timed."""
+    code = AutoencoderSettings(code="pca", latent=16)
+    return {
+        "tree": lambda: run_tree(out / "masks", out / "tree", TreeSettings()),
+        "contributions": lambda: run_contributions(
+            out / "scene",
+            out / "gaussians.ply",
+            out / "masks",
+            out / "contributions",
+            out / "cache",
+            ContributionsSettings(),
+            threads,
+        ),
+        "semantic_tree": lambda: run_semantic_tree(
+            out / "contributions",
+            out / "masks",
+            out / "clip",
+            out / "semantic_tree",
+            SemanticTreeSettings(),
+            threads,
+        ),
+        "autoencoder": lambda: run_autoencoder(
+            out / "clip", out / "semantic_tree", out / "contributions", out / "autoencoder", code, 0
+        ),
+        "language": lambda: run_language(
+            out / "contributions",
+            out / "tree",
+            out / "autoencoder",
+            out / "language.safetensors",
+            LanguageSettings(),
+            0,
+            threads,
+        ),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--gaussians", type=int, default=1_000_000)
+    parser.add_argument("--views", type=int, default=250)
+    parser.add_argument("--width", type=int, default=986)
+    parser.add_argument("--height", type=int, default=728)
+    parser.add_argument("--masks", type=int, default=300, help="of a view, all levels together")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--stage", choices=STAGES, help="run this one here and print seconds and MiB")
+    asked = parser.parse_args()
+    asked.out.mkdir(parents=True, exist_ok=True)
+    if asked.stage:
+        begun = time.perf_counter()
+        stages(asked.out, asked.threads)[asked.stage]()
+        print(f"{time.perf_counter() - begun:.1f} {status_mib('VmHWM'):.0f}")
+        return
+    if not (asked.out / "clip").exists():
+        size_hw = (asked.height, asked.width)
+        make(asked.out, asked.gaussians, asked.views, size_hw, asked.masks, asked.threads)
+    rows = []
+    for stage in STAGES:
+        command = [sys.executable, "-m", "benchmarks.large_scene", str(asked.out), "--stage", stage]
+        command += ["--threads", str(asked.threads)]
+        environment = {**os.environ, "NUMBA_NUM_THREADS": str(asked.threads)}
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=environment)
+        seconds, peak = done.stdout.split()[-2:]
+        rows.append((stage, seconds, peak))
+        print(*rows[-1], flush=True)
+    rows.append(
+        ("all", f"{sum(float(row[1]) for row in rows):.1f}", max((row[2] for row in rows), key=float))
+    )
+    table = markdown_table(("stage", "s", "peak MiB"), rows, 1)
+    (asked.out / "times.md").write_text(table + "\n")
+    print(table)
+
+
+if __name__ == "__main__":
+    main()
