@@ -46,7 +46,7 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 
 @cache
 def open_scene(code_name: str) -> LanguageScene:
-    """A scene whose field has three numbers (network) or eight (pca)."""
+    """A scene whose field has three numbers (network) or sixteen (pca)."""
     gaussians, camera = random_scene(200_000, SIZE_HW, sh_degree=0)
     rng = np.random.default_rng(0)
     place = gaussians.means.numpy() @ camera.K.T
@@ -65,7 +65,7 @@ def open_scene(code_name: str) -> LanguageScene:
     kinds = rng.normal(size=(40, CHANNELS))
     clip = unit(kinds[rng.integers(0, 40, first)] + 0.5 * rng.normal(size=(first, CHANNELS)))
     if code_name == "pca":
-        code = LinearCode.fit(clip, 8)
+        code = LinearCode.fit(clip, 16)
     else:
         settings = AutoencoderSettings(latent=3, epochs=1, min_steps=1000)
         code = train_autoencoder(clip, settings, 0)
@@ -195,7 +195,7 @@ LINKAGE = "evidence and linkage, 40 views, 3000 masks"
 
 def field_case(code: str) -> str:
     """Name of a case of the field."""
-    size = "d=3, network" if code == "network" else "d=8, pca"
+    size = "d=3, network" if code == "network" else "d=16, pca"
     return f"query on the field at three levels, {size}, 986x728"
 
 

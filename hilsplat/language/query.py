@@ -324,10 +324,11 @@ class LanguageScene:
         Args:
             texts: queries.
             view: name of the view.
-            exact: decode every pixel; else answer in latent space (see `latent_relevancy`): to rounding
-                for a linear code, within 2e-3 of it at all but few pixels for a network with d = 3.
+            exact: a network with d = 3 decodes every pixel; else it answers from a table, within 2e-3 of
+                that at all but few pixels (see `latent_relevancy`). Other codes have one way.
         """
-        shown, placed = self._view_latents(view), None if exact else self._placed_latents(view)
+        by_look_up = self._latent_relevancy.is_linear or not exact
+        shown, placed = self._view_latents(view), self._placed_latents(view) if by_look_up else None
         vectors = self.text_vectors(texts)
         answer = self._latent_relevancy
         height, width = self.scene.cameras[view].size_hw
@@ -335,7 +336,9 @@ class LanguageScene:
         for index, (pixels, latents) in enumerate(shown):
             if len(pixels):
                 found = (
-                    answer.exact(latents, vectors) if exact else answer.fast(latents, placed[index], vectors)
+                    answer.fast(latents, placed[index], vectors)
+                    if by_look_up
+                    else answer.exact(latents, vectors)
                 )
                 maps[:, index] = found.min(axis=1, keepdims=True)
                 maps[:, index, pixels] = found

@@ -82,15 +82,16 @@ class Project:
 
 
 def copy_project(source: Path, target: Path, *, results: bool) -> Project:
-    """Copy the project's own files and, where asked, results with Snakemake's records; times stay."""
+    """Copy the project's own files and, where asked, results with Snakemake's records; times stay.
+
+    Kernels that numba compiled go along: they hold as long as the time of their source does.
+    """
     target.mkdir(parents=True)
     parts = [*PARTS, *(["results", ".snakemake"] if results else [])]
     for part in parts:
         origin = source / part
         if origin.is_dir():
-            shutil.copytree(
-                origin, target / part, symlinks=True, ignore=shutil.ignore_patterns("__pycache__")
-            )
+            shutil.copytree(origin, target / part, symlinks=True, ignore=shutil.ignore_patterns("*.pyc"))
         elif origin.exists():
             shutil.copy2(origin, target / part)
     if not results:  # rows that somebody added to the sheet do not belong into tests

@@ -68,10 +68,11 @@ def test_cells_of_a_second_view_are_added(vectors, texts):
 def test_linear_codes_need_no_decoding(vectors, texts, latent):
     code = LinearCode.fit(vectors, latent)
     fast = LatentRelevancy(code, texts[:4], 10.0, code.encode_array(vectors))
-    latents = blends(code.encode_array(vectors), 500)
-    assert fast.fast(latents, fast.prepare(latents), texts[4:]) == pytest.approx(
-        fast.exact(latents, texts[4:]), abs=1e-5
-    )
+    latents = blends(code.encode_array(vectors), 70_000)  # more than one thread takes at a time
+    found = fast.fast(latents, fast.prepare(latents), texts[4:])
+    assert found == pytest.approx(fast.exact(latents, texts[4:]), abs=1e-5)
+    two = LatentRelevancy(code, texts[:4], 10.0, latents[:1], threads=2)
+    assert np.array_equal(two.fast(latents, two.prepare(latents), texts[4:]), found)
 
 
 def test_networks_of_other_sizes_are_decoded(vectors, texts):
