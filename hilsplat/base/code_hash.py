@@ -3,6 +3,8 @@
 import ast
 import functools
 import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from hilsplat.base.errors import HilsplatError
@@ -31,7 +33,7 @@ def code_hash(*modules: str, root: Path = ROOT) -> str:
     digest = hashlib.sha256()
     for module in import_closure(*modules, root=root):
         digest.update(module.encode())
-        digest.update(_module_dump(_module_path(module, root)).encode())
+        digest.update(_facts(_module_path(module, root)).dump)
     return digest.hexdigest()[:16]
 
 
@@ -49,7 +51,7 @@ def import_closure(*modules: str, root: Path = ROOT) -> list[str]:
         seen.add(module)
         parents = module.split(".")[:-1]
         waiting += [".".join(parents[: depth + 1]) for depth in range(len(parents))]
-        waiting += _imports(module, path, root)
+        waiting += _imports(module, root)
     return sorted(seen)
 
 
@@ -65,32 +67,45 @@ def _module_path(module: str, root: Path) -> Path | None:
 
 
 @functools.cache
-def _tree(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
-
-
-def _imports(module: str, path: Path, root: Path) -> list[str]:
+def _imports(module: str, root: Path) -> tuple[str, ...]:
     """Package modules that one module's import statements name."""
+    path = _module_path(module, root)
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     names: list[str] = []
-    for node in ast.walk(_tree(path)):
+    for node in _facts(path).imports:
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            base = node.module or ""
-            if node.level:
-                parent = package.split(".")[: len(package.split(".")) - node.level + 1]
-                base = ".".join([*parent, *([base] if base else [])])
-            names.append(base)
-            names += [f"{base}.{alias.name}" for alias in node.names]
-    return [name for name in names if _module_path(name, root) is not None]
+            continue
+        base = node.module or ""
+        if node.level:
+            parent = package.split(".")[: len(package.split(".")) - node.level + 1]
+            base = ".".join([*parent, *([base] if base else [])])
+        names.append(base)
+        names += [f"{base}.{alias.name}" for alias in node.names]
+    return tuple(name for name in names if _module_path(name, root) is not None)
+
+
+@dataclass(frozen=True)
+class _Facts:
+    """What counts of a file.
+
+    Attributes:
+        imports: its import statements, also those inside functions.
+        dump: its syntax tree without docstrings, as text.
+    """
+
+    imports: tuple[ast.Import | ast.ImportFrom, ...]
+    dump: bytes
 
 
 @functools.cache
-def _module_dump(path: Path) -> str:
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+def _facts(path: Path) -> _Facts:
+    tree = ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+    imports = []
+    for node in _statements(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            imports.append(node)
+        elif isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             first = node.body[0] if node.body else None
             if (
                 isinstance(first, ast.Expr)
@@ -98,4 +113,14 @@ def _module_dump(path: Path) -> str:
                 and isinstance(first.value.value, str)
             ):
                 node.body = node.body[1:] or [ast.Pass()]
-    return ast.dump(tree)
+    return _Facts(tuple(imports), ast.dump(tree).encode())
+
+
+def _statements(tree: ast.Module) -> Iterator[ast.AST]:
+    """The module and all statements in it; what they are made of holds no statement but in their blocks."""
+    waiting: list[ast.AST] = [tree]
+    while waiting:
+        node = waiting.pop()
+        yield node
+        for block in ("body", "orelse", "finalbody", "handlers", "cases"):
+            waiting += getattr(node, block, ())
