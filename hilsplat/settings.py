@@ -284,9 +284,9 @@ class AutoencoderSettings(Section):
     """Scene autoencoder of CLIP vectors."""
 
     code: Literal["network", "pca"] = knob(
-        "network", "network: trained; pca: mean and principal directions", origin="paper: network"
+        "pca", "network: trained; pca: mean and principal directions", origin="paper: network"
     )
-    latent: int = knob(8, "latent numbers d", ge=1, le=64, origin="paper, LangSplat: 3")
+    latent: int = knob(16, "latent numbers d", ge=1, le=64, origin="paper, LangSplat: 3")
     targets: Literal["node", "mask"] = knob(
         "node",
         "node: the view-averaged vector of the mask's node, where it fits one; mask: its own",
@@ -307,9 +307,9 @@ class LanguageSettings(Section):
     weight_language: float = knob(
         1.0, "weight of the regression to the latents", ge=0, origin="paper: not stated"
     )
-    weight_clustering: float = knob(0.3, "weight of L_h (Eq. 2)", ge=0, origin="paper: 1")
-    weight_instance: float = knob(0.03, "weight of L_ins (Eq. 3), lambda_1", ge=0, origin="paper: e-6")
-    weight_part: float = knob(0.0, "weight of L_part (Eq. 5), lambda_2", ge=0, origin="paper: e-5")
+    weight_clustering: float = knob(0.0, "weight of L_h (Eq. 2)", ge=0, origin="paper: 1")
+    weight_instance: float = knob(0.0, "weight of L_ins (Eq. 3), lambda_1", ge=0, origin="paper: e-6")
+    weight_part: float = knob(0.003, "weight of L_part (Eq. 5), lambda_2", ge=0, origin="paper: e-5")
     instance_mode: Literal["literal", "tree", "logratio"] = knob(
         "tree", "reading of L_ins", origin="paper: literal"
     )

@@ -53,10 +53,10 @@ def test_without_sweeps_every_stage_runs_once(base):
             "theta_variants=[theta-0.6,theta-0.7,theta-0.8,default]",
             {"tree": 3, "language": 3, "evaluate": 3},
         ),
-        ("omega_variants=[omega-2,default,omega-100,omega-1000]", {"language": 3, "evaluate": 3}),
+        ("omega_variants=[omega-2,omega-10,omega-100,omega-1000]", {"language": 4, "evaluate": 4}),
         ("pruning_variants=[default,pruned]", {"language": 1, "evaluate": 1}),
         (
-            "ablation_variants=[no-hierarchy,clustering,clustering-part,default,part]",
+            "ablation_variants=[no-hierarchy,clustering,clustering-part,default,all-losses]",
             {"language": 4, "evaluate": 4},
         ),
         # d = 3 needs a code of its own, which both share; baselines write the field by another rule

@@ -19,7 +19,7 @@ from hilsplat.language.mask_rows import Contributions
 from hilsplat.language.semantic_tree import SemanticTree, run_semantic_tree
 from hilsplat.settings import AutoencoderSettings, SemanticTreeSettings
 
-QUICK = AutoencoderSettings(latent=3, epochs=1, min_steps=200)
+QUICK = AutoencoderSettings(code="network", latent=3, epochs=1, min_steps=200)
 
 
 def unit_vectors(rows: int, channels: int, seed: int = 0) -> np.ndarray:
@@ -55,7 +55,7 @@ def test_a_batch_of_one_vector_trains():
 
 def test_training_recovers_a_few_vectors():
     vectors = unit_vectors(6, 16)
-    settings = AutoencoderSettings(latent=3, epochs=1, min_steps=600, learning_rate=2e-3)
+    settings = AutoencoderSettings(code="network", latent=3, epochs=1, min_steps=600, learning_rate=2e-3)
     model = train_autoencoder(vectors, settings, seed=0)
     decoded = model.decode_array(model.encode_array(vectors))
     assert (decoded * vectors).sum(axis=1).mean() > 0.95
@@ -103,7 +103,7 @@ def test_targets_are_node_vectors_where_a_mask_fits_one(boxes_with_tree):
 def test_stage_encodes_every_mask(boxes_with_tree):
     world, contributions, tree = boxes_with_tree
     out = world.folder / "autoencoder"
-    settings = AutoencoderSettings(latent=3, epochs=1, min_steps=600, learning_rate=2e-3)
+    settings = AutoencoderSettings(code="network", latent=3, epochs=1, min_steps=600, learning_rate=2e-3)
     run_autoencoder(world.clip, tree, contributions, out, settings, 0)
     latents = load_latents(out, Contributions.load(contributions))
     assert latents.shape == (24, 3)

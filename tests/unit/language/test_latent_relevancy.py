@@ -36,7 +36,9 @@ def blends(features, count):
 
 
 def test_look_up_is_within_two_thousandths_of_decoding_but_for_few_pixels(vectors, texts):
-    code = train_autoencoder(vectors, AutoencoderSettings(latent=3, epochs=1, min_steps=600), 0)
+    code = train_autoencoder(
+        vectors, AutoencoderSettings(code="network", latent=3, epochs=1, min_steps=600), 0
+    )
     features = code.encode_array(vectors)
     fast = LatentRelevancy(code, texts[:4], 10.0, features)
     latents = blends(features, 3000)
@@ -52,7 +54,9 @@ def test_look_up_is_within_two_thousandths_of_decoding_but_for_few_pixels(vector
 
 
 def test_cells_of_a_second_view_are_added(vectors, texts):
-    code = train_autoencoder(vectors, AutoencoderSettings(latent=3, epochs=1, min_steps=50), 0)
+    code = train_autoencoder(
+        vectors, AutoencoderSettings(code="network", latent=3, epochs=1, min_steps=50), 0
+    )
     features = code.encode_array(vectors)
     fast = LatentRelevancy(code, texts[:4], 10.0, features)
     latents = blends(features, 400)
@@ -76,7 +80,9 @@ def test_linear_codes_need_no_decoding(vectors, texts, latent):
 
 
 def test_networks_of_other_sizes_are_decoded(vectors, texts):
-    code = train_autoencoder(vectors, AutoencoderSettings(latent=5, epochs=1, min_steps=50), 0)
+    code = train_autoencoder(
+        vectors, AutoencoderSettings(code="network", latent=5, epochs=1, min_steps=50), 0
+    )
     fast = LatentRelevancy(code, texts[:4], 10.0, code.encode_array(vectors))
     latents = blends(code.encode_array(vectors), 50)
     assert np.array_equal(

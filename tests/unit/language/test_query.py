@@ -42,7 +42,7 @@ def scene(tmp_path_factory) -> LanguageScene:
         world = build_two_boxes(folder, monkeypatch)
         contributions = build_contributions(world)
     run_semantic_tree(contributions, world.masks, world.clip, folder / "st", SemanticTreeSettings())
-    settings = AutoencoderSettings(latent=4, epochs=1, min_steps=400, learning_rate=2e-3)
+    settings = AutoencoderSettings(code="network", latent=4, epochs=1, min_steps=400, learning_rate=2e-3)
     run_autoencoder(world.clip, folder / "st", contributions, folder / "ae", settings, 0)
     run_language(
         contributions, world.tree, folder / "ae", folder / "language.safetensors", LanguageSettings(), 0, 1
