@@ -309,7 +309,7 @@ class LanguageSettings(Section):
     )
     weight_clustering: float = knob(0.0, "weight of L_h (Eq. 2)", ge=0, origin="paper: 1")
     weight_instance: float = knob(0.0, "weight of L_ins (Eq. 3), lambda_1", ge=0, origin="paper: e-6")
-    weight_part: float = knob(0.003, "weight of L_part (Eq. 5), lambda_2", ge=0, origin="paper: e-5")
+    weight_part: float = knob(0.01, "weight of L_part (Eq. 5), lambda_2", ge=0, origin="paper: e-5")
     instance_mode: Literal["literal", "tree", "logratio"] = knob(
         "tree", "reading of L_ins", origin="paper: literal"
     )
@@ -330,7 +330,7 @@ class LanguageSettings(Section):
         origin="paper, LangSplat: 0",
     )
     cg_steps: int = knob(10, "conjugate-gradient steps of the quadratic part", ge=0)
-    lbfgs_steps: int = knob(30, "L-BFGS steps where L_ins or L_part are on", ge=0)
+    lbfgs_steps: int = knob(10, "L-BFGS steps where L_ins or L_part are on", ge=0)
     min_mask_px: int = knob(50, "smaller masks stay out of L_ins and L_part", unit="px", ge=1)
     max_masks_per_level: int = knob(
         96, "masks of one view and level in L_ins and L_part, largest first", ge=2
