@@ -18,7 +18,7 @@ def load(project: Path, name: str) -> dict:
     return config
 
 
-@pytest.mark.parametrize("name", ["config.yaml", "paper.yaml", "ci.yaml"])
+@pytest.mark.parametrize("name", ["config.yaml", "paper.yaml", "ci.yaml", "comparison.yaml"])
 def test_shipped_configurations_are_valid(project: Path, name: str) -> None:
     parse_run(load(project, name))
 
