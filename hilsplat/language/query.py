@@ -334,14 +334,17 @@ class LanguageScene:
         height, width = self.scene.cameras[view].size_hw
         maps = np.zeros((len(texts), len(LEVELS), height * width), np.float32)
         for index, (pixels, latents) in enumerate(shown):
-            if len(pixels):
-                found = (
-                    answer.fast(latents, placed[index], vectors)
-                    if by_look_up
-                    else answer.exact(latents, vectors)
-                )
-                maps[:, index] = found.min(axis=1, keepdims=True)
-                maps[:, index, pixels] = found
+            if not len(pixels):
+                continue
+            found = (
+                answer.fast(latents, placed[index], vectors) if by_look_up else answer.exact(latents, vectors)
+            )
+            for row, level_map in zip(found, maps[:, index], strict=True):
+                if len(pixels) == len(level_map):
+                    level_map[:] = row
+                else:
+                    level_map[:] = row.min()
+                    level_map[pixels] = row
         return maps.reshape(len(texts), len(LEVELS), height, width)
 
     def field_image(self, view: str, level: Level) -> UInt8[np.ndarray, "H W 3"]:
