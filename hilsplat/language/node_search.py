@@ -10,6 +10,10 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.language.relevancy import min_max
 from hilsplat.language.semantic_tree import SemanticTree
 
+CHILD_BONUS = 0.1
+"""By how much a child of the answer before is ahead of other parts of the path's first thing: a share of the
+range of the level's margins."""
+
 
 @dataclass(frozen=True)
 class NodeHits:
@@ -76,8 +80,9 @@ def search_path(
 ) -> NodeHits:
     """Search each text inside the nodes that answered the one before: ("bear", "head", "nose").
 
-    The i-th text is searched at the i-th level. Falls back from children of the chosen nodes to any
-    descendant of the first text's nodes, then to the whole level.
+    The i-th text is searched at the i-th level among the descendants of the first text's nodes, where
+    children of the last answer are a little ahead; where there are none, in the whole level. Children alone
+    would lose what hangs under the wrong part, or under none (docs/tree.md).
 
     Args:
         tree: nodes.
@@ -98,11 +103,32 @@ def search_path(
     hits = first = best_nodes(scores[0], tree.nodes_of(LEVELS[0]), LEVELS[0], threshold)
     for index, level in enumerate(LEVELS[1 : len(path)], start=1):
         nodes = tree.nodes_of(level)
-        routes = {
-            "child": np.intersect1d(nodes, tree.children_of(hits.ids)),
-            "descendant": np.intersect1d(nodes, tree.descendants_of(first.ids)),
-            "fallback": nodes,
-        }
-        route = next((name for name, found in routes.items() if len(found)), "fallback")
-        hits = best_nodes(scores[index], routes[route], level, threshold, route)
+        children = np.intersect1d(nodes, tree.children_of(hits.ids))
+        inside = np.union1d(children, np.intersect1d(nodes, tree.descendants_of(first.ids)))
+        if len(inside):
+            hits = _best_inside(scores[index], nodes, inside, children, level, threshold)
+        else:
+            hits = best_nodes(scores[index], nodes, level, threshold, "fallback")
     return hits
+
+
+def _best_inside(
+    scores: Float[np.ndarray, " n"],
+    nodes: Int64[np.ndarray, " l"],
+    inside: Int64[np.ndarray, " c"],
+    children: Int64[np.ndarray, " k"],
+    level: Level,
+    threshold: float,
+) -> NodeHits:
+    """Best of the nodes inside the path's first thing, children of the last answer ahead by `CHILD_BONUS`.
+
+    The threshold is taken on the range of the whole level: of two or three candidates the worst says nothing
+    about how near the second is to the best.
+    """
+    step = np.ptp(margins(scores[nodes]))
+    value = margins(scores[inside]) + CHILD_BONUS * step * np.isin(inside, children)
+    kept = value >= value.max() - (1 - threshold) * step
+    chosen = inside[kept]
+    chosen = chosen[np.lexsort((chosen, -value[kept]))].astype(np.int64)
+    route = "child" if np.isin(chosen[0], children) else "descendant"
+    return NodeHits(chosen, scores[chosen].astype(np.float32), level, route)

@@ -13,7 +13,7 @@ from hilsplat.base.provenance import provenance_path
 from hilsplat.language.autoencoder import load_code, run_autoencoder
 from hilsplat.language.field import LanguageField, run_language
 from hilsplat.language.finished import FinishedScene, require_same
-from hilsplat.language.node_search import automatic_level, best_nodes
+from hilsplat.language.node_search import automatic_level, best_nodes, search_path
 from hilsplat.language.query import LanguageScene
 from hilsplat.language.semantic_tree import SemanticTree, run_semantic_tree
 from hilsplat.language.view_store import ViewStore
@@ -99,6 +99,30 @@ def test_selection_is_by_margins_which_do_not_saturate():
     assert best_nodes(scores, every, Level.PART, 0.85).ids.tolist() == [3]
     assert best_nodes(scores, every, Level.PART, 0.5).ids.tolist() == [3, 2, 1]
     assert best_nodes(np.array([0.4, 0.9, 0.9]), np.arange(3), Level.PART, 0.95).ids.tolist() == [1, 2]
+
+
+def test_a_path_stays_inside_its_first_thing(scene):
+    scores = np.full((3, 7), 0.1, np.float32)
+    scores[0, NODE["A"]] = scores[1, NODE["A bottom"]] = 0.9
+    scores[2, NODE["A top left"]], scores[2, NODE["B corner"]] = 0.6, 0.9
+    hits = search_path(scene.tree, scores, ("A", "A bottom", "x"), 0.95)
+    # the one subpart of A hangs under its top; that of B answers better, but is no part of A
+    assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "descendant")
+
+
+@pytest.mark.parametrize(
+    ("child_margin", "found", "route"), [(0.97, "B corner", "child"), (0.8, "A top left", "descendant")]
+)
+def test_a_child_of_the_last_answer_is_a_tenth_of_the_range_ahead(scene, child_margin, found, route):
+    level, parent = scene.tree.level.copy(), scene.tree.parent.copy()
+    level[NODE["B top"]] = 3  # the third subpart, which spans the range of margins from 0 to 1
+    parent[NODE["B corner"]] = NODE["A bottom"]
+    margins = np.full((3, 7), -1.0)
+    margins[0, NODE["A"]] = margins[1, NODE["A bottom"]] = 1.0
+    margins[2, [NODE["A top left"], NODE["B corner"], NODE["B top"]]] = 1.0, child_margin, 0.0
+    scores = (1 / (1 + np.exp(-margins))).astype(np.float32)
+    hits = search_path(replace(scene.tree, level=level, parent=parent), scores, ("A", "A bottom", "x"), 0.95)
+    assert (hits.ids.tolist(), hits.route) == ([NODE[found]], route)
 
 
 def test_a_scene_opens_with_the_settings_it_was_evaluated_with(tmp_path):
