@@ -1,0 +1,86 @@
+"""Scoring a view: 20 annotated texts in 986 x 728 px, relevancy maps and node masks given."""
+
+import time
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from benchmarks.goals import Goal
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.evaluate.protocols.answers import Selections
+from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
+from hilsplat.evaluate.protocols.views import measure_view
+from hilsplat.settings import EvaluateSettings
+
+SIZE_HW = (728, 986)
+VIEW = "view"
+one_thread = pytest.mark.benchmark(timer=time.process_time, min_rounds=3, max_time=5)
+
+
+class Answers:
+    """Answers that cost nothing: a map per text and level, a node per text."""
+
+    def __init__(self, texts: list[str], regions: list[np.ndarray]) -> None:
+        rng = np.random.default_rng(0)
+        self.regions = dict(zip(texts, regions, strict=True))
+        noise = rng.uniform(0, 0.4, (len(LEVELS), *SIZE_HW)).astype(np.float32)
+        self.maps = {text: noise + np.float32(0.6) * region for text, region in self.regions.items()}
+
+    def field_relevancy(self, texts, view):
+        return np.stack([self.maps[text] for text in texts])
+
+    node_relevancy_map = field_relevancy
+
+    def select_nodes(self, text, *, level=None, threshold=0.85, within=None):
+        return SimpleNamespace(ids=np.array([list(self.regions).index(text)]), level=level)
+
+    def select_path(self, path, threshold=0.85):
+        return self.select_nodes(path[-1])
+
+    def node_masks(self, view, ids):
+        return list(self.regions.values())[ids[0]]
+
+
+@cache
+def annotated_view() -> tuple[Answers, ViewTruth]:
+    """Five things of 200 x 300 px with a half and two quarters each."""
+    queries, regions, by_path = [], [], {}
+    for thing in range(5):
+        top, left = 60 + 250 * (thing // 3), 20 + 320 * (thing % 3)
+        parts = (("thing", 1, 200, 300), ("half", 2, 200, 150), ("quarter", 3, 100, 150), ("rim", 3, 40, 150))
+        path: tuple[str, ...] = ()
+        for name, level, height, width in parts:
+            region = np.zeros(SIZE_HW, bool)
+            region[top : top + height, left : left + width] = True
+            text = f"{name} {thing}"
+            path = (*path[: level - 1], text)
+            box = np.array([[left, top, left + width - 1, top + height - 1]])
+            queries.append(Query(text, Level(level), (path,), region, box))
+            regions.append(region)
+            by_path[path] = region
+    texts = [query.text for query in queries]
+    categories = tuple(Query(q.text, None, q.paths, q.truth, q.boxes_xyxy) for q in queries)
+    return Answers(texts, regions), ViewTruth(tuple(queries), categories, by_path)
+
+
+@one_thread
+@pytest.mark.parametrize("method", ["field", "tree", "tree-path"])
+def test_scoring_a_view(benchmark, method):
+    answers, truth = annotated_view()
+    settings = EvaluateSettings(methods=(method,))
+    selections = Selections(answers, settings.node_select)
+    benchmark.extra_info |= {"case": scoring(method), "count": len(truth.queries), "of": "queries"}
+    assert benchmark(lambda: list(measure_view(answers, selections, truth, VIEW, SIZE_HW, settings)))
+
+
+def scoring(method: str) -> str:
+    """Name of a case."""
+    return f"scoring a view of 986x728 with 20 queries, {method}"
+
+
+GOALS = [
+    Goal("scoring 20 queries of the field, 986x728", "ms", 1000, lambda t: t[scoring("field")]),
+    Goal("the same of the tree", "ms", 1000, lambda t: t[scoring("tree")]),
+]
