@@ -153,7 +153,7 @@ def draw_methods(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: E
         label_left(axes[0], row.text, row.level)
         for place, method in zip(axes[1:], methods, strict=True):
             mask = method.mask(row, evaluate)
-            score = f": IoU {iou(mask, row.truth):.2f}" if row.truth is not None else ""
+            score = f"\nIoU {iou(mask, row.truth):.2f}" if row.truth is not None else ""
             show(place, paint_answer(image, mask, row.truth), method.title + score)
     return figure
 

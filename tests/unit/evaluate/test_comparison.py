@@ -35,7 +35,7 @@ def test_titles_name_the_method_and_its_iou(block_world, rows):
     methods = [Answerer("hilsplat (tree)", "tree", block_world.answers)]
     figure = draw_methods(methods, rows[1], EVALUATE)
     titles = [axes.get_title() for axes in figure.get_axes()]
-    assert titles[:2] == ["truth, 001.png", "hilsplat (tree): IoU 1.00"]
+    assert titles[:2] == ["truth, 001.png", "hilsplat (tree)\nIoU 1.00"]
     assert len(titles) == 2 * len(rows[1])
 
 
