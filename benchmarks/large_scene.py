@@ -1,7 +1,7 @@
 """A scene of the size of a large capture, made up, and the time and memory of each stage of the method.
 
-    python -m benchmarks.large_scene /tmp/large                        # 1M Gaussians, 250 views of 986 x 728
-    python -m benchmarks.large_scene /tmp/small --gaussians 100000 --views 48 --width 800 --height 600
+    python -m benchmarks.large_scene LARGE                             # 1M Gaussians, 250 views of 986 x 728
+    python -m benchmarks.large_scene SMALL --gaussians 100000 --views 48 --width 800 --height 600
 
 makes a floor with 400 balls on it, a ring of cameras, masks of each view at three levels (balls, their
 halves, their eighths; the largest of each level) with a CLIP vector each, and then runs tree, contributions,
