@@ -23,7 +23,7 @@ class NodeHits:
         ids: rows of the semantic tree, best first.
         scores: their relevancies.
         level: the level that was searched.
-        route: how they were reached: "flat", or on a path that of the best: "child", "descendant" or "fallback" (the
+        route: how the best was reached: "flat", or on a path "child", "descendant" or "fallback" (the
             whole level, as the nodes before hold nothing there).
     """
 
