@@ -41,6 +41,7 @@ from hilsplat.settings import (
     TreeSettings,
 )
 from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.order import morton_order
 from hilsplat.splat.ply import save_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 
@@ -53,7 +54,11 @@ STAGES = ("tree", "contributions", "semantic_tree", "autoencoder", "language")
 
 
 def made_gaussians(number: int) -> tuple[Gaussians, np.ndarray]:
-    """Balls (seven tenths of all) and floor; whose ball, half and eighth each is (N, 3), -1 on the floor."""
+    """Balls (seven tenths of all) and floor, in the order in which a fit leaves them.
+
+    Returns:
+        the Gaussians, and (N, 3) whose ball, half and eighth each is, -1 on the floor.
+    """
     rng = np.random.default_rng(0)
     on_balls = number * 7 // 10
     ball = rng.integers(0, ROWS * ROWS, on_balls)
@@ -75,7 +80,9 @@ def made_gaussians(number: int) -> tuple[Gaussians, np.ndarray]:
         rng.normal(0.5, 1.5, size=number),
         0.3 * rng.normal(size=(number, 1, 3)),
     )
-    return Gaussians(*(torch.tensor(values, dtype=torch.float32) for values in arrays)), labels
+    order = morton_order(arrays[0])
+    tensors = (torch.tensor(values[order], dtype=torch.float32) for values in arrays)
+    return Gaussians(*tensors), labels[order]
 
 
 def ring_of_cameras(number: int, size_hw: tuple[int, int]) -> Cameras:
@@ -142,10 +149,11 @@ def front_gaussian(weights) -> np.ndarray:
     """The Gaussian of the largest weight of each pixel; -1 where there is none."""
     front = np.full(weights.shape[0], -1, np.int64)
     counts = np.diff(weights.indptr)
-    pixel = np.repeat(np.arange(len(counts)), counts)
-    order = np.lexsort((weights.data, pixel))
-    filled = counts > 0
-    front[filled] = weights.indices[order[weights.indptr[1:][filled] - 1]]
+    filled = np.flatnonzero(counts)
+    largest = np.maximum.reduceat(weights.data, weights.indptr[filled])
+    place = np.flatnonzero(weights.data == np.repeat(largest, counts[filled]))
+    pixel = np.repeat(filled, counts[filled])[place]
+    front[pixel] = weights.indices[place]
     return front
 
 

@@ -207,7 +207,7 @@ def node_image(scene: LanguageScene, view: str, level: Level) -> np.ndarray:
         values = centred @ directions.T
         low, high = np.percentile(values, (2, 98), axis=0)
         colours[nodes, : len(directions)] = np.clip((values - low) / np.maximum(high - low, 1e-9), 0, 1)
-    weights, _ = scene.view_weights(view)
+    weights = scene.view_weights(view)
     of_gaussian = colours[scene.tree.node_of_gaussian[:, level.index]].astype(np.float32)
     height, width = scene.scene.cameras[view].size_hw
     return (255 * np.clip(weights @ of_gaussian, 0, 1)).astype(np.uint8).reshape(height, width, 3)

@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.datasets.hierarchy import HierarchyAnnotations
-from hilsplat.language.contributions import normalised_weights
+from hilsplat.language.compositing import normalised_weights
 from hilsplat.language.semantic_tree import SemanticTree
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import ContributionsSettings
@@ -133,7 +133,7 @@ def true_votes(
         raw = pixel_weights(
             gaussians, scene.cameras[view], min_weight=ContributionsSettings().min_weight, threads=threads
         )
-        weights = normalised_weights(raw)[0].astype(np.float64)
+        weights = normalised_weights(raw).astype(np.float64)
         for level in LEVELS:
             labels: Int32[np.ndarray, " P"] = truth.label_image(view, level).reshape(-1)
             labelled = np.flatnonzero(labels >= 0)

@@ -112,50 +112,62 @@ def distinct(
     return np.flatnonzero(kept)
 
 
-def contrastive_terms(
+def instance_term(
+    means: Float[Tensor, "M D"], relations: list[ViewRelations], settings: LanguageSettings
+) -> Tensor:
+    """L_ins, averaged over the views that have masks to compare.
+
+    Args:
+        means: mean feature of each mask.
+        relations: per view.
+        settings: which reading, and Omega.
+    """
+    losses = []
+    for view in relations:
+        if len(view.rows) < 2:
+            continue
+        chosen = means[view.rows]
+        if settings.instance_mode == "literal":
+            losses.append(instance_loss_literal(chosen, view.level, settings.omega))
+        elif settings.instance_mode == "tree":
+            losses.append(instance_loss_tree(chosen, view.depth, settings.omega))
+        else:
+            losses.append(instance_loss_logratio(chosen, view.depth, settings.omega))
+    return torch.stack(losses).mean() if losses else means.sum() * 0
+
+
+def part_term(
     means: Float[Tensor, "M D"],
     halves: Float[Tensor, "M D"],
     other_halves: Float[Tensor, "M D"],
     relations: list[ViewRelations],
     settings: LanguageSettings,
-) -> tuple[Tensor, Tensor]:
-    """L_ins and L_part, averaged over the views (and levels) that have masks to compare.
+) -> Tensor:
+    """L_part, averaged over the views and levels that have masks to compare.
 
     Args:
         means: mean feature of each mask.
         halves: mean over a random half of its pixels.
         other_halves: mean over the other pixels.
         relations: per view.
-        settings: which reading of each loss, Omega and tau.
+        settings: which reading, and tau.
     """
-    instance, part = [], []
+    losses = []
     for view in relations:
-        if len(view.rows) >= 2:
-            chosen = means[view.rows]
-            if settings.instance_mode == "literal":
-                instance.append(instance_loss_literal(chosen, view.level, settings.omega))
-            elif settings.instance_mode == "tree":
-                instance.append(instance_loss_tree(chosen, view.depth, settings.omega))
-            else:
-                instance.append(instance_loss_logratio(chosen, view.depth, settings.omega))
         for rows, parent in zip(view.part_rows, view.part_parent, strict=True):
             has_parent = parent != NONE
             if len(rows) < 2 or not has_parent.any():
                 continue
             parent_means = means[parent.clamp(min=0)]
             if settings.part_mode == "literal":
-                part.append(part_loss_literal(means[rows], parent, parent_means, settings.tau))
+                losses.append(part_loss_literal(means[rows], parent, parent_means, settings.tau))
             else:
-                part.append(
+                losses.append(
                     part_loss_disentangle(
                         halves[rows], other_halves[rows], has_parent.long(), parent_means, settings.tau
                     )
                 )
-    zero = means.sum() * 0
-    return (
-        torch.stack(instance).mean() if instance else zero,
-        torch.stack(part).mean() if part else zero,
-    )
+    return torch.stack(losses).mean() if losses else means.sum() * 0
 
 
 @dataclass(frozen=True)
@@ -178,19 +190,40 @@ class Contrast:
     relations: list[ViewRelations]
     settings: LanguageSettings
 
-    def terms(
+    def values(self, features: Float32[np.ndarray, "N 3 D"]) -> dict[str, float]:
+        """Unweighted L_ins and L_part."""
+        with torch.no_grad():
+            means, halves = self._means(features)
+            instance, part = self._losses(means, halves, (True, True))
+        return {"instance": float(instance), "part": float(part)}
+
+    def weighted(
         self, features: Float32[np.ndarray, "N 3 D"], weights: tuple[float, float]
-    ) -> tuple[dict[str, float], Float32[np.ndarray, "N 3 D"]]:
-        """Unweighted L_ins and L_part, and the gradient of their weighted sum."""
-        means = torch.from_numpy(self.masks.means(features)).double().requires_grad_()
-        halves = torch.from_numpy(self.half_masks.means(features)).double().requires_grad_()
-        n = torch.from_numpy(self.pixels).double()[:, None]
-        half = torch.from_numpy(self.half_pixels).double()[:, None]
-        others = (n * means - half * halves) / (n - half).clamp(min=1)
-        instance, part = contrastive_terms(means, halves, others, self.relations, self.settings)
-        total = weights[0] * instance + weights[1] * part
+    ) -> tuple[float, Float32[np.ndarray, "N 3 D"]]:
+        """The weighted sum of L_ins and L_part and its gradient; a loss without weight costs nothing."""
+        means, halves = (values.requires_grad_() for values in self._means(features))
+        losses = self._losses(means, halves, (weights[0] != 0, weights[1] != 0))
+        total = weights[0] * losses[0] + weights[1] * losses[1]
         by_means, by_halves = torch.autograd.grad(total, (means, halves), allow_unused=True)
         gradient = self.masks.spread(by_means.float().numpy())
         if by_halves is not None:
             gradient += self.half_masks.spread(by_halves.float().numpy())
-        return {"instance": float(instance.detach()), "part": float(part.detach())}, gradient
+        return float(total.detach()), gradient
+
+    def _means(self, features: np.ndarray) -> tuple[Tensor, Tensor]:
+        """Mean feature of each mask, and over its random half, in float64."""
+        return (
+            torch.from_numpy(self.masks.means(features)).double(),
+            torch.from_numpy(self.half_masks.means(features)).double(),
+        )
+
+    def _losses(self, means: Tensor, halves: Tensor, wanted: tuple[bool, bool]) -> tuple[Tensor, Tensor]:
+        """L_ins and L_part; 0 for one that is not wanted."""
+        n = torch.from_numpy(self.pixels).double()[:, None]
+        half = torch.from_numpy(self.half_pixels).double()[:, None]
+        others = (n * means - half * halves) / (n - half).clamp(min=1)
+        nothing = means.sum() * 0
+        return (
+            instance_term(means, self.relations, self.settings) if wanted[0] else nothing,
+            part_term(means, halves, others, self.relations, self.settings) if wanted[1] else nothing,
+        )

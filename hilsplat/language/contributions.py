@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float32, Int32, Int64
+from jaxtyping import Int32, Int64
 
 from hilsplat.base.artifacts import (
     INDEX,
@@ -37,6 +37,7 @@ from hilsplat.base.code_hash import code_hash
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import stage_log, track
+from hilsplat.language.compositing import normalised_weights, visible_mass
 from hilsplat.language.quadratic import Gram, StackedWeights
 from hilsplat.language.quadratic_builder import QuadraticBuilder, QuadraticCheckpoint
 from hilsplat.language.streams import ArrayStream, MatrixStream
@@ -50,39 +51,7 @@ from hilsplat.splat.rasterise.device import choose_device
 
 logger = logging.getLogger(__name__)
 
-MIN_ALPHA = 0.5
-"""Pixels that the Gaussians cover less than this are ignored: their features are extrapolated."""
-
 MATRICES = ("A", "A_half", "S")
-
-
-def normalised_weights(
-    weights: sp.csr_matrix, min_alpha: float = MIN_ALPHA
-) -> tuple[sp.csr_matrix, Float32[np.ndarray, " P"]]:
-    """Divide the weights of each pixel by their sum, the accumulated alpha.
-
-    Kept weights then sum to 1, so that a rendered feature is an average of features. Weights that
-    the rasteriser dropped as too small are no part of the sum.
-
-    Args:
-        weights: compositing weights (pixels x Gaussians).
-        min_alpha: pixels with a smaller sum become empty rows.
-
-    Returns:
-        the normalised matrix, columns sorted, and the accumulated alpha of each pixel.
-    """
-    weights = sp.csr_matrix(weights, copy=True)
-    weights.sort_indices()
-    counts = np.diff(weights.indptr)
-    row = np.repeat(np.arange(weights.shape[0]), counts)
-    alpha = np.bincount(row, weights.data, minlength=weights.shape[0])
-    keep = alpha[row] >= min_alpha
-    data = (weights.data / np.where(alpha > 0, alpha, 1.0)[row]).astype(np.float32)[keep]
-    indptr = np.concatenate(([0], np.cumsum(np.where(alpha >= min_alpha, counts, 0))))
-    matrix = sp.csr_matrix(
-        (data, weights.indices[keep].astype(np.int32), indptr.astype(np.int32)), shape=weights.shape
-    )
-    return matrix, alpha.astype(np.float32)
 
 
 def label_maps(masks: HierarchicalMasks) -> Int32[np.ndarray, "P 3"]:
@@ -105,11 +74,10 @@ def painted_indicator(labels: Int32[np.ndarray, "P 3"], num_masks: int, pixels: 
 def mask_means(
     indicator: sp.csr_matrix, weights: sp.csr_matrix
 ) -> tuple[sp.csr_matrix, Int64[np.ndarray, " M"]]:
-    """diag(1/n) B W with float64 sums, and n; a mask without a pixel has an empty row."""
+    """diag(1/n) B W with the weights in float64, and n; a mask without a pixel has an empty row."""
     pixels = np.diff(indicator.indptr).astype(np.int64)
-    sums = indicator @ weights.astype(np.float64)
     scale = sp.diags(1.0 / np.maximum(pixels, 1))
-    return _single(scale @ sums), pixels
+    return _single(scale @ (indicator @ weights)), pixels
 
 
 def raw_indicator(masks: HierarchicalMasks, pixels: np.ndarray) -> sp.csr_matrix:
@@ -143,13 +111,14 @@ def view_contributions(view: str, weights: sp.csr_matrix, masks: HierarchicalMas
     labels = label_maps(masks)
     num_masks = len(masks)
     half = covered & random_half(view, len(covered))
-    A, pixels = mask_means(painted_indicator(labels, num_masks, covered), weights)
-    A_half, half_pixels = mask_means(painted_indicator(labels, num_masks, half), weights)
-    S = _single(raw_indicator(masks, covered) @ weights.astype(np.float64))
+    exact = weights.astype(np.float64)
+    A, pixels = mask_means(painted_indicator(labels, num_masks, covered), exact)
+    A_half, half_pixels = mask_means(painted_indicator(labels, num_masks, half), exact)
+    S = _single(raw_indicator(masks, covered) @ exact)
     arrays = {
         "pixels": pixels,
         "half_pixels": half_pixels,
-        "mass": np.bincount(weights.indices, weights.data, minlength=weights.shape[1]).astype(np.float32),
+        "mass": visible_mass(weights),
     }
     for name, matrix in (("A", A), ("A_half", A_half), ("S", S)):
         arrays |= {f"{name}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr")}
@@ -233,7 +202,7 @@ def run_contributions(
                     raw = pixel_weights(
                         gaussians, camera, min_weight=settings.min_weight, threads=threads, device=device
                     )
-                    return normalised_weights(raw)[0]
+                    return normalised_weights(raw)
 
                 part = store.get(
                     view.key,

@@ -81,7 +81,7 @@ def run_language(
     """Solve the language field of a scene: `language.safetensors` and `language.report.json` beside it.
 
     The result does not depend on `seed` (nothing is random: halves of masks are fixed by the view's
-    name) nor on `threads` (sums are taken by one thread, in one order).
+    name) nor on `threads` (sums are taken in one order).
 
     Raises:
         MisalignedArtifactError: coverage trees or latents belong to other masks.
@@ -94,7 +94,7 @@ def run_language(
         device = compute_device(settings.device)
         masks = MaskOperator.of(contributions.matrix("A"), contributions.level)
         half_masks = MaskOperator.of(contributions.matrix("A_half"), contributions.level)
-        quadratic = contributions.quadratic()
+        quadratic = contributions.quadratic(threads)
         pixels = contributions.pixels.astype(np.float32)
         problem = QuadraticProblem.of(
             masks,

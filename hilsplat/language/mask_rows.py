@@ -64,9 +64,9 @@ class Contributions:
         """Centres of the Gaussians, scene units."""
         return read_npy(self.folder / "means.npy")
 
-    def quadratic(self) -> Quadratic:
+    def quadratic(self, threads: int = 1) -> Quadratic:
         """Read G, or the stacked weights where those are smaller."""
-        return load_quadratic(self.folder)
+        return load_quadratic(self.folder, threads)
 
     @staticmethod
     def load(folder: Path) -> "Contributions":

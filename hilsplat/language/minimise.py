@@ -8,6 +8,9 @@ LBFGS_MEMORY = 8
 SUFFICIENT_DECREASE = 1e-4
 MAX_HALVINGS = 12
 
+CHUNK = 2**18
+"""Numbers that a sum takes at a time: two megabytes in float64, whatever the size of the field."""
+
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
 
@@ -47,7 +50,14 @@ def lbfgs(objective: Objective, start: np.ndarray, steps: int, first_step: float
 
 def dot(a: np.ndarray, b: np.ndarray) -> float:
     """Sum of products in float64 (no BLAS: its order of summation depends on the threads)."""
-    return float(np.multiply(a, b, dtype=np.float64).sum())
+    a, b = np.broadcast_arrays(a, b)
+    a, b = a.reshape(-1), b.reshape(-1)
+    return float(
+        sum(
+            np.multiply(a[begin : begin + CHUNK], b[begin : begin + CHUNK], dtype=np.float64).sum()
+            for begin in range(0, len(a), CHUNK)
+        )
+    )
 
 
 def _two_loops(

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from hilsplat.language.mask_operator import MaskOperator, lifted_average, lifted_median
-from hilsplat.language.minimise import dot
+from hilsplat.language.minimise import CHUNK, dot
 from hilsplat.language.quadratic import Quadratic, level_mass
 
 
@@ -133,7 +133,11 @@ def _channel_dot(
     a: Float32[np.ndarray, "N 3 D"], b: Float32[np.ndarray, "N 3 D"]
 ) -> Float64[np.ndarray, "3 D"]:
     """Sum of products over Gaussians, per level and channel."""
-    return np.multiply(a, b, dtype=np.float64).sum(axis=0)
+    out = np.zeros(a.shape[1:])
+    rows = max(1, CHUNK // max(out.size, 1))
+    for begin in range(0, len(a), rows):
+        out += np.multiply(a[begin : begin + rows], b[begin : begin + rows], dtype=np.float64).sum(axis=0)
+    return out
 
 
 def _ratio(

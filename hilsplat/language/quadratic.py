@@ -7,6 +7,7 @@ non-zeros, W is kept and streamed instead. Both give the same products.
 
 import inspect
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +20,10 @@ from hilsplat.base.artifacts import read_into, read_npz, write_npz
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
 
+PRODUCT_PARTS = 4
+"""Parts of equally many pairs in which a product with G is summed. Fixed, so that the number of threads
+changes no byte; each part holds the sums of its rows and of those below."""
+
 
 def compiled(function: Callable, **options: bool) -> Callable:
     """Compile a loop with numba (unwrapped: the tests' type checker wraps every function)."""
@@ -30,13 +35,15 @@ class Gram:
     """Upper triangle of G for all levels, with one pattern.
 
     Attributes:
-        pairs: CSR pattern (N, N), columns from the diagonal on; its data are not used.
+        indptr: of the CSR pattern (N, N), as are `indices`; columns from the diagonal on.
         values: G of each level at each pair of the pattern, float32.
+        threads: that share a product.
     """
 
     indptr: np.ndarray
     indices: np.ndarray
     values: Float32[np.ndarray, "E 3"]
+    threads: int = 1
 
     @property
     def nonzeros(self) -> int:
@@ -49,10 +56,22 @@ class Gram:
         return len(self.indptr) - 1
 
     def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
-        """G_l F_l for every level; summed in their precision, by one thread, in one order."""
-        out = np.zeros_like(features)
-        _gram_product(self.indptr, self.indices, self.values, np.ascontiguousarray(features), out)
-        return out
+        """G_l F_l for every level; summed in their precision, in one order on any number of threads."""
+        features = np.ascontiguousarray(features)
+        shares = np.linspace(0, self.nonzeros, PRODUCT_PARTS + 1)[1:-1]
+        edges = [0, *np.searchsorted(self.indptr, shares).tolist(), self.num_gaussians]
+
+        def part(begin: int, end: int) -> np.ndarray:
+            out = np.zeros_like(features[begin:])
+            _gram_product(begin, end, self.indptr, self.indices, self.values, features, out)
+            return out
+
+        with ThreadPoolExecutor(self.threads) as pool:
+            parts = list(pool.map(part, edges[:-1], edges[1:]))
+        total = parts[0]
+        for begin, rest in zip(edges[1:-1], parts[1:], strict=True):
+            total[begin:] += rest
+        return total
 
     def save(self, path: Path) -> None:
         """Write `G.npz`."""
@@ -115,14 +134,18 @@ def level_mass(quadratic: Quadratic) -> Float32[np.ndarray, "N 3"]:
     return quadratic.product(ones)[:, :, 0]
 
 
-def load_quadratic(folder: Path) -> Quadratic:
+def load_quadratic(folder: Path, threads: int = 1) -> Quadratic:
     """Read `G.npz` or `W.npz`, whichever the contributions stage kept.
+
+    Args:
+        folder: of the contributions.
+        threads: that share a product with G (one with W is one thread's).
 
     Raises:
         ArtifactError: neither is there.
     """
     if (folder / "G.npz").is_file():
-        return read_into(Gram, folder / "G.npz")
+        return read_into(Gram, folder / "G.npz", threads=threads)
     if (folder / "W.npz").is_file():
         arrays = read_npz(folder / "W.npz")
         shape = (len(arrays["indptr"]) - 1, int(arrays["columns"][0]))
@@ -132,18 +155,19 @@ def load_quadratic(folder: Path) -> Quadratic:
 
 
 @compiled
-def _gram_product(indptr, indices, values, features, out):
+def _gram_product(begin, end, indptr, indices, values, features, out):
+    """Rows begin..end of the upper triangle and their mirror images; `out` starts with row `begin`."""
     levels, channels = features.shape[1], features.shape[2]
-    for i in range(len(indptr) - 1):
+    for i in range(begin, end):
         for k in range(indptr[i], indptr[i + 1]):
             j = indices[k]
             for level in range(levels):
                 value = values[k, level]
                 for c in range(channels):
-                    out[i, level, c] += value * features[j, level, c]
+                    out[i - begin, level, c] += value * features[j, level, c]
                 if j != i:
                     for c in range(channels):
-                        out[j, level, c] += value * features[i, level, c]
+                        out[j - begin, level, c] += value * features[i, level, c]
 
 
 @compiled

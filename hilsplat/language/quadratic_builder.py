@@ -41,6 +41,7 @@ class GramBuilder:
         edges = np.linspace(0, num_gaussians, BLOCKS + 1).astype(np.int64).tolist()
         self._ranges = list(pairwise(edges))
         self._threads = max(1, threads)
+        self._pixels = self._places = np.zeros(0, np.int32)
         self._blocks = [
             (np.zeros(end - begin + 1, np.int64), np.zeros(0, np.int32), np.zeros((0, len(LEVELS))))
             for begin, end in self._ranges
@@ -54,12 +55,8 @@ class GramBuilder:
     def add(self, part: StackedWeights) -> None:
         """Add W' diag(valid) W of further pixels; columns of W are sorted within rows."""
         weights = part.weights
-        # The transposed matrix holds positions in W: from there on lie the columns of the upper triangle.
-        positions = sp.csr_matrix(
-            (np.arange(weights.nnz, dtype=np.int64), weights.indices, weights.indptr), shape=weights.shape
-        ).tocsc()
         arrays = (weights.indptr, weights.indices, weights.data, part.valid)
-        columns = (positions.indptr, positions.indices, positions.data)
+        columns = self._columns(weights)
 
         def grow(block: int) -> None:
             self._blocks[block] = _grown_block(
@@ -68,6 +65,20 @@ class GramBuilder:
 
         with ThreadPoolExecutor(self._threads) as pool:
             list(pool.map(grow, range(len(self._blocks))))
+
+    def _columns(self, weights: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where each Gaussian's weights lie: begins in the lists, pixels, and places in W.
+
+        From such a place on lie the columns of the upper triangle. The lists are used again for the next
+        part, for new memory costs more time than filling it.
+        """
+        dtype = np.int32 if weights.nnz < 2**31 else np.int64
+        if len(self._places) < weights.nnz or self._places.dtype != dtype:
+            self._pixels = np.empty(weights.nnz * 9 // 8, np.int32)
+            self._places = np.empty(len(self._pixels), dtype)
+        begins = np.zeros(weights.shape[1] + 1, np.int64)
+        _transpose(weights.indptr, weights.indices, begins, self._pixels, self._places)
+        return begins, self._pixels, self._places
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything that was summed, as arrays."""
@@ -223,6 +234,21 @@ def stack_weights(parts: list[StackedWeights]) -> StackedWeights:
 
 
 @compiled
+def _transpose(indptr, indices, begins, pixels, places):
+    """Begins of each column, and the row and place of its values; `begins` comes as zeros."""
+    for k in range(indptr[-1]):
+        begins[indices[k] + 1] += 1
+    begins[:] = np.cumsum(begins)
+    filled = begins[:-1].copy()
+    for p in range(len(indptr) - 1):
+        for k in range(indptr[p], indptr[p + 1]):
+            at = filled[indices[k]]
+            pixels[at] = p
+            places[at] = k
+            filled[indices[k]] += 1
+
+
+@compiled
 def _grown_block(
     begin,
     end,
@@ -230,16 +256,16 @@ def _grown_block(
     indices,
     data,
     valid,
-    col_indptr,
-    col_rows,
-    col_positions,
+    begins,
+    pixels,
+    places,
     old_indptr,
     old_indices,
     old_values,
     levels,
 ):
     """Rows begin..end of G with the new pixels added to the old values; columns sorted."""
-    num = len(col_indptr) - 1
+    num = len(begins) - 1
     seen = np.full(num, -1, np.int64)
     sums = np.zeros((num, levels), np.float64)
     found = np.empty(num, np.int32)
@@ -257,13 +283,13 @@ def _grown_block(
             for level in range(levels):
                 sums[j, level] = old_values[k, level]
         known = count
-        for t in range(col_indptr[i], col_indptr[i + 1]):
-            p = col_rows[t]
-            weight = np.float64(data[col_positions[t]])
+        for t in range(begins[i], begins[i + 1]):
+            p = pixels[t]
+            weight = np.float64(data[places[t]])
             whole = weight if valid[p, 0] else 0.0
             part = weight if valid[p, 1] else 0.0
             subpart = weight if valid[p, 2] else 0.0
-            for k in range(col_positions[t], indptr[p + 1]):
+            for k in range(places[t], indptr[p + 1]):
                 j = indices[k]
                 if seen[j] != i:
                     seen[j] = i

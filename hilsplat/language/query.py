@@ -24,7 +24,7 @@ from hilsplat.base.errors import SettingsError
 from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.language.autoencoder import Code, autoencoder_file, load_code
-from hilsplat.language.contributions import normalised_weights
+from hilsplat.language.compositing import normalised_weights
 from hilsplat.language.field import LanguageField
 from hilsplat.language.field_colours import field_colours
 from hilsplat.language.finished import FinishedScene, require_same
@@ -271,7 +271,7 @@ class LanguageScene:
             return self._view_nodes(view, Level(int(levels[0]))).mask(chosen).reshape(height, width)
         member = np.zeros(len(self.tree.node_of_gaussian), np.float32)
         member[self.gaussians_of(ids)] = 1
-        return (self.view_weights(view)[0] @ member > 0.5).reshape(height, width)
+        return (self.view_weights(view) @ member > 0.5).reshape(height, width)
 
     # -- relevancy --------------------------------------------------------------------------------
 
@@ -349,24 +349,24 @@ class LanguageScene:
 
     def field_image(self, view: str, level: Level) -> UInt8[np.ndarray, "H W 3"]:
         """The field of a level as colours (see `field_colours`); uncovered pixels are black."""
-        weights, _ = self.view_weights(view)
+        weights = self.view_weights(view)
         colours = field_colours(self.language.features[:, level.index])
         return to_uint8((weights @ colours).reshape(*self.scene.cameras[view].size_hw, 3))
 
     # -- what is kept of a view -------------------------------------------------------------------
 
-    def view_weights(self, view: str) -> tuple[sp.csr_matrix, Float32[np.ndarray, " P"]]:
-        """W of a view with rows divided by alpha (empty below half coverage), and alpha."""
+    def view_weights(self, view: str) -> sp.csr_matrix:
+        """W of a view with rows divided by alpha, empty below half coverage."""
         return self._views.get(
             ("weights", view),
             lambda: normalised_weights(self.pixel_weights(view)),
-            lambda kept: kept[0].data.nbytes + kept[0].indices.nbytes + kept[0].indptr.nbytes,
+            lambda kept: kept.data.nbytes + kept.indices.nbytes + kept.indptr.nbytes,
         )
 
     def _view_nodes(self, view: str, level: Level) -> ViewNodes:
         return self._views.get(
             ("nodes", view, level),
-            lambda: ViewNodes.of(self.view_weights(view)[0], self.tree.node_of_gaussian[:, level.index]),
+            lambda: ViewNodes.of(self.view_weights(view), self.tree.node_of_gaussian[:, level.index]),
             lambda kept: kept.nbytes,
         )
 
@@ -374,7 +374,7 @@ class LanguageScene:
         """Per level the pixels that show mostly Gaussians with a latent, and their rendered latents."""
 
         def render() -> list[tuple[np.ndarray, np.ndarray]]:
-            weights, _ = self.view_weights(view)
+            weights = self.view_weights(view)
             shown = []
             for index in range(len(LEVELS)):
                 own = np.ascontiguousarray(self.language.features[:, index], np.float32)

@@ -17,7 +17,8 @@ from hilsplat.base.artifacts import read_index, sha256_of_file, write_json
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import stage_log
 from hilsplat.language.autoencoder import autoencoder_file, load_latents, one_torch_thread
-from hilsplat.language.contributions import MIN_ALPHA, label_maps
+from hilsplat.language.compositing import MIN_ALPHA
+from hilsplat.language.contributions import label_maps
 from hilsplat.language.field import LanguageField, report_path
 from hilsplat.language.mask_rows import Contributions
 from hilsplat.scene.scene import Scene

@@ -31,24 +31,23 @@ def solve_field(
         features = scaled * inverse_root
         curved = problem.hessian_product(features)
         value = (dot(features, curved) - 2 * dot(features, right)) / total
-        terms, gradient = contrast.terms(features, weights)
-        value += weights[0] * terms["instance"] + weights[1] * terms["part"]
-        gradient = gradient + np.float32(2 / total) * (curved - right)
-        return value, gradient * inverse_root
+        contrastive, gradient = contrast.weighted(features, weights)
+        gradient += np.float32(2 / total) * (curved - right)
+        return value + contrastive, gradient * inverse_root
 
     lifted = problem.lifted
     report: dict[str, object] = {
-        "lifted": problem.terms(lifted) | contrast.terms(lifted, weights)[0],
+        "lifted": problem.terms(lifted) | contrast.values(lifted),
         "gradient_norms": gradient_norms(problem, contrast, inverse_root),
     }
     features = lifted
     if settings.cg_steps and any(problem.weights):
         features = conjugate_gradient(problem, lifted, settings.cg_steps)
-        report["after_cg"] = problem.terms(features) | contrast.terms(features, weights)[0]
+        report["after_cg"] = problem.terms(features) | contrast.values(features)
     if any(weights) and settings.lbfgs_steps:
         first_step = total / (2 * max(sum(problem.weights), 1e-3))
         features = lbfgs(objective, features * root, settings.lbfgs_steps, first_step) * inverse_root
-        report["after_lbfgs"] = problem.terms(features) | contrast.terms(features, weights)[0]
+        report["after_lbfgs"] = problem.terms(features) | contrast.values(features)
     return features.astype(np.float32), report
 
 
@@ -62,8 +61,8 @@ def gradient_norms(
     gradients = {
         "language": factor * (curved - problem.masks.spread(problem.pixels[:, None] * problem.latents)),
         "clustering": factor * (curved - problem.masks.spread(problem.pixels[:, None] * means)),
-        "instance": contrast.terms(lifted, (1.0, 0.0))[1],
-        "part": contrast.terms(lifted, (0.0, 1.0))[1],
+        "instance": contrast.weighted(lifted, (1.0, 0.0))[1],
+        "part": contrast.weighted(lifted, (0.0, 1.0))[1],
     }
     return {name: float(np.sqrt(dot(g * inverse_root, g * inverse_root))) for name, g in gradients.items()}
 

@@ -14,7 +14,8 @@ import scipy.sparse as sp
 from jaxtyping import Float32, Int32
 
 from hilsplat.language.autoencoder import load_latents
-from hilsplat.language.contributions import label_maps, normalised_weights
+from hilsplat.language.compositing import normalised_weights
+from hilsplat.language.contributions import label_maps
 from hilsplat.language.mask_rows import Contributions
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
@@ -62,7 +63,7 @@ class MethodInputs:
             min_weight=ContributionsSettings().min_weight,
             threads=self.threads,
         )
-        return normalised_weights(weights)[0]
+        return normalised_weights(weights)
 
     def view_labels(self, view: str) -> Int32[np.ndarray, "P 3"]:
         """Row of the view's painted mask at each pixel and level, -1 where there is none."""

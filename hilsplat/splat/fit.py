@@ -22,6 +22,7 @@ from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.initial import first_gaussians
 from hilsplat.splat.mcmc import add_noise, add_regularisers, relocate_and_grow
 from hilsplat.splat.optimise import Adam, means_rate
+from hilsplat.splat.order import morton_order
 from hilsplat.splat.photometric import photometric_loss
 from hilsplat.splat.ply import save_ply
 from hilsplat.splat.rasterise.api import draw
@@ -110,7 +111,8 @@ def fit_gaussians(
         key: digest of everything the fit depends on; another fit's checkpoint is not used.
 
     Returns:
-        The Gaussians, and the curve: rows of (step, loss, training PSNR, number of Gaussians).
+        The Gaussians, along a Morton curve (frozen ones in the order of their points), and the
+        training curve: rows of (step, loss, training PSNR, number of Gaussians).
 
     Raises:
         SceneError: there is no training view, or nothing is left to draw.
@@ -138,7 +140,11 @@ def fit_gaussians(
             state.save(checkpoint, key)
     if settings.initial != "frozen":
         prune(state.adam, settings, extent)
-    tensors = {name: torch.from_numpy(values) for name, values in state.adam.parameters.items()}
+    parameters = state.adam.parameters
+    if settings.initial != "frozen":
+        order = morton_order(parameters["means"])
+        parameters = {name: values[order] for name, values in parameters.items()}
+    tensors = {name: torch.from_numpy(values) for name, values in parameters.items()}
     if checkpoint:
         checkpoint.unlink(missing_ok=True)
     return Gaussians(**tensors), np.array(state.curve, dtype=np.float64).reshape(-1, 4)

@@ -1,7 +1,6 @@
 """What the instance and part losses share: softened distances, ancestors, cosines."""
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
@@ -10,11 +9,20 @@ from hilsplat.base.levels import NONE
 SOFTENING = 1e-3
 """Added in quadrature to every distance, so that its logarithm has a finite slope at zero."""
 
+SHORTEST = 1e-6
+"""Added in quadrature to every length that divides, so that the cosine of a zero vector is zero."""
+
 
 def soft_distances(means: Float[Tensor, "M D"]) -> Float[Tensor, "M M"]:
-    """Pairwise sqrt(|m_i - m_j|^2 + SOFTENING^2)."""
-    difference = means[:, None] - means[None]
-    return (difference.square().sum(-1) + SOFTENING**2).sqrt()
+    """Pairwise sqrt(|m_i - m_j|^2 + SOFTENING^2).
+
+    Squares are taken from products: M x M numbers instead of M x M x D. In float64 what cancels there is
+    far below the softening.
+    """
+    centred = means - means.detach().mean(0)
+    squares = centred.square().sum(-1)
+    apart = squares[:, None] + squares[None] - 2 * centred @ centred.T
+    return (apart.clamp(min=0) + SOFTENING**2).sqrt()
 
 
 def off_diagonal_mean(values: Float[Tensor, "M M"]) -> Float[Tensor, ""]:
@@ -50,11 +58,6 @@ def common_ancestor_depth(parent: Int32[np.ndarray, " M"]) -> Int64[np.ndarray, 
     return (chains @ chains.T).astype(np.int64)
 
 
-def unit(values: Float[Tensor, "*rows D"]) -> Float[Tensor, "*rows D"]:
-    """Divide by the softened length, so that a zero vector stays zero and has a finite gradient."""
-    return values / (values.square().sum(-1, keepdim=True) + 1e-12).sqrt()
-
-
 def similarity_without_parent(
     anchors: Float[Tensor, "A D"], others: Float[Tensor, "B D"], parent: Float[Tensor, "A D"]
 ) -> Float[Tensor, "A B"]:
@@ -65,4 +68,9 @@ def similarity_without_parent(
     parent is detached: parts move against their whole, not the whole against its parts.
     """
     parent = parent.detach()
-    return torch.einsum("ad,abd->ab", unit(anchors - parent), unit(others[None] - parent[:, None]))
+    own = anchors - parent
+    length = (own.square().sum(-1, keepdim=True) + SHORTEST**2).sqrt()
+    along = own @ others.T - (own * parent).sum(-1, keepdim=True)
+    # |other - parent|^2 from products: A x B numbers instead of A x B x D.
+    squares = others.square().sum(-1) - 2 * parent @ others.T + parent.square().sum(-1, keepdim=True)
+    return along / length / (squares.clamp(min=0) + SHORTEST**2).sqrt()

@@ -11,10 +11,10 @@ from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.language import contributions as stage
 from hilsplat.language import quadratic_builder
+from hilsplat.language.compositing import normalised_weights
 from hilsplat.language.contributions import (
     label_maps,
     labelled_rows,
-    normalised_weights,
     random_half,
     run_contributions,
     view_contributions,
@@ -50,16 +50,15 @@ def matrix(arrays: dict[str, np.ndarray], name: str, columns: int) -> np.ndarray
 
 def test_normalised_rows_sum_to_one_or_are_empty():
     weights = sp.csr_matrix(np.array([[0.6, 0.3, 0], [0.1, 0.2, 0], [0, 0, 0]], np.float32))
-    normalised, alpha = normalised_weights(weights)
+    normalised = normalised_weights(weights)
     assert normalised.toarray() == pytest.approx(np.array([[2 / 3, 1 / 3, 0], [0, 0, 0], [0, 0, 0]]))
-    assert alpha == pytest.approx([0.9, 0.3, 0])
     assert weights[0, 0] == pytest.approx(0.6)  # the argument is left alone
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_mask_means_equal_their_definition(seed):
     raw, masks = random_view(seed)
-    weights, _ = normalised_weights(raw)
+    weights = normalised_weights(raw)
     arrays = view_contributions("v", weights, masks)
     dense = weights.toarray().astype(np.float64)
     covered = dense.sum(axis=1) > 0
@@ -82,7 +81,7 @@ def test_gram_and_weights_give_the_quadratic_form_of_every_level():
     stacked, dense = [], np.zeros((3, 40, 40))
     for seed in range(3):
         raw, masks = random_view(seed)
-        weights, _ = normalised_weights(raw)
+        weights = normalised_weights(raw)
         labels = label_maps(masks)
         stacked.append(labelled_rows(weights, labels))
         full = weights.toarray().astype(np.float64)
@@ -117,7 +116,7 @@ def chosen_quadratic(part, keep):
 
 def test_gram_does_not_depend_on_threads():
     raw, masks = random_view(0)
-    weights, _ = normalised_weights(raw)
+    weights = normalised_weights(raw)
     part = labelled_rows(weights, label_maps(masks))
     one, two = built_gram([part], threads=1), built_gram([part], threads=2)
     assert one.values.tobytes() == two.values.tobytes()
@@ -128,7 +127,7 @@ def test_gram_does_not_depend_on_how_the_pixels_are_parted(monkeypatch):
     parts = []
     for seed in range(4):
         raw, masks = random_view(seed)
-        weights, _ = normalised_weights(raw)
+        weights = normalised_weights(raw)
         parts.append(labelled_rows(weights, label_maps(masks)))
     one, four = built_gram([stack_weights(parts)]), built_gram(parts)
     for name in ("indptr", "indices", "values"):
@@ -143,7 +142,7 @@ def test_gram_does_not_depend_on_how_the_pixels_are_parted(monkeypatch):
 
 def test_the_smaller_quadratic_is_kept_and_read_back_equal(tmp_path):
     raw, masks = random_view(0)
-    weights, _ = normalised_weights(raw)
+    weights = normalised_weights(raw)
     part = labelled_rows(weights, label_maps(masks))
     features = np.random.default_rng(5).normal(size=(40, 3, 4)).astype(np.float32)
     for keep in ("gram", "weights"):
@@ -172,7 +171,7 @@ def test_stage_writes_rows_in_view_order_and_masses(two_boxes_contributions):
     assert found.mass().sum(axis=1) == pytest.approx([HEIGHT * WIDTH] * 4, rel=1e-5)
     A = found.matrix("A").toarray()
     assert A.sum(axis=1) == pytest.approx(np.ones(len(found)), abs=1e-5)
-    weights, _ = normalised_weights(two_boxes_weights(0))
+    weights = normalised_weights(two_boxes_weights(0))
     corner = weights.toarray().reshape(HEIGHT, WIDTH, -1)[6:8, 6:9].reshape(6, -1).mean(axis=0)
     assert A[5] == pytest.approx(corner, abs=1e-6)
     assert mask_embeddings(world.clip, found).shape == (24, 16)
@@ -220,7 +219,7 @@ def test_a_builder_goes_on_from_its_state(keep, monkeypatch):
     parts = []
     for seed in range(3):
         raw, masks = random_view(seed)
-        parts.append(labelled_rows(normalised_weights(raw)[0], label_maps(masks)))
+        parts.append(labelled_rows(normalised_weights(raw), label_maps(masks)))
     monkeypatch.setattr(quadratic_builder, "CHUNK_WEIGHTS", parts[0].nonzeros + 1)
     whole, first, second = (QuadraticBuilder(40, keep, threads=1) for _ in range(3))
     for part in parts:

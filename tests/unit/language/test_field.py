@@ -8,7 +8,7 @@ import torch
 from hilsplat.base.artifacts import read_json
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.language.autoencoder import run_autoencoder
-from hilsplat.language.contrast import Contrast, ViewRelations, contrastive_terms, distinct
+from hilsplat.language.contrast import Contrast, ViewRelations, distinct, instance_term, part_term
 from hilsplat.language.contributions import painted_indicator
 from hilsplat.language.field import LanguageField, run_language
 from hilsplat.language.losses.clustering import clustering_loss
@@ -157,7 +157,8 @@ def test_lbfgs_finds_the_minimum_of_a_bowl():
 def test_contrastive_gradients_equal_autograd_through_the_means(instance, part):
     toy = Toy((1.0, 0.3, 0.1))
     contrast = toy.contrast(LanguageSettings(instance_mode=instance, part_mode=part, tau=0.5))
-    terms, gradient = contrast.terms(toy.features, (0.5, 0.25))
+    terms = contrast.values(toy.features)
+    value, gradient = contrast.weighted(toy.features, (0.5, 0.25))
 
     features = torch.from_numpy(toy.features).double().requires_grad_()
     own = [features[:, level - 1] for level in toy.level]
@@ -167,10 +168,17 @@ def test_contrastive_gradients_equal_autograd_through_the_means(instance, part):
     )
     n, half = (torch.from_numpy(count).double()[:, None] for count in (toy.pixels, toy.half_pixels))
     others = (n * means - half * halves) / (n - half)
-    losses = contrastive_terms(means, halves, others, contrast.relations, contrast.settings)
-    assert terms == pytest.approx({"instance": losses[0].item(), "part": losses[1].item()}, rel=1e-5)
-    (expected,) = torch.autograd.grad(0.5 * losses[0] + 0.25 * losses[1], features)
+    instance_loss = instance_term(means, contrast.relations, contrast.settings)
+    part_loss = part_term(means, halves, others, contrast.relations, contrast.settings)
+    assert terms == pytest.approx({"instance": instance_loss.item(), "part": part_loss.item()}, rel=1e-5)
+    total = 0.5 * instance_loss + 0.25 * part_loss
+    assert value == pytest.approx(total.item(), rel=1e-5)
+    (expected,) = torch.autograd.grad(total, features, retain_graph=True)
     assert gradient == pytest.approx(expected.numpy(), abs=1e-5)
+    (of_part,) = torch.autograd.grad(part_loss, features)
+    value, gradient = contrast.weighted(toy.features, (0.0, 1.0))  # the other is not computed
+    assert value == pytest.approx(part_loss.item(), rel=1e-5)
+    assert gradient == pytest.approx(of_part.numpy(), abs=1e-5)
 
 
 def test_contrastive_weights_lower_their_terms():
