@@ -3,7 +3,6 @@
 import errno
 import fcntl
 import hashlib
-import io
 import json
 import os
 import shutil
@@ -18,6 +17,9 @@ from typing import Any
 import numpy as np
 
 from hilsplat.base.errors import ArtifactError, DiskSpaceError
+
+ZIP64_BYTES = 2**30
+"""Arrays above this size get an entry whose size may pass 2 GiB."""
 
 INDEX = "index.json"
 """Written last into a folder artifact: its presence means that the folder is complete."""
@@ -126,13 +128,16 @@ def read_json(path: Path) -> Any:
 
 def write_npz(path: Path, **arrays: np.ndarray) -> None:
     """Write a compressed .npz atomically, with fixed time stamps: same arrays, same bytes."""
-    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+    with (
+        atomic_path(path) as temporary,
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+    ):
         for name, array in arrays.items():
-            buffer = io.BytesIO()
-            np.lib.format.write_array(buffer, np.ascontiguousarray(array), allow_pickle=False)
-            info = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
-            info.compress_type = zipfile.ZIP_DEFLATED
-            archive.writestr(info, buffer.getvalue(), compresslevel=1)
+            # Entries opened by name get the time 1980-01-01. What is written goes out piece by piece: a
+            # large array is held neither twice nor compressed.
+            large = array.nbytes > ZIP64_BYTES
+            with archive.open(f"{name}.npy", "w", force_zip64=large) as stream:
+                np.lib.format.write_array(stream, np.ascontiguousarray(array), allow_pickle=False)
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:

@@ -13,8 +13,9 @@ from hilsplat.base.artifacts import INDEX, atomic_folder, read_index, sha256_of_
 from hilsplat.base.levels import LEVELS
 from hilsplat.language.quadratic import Gram, Quadratic, StackedWeights, compiled
 
-BLOCKS = 16
-"""Blocks of rows in which G is built, one a thread at a time; the result does not depend on it."""
+BLOCKS = 64
+"""Blocks of rows in which G is built, one a thread at a time; the result does not depend on it. A block
+whose Gaussians a part does not show is left as it is, which a Morton order makes frequent."""
 
 CHUNK_WEIGHTS = 2**25
 """Non-zeros of W that are gathered before they are added to G; 0.7 GiB while they are."""
@@ -42,10 +43,7 @@ class GramBuilder:
         self._ranges = list(pairwise(edges))
         self._threads = max(1, threads)
         self._pixels = self._places = np.zeros(0, np.int32)
-        self._blocks = [
-            (np.zeros(end - begin + 1, np.int64), np.zeros(0, np.int32), np.zeros((0, len(LEVELS))))
-            for begin, end in self._ranges
-        ]
+        self._blocks = [_empty_block(end - begin) for begin, end in self._ranges]
 
     @property
     def nonzeros(self) -> int:
@@ -59,8 +57,11 @@ class GramBuilder:
         columns = self._columns(weights)
 
         def grow(block: int) -> None:
+            begin, end = self._ranges[block]
+            if columns[0][begin] == columns[0][end]:
+                return
             self._blocks[block] = _grown_block(
-                *self._ranges[block], *arrays, *columns, *self._blocks[block], len(LEVELS)
+                begin, end, *arrays, *columns, *self._blocks[block], len(LEVELS)
             )
 
         with ThreadPoolExecutor(self._threads) as pool:
@@ -104,12 +105,17 @@ class GramBuilder:
         done = 0
         for (begin, end), block in zip(self._ranges, range(len(self._blocks)), strict=True):
             some_indptr, some_indices, some_values = self._blocks[block]
-            self._blocks[block] = (np.zeros(1, np.int64), some_indices[:0], some_values[:0])
+            self._blocks[block] = _empty_block(end - begin)
             indptr[begin + 1 : end + 1] = some_indptr[1:] + done
             indices[done : done + len(some_indices)] = some_indices
             values[done : done + len(some_indices)] = some_values
             done += len(some_indices)
         return Gram(indptr, indices, values)
+
+
+def _empty_block(rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of G without a pair: begins, columns, values."""
+    return np.zeros(rows + 1, np.int64), np.zeros(0, np.int32), np.zeros((0, len(LEVELS)))
 
 
 class QuadraticBuilder:

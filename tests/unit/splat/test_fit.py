@@ -13,6 +13,7 @@ from hilsplat.splat import fit
 from hilsplat.splat.densify import ScreenGradients, densify, prune, reset_opacities
 from hilsplat.splat.initial import RANDOM_POINTS, first_gaussians
 from hilsplat.splat.optimise import Adam, means_rate
+from hilsplat.splat.order import morton_order
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.cpu import Gradients
 from hilsplat.splat.state import FitState
@@ -31,6 +32,7 @@ def test_fit_improves_held_out_views(scene, strategy):
     assert mean_psnr(scene, last) > mean_psnr(scene, first) + 5
     assert len(last) <= SETTINGS.max_gaussians
     assert curve[-1, 0] == 200
+    assert np.array_equal(morton_order(last.means.numpy()), np.arange(len(last)))
 
 
 def outputs(folder: Path) -> dict[str, bytes]:
