@@ -97,11 +97,6 @@ class Autoencoder(nn.Module):
             out[start : start + len(part)] = self.decode(part).numpy()
         return out
 
-    @torch.no_grad()
-    def decode_raw_array(self, latents: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:
-        """What the decoder says before it is scaled to unit length: piecewise linear in the latents."""
-        return self.decoder(torch.from_numpy(np.ascontiguousarray(latents))).numpy()
-
     def save(self, path: Path) -> None:
         """Write a .safetensors file; the same weights give the same bytes."""
         about = json.dumps({"channels": self.channels, "latent": self.latent}, sort_keys=True)

@@ -1,9 +1,7 @@
 """Relevancy of rendered latents without decoding every pixel.
 
-- d = 3: the decoder becomes a table of cells (see `latent_grid`). A text costs one product with the
-  corners of the cells, a pixel one trilinear look-up.
-- a linear code (PCA), any d: cosines are ratios of d numbers and need no decoding at all.
-- a network of another size: every latent is decoded, in chunks.
+- a linear code (PCA): cosines are ratios of d numbers and need no decoding at all (`linear_look_up`).
+- a network: a view is decoded once and kept as coordinates in few directions (`projected_look_up`).
 """
 
 from collections.abc import Callable
@@ -13,10 +11,10 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from hilsplat.language.autoencoder import CHUNK_ROWS, Autoencoder, Code, one_torch_thread
-from hilsplat.language.latent_grid import LatentGrid, Placed
+from hilsplat.language.autoencoder import CHUNK_ROWS, Code, one_torch_thread
 from hilsplat.language.linear_code import LinearCode
 from hilsplat.language.linear_look_up import LinearLookUp, PlacedLinear
+from hilsplat.language.projected_look_up import PlacedProjected, ProjectedLookUp
 from hilsplat.language.relevancy import relevancy
 
 PIXELS_AT_A_TIME = 1 << 16
@@ -29,7 +27,6 @@ class LatentRelevancy:
         code: decodes latents.
         canonical: unit vectors of the generic phrases.
         scale: of the cosines.
-        features: latents of the Gaussians.
         threads: pixels are shared among them; results do not depend on it.
     """
 
@@ -38,21 +35,13 @@ class LatentRelevancy:
         code: Code,
         canonical: Float32[np.ndarray, "K C"],
         scale: float,
-        features: Float32[np.ndarray, "N D"],
         threads: int = 1,
     ) -> None:
         self._code, self._canonical, self._scale, self._threads = code, canonical, scale, threads
-        self.grid: LatentGrid | None = None
-        self._linear: LinearLookUp | None = None
-        if isinstance(code, LinearCode):
-            self._linear = LinearLookUp(code, canonical, scale)
-        elif isinstance(code, Autoencoder) and code.latent == 3:
-            self.grid = LatentGrid(code, features, canonical, scale)
-
-    @property
-    def is_linear(self) -> bool:
+        self.is_linear = isinstance(code, LinearCode)
         """Whether the fast way loses nothing but rounding."""
-        return self._linear is not None
+        look_up = LinearLookUp if self.is_linear else ProjectedLookUp
+        self._look_up = look_up(code, canonical, scale)
 
     def exact(
         self, latents: Float32[np.ndarray, "P D"], texts: Float32[np.ndarray, "T C"]
@@ -61,51 +50,47 @@ class LatentRelevancy:
         out = np.empty((len(texts), len(latents)), np.float32)
 
         def decode(span: slice) -> None:
-            torch.set_num_threads(1)  # holds for one thread of the pool; they share the cores already
             decoded = self._code.decode_array(np.ascontiguousarray(latents[span], np.float32))
             out[:, span] = relevancy(decoded, texts, self._canonical, self._scale)
 
-        with one_torch_thread():
-            self._in_parts(decode, len(latents), CHUNK_ROWS)
+        self._decode_in_parts(decode, len(latents))
         return out
 
-    def prepare(self, latents: Float32[np.ndarray, "P D"]) -> Placed | PlacedLinear | None:
-        """What a look-up of these latents needs; once per view. None where every latent is decoded."""
-        if self._linear is not None:
-            return self._linear.place(latents)
-        return None if self.grid is None else self.grid.place(latents)
+    def prepare(self, latents: Float32[np.ndarray, "P D"]) -> PlacedLinear | PlacedProjected:
+        """What a look-up of these latents needs; once per view."""
+        if isinstance(self._look_up, LinearLookUp):
+            return self._look_up.place(latents)
+        return self._look_up.place(latents, self._decode_in_parts)
 
     def fast(
         self,
-        latents: Float32[np.ndarray, "P D"],
-        placed: Placed | PlacedLinear | None,
+        placed: PlacedLinear | PlacedProjected,
         texts: Float32[np.ndarray, "T C"],
     ) -> Float32[np.ndarray, "T P"]:
         """The fast way of this code; see the module for which that is.
 
         Args:
-            latents: of pixels.
-            placed: what `prepare` returned for them.
+            placed: what `prepare` returned.
             texts: unit vectors.
         """
-        if placed is None:
-            return self.exact(latents, texts)
-        out = np.empty((len(texts), len(latents)), np.float32)
+        out = np.empty((len(texts), len(placed.generic)), np.float32)
         for text, row in zip(texts, out, strict=True):
-            self._in_parts(self._look_up(placed, text, row), len(latents))
+
+            def answer(span: slice, text: np.ndarray = text, row: np.ndarray = row) -> None:
+                self._look_up.look_up(placed, span, text, row[span])
+
+            self._in_parts(answer, len(placed.generic))
         return out
 
-    def _look_up(
-        self,
-        placed: Placed | PlacedLinear,
-        text: Float32[np.ndarray, " C"],
-        out: Float32[np.ndarray, " P"],
-    ) -> Callable[[slice], None]:
-        if isinstance(placed, PlacedLinear):
-            linear = self._linear
-            return lambda span: linear.look_up(placed, span, text, out[span])
-        grid, table = self.grid, self.grid.table(text)
-        return lambda span: grid.look_up(table, placed.cell[span], placed.inside[span], out[span])
+    def _decode_in_parts(self, work: Callable[[slice], None], count: int) -> None:
+        """`_in_parts` for work that decodes; torch takes one thread, as the parts share the cores."""
+
+        def alone(span: slice) -> None:
+            torch.set_num_threads(1)  # holds for one thread of the pool
+            work(span)
+
+        with one_torch_thread():
+            self._in_parts(alone, count, CHUNK_ROWS)
 
     def _in_parts(self, work: Callable[[slice], None], count: int, at_a_time: int = PIXELS_AT_A_TIME) -> None:
         spans = [slice(begin, begin + at_a_time) for begin in range(0, count, at_a_time)]

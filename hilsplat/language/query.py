@@ -324,8 +324,8 @@ class LanguageScene:
         Args:
             texts: queries.
             view: name of the view.
-            exact: a network with d = 3 decodes every pixel; else it answers from a table, within 2e-3 of
-                that at all but few pixels (see `latent_relevancy`). Other codes have one way.
+            exact: a network decodes every pixel for every call; else a view is decoded once and answers
+                within 2e-3 of that (see `latent_relevancy`). A linear code has one way.
         """
         by_look_up = self._latent_relevancy.is_linear or not exact
         shown, placed = self._view_latents(view), self._placed_latents(view) if by_look_up else None
@@ -336,9 +336,7 @@ class LanguageScene:
         for index, (pixels, latents) in enumerate(shown):
             if not len(pixels):
                 continue
-            found = (
-                answer.fast(latents, placed[index], vectors) if by_look_up else answer.exact(latents, vectors)
-            )
+            found = answer.fast(placed[index], vectors) if by_look_up else answer.exact(latents, vectors)
             for row, level_map in zip(found, maps[:, index], strict=True):
                 if len(pixels) == len(level_map):
                     level_map[:] = row
@@ -392,7 +390,7 @@ class LanguageScene:
         return self._views.get(
             ("placed", view),
             lambda: [self._latent_relevancy.prepare(latents) for _, latents in self._view_latents(view)],
-            lambda kept: sum(each.nbytes for each in kept if each),
+            lambda kept: sum(each.nbytes for each in kept),
         )
 
     @cached_property
@@ -401,7 +399,6 @@ class LanguageScene:
             self.autoencoder,
             self.text_vectors(self.canonical),
             self.relevancy_scale,
-            self.language.features.reshape(-1, self.language.features.shape[2]),
             self.threads,
         )
 
