@@ -27,14 +27,11 @@ from hilsplat.base.artifacts import (
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log
-from hilsplat.language.device import compute_device
-from hilsplat.language.evidence import mask_evidence
-from hilsplat.language.linkage import pooled_linkage
+from hilsplat.language.level_nodes import level_nodes
 from hilsplat.language.mask_rows import Contributions, mask_embeddings
 from hilsplat.language.tree_boxes import node_boxes
 from hilsplat.language.tree_export import readable_nodes
 from hilsplat.language.tree_nodes import (
-    gaussian_nodes,
     mask_fits,
     nest_nodes,
     node_parents,
@@ -151,42 +148,15 @@ def build_tree(
     membership = np.zeros((S.shape[1], len(LEVELS)), np.float32)
     for each in LEVELS:
         rows = contributions.rows_of(each)
-        view = contributions.view[rows]
-        weights = S[rows]
-        seen_in = view[_row_of(weights)]
-        shares = _divide(
-            weights, np.where(visible[seen_in, weights.indices], mass[seen_in, weights.indices], np.inf)
+        found = level_nodes(
+            S[rows], contributions.view[rows], mass, visible, importance, total_mass, settings, threads
         )
-        evidence = mask_evidence(
-            shares,
-            importance,
-            visible,
-            view,
-            settings.min_covisible,
-            settings.overlap,
-            threads,
-            compute_device(settings.device),
-        )
-        del shares
-        cluster, cluster_quality = pooled_linkage(evidence, settings.link_threshold)
-        del evidence
-        num_clusters = int(cluster.max(initial=-1)) + 1
-        pairs = np.unique(np.stack([cluster, view.astype(np.int64)], axis=1), axis=0)
-        large = np.flatnonzero(np.bincount(pairs[:, 0], minlength=num_clusters) >= settings.min_views)
-        local = np.full(num_clusters + 1, NONE, np.int64)
-        local[large] = np.arange(len(large))
-        shares = _divide(weights, np.maximum(total_mass, 1e-12)[weights.indices])
-        nodes, share = gaussian_nodes(local[cluster], len(large), shares, settings.min_member_share)
-        del shares, weights
-        # A node that wins no Gaussian selects nothing: it is dropped.
-        used = np.unique(nodes[nodes >= 0])
-        renumber = np.full(len(large) + 1, NONE, np.int64)
-        renumber[used] = len(level) + np.arange(len(used))
-        node_of_gaussian[:, each.index] = renumber[nodes]
-        membership[:, each.index] = share
-        cluster_of_mask[rows] = renumber[local[cluster]]
-        level += [int(each)] * len(used)
-        quality += cluster_quality[large[used]].tolist()
+        renumber = np.append(len(level) + np.arange(len(found.quality)), NONE)
+        node_of_gaussian[:, each.index] = renumber[found.of_gaussian]
+        membership[:, each.index] = found.membership
+        cluster_of_mask[rows] = renumber[found.of_mask]
+        level += [int(each)] * len(found.quality)
+        quality += found.quality.tolist()
 
     levels = np.array(level, np.uint8)
     num = len(levels)
@@ -287,17 +257,3 @@ def run_semantic_tree(
                 masks=len(contributions),
                 gaussians_sha256=contributions.gaussians_sha256,
             )
-
-
-def _row_of(matrix: sp.csr_matrix) -> np.ndarray:
-    """Row of every stored value."""
-    return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
-
-
-def _divide(matrix: sp.csr_matrix, by: np.ndarray) -> sp.csr_matrix:
-    """Divide the stored values one by one (float64); those divided by infinity are dropped."""
-    divided = sp.csr_matrix(
-        (matrix.data.astype(np.float64) / by, matrix.indices.copy(), matrix.indptr.copy()), shape=matrix.shape
-    )
-    divided.eliminate_zeros()
-    return divided

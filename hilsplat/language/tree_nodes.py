@@ -82,23 +82,47 @@ def mask_fits(
         node of the mask's level above `min_fit`, else -1.
     """
     fits = np.full(len(view), NONE, np.int32)
-    area = np.asarray(S.sum(axis=1, dtype=np.float64)).ravel()
     for each in LEVELS:
-        node = node_of_gaussian[:, each.index]
-        has = np.flatnonzero(node >= 0)
-        member = sp.csr_matrix((np.ones(len(has)), (has, node[has])), shape=(len(node), num_nodes))
         rows = np.flatnonzero(level == int(each))
-        inter = (S[rows].astype(np.float64) @ member).tocsr()
-        size = np.asarray(member.T @ mass.T.astype(np.float64))  # [node, view]
-        for place, row in enumerate(rows):
-            span = slice(inter.indptr[place], inter.indptr[place + 1])
-            if span.start == span.stop:
-                continue
-            nodes, shared = inter.indices[span], inter.data[span]
-            iou = shared / (area[row] + size[nodes, view[row]] - shared)
-            best = np.lexsort((nodes, -iou))[0]
-            if iou[best] > min_fit:
-                fits[row] = nodes[best]
+        own = node_of_gaussian[:, each.index]
+        fits[rows] = level_fits(own, num_nodes, S[rows], mass, view[rows], min_fit)
+    return fits
+
+
+def level_fits(
+    node_of_gaussian: Int32[np.ndarray, " N"],
+    num_nodes: int,
+    weights: sp.csr_matrix,
+    mass: Float32[np.ndarray, "V N"],
+    view: Int32[np.ndarray, " m"],
+    min_fit: float,
+) -> Int32[np.ndarray, " m"]:
+    """`mask_fits` of one level.
+
+    Args:
+        node_of_gaussian: at the level.
+        num_nodes: ids are below it.
+        weights: S of the level's masks.
+        mass: visible mass of each Gaussian in each view, px.
+        view: of each mask.
+        min_fit: least IoU.
+    """
+    has = np.flatnonzero(node_of_gaussian >= 0)
+    node = node_of_gaussian[has]
+    member = sp.csr_matrix((np.ones(len(has)), (has, node)), shape=(len(node_of_gaussian), num_nodes))
+    inter = (weights.astype(np.float64) @ member).tocsr()
+    area = np.asarray(weights.sum(axis=1, dtype=np.float64)).ravel()
+    size = np.stack([np.bincount(node, seen[has], num_nodes) for seen in mass])  # [view, node]
+    fits = np.full(len(view), NONE, np.int32)
+    for row in range(len(view)):
+        span = slice(inter.indptr[row], inter.indptr[row + 1])
+        if span.start == span.stop:
+            continue
+        nodes, shared = inter.indices[span], inter.data[span]
+        iou = shared / (area[row] + size[view[row], nodes] - shared)
+        best = np.lexsort((nodes, -iou))[0]
+        if iou[best] > min_fit:
+            fits[row] = nodes[best]
     return fits
 
 

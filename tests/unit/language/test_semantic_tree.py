@@ -7,12 +7,9 @@ import scipy.sparse as sp
 from hilsplat.base.artifacts import read_index, read_json, sha256_of_path, write_index
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
-from hilsplat.language.semantic_tree import (
-    SemanticTree,
-    gaussian_nodes,
-    node_parents,
-    run_semantic_tree,
-)
+from hilsplat.language.level_nodes import level_nodes
+from hilsplat.language.semantic_tree import SemanticTree, run_semantic_tree
+from hilsplat.language.tree_nodes import gaussian_nodes, node_parents
 from hilsplat.settings import SemanticTreeSettings
 from tests.unit.language.two_boxes_world import HEIGHT, NUM_GAUSSIANS, REGIONS, WIDTH, region_mask
 
@@ -24,6 +21,29 @@ def test_gaussians_join_the_node_with_the_largest_share():
     # 0.9 against 0.2; 0.2 is too little; a tie goes to the lower node
     assert node.tolist() == [0, -1, 0]
     assert membership == pytest.approx([0.9, 0, 0.3])
+
+
+def test_a_double_that_shows_nothing_is_no_node():
+    # Four views of ten Gaussians: one mask of all (two views miss Gaussian 3), and in three of the views
+    # one of the first four. Those are a cluster of their own and win Gaussian 3 alone, which none shows.
+    whole = np.ones((4, 10))
+    whole[:2, 3] = 0
+    double = np.repeat((np.arange(10) < 4)[None], 3, axis=0)
+    weights = sp.csr_matrix(np.concatenate([whole, double]).astype(np.float32))
+    view = np.array([0, 1, 2, 3, 0, 1, 2], np.int32)
+    mass, once = np.ones((4, 10), np.float32), np.ones(10)
+    seen = mass > 0
+
+    found = level_nodes(weights, view, mass, seen, once, 4 * once, SemanticTreeSettings(), 1)
+    assert found.of_mask.tolist() == [0, 0, 0, 0, -1, -1, -1]
+    assert found.of_gaussian.tolist() == [0] * 10
+    assert found.membership == pytest.approx(np.where(np.arange(10) == 3, 0.5, 1.0))
+    assert len(found.quality) == 1
+
+    whole[:2, :4] = 0  # now it wins all four, and is a node
+    weights = sp.csr_matrix(np.concatenate([whole, double]).astype(np.float32))
+    found = level_nodes(weights, view, mass, seen, once, 4 * once, SemanticTreeSettings(), 1)
+    assert found.of_gaussian.tolist() == [1] * 4 + [0] * 6
 
 
 def test_subpart_may_hang_directly_under_a_whole():
