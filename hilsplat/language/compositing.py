@@ -4,7 +4,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float32
 
-from hilsplat.language.quadratic import compiled
+from hilsplat.language.compiled import compiled
 
 MIN_ALPHA = 0.5
 """Pixels that the Gaussians cover less than this are ignored: their features are extrapolated."""

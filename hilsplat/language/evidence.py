@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float64, Int32
 
-from hilsplat.language.quadratic import compiled
+from hilsplat.language.compiled import compiled
 
 ROWS_AT_A_TIME = 64
 """Rows of masks that one thread takes at a time."""

@@ -8,8 +8,8 @@ Gaussians, not with all pairs.
 import numpy as np
 from jaxtyping import Float, Int64
 
+from hilsplat.language.compiled import compiled
 from hilsplat.language.evidence import Evidence
-from hilsplat.language.quadratic import compiled
 
 
 def pooled_linkage(

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Float32, Int64, UInt8
 
-from hilsplat.language.quadratic import compiled
+from hilsplat.language.compiled import compiled
 
 MEDIAN_SOFTENING = 1e-4
 """Least distance of a latent to the median, so that a step never divides by zero."""

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Float32, Int16
 
 from hilsplat.language.autoencoder import Autoencoder
-from hilsplat.language.linear_look_up import BLOCK, dots_of_block, write_relevancy
-from hilsplat.language.quadratic import compiled
+from hilsplat.language.look_up_kernels import projected_relevancy
 
 RESIDUAL = 5e-5
 """Root mean square of what decoded vectors lose outside the kept directions."""
@@ -82,7 +81,7 @@ class ProjectedLookUp:
     ) -> None:
         """Write the relevancy of a text at the latents of a span."""
         weights = (placed.directions @ text / STEPS).astype(np.float32)
-        _relevancy(placed.coordinates, placed.generic, span.start, weights, self._scale, out)
+        projected_relevancy(placed.coordinates, placed.generic, span.start, weights, self._scale, out)
 
     def _directions(self, latents: Float32[np.ndarray, "P D"]) -> Float32[np.ndarray, "R C"]:
         """As few as hold the decoded vectors but for `RESIDUAL`, at least one."""
@@ -93,12 +92,3 @@ class ProjectedLookUp:
         lost = np.sqrt(np.maximum(np.cumsum(values), 0))  # of the smallest directions
         keep = max(1, int((lost > RESIDUAL).sum()))
         return np.ascontiguousarray(directions[:, -keep:].T, np.float32)
-
-
-@compiled
-def _relevancy(coordinates, generic, first, weights, scale, out):
-    dots = np.empty(BLOCK, np.float32)
-    for begin in range(first, first + len(out), BLOCK):
-        end = min(begin + BLOCK, first + len(out))
-        dots_of_block(coordinates, begin, end, np.float32(0), weights, dots)
-        write_relevancy(dots, generic[begin:end], scale, out[begin - first : end - first])

@@ -5,13 +5,10 @@ all levels, as an upper triangle with three values per pair of Gaussians; where 
 non-zeros, W is kept and streamed instead. Both give the same products.
 """
 
-import inspect
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-import numba
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float32
@@ -19,15 +16,11 @@ from jaxtyping import Bool, Float, Float32
 from hilsplat.base.artifacts import read_into, read_npz, write_npz
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
+from hilsplat.language.compiled import compiled
 
 PRODUCT_PARTS = 4
 """Parts of equally many pairs in which a product with G is summed. Fixed, so that the number of threads
 changes no byte; each part holds the sums of its rows and of those below."""
-
-
-def compiled(function: Callable, **options: bool) -> Callable:
-    """Compile a loop with numba (unwrapped: the tests' type checker wraps every function)."""
-    return numba.njit(cache=True, nogil=True, **options)(inspect.unwrap(function))
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ import scipy.sparse as sp
 
 from hilsplat.base.artifacts import INDEX, atomic_folder, read_index, sha256_of_json, write_index
 from hilsplat.base.levels import LEVELS
-from hilsplat.language.quadratic import Gram, Quadratic, StackedWeights, compiled
+from hilsplat.language.compiled import compiled
+from hilsplat.language.quadratic import Gram, Quadratic, StackedWeights
 
 BLOCKS = 64
 """Blocks of rows in which G is built, one a thread at a time; the result does not depend on it. A block

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float32, Int32, Int64
 
-from hilsplat.language.quadratic import compiled
+from hilsplat.language.compiled import compiled
 
 
 @dataclass(frozen=True)
