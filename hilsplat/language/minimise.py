@@ -50,7 +50,6 @@ def lbfgs(objective: Objective, start: np.ndarray, steps: int, first_step: float
 
 def dot(a: np.ndarray, b: np.ndarray) -> float:
     """Sum of products in float64 (no BLAS: its order of summation depends on the threads)."""
-    a, b = np.broadcast_arrays(a, b)
     a, b = a.reshape(-1), b.reshape(-1)
     return float(
         sum(

@@ -1,8 +1,8 @@
 """Relevancy of a network's latents: every pixel of a view is decoded once, and kept short.
 
-Decoded vectors of one view lie near a plane of few directions (some 65 of 512). Each is kept as its
-coordinates there, in 16 bits, with the cosine of its nearest canonical phrase, which is found from the whole
-vector. A text then costs as many products a pixel as there are directions; the limit is reading them.
+Decoded vectors of one view lie near a plane of few directions (some 65 of 128, 105 of 512). Each is kept
+as its coordinates there, in 16 bits, with the cosine of its nearest canonical phrase, which is found from the
+whole vector. A text then costs as many products a pixel as there are directions; the limit is reading them.
 """
 
 from collections.abc import Callable
