@@ -123,9 +123,6 @@ UPSTREAM: dict[str, tuple[str, ...]] = {
 SEEDED = re.compile(r"(?P<variant>.+?)(?:\.seed(?P<seed>[0-9]+))?")
 """A variant's name, with the number of the seed behind it where it is not the first."""
 
-SEEDED_STAGES = ("autoencoder", "language", "evaluate")
-"""Stages whose results depend on the seed; variants that differ in it share those before."""
-
 
 class RunSettings(StageSettings):
     """The whole configuration: what is run, with which settings."""
@@ -147,7 +144,9 @@ class RunSettings(StageSettings):
     sweep_scenes: tuple[str, ...] = knob(
         (), "names of scenes for ablation, sweeps and pruning; empty: all tabletop and photographed ones"
     )
-    seeds: int = knob(1, "seeds of autoencoder and field; more than one gives mean and spread", ge=1, le=10)
+    seeds: int = knob(
+        1, "seeds of trained autoencoders and fields; more than one gives mean and spread", ge=1, le=10
+    )
     variants: dict[str, dict[str, dict[str, Any]]] = knob(
         {}, "named overrides: variant -> section -> knob -> value; 'default' always exists"
     )
@@ -160,15 +159,26 @@ class RunSettings(StageSettings):
     )
 
     def variant_names(self) -> list[str]:
-        """Variants that a run needs, "default" first; with more than one seed each of them per seed."""
+        """Variants that a run may need, "default" first; with more than one seed each of them per seed."""
         lists = (self.main_variants, self.ablation_variants, self.theta_variants)
         lists += (self.omega_variants, self.pruning_variants)
         names = dict.fromkeys(["default", *(name for names in lists for name in names)])
-        return [name for first in names for name in self.seeded(first)]
+        return [name for first in names for name in self._all_seeds(first)]
 
-    def seeded(self, variant: str) -> list[str]:
-        """A variant under every seed: its own name, then `<name>.seed1`, ..."""
+    def seeded(self, variant: str, scopes: tuple[str, ...] = ()) -> list[str]:
+        """A variant under every seed: its own name, then `<name>.seed1`, ...
+
+        One in which nothing is random has one seed: it would be computed again to the same bytes.
+        """
+        return self._all_seeds(variant) if self.is_random("evaluate", variant, scopes) else [variant]
+
+    def _all_seeds(self, variant: str) -> list[str]:
         return [variant, *(f"{variant}.seed{number}" for number in range(1, self.seeds))]
+
+    def is_random(self, stage: str, variant: str, scopes: tuple[str, ...] = ()) -> bool:
+        """Whether a variant's stage, or one that it reads, depends on the variant's seed."""
+        stages = self.stages(variant, scopes)
+        return any(getattr(stages, section).is_random for section in UPSTREAM[stage])
 
     def seed_of(self, variant: str) -> int:
         """Seed of a variant's networks."""

@@ -20,6 +20,11 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    @property
+    def is_random(self) -> bool:
+        """Whether the stage's result depends on a variant's seed."""
+        return False
+
 
 Probability = Annotated[float, Field(ge=0, le=1)]
 
@@ -300,6 +305,11 @@ class AutoencoderSettings(Section):
         1e-3, "weight of 1 - cosine beside the squared error", ge=0, origin="LangSplat: 1e-3"
     )
 
+    @property
+    def is_random(self) -> bool:
+        """A network has random first weights; principal directions hold nothing random."""
+        return self.code == "network"
+
 
 class LanguageSettings(Section):
     """Language field: per Gaussian one latent for each level."""
@@ -366,6 +376,11 @@ class MethodSettings(Section):
     pixel_step: int = knob(
         2, "langsplat: every so many pixels of rows and columns are compared", ge=1, origin="LangSplat: 1"
     )
+
+    @property
+    def is_random(self) -> bool:
+        """Our solver and plain averaging hold nothing random; another method may."""
+        return self.name not in ("hilsplat", "lifted")
 
 
 class EvaluateSettings(Section):

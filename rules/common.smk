@@ -24,7 +24,7 @@ from hilsplat.datasets.sources import (
 from hilsplat.evaluate.tables.build import TABLES
 from hilsplat.methods.registry import METHODS, OURS, require_method
 from hilsplat.scene.sheet import choose_scenes, read_sheet
-from hilsplat.configuration import SEEDED_STAGES, UPSTREAM, parse_run
+from hilsplat.configuration import UPSTREAM, parse_run
 
 
 def or_stop(function, *arguments):
@@ -160,7 +160,7 @@ def shared_variant(stage, wildcards):
             getattr(other, section) == getattr(wanted, section)
             for section in UPSTREAM[stage]
         ) and (
-            stage not in SEEDED_STAGES
+            not or_stop(RUN.is_random, stage, wildcards.variant, scopes)
             or RUN.seed_of(name) == RUN.seed_of(wildcards.variant)
         ):
             return name
@@ -299,10 +299,11 @@ def data_of(row):
     return place[0] if place else ""
 
 
-def variants_of(table):
-    """Variants of a table, every seed of each."""
+def variants_of(table, row):
+    """Variants of a table for a scene, every seed of each that holds something random."""
     listed = getattr(RUN, TABLES[table].variants)
-    return [name for variant in listed for name in RUN.seeded(variant)]
+    scopes = scopes_of(row)
+    return [name for variant in listed for name in or_stop(RUN.seeded, variant, scopes)]
 
 
 def scores_of(table):
@@ -314,7 +315,7 @@ def scores_of(table):
     return [
         f"results/{row.dataset}/{row.scene}/{variant}/scores.csv"
         for row in rows
-        for variant in variants_of(table)
+        for variant in variants_of(table, row)
     ]
 
 

@@ -66,6 +66,30 @@ def test_overrides_apply_in_order_group_then_scene_then_variant() -> None:
     assert run.stages("v", scopes=("g", "d/s")).tree.theta == 0.8
 
 
+def test_only_what_holds_something_random_is_repeated_per_seed() -> None:
+    network = {"autoencoder": {"code": "network"}}
+    run = parse_run(
+        {
+            "seeds": 3,
+            "variants": {
+                "network": network,
+                "langsplat": {"method": {"name": "langsplat"}},
+                "lifted": {"method": {"name": "lifted"}},
+            },
+            "overrides": {"photos": network},
+        }
+    )
+    assert run.seeded("default") == ["default"]
+    assert run.seeded("lifted") == ["lifted"]
+    assert run.seeded("network") == ["network", "network.seed1", "network.seed2"]
+    assert run.seeded("langsplat") == ["langsplat", "langsplat.seed1", "langsplat.seed2"]
+    assert len(run.seeded("default", scopes=("photos",))) == 3
+    assert [run.seed_of(name) for name in run.seeded("network")] == [0, 1, 2]
+    assert not run.is_random("autoencoder", "langsplat")
+    assert run.is_random("language", "langsplat")
+    assert not run.is_random("semantic_tree", "network")
+
+
 def test_every_knob_has_description_and_origin() -> None:
     for section, model in SECTIONS.items():
         for name, field in model.model_fields.items():

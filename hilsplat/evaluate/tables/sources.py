@@ -25,7 +25,7 @@ TRUE_MASKS_NOTE = (
     "method from errors of the segmenter."
 )
 
-SEEDS_NOTE = "Values with ± are mean and standard deviation over seeds of autoencoder and field."
+SEEDS_NOTE = "Values with ± are mean and standard deviation over seeds; rows without hold nothing random."
 
 
 @dataclass(frozen=True)
