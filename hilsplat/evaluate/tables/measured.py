@@ -50,6 +50,7 @@ def measured_blocks(
     unranked: frozenset[str] = frozenset(),
     ranked_by_protocol: bool = True,
     lower_is_better: frozenset[str] = frozenset(),
+    over_seeds: Callable[["pd.DataFrame"], dict[str, Cell]] = lambda part: {},
 ) -> list[Block]:
     """One block per data set; one row per variant, method, masks and protocol.
 
@@ -62,6 +63,7 @@ def measured_blocks(
         unranked: columns in which nothing is best.
         ranked_by_protocol: rows of different protocols are not ranked against each other.
         lower_is_better: columns in which the smallest value is best.
+        over_seeds: further values of a row, from the scores of all its seeds together.
     """
     if scores.empty:
         return []
@@ -94,7 +96,8 @@ def measured_blocks(
             )
             group = protocol if ranked_by_protocol else ""
             ranked = method != "truth" and not made_from_truth(masks)
-            rows.append((place, Row(names, mean_over_seeds(seeds), group if ranked else None)))
+            cells = {**mean_over_seeds(seeds), **over_seeds(part)}
+            rows.append((place, Row(names, cells, group if ranked else None)))
         distinct = without_repeats([row for _, row in sorted(rows, key=lambda item: item[0])])
         if distinct:
             columns = tuple(columns_of(wanted))

@@ -13,7 +13,7 @@ class Cell:
         text: as it is shown.
         value: as a number, where it is one; ranking needs it.
         note: footnote, empty where there is none.
-        spread: standard deviation over seeds; None where there is one seed.
+        spread: what stands behind ±, mostly the standard deviation over seeds; None where nothing does.
     """
 
     text: str = "-"

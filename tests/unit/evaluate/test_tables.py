@@ -143,6 +143,21 @@ def test_ablation_rows_take_localization_from_the_flat_protocol(tmp_path):
     assert names == ["hilsplat (field)", "hilsplat (tree)", "Omega 2"]
 
 
+def test_ablation_rows_are_held_against_the_default_field_scene_by_scene(tmp_path):
+    values = {"default": (0.4, 0.8), "d-8": (0.5, 0.7), "d-8.seed1": (0.7, 0.9), "paper": (0.3, None)}
+    scores = [
+        score("iou", value, variant=variant, method="field", scene=scene)
+        for variant, of_scenes in values.items()
+        for scene, value in zip(("one", "two"), of_scenes, strict=True)
+        if value is not None
+    ]
+    rows, forms = built(tmp_path, "ablation", scores)
+    told = {row["method"]: row["against default field"] for row in rows if row["kind"] != "reported"}
+    # scene one: (0.5 + 0.7) / 2 - 0.4 = 0.2; scene two: (0.7 + 0.9) / 2 - 0.8 = 0
+    assert told == {"hilsplat (field)": "", "d-8": "10.00 ± 10.00", "paper": "-10.00"}
+    assert "+10.0 ± 10.0" in forms[".md"]
+
+
 def test_tables_are_the_same_bytes_whatever_the_order_of_rows(tmp_path):
     for name in ("hierarchy", "lerf", "ablation"):
         (tmp_path / "forward").mkdir(exist_ok=True)
