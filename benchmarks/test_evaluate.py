@@ -36,7 +36,7 @@ class Answers:
     def select_nodes(self, text, *, level=None, threshold=0.85, within=None):
         return SimpleNamespace(ids=np.array([list(self.regions).index(text)]), level=level)
 
-    def select_path(self, path, threshold=0.85):
+    def select_path(self, path, *, level=None, threshold=0.85):
         return self.select_nodes(path[-1])
 
     def node_masks(self, view, ids):

@@ -130,7 +130,8 @@ def figures(
 
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
     inputs = {"scene": scene, "gaussians": gaussians, "masks": masks, "language": language}
-    with stage("figures", out, log, settings=section, threads=threads, inputs=inputs):
+    recorded = {"figures": section, "evaluate": protocol}
+    with stage("figures", out, log, settings=recorded, threads=threads, inputs=inputs):
         from hilsplat.datasets.registry import open_labelled
         from hilsplat.evaluate.figures import run_figures
 

@@ -58,7 +58,8 @@ def stage(
 ) -> Iterator[None]:
     """Everything around a stage's one function call: log, lock, disk space, provenance.
 
-    `also` names modules that the stage runs and does not import.
+    `settings` is the section that the stage takes, or several by name; `also` names modules that the stage
+    runs and does not import.
     """
     from hilsplat.base.code_hash import code_hash
     from hilsplat.base.provenance import write_provenance
@@ -79,7 +80,7 @@ def stage(
                 stage=name,
                 code="-".join(code_hash(module) for module in (STAGE_MODULES[name], *also)),
                 command=["hilsplat", *sys.argv[1:]],
-                settings=settings.model_dump(mode="json") if settings is not None else {},
+                settings=_recorded(settings),
                 seed=seed,
                 inputs=inputs or {},
             )
@@ -88,6 +89,13 @@ def stage(
     except Exception:  # a mistake of ours: the traceback belongs into the log
         logging.getLogger("hilsplat").exception("%s failed on %s", name, out)
         sys.exit(1)
+
+
+def _recorded(settings: Any) -> dict[str, Any]:
+    """Settings as provenance records them."""
+    if isinstance(settings, dict):
+        return {name: _recorded(section) for name, section in settings.items()}
+    return settings.model_dump(mode="json") if settings is not None else {}
 
 
 def section_of(name: str, text: str) -> Any:

@@ -227,7 +227,7 @@ def draw_queries(
         field_mask, _ = relevancy_mask(SmoothedRelevancy.of(relevancy, rule), level, rule)
         pictures = [("tree", _node_mask(answers, row.view, hits))]
         if columns == 7:
-            path = answers.select_path(row.path, threshold=evaluate.node_select)
+            path = answers.select_path(row.path, level=row.level, threshold=evaluate.node_select)
             pictures.append(("tree, path", _node_mask(answers, row.view, path)))
         pictures.append(("field", field_mask))
         title = f"truth, {row.view}" if row.truth is not None else row.view

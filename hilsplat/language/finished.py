@@ -17,7 +17,7 @@ class FinishedScene:
     Attributes:
         folder: `results/<dataset>/<scene>`.
         scene, gaussians, semantic_tree, language, autoencoder, clip, masks: its artifacts.
-        contributions, scores: where these are, or would be; nothing is asked of them but settings.
+        contributions, scores, panel: where these are, or would be; nothing is asked of them but settings.
     """
 
     folder: Path
@@ -30,6 +30,7 @@ class FinishedScene:
     masks: Path
     contributions: Path
     scores: Path
+    panel: Path
 
     @staticmethod
     def locate(folder: Path, variant: str = "default") -> "FinishedScene":
@@ -67,8 +68,13 @@ class FinishedScene:
                     f"{folder} is not finished: {path} is missing", fix=f"snakemake --cores 2 {path}"
                 )
         contributions = _input_of(language, "contributions", folder)
+        place = folder.resolve()
         return FinishedScene(
-            folder, **parts, contributions=contributions, scores=folder / variant / "scores.csv"
+            folder,
+            **parts,
+            contributions=contributions,
+            scores=folder / variant / "scores.csv",
+            panel=place.parents[1] / "figures" / place.parent.name / place.name / "panel.png",
         )
 
     @property
@@ -77,18 +83,27 @@ class FinishedScene:
         return Path(read_index(self.clip)["model"])
 
     def evaluate_settings(self) -> EvaluateSettings:
-        """Canonical phrases, scale and selection of the run that made the scene; else the defaults."""
-        return _settings_of(self.scores, EvaluateSettings)
+        """Canonical phrases, template, scale and selection of the run that made the scene; else the defaults.
+
+        A scene without labels has no scores; its panel was drawn with the same settings.
+        """
+        if provenance_path(self.scores).is_file():
+            return _section(EvaluateSettings, _recorded_settings(self.scores))
+        return _section(EvaluateSettings, _recorded_settings(self.panel).get("evaluate", {}))
 
     def contributions_settings(self) -> ContributionsSettings:
         """How its weights were drawn."""
-        return _settings_of(self.contributions, ContributionsSettings)
+        return _section(ContributionsSettings, _recorded_settings(self.contributions))
 
 
-def _settings_of(artifact: Path, section: type[Section]) -> Any:
-    """Settings in an artifact's provenance; knobs that it does not know take their defaults."""
+def _recorded_settings(artifact: Path) -> dict[str, Any]:
+    """Settings in an artifact's provenance; none where it has none."""
     record = provenance_path(artifact)
-    found = read_json(record)["settings"] if record.is_file() else {}
+    return read_json(record)["settings"] if record.is_file() else {}
+
+
+def _section(section: type[Section], found: dict[str, Any]) -> Any:
+    """A section from recorded settings; knobs that they do not know take their defaults."""
     return section(**{name: value for name, value in found.items() if name in section.model_fields})
 
 

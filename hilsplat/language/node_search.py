@@ -1,6 +1,7 @@
 """Choose nodes of the semantic tree by their scores: a level, several hits, a path with fall-backs."""
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
@@ -11,8 +12,8 @@ from hilsplat.language.relevancy import min_max
 from hilsplat.language.semantic_tree import SemanticTree
 
 CHILD_BONUS = 0.1
-"""By how much a child of the answer before is ahead of other parts of the path's first thing: a share of the
-range of the level's margins."""
+"""By how much what lies inside the answer before is ahead of other parts of the path's first thing: a share
+of the range of the level's margins."""
 
 
 @dataclass(frozen=True)
@@ -76,59 +77,98 @@ def automatic_level(
 
 
 def search_path(
-    tree: SemanticTree, scores: Float[np.ndarray, "T n"], path: tuple[str, ...], threshold: float
+    tree: SemanticTree,
+    scores: Float[np.ndarray, "T n"],
+    path: tuple[str, ...],
+    threshold: float,
+    level: Level | None = None,
 ) -> NodeHits:
     """Search each text inside the nodes that answered the one before: ("bear", "head", "nose").
 
-    The i-th text is searched at the i-th level among the descendants of the first text's nodes, where
-    children of the last answer are a little ahead; where there are none, in the whole level. Children alone
-    would lose what hangs under the wrong part, or under none (docs/tree.md).
+    Each text is searched at a finer level than the one before, among the descendants of the first text's
+    nodes, where descendants of the last answer are a little ahead; where there are none, in the whole level.
+    Children of the last answer alone would lose what hangs under the wrong part, or under none
+    (docs/tree.md).
+
+    A path shorter than there are levels leaves open which levels it means: a handle of a mug may be a part
+    or a subpart, and the head of ("head", "nose") is no whole. All ways through the levels are searched.
+    Those that never had to search a whole level come first, and of these the one with the largest sum of
+    margins.
 
     Args:
         tree: nodes.
         scores: relevancy of every node to each text of the path.
         path: the texts, coarse to fine.
         threshold: as in `best_nodes`.
+        level: of the last text; None: any that the path leaves room for.
 
     Raises:
-        SettingsError: the path is empty or longer than there are levels.
+        SettingsError: the path is empty or longer than the levels down to the last text's.
     """
-    if not 1 <= len(path) <= len(LEVELS):
+    ways = [way for way in combinations(LEVELS, len(path)) if way and level in (None, way[-1])]
+    if not ways:
+        levels = LEVELS if level is None else LEVELS[: level.index + 1]
         raise SettingsError(
-            f"the path {' > '.join(path)!r} cannot be searched",
-            expected=f"1 to {len(LEVELS)} texts, coarse to fine",
+            f"the path {' > '.join(path)!r} cannot be searched"
+            + ("" if level is None else f" at level {level.label}"),
+            expected=f"1 to {len(levels)} texts, coarse to fine: {' > '.join(each.label for each in levels)}",
             found=f"{len(path)}",
             fix="name the object, then its part, then the part of the part",
         )
-    hits = first = best_nodes(scores[0], tree.nodes_of(LEVELS[0]), LEVELS[0], threshold)
-    for index, level in enumerate(LEVELS[1 : len(path)], start=1):
+    found = [_search_way(tree, scores, way, threshold) for way in ways]
+    return max(found, key=lambda way: (way.stayed_inside, way.margin)).hits
+
+
+@dataclass(frozen=True)
+class _Way:
+    """What a path found at certain levels.
+
+    Attributes:
+        hits: answers to the last text.
+        margin: sum of the margins of each text's best answer.
+        stayed_inside: every text had an answer, those behind the first inside the first thing.
+    """
+
+    hits: NodeHits
+    margin: float
+    stayed_inside: bool
+
+
+def _search_way(
+    tree: SemanticTree, scores: Float[np.ndarray, "T n"], levels: tuple[Level, ...], threshold: float
+) -> _Way:
+    """Search the i-th text at the i-th of some levels."""
+    hits = first = best_nodes(scores[0], tree.nodes_of(levels[0]), levels[0], threshold)
+    steps = [hits]
+    for of_text, level in zip(scores[1:], levels[1:], strict=True):
         nodes = tree.nodes_of(level)
-        children = np.intersect1d(nodes, tree.children_of(hits.ids))
-        inside = np.union1d(children, np.intersect1d(nodes, tree.descendants_of(first.ids)))
+        ahead = np.intersect1d(nodes, tree.descendants_of(hits.ids))
+        inside = np.union1d(ahead, np.intersect1d(nodes, tree.descendants_of(first.ids)))
         if len(inside):
-            hits = _best_inside(scores[index], nodes, inside, children, level, threshold)
+            chosen = _best_inside(of_text, nodes, inside, ahead, threshold)
+            route = "child" if tree.parent[chosen[0]] in hits.ids else "descendant"
+            hits = NodeHits(chosen, of_text[chosen].astype(np.float32), level, route)
         else:
-            hits = best_nodes(scores[index], nodes, level, threshold, "fallback")
-    return hits
+            hits = best_nodes(of_text, nodes, level, threshold, "fallback")
+        steps.append(hits)
+    margin = sum(float(margins(step.scores[:1]).sum()) for step in steps)
+    return _Way(hits, margin, all(len(step.ids) and step.route != "fallback" for step in steps))
 
 
 def _best_inside(
     scores: Float[np.ndarray, " n"],
     nodes: Int64[np.ndarray, " l"],
     inside: Int64[np.ndarray, " c"],
-    children: Int64[np.ndarray, " k"],
-    level: Level,
+    ahead: Int64[np.ndarray, " k"],
     threshold: float,
-) -> NodeHits:
-    """Best of the nodes inside the path's first thing, children of the last answer ahead by `CHILD_BONUS`.
+) -> Int64[np.ndarray, " h"]:
+    """Best of the nodes inside the path's first thing, best first; those `ahead` are so by `CHILD_BONUS`.
 
     The threshold is taken on the range of the whole level: of two or three candidates the worst says nothing
     about how near the second is to the best.
     """
     step = np.ptp(margins(scores[nodes]))
-    value = margins(scores[inside]) + CHILD_BONUS * step * np.isin(inside, children)
+    value = margins(scores[inside]) + CHILD_BONUS * step * np.isin(inside, ahead)
     kept = value >= value.max() - (1 - threshold) * step
     chosen = inside[kept]
-    chosen = chosen[np.lexsort((chosen, -value[kept]))].astype(np.int64)
-    route = "child" if np.isin(chosen[0], children) else "descendant"
-    return NodeHits(chosen, scores[chosen].astype(np.float32), level, route)
+    return chosen[np.lexsort((chosen, -value[kept]))].astype(np.int64)

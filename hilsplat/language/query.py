@@ -89,8 +89,8 @@ class LanguageScene:
     def open(folder: Path | str, variant: str = "default", *, threads: int = 1) -> "LanguageScene":
         """Open `results/<dataset>/<scene>` with the settings that made it.
 
-        Canonical phrases, scale and selection threshold are those that the variant was evaluated with,
-        read from its provenance.
+        Canonical phrases, template, scale and selection threshold are those that the variant was evaluated
+        with, read from its provenance; of a scene without labels those that its panel was drawn with.
 
         Args:
             folder: of a finished scene.
@@ -185,7 +185,7 @@ class LanguageScene:
 
         Args:
             text: words, or words separated by ">".
-            level: "whole", "part", "subpart" or "auto"; a path brings its own.
+            level: "whole", "part", "subpart" or "auto"; of a path, that of its last text.
             answerer: "tree": nodes answer with their averaged CLIP vectors; "field": with what the
                 paper's field holds for their Gaussians, decoded.
             threshold: nodes above this share of the range between the level's worst and best node are
@@ -193,7 +193,7 @@ class LanguageScene:
             limit: answers at most.
 
         Raises:
-            SettingsError: the text is empty or the level is unknown.
+            SettingsError: the text is empty, the level is unknown, or a path has more texts than levels.
         """
         hits = self.find(text, level, threshold, answerer)
         return [
@@ -210,14 +210,15 @@ class LanguageScene:
             raise SettingsError(
                 f"the query {text!r} holds no text", fix='write words, or "bear > head > nose"'
             )
-        if len(path) > 1:
-            return self.select_path(path, threshold, answerer)
         names = {each.label: each for each in LEVELS}
         if level != "auto" and level not in names:
             raise SettingsError(
                 f"level {level!r} is unknown", expected=f"auto, {', '.join(names)}", found=level
             )
-        return self.select_nodes(path[0], level=names.get(level), threshold=threshold, answerer=answerer)
+        given = names.get(level)
+        if len(path) > 1:
+            return self.select_path(path, level=given, threshold=threshold, answerer=answerer)
+        return self.select_nodes(path[0], level=given, threshold=threshold, answerer=answerer)
 
     def select_nodes(
         self,
@@ -246,15 +247,21 @@ class LanguageScene:
         return best_nodes(scores, candidates, level, self.node_select if threshold is None else threshold)
 
     def select_path(
-        self, path: tuple[str, ...], threshold: float | None = None, answerer: Answerer = "tree"
+        self,
+        path: tuple[str, ...],
+        *,
+        level: Level | None,
+        threshold: float | None = None,
+        answerer: Answerer = "tree",
     ) -> NodeHits:
         """Search each text inside the nodes that answered the one before; see `search_path`.
 
         Raises:
-            SettingsError: the path is empty or longer than there are levels.
+            SettingsError: the path is empty or longer than the levels down to the last text's.
         """
         scores = self.node_relevancy(list(path), answerer) if path else np.zeros((0, len(self.tree)))
-        return search_path(self.tree, scores, path, self.node_select if threshold is None else threshold)
+        threshold = self.node_select if threshold is None else threshold
+        return search_path(self.tree, scores, path, threshold, level)
 
     def gaussians_of(self, ids: Sequence[int] | Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " g"]:
         """Gaussians of any of the nodes."""

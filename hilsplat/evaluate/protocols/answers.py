@@ -20,8 +20,8 @@ class QueryableScene(Protocol):
     def select_nodes(self, text, level=None, threshold=0.85, within=None):
         """Nodes that answer a text, with the level they are of."""
 
-    def select_path(self, texts, threshold=0.85):
-        """Nodes that answer the last of a chain of texts."""
+    def select_path(self, texts, level=None, threshold=0.85):
+        """Nodes that answer the last of a chain of texts, at a level or at the one that is chosen."""
 
     def node_masks(self, view, ids):
         """Union of the rendered nodes in a view, (H, W)."""
@@ -62,11 +62,13 @@ class Selections:
             self._of[key] = np.asarray(hits.ids)
         return self._of[key]
 
-    def path(self, texts: tuple[str, ...]) -> np.ndarray:
-        """Ids of the nodes that answer a chain of texts."""
-        if texts not in self._of:
-            self._of[texts] = np.asarray(self.scene.select_path(texts, threshold=self.threshold).ids)
-        return self._of[texts]
+    def path(self, texts: tuple[str, ...], level: Level | None) -> np.ndarray:
+        """Ids of the nodes that answer the last of a chain of texts, at a level or at the one chosen."""
+        key = (texts, level)
+        if key not in self._of:
+            hits = self.scene.select_path(texts, level=level, threshold=self.threshold)
+            self._of[key] = np.asarray(hits.ids)
+        return self._of[key]
 
     def mask(self, view: str, ids: np.ndarray, size_hw: tuple[int, int]) -> np.ndarray:
         """Union of some nodes in a view; no node gives an empty mask."""

@@ -225,11 +225,13 @@ def _path_rows(
         mask = np.zeros(size_hw, dtype=bool)
         inside = np.zeros(size_hw, dtype=bool)
         for path in query.paths:
-            path_mask = selections.mask(view, selections.path(path), size_hw)
+            path_mask = selections.mask(view, selections.path(path, query.level), size_hw)
             masks.put(("tree-path", protocol, path), path_mask)
             mask |= path_mask
             if len(path) > 1:
-                inside |= selections.mask(view, selections.path(path[:-1]), size_hw)
+                is_full = len(path) == int(query.level)  # labels may lack a level in between
+                parent_level = Level(len(path) - 1) if is_full else None
+                inside |= selections.mask(view, selections.path(path[:-1], parent_level), size_hw)
         level_map = relevancy[query.level.index]
         filtered = mean_filter(np.where(inside, level_map, 0) if inside.any() else level_map, side_px)
         points, _ = peak_points(np.stack([filtered] * len(LEVELS)), query.level)

@@ -50,7 +50,7 @@ class HandMade:
     def select_nodes(self, text, *, level=None, threshold=0.85, within=None):
         return SimpleNamespace(ids=np.array(self.answers.get((text, level), []), dtype=np.int64), level=level)
 
-    def select_path(self, path, threshold=0.85):
+    def select_path(self, path, *, level=None, threshold=0.85):
         return SimpleNamespace(ids=np.array(self.answers.get(path, []), dtype=np.int64))
 
     def node_masks(self, view, ids):

@@ -141,6 +141,19 @@ def test_a_scene_opens_with_the_settings_it_was_evaluated_with(tmp_path):
     assert found.node_select == 0.9
 
 
+def test_a_scene_without_labels_opens_with_the_settings_of_its_panel(tmp_path):
+    folder = tmp_path / "results" / "photos" / "bear"
+    panel = tmp_path / "results" / "figures" / "photos" / "bear" / "panel.png"
+    for part in ("default/semantic_tree", "default/autoencoder", "default/clip", "default/masks", "scene"):
+        (folder / part).mkdir(parents=True)
+    for name in ("gaussians.ply", "default/language.safetensors"):
+        (folder / name).touch()
+    panel.parent.mkdir(parents=True)
+    settings = {"figures": {}, "evaluate": {"template": "a photo of a {}"}}
+    write_json(provenance_path(panel), {"settings": settings, "inputs": {}})
+    assert FinishedScene.locate(folder).evaluate_settings().template == "a photo of a {}"
+
+
 def test_the_field_answers_through_the_same_interface(scene):
     hits = scene.query("B", "whole", answerer="field")
     assert hits[0].node == NODE["B"]
@@ -169,7 +182,7 @@ def test_only_the_given_nodes_compete(scene):
 
 
 def test_path_goes_from_child_to_child(scene):
-    hits = scene.select_path(("A", "A top", "A top left"), 0.85)
+    hits = scene.select_path(("A", "A top", "A top left"), level=None, threshold=0.85)
     assert hits.ids.tolist() == [NODE["A top left"]]
     assert hits.route == "child"
     assert hits.level == Level.SUBPART
@@ -177,12 +190,37 @@ def test_path_goes_from_child_to_child(scene):
 
 def test_path_restricts_a_part_to_its_object(scene):
     # "A top" asked inside B can only be a part of B
-    assert scene.select_path(("B", "A top"), 0.85).ids.tolist() == [NODE["B top"]]
+    assert scene.select_path(("B", "A top"), level=None, threshold=0.85).ids.tolist() == [NODE["B top"]]
+
+
+@pytest.mark.parametrize(
+    ("path", "level", "found"),
+    [
+        (("A", "A top left"), None, "A top left"),  # a subpart, with the part in between left out
+        (("A", "A top left"), Level.SUBPART, "A top left"),
+        (("A", "A top left"), Level.PART, "A top"),  # the part most like it
+        (("A", "A bottom"), None, "A bottom"),
+        (("A top", "A top left"), None, "A top left"),  # the first text need be no whole
+        (("B", "B corner"), None, "B corner"),
+    ],
+)
+def test_a_short_path_finds_its_levels_unless_one_is_given(scene, path, level, found):
+    hits = scene.select_path(path, level=level, threshold=0.85)
+    assert hits.ids.tolist() == [NODE[found]]
+    assert hits.level == Level(int(scene.tree.level[NODE[found]]))
+
+
+def test_a_way_through_the_levels_that_stays_inside_goes_before_one_that_does_not(scene):
+    scores = np.full((2, 7), 0.1, np.float32)
+    scores[0, NODE["A"]], scores[0, NODE["B top"]] = 0.8, 0.9  # B top has no subpart to search
+    scores[1, NODE["A top left"]], scores[1, NODE["B corner"]] = 0.6, 0.9
+    hits = search_path(scene.tree, scores, ("x", "y"), 0.95)
+    assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "descendant")
 
 
 def test_path_falls_back_to_any_descendant_of_the_object(scene):
     # "B top" has no subpart; "B corner" hangs directly under B
-    hits = scene.select_path(("B", "B top", "B corner"), 0.85)
+    hits = scene.select_path(("B", "B top", "B corner"), level=None, threshold=0.85)
     assert hits.ids.tolist() == [NODE["B corner"]]
     assert hits.route == "descendant"
 
@@ -190,7 +228,7 @@ def test_path_falls_back_to_any_descendant_of_the_object(scene):
 def test_path_falls_back_to_the_whole_level(scene):
     parent = np.where(scene.tree.level == Level.SUBPART, -1, scene.tree.parent).astype(np.int32)
     orphaned = replace(scene, tree=replace(scene.tree, parent=parent))
-    hits = orphaned.select_path(("A", "A top", "B corner"), 0.85)
+    hits = orphaned.select_path(("A", "A top", "B corner"), level=None, threshold=0.85)
     assert hits.ids.tolist() == [NODE["B corner"]]
     assert hits.route == "fallback"
 
@@ -205,7 +243,13 @@ def test_query_parses_paths_and_describes_hits(scene):
 
 @pytest.mark.parametrize(
     ("text", "level", "words"),
-    [("a > b > c > d", "auto", "1 to 3 texts"), (" ", "auto", "holds no text"), ("A", "hole", "unknown")],
+    [
+        ("a > b > c > d", "auto", "1 to 3 texts"),
+        ("a > b > c", "part", "cannot be searched at level part"),
+        (" ", "auto", "holds no text"),
+        ("A", "hole", "unknown"),
+        ("A > A top", "hole", "unknown"),
+    ],
 )
 def test_impossible_queries_say_why(scene, text, level, words):
     with pytest.raises(SettingsError, match=words):
