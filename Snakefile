@@ -35,8 +35,7 @@ include: "rules/report.smk"
 rule all:
     default_target: True
     input:
-        targets_of_tables(),
-        targets_of_figures(),
+        targets_of_run(),
 
 
 onsuccess:

@@ -188,7 +188,6 @@ def stages(out: Path, threads: int) -> dict[str, Callable[[], None]]:
             out / "autoencoder",
             out / "language.safetensors",
             LanguageSettings(),
-            0,
             threads,
         ),
     }

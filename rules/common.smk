@@ -347,9 +347,18 @@ def targets_of_tables():
     return [f"results/tables/{name}.csv" for name in TABLES]
 
 
+def targets_of_run():
+    """Pictures of every scene, and tables and plots where the run has a scene to measure.
+
+    A run of photographs would leave tables of reported rows where a benchmark's were.
+    """
+    measured = [*targets_of_tables(), *targets_of_plots()] if labelled(SCENES) else []
+    return [*targets_of_figures(), *measured]
+
+
 def targets_of_figures():
     """The panel of every scene, masks against the truth where it is known, methods side by side in the
-    scenes of the sweeps, plots of the sweeps."""
+    scenes of the sweeps."""
     compared = [
         row for row in SCENES if not RUN.sweep_scenes or row.scene in RUN.sweep_scenes
     ]
@@ -364,8 +373,12 @@ def targets_of_figures():
             f"results/figures/{row.dataset}/{row.scene}/comparison.png"
             for row in compared
         ),
-        *(f"results/figures/sweep-{name}.png" for name in ("theta", "omega")),
     ]
+
+
+def targets_of_plots():
+    """Plots of the sweeps."""
+    return [f"results/figures/sweep-{name}.png" for name in ("theta", "omega")]
 
 
 def figure_truth_of(wildcards):

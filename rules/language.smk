@@ -121,9 +121,8 @@ rule language:
         mem_mb=4000,
     params:
         settings=settings_of("language"),
-        seed=lambda wildcards: RUN.seed_of(wildcards.variant),
         code=code("language"),
     shell:
         "hilsplat language --contributions {input.contributions} --tree {input.tree}"
-        " --autoencoder {input.autoencoder} --settings {params.settings:q} --seed {params.seed}"
+        " --autoencoder {input.autoencoder} --settings {params.settings:q}"
         " --threads {threads} --out {output.language} --log {log}"

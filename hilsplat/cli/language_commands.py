@@ -84,17 +84,16 @@ def language(
     autoencoder: PathIn,
     out: PathOut,
     settings: Settings = "{}",
-    seed: Seed = 0,
     threads: Threads = 1,
     log: Log = None,
 ) -> None:
     """Train the language field: regression, L_h, L_ins and L_part over three levels."""
     section = section_of("language", settings)
     inputs = {"contributions": contributions, "tree": tree, "autoencoder": autoencoder}
-    with stage("language", out, log, settings=section, seed=seed, threads=threads, inputs=inputs):
+    with stage("language", out, log, settings=section, threads=threads, inputs=inputs):
         from hilsplat.language.field import run_language
 
-        run_language(contributions, tree, autoencoder, out, section, seed, threads)
+        run_language(contributions, tree, autoencoder, out, section, threads)
 
 
 @app.command("language-reference")

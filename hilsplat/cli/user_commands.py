@@ -16,15 +16,23 @@ from hilsplat.cli.stage import (
 def query(
     scene: Annotated[str, typer.Argument(help="dataset/scene, such as photos/bear")],
     text: Annotated[
-        str, typer.Argument(help="what to look for; 'bear > nose' searches a nose inside a bear")
+        str,
+        typer.Argument(
+            help="what to look for; 'bear > nose' is a nose of a bear, 'bear > head > nose' one of its head"
+        ),
     ],
-    level: Annotated[str, typer.Option(help="auto, whole, part or subpart")] = "auto",
+    level: Annotated[
+        str, typer.Option(help="auto, whole, part or subpart: where (the last of) the text is searched")
+    ] = "auto",
     variant: Annotated[str, typer.Option(help="variant whose files answer")] = "default",
     results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
     views: Annotated[int, typer.Option(min=1, max=8, help="views in the panel")] = 3,
     answerer: Annotated[str, typer.Option(help="tree, or field: the paper's")] = "tree",
     out: Annotated[
-        Path | None, typer.Option(help="folder of panel.png and selection.ply; default: beside the scene")
+        Path | None,
+        typer.Option(
+            help="folder of panel.png and selection.ply; default: queries/TEXT in the scene's folder"
+        ),
     ] = None,
     threads: Threads = 2,
 ) -> None:
@@ -51,7 +59,9 @@ def export(
     scene: Annotated[str, typer.Argument(help="dataset/scene, such as photos/bear")],
     variant: Annotated[str, typer.Option(help="variant whose tree is written")] = "default",
     results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
-    out: Annotated[Path | None, typer.Option(help="folder to write; default: beside the scene")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="folder to write; default: export/VARIANT in the scene's folder")
+    ] = None,
     threads: Threads = 2,
 ) -> None:
     """Write the semantic tree of a finished scene: JSON, a PLY with nodes per Gaussian, a picture."""

@@ -15,7 +15,6 @@ from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.language.compositing import normalised_weights
 from hilsplat.language.semantic_tree import SemanticTree
 from hilsplat.scene.scene import Scene
-from hilsplat.settings import ContributionsSettings
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 
@@ -124,15 +123,18 @@ def measure_tree(
 
 
 def true_votes(
-    scene: Scene, gaussians_ply: Path, truth: HierarchyAnnotations, views: Iterable[str], threads: int
+    scene: Scene,
+    gaussians_ply: Path,
+    truth: HierarchyAnnotations,
+    views: Iterable[str],
+    min_weight: float,
+    threads: int,
 ) -> Float[np.ndarray, "N t"]:
     """Visible weight of each Gaussian in each true node over the views."""
     gaussians = load_ply(gaussians_ply)
     votes = np.zeros((len(gaussians), len(truth.nodes)))
     for view in views:
-        raw = pixel_weights(
-            gaussians, scene.cameras[view], min_weight=ContributionsSettings().min_weight, threads=threads
-        )
+        raw = pixel_weights(gaussians, scene.cameras[view], min_weight=min_weight, threads=threads)
         weights = normalised_weights(raw).astype(np.float64)
         for level in LEVELS:
             labels: Int32[np.ndarray, " P"] = truth.label_image(view, level).reshape(-1)
@@ -149,8 +151,9 @@ def run_tree_truth(
 ) -> str:
     """Measure a tree; writes a CSV with one row per level and returns it as a Markdown table."""
     scene, annotations = Scene.load(scene_folder), HierarchyAnnotations.load(truth)
-    votes = true_votes(scene, gaussians_ply, annotations, scene.views("train"), threads)
-    measured = measure_tree(SemanticTree.load(semantic_tree), votes, annotations)
+    tree = SemanticTree.load(semantic_tree)
+    votes = true_votes(scene, gaussians_ply, annotations, scene.views("train"), tree.min_weight, threads)
+    measured = measure_tree(tree, votes, annotations)
     rows = [
         [scene.name, level.label, *(str(v) if isinstance(v, int) else f"{v:.4f}" for v in vars(one).values())]
         for level, one in measured.items()

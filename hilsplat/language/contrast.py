@@ -18,7 +18,7 @@ from hilsplat.language.losses.instance import (
     instance_loss_tree,
 )
 from hilsplat.language.losses.part import part_loss_disentangle, part_loss_literal
-from hilsplat.language.mask_operator import MaskOperator
+from hilsplat.language.mask_operator import MaskProducts
 from hilsplat.language.mask_rows import Contributions
 from hilsplat.settings import LanguageSettings
 
@@ -183,8 +183,8 @@ class Contrast:
         settings: readings and weights.
     """
 
-    masks: MaskOperator
-    half_masks: MaskOperator
+    masks: MaskProducts
+    half_masks: MaskProducts
     pixels: Float32[np.ndarray, " M"]
     half_pixels: Float32[np.ndarray, " M"]
     relations: list[ViewRelations]

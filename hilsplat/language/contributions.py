@@ -164,9 +164,10 @@ def run_contributions(
 ) -> None:
     """One pass over the train views: write A, A_half, S, mass, and G or W.
 
-    Views are worked on one by one and their rows go to disk at once; memory holds one view, and G as far
-    as it is summed. A killed run finds finished views' matrices in the cache, and G as it was at most
-    `CHECKPOINT_SECONDS` (and one view) before; W of views that G lacks is rasterised again.
+    Views are worked on one by one and their rows go to disk at once; memory holds one view, G as far as it
+    is summed, and the weights that wait to be added to it (`quadratic_builder`). A killed run finds
+    finished views' matrices in the cache, and G as it was at most `CHECKPOINT_SECONDS` (and one view)
+    before; W of views that G lacks is rasterised again.
 
     Raises:
         MisalignedArtifactError: masks and images differ in size.
@@ -175,9 +176,11 @@ def run_contributions(
     scene = Scene.load(scene_folder)
     gaussians = load_ply(gaussians_ply)
     gaussians_sha256 = sha256_of_file(gaussians_ply)
+    device = choose_device(settings.device)
     read_index(masks_folder)
     about = {
         "code": code_hash("hilsplat.language.contributions"),
+        "device": device,
         "gaussians": gaussians_sha256,
         "min_weight": settings.min_weight,
     }
@@ -188,7 +191,6 @@ def run_contributions(
         name: [] for name in ("view", "mask", "level", "area_px", "pixels", "half_pixels")
     }
     with stage_log("contributions", scene.name) as counts, atomic_folder(out) as folder:
-        device = choose_device(settings.device)
         builder = QuadraticBuilder(len(gaussians), settings.keep, threads)
         summed = checkpoint.resume(builder)
         matrices = {name: MatrixStream(folder / name) for name in MATRICES}
@@ -248,6 +250,7 @@ def run_contributions(
             scene=scene.name,
             num_gaussians=len(gaussians),
             gaussians_sha256=gaussians_sha256,
+            min_weight=settings.min_weight,
             masks_sha256=sha256_of_file(Path(masks_folder) / INDEX),
             num_masks=counts["masks"],
             quadratic=kept,

@@ -1,8 +1,8 @@
 """The sparse products of the solver and of the linkage by torch, for CUDA devices.
 
 The operators have the methods of `mask_operator.MaskOperator` and `quadratic.Quadratic`: arrays in,
-arrays out. Sums are those of the CPU to rounding (tested), not the same bytes. The code runs on
-torch's CPU too, which is how it is tested where there is no device.
+arrays out, sums in the type of what comes in. They are those of the CPU to rounding (tested), not the
+same bytes. The code runs on torch's CPU too, which is how it is tested where there is no device.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 import torch
-from jaxtyping import Bool, Float, Float32, Int32
+from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
 from hilsplat.base.levels import LEVELS
@@ -52,19 +52,19 @@ class DeviceMasks:
             device,
         )
 
-    def means(self, features: Float32[np.ndarray, "N 3 D"]) -> Float32[np.ndarray, "M D"]:
+    def means(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "M D"]:
         """A F at each mask's level."""
         on_device = torch.from_numpy(np.ascontiguousarray(features)).to(self.device)
-        out = np.zeros((sum(map(len, self.rows)), features.shape[2]), np.float32)
+        out = np.zeros((sum(map(len, self.rows)), features.shape[2]), features.dtype)
         for index, (rows, part) in enumerate(zip(self.rows, self.forward, strict=True)):
-            out[rows] = (part @ on_device[:, index].contiguous()).cpu().numpy()
+            out[rows] = (part.to(on_device.dtype) @ on_device[:, index].contiguous()).cpu().numpy()
         return out
 
-    def spread(self, values: Float32[np.ndarray, "M D"]) -> Float32[np.ndarray, "N 3 D"]:
+    def spread(self, values: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "N 3 D"]:
         """A' x at each level."""
         on_device = torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
         parts = [
-            part @ on_device[torch.from_numpy(rows).to(self.device)]
+            part.to(on_device.dtype) @ on_device[torch.from_numpy(rows).to(self.device)]
             for rows, part in zip(self.rows, self.backward, strict=True)
         ]
         return torch.stack(parts, dim=1).cpu().numpy()
@@ -111,17 +111,19 @@ class DeviceQuadratic:
 
     def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
         """G_l F_l for every level."""
-        single = np.ascontiguousarray(features, np.float32)
-        on_device = torch.from_numpy(single).to(self.device)
+        on_device = torch.from_numpy(np.ascontiguousarray(features)).to(self.device)
+        forward, backward = (
+            [part.to(on_device.dtype) for part in parts] for parts in (self.forward, self.backward)
+        )
         parts = []
         for index in range(len(LEVELS)):
             own = on_device[:, index].contiguous()
             if self.valid is None:
-                parts.append(self.forward[index] @ own + self.backward[index] @ own)
+                parts.append(forward[index] @ own + backward[index] @ own)
             else:
-                rendered = (self.forward[0] @ own) * self.valid[:, index : index + 1]
-                parts.append(self.backward[0] @ rendered)
-        return torch.stack(parts, dim=1).cpu().numpy().astype(features.dtype)
+                rendered = (forward[0] @ own) * self.valid[:, index : index + 1]
+                parts.append(backward[0] @ rendered)
+        return torch.stack(parts, dim=1).cpu().numpy()
 
 
 def shared_pairs_on(

@@ -75,13 +75,12 @@ def run_language(
     autoencoder_folder: Path,
     out: Path,
     settings: LanguageSettings,
-    seed: int,
     threads: int,
 ) -> None:
     """Solve the language field of a scene: `language.safetensors` and `language.report.json` beside it.
 
-    The result does not depend on `seed` (nothing is random: halves of masks are fixed by the view's
-    name) nor on `threads` (sums are taken in one order).
+    Nothing is random (halves of masks are fixed by the view's name), and the result does not depend on
+    `threads` (sums are taken in one order).
 
     Raises:
         MisalignedArtifactError: coverage trees or latents belong to other masks.

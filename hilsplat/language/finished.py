@@ -7,7 +7,7 @@ from typing import Any
 from hilsplat.base.artifacts import read_index, read_json, sha256_of_file
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.provenance import provenance_path
-from hilsplat.settings import ContributionsSettings, EvaluateSettings, Section
+from hilsplat.settings import EvaluateSettings, Section
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class FinishedScene:
     Attributes:
         folder: `results/<dataset>/<scene>`.
         scene, gaussians, semantic_tree, language, autoencoder, clip, masks: its artifacts.
-        contributions, scores, panel: where these are, or would be; nothing is asked of them but settings.
+        scores, panel: where these are, or would be; nothing is asked of them but settings.
     """
 
     folder: Path
@@ -28,7 +28,6 @@ class FinishedScene:
     autoencoder: Path
     clip: Path
     masks: Path
-    contributions: Path
     scores: Path
     panel: Path
 
@@ -36,21 +35,25 @@ class FinishedScene:
     def locate(folder: Path, variant: str = "default") -> "FinishedScene":
         """Find the parts of a variant.
 
-        What a stage read is written in its provenance; without one, the parts are expected beside it.
+        What a stage read is written in its provenance; without one, the parts are expected beside it. A
+        variant without a field of its own was scored with another's, which its scores' provenance names.
 
         Raises:
             ArtifactError: a part is missing, or there is no such variant.
         """
         folder = Path(folder)
+        scores = folder / variant / "scores.csv"
+        if not (folder / variant).exists():
+            raise ArtifactError(
+                f"{folder} has no variant {variant!r}",
+                expected=f"one of {', '.join(_variants(folder)) or 'none yet'}",
+                fix="name it under ablation_variants and run the workflow",
+            )
         language = folder / variant / "language.safetensors"
         if not language.exists():
-            language = folder / "default" / "language.safetensors"
-            if variant != "default" and not (folder / variant).exists():
-                raise ArtifactError(
-                    f"{folder} has no variant {variant!r}",
-                    expected=f"one of {', '.join(_variants(folder)) or 'none yet'}",
-                    fix="name it under ablation_variants and run the workflow",
-                )
+            language = _recorded_input(scores, "language", folder) or language
+        if not language.exists():
+            raise _unfinished(folder, language)
         autoencoder = _input_of(language, "autoencoder", folder)
         clip = _input_of(autoencoder, "clip", folder)
         parts = {
@@ -64,16 +67,12 @@ class FinishedScene:
         }
         for path in parts.values():
             if not path.exists():
-                raise ArtifactError(
-                    f"{folder} is not finished: {path} is missing", fix=f"snakemake --cores 2 {path}"
-                )
-        contributions = _input_of(language, "contributions", folder)
+                raise _unfinished(folder, path)
         place = folder.resolve()
         return FinishedScene(
             folder,
             **parts,
-            contributions=contributions,
-            scores=folder / variant / "scores.csv",
+            scores=scores,
             panel=place.parents[1] / "figures" / place.parent.name / place.name / "panel.png",
         )
 
@@ -91,10 +90,6 @@ class FinishedScene:
             return _section(EvaluateSettings, _recorded_settings(self.scores))
         return _section(EvaluateSettings, _recorded_settings(self.panel).get("evaluate", {}))
 
-    def contributions_settings(self) -> ContributionsSettings:
-        """How its weights were drawn."""
-        return _section(ContributionsSettings, _recorded_settings(self.contributions))
-
 
 def _recorded_settings(artifact: Path) -> dict[str, Any]:
     """Settings in an artifact's provenance; none where it has none."""
@@ -111,15 +106,26 @@ def _variants(folder: Path) -> list[str]:
     return sorted(path.parent.name for path in folder.glob("*/language.safetensors"))
 
 
+def _unfinished(folder: Path, missing: Path) -> ArtifactError:
+    return ArtifactError(
+        f"{folder} is not finished: {missing} is missing", fix=f"snakemake --cores 2 {missing}"
+    )
+
+
 def _input_of(artifact: Path, name: str, folder: Path) -> Path:
     """Where an artifact's input lies: as its provenance says, else beside it."""
+    return _recorded_input(artifact, name, folder) or artifact.parent / name
+
+
+def _recorded_input(artifact: Path, name: str, folder: Path) -> Path | None:
+    """Where an artifact's input lies by its provenance, within the scene's folder wherever that is now."""
     record = provenance_path(artifact)
     if record.is_file():
         path = Path(read_json(record)["inputs"].get(name, {}).get("path", ""))
         recorded = folder / path.parent.name / path.name
         if path.name and recorded.exists():
             return recorded
-    return artifact.parent / name
+    return None
 
 
 def require_same(what: str, scene: str, path: Path, expected_sha256: str) -> None:

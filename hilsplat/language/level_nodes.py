@@ -76,12 +76,13 @@ def level_nodes(
     del evidence
     pairs = np.unique(np.stack([cluster, view.astype(np.int64)], axis=1), axis=0)
     kept = np.flatnonzero(np.bincount(pairs[:, 0], minlength=len(quality)) >= settings.min_views)
-    shares = _divide(weights, np.maximum(total_mass, 1e-12)[weights.indices])
 
     def winners(kept: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         of_cluster = np.full(len(quality) + 1, NONE, np.int64)
         of_cluster[kept] = np.arange(len(kept))
-        return of_cluster, *gaussian_nodes(of_cluster[cluster], len(kept), shares, settings.min_member_share)
+        return of_cluster, *gaussian_nodes(
+            of_cluster[cluster], len(kept), weights, view, mass, total_mass, settings.min_member_share
+        )
 
     fits = level_fits(winners(kept)[1], len(kept), weights, mass, view, settings.min_fit)
     kept = kept[np.bincount(fits[fits >= 0], minlength=len(kept)) >= settings.min_views]

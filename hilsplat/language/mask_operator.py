@@ -1,6 +1,7 @@
 """Mask means as a linear map of the field, its adjoint, and averages of latents over masks."""
 
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import scipy.sparse as sp
@@ -10,6 +11,17 @@ from hilsplat.language.compiled import compiled
 
 MEDIAN_SOFTENING = 1e-4
 """Least distance of a latent to the median, so that a step never divides by zero."""
+
+
+@runtime_checkable
+class MaskProducts(Protocol):
+    """The two products with A that the solver takes, whoever computes them."""
+
+    def means(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "M D"]:
+        """A F: mean rendered feature of each mask at its level."""
+
+    def spread(self, values: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "N 3 D"]:
+        """A' x at each level: the adjoint of `means`."""
 
 
 @dataclass(frozen=True)

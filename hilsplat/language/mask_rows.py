@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float32, Int32, Int64, UInt8
 
-from hilsplat.base.artifacts import read_index, read_into, read_npy
+from hilsplat.base.artifacts import INDEX, read_index, read_into, read_npy
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.language.quadratic import Quadratic, load_quadratic
@@ -25,6 +26,7 @@ class Contributions:
         views: train views in the order of `view`.
         num_gaussians: N.
         gaussians_sha256: digest of the PLY the weights belong to.
+        min_weight: smaller weights of a Gaussian at a pixel were dropped.
         view: index of each row's view in `views`.
         mask: row of the mask among its view's masks.
         level: `Level` of the mask.
@@ -37,6 +39,7 @@ class Contributions:
     views: tuple[str, ...]
     num_gaussians: int
     gaussians_sha256: str
+    min_weight: float
     view: Int32[np.ndarray, " M"]
     mask: Int32[np.ndarray, " M"]
     level: UInt8[np.ndarray, " M"]
@@ -76,7 +79,7 @@ class Contributions:
             ArtifactError: it is missing, damaged or of another version.
         """
         folder = Path(folder)
-        index = read_index(folder)
+        index = read_full_index(folder, "num_gaussians", "gaussians_sha256", "min_weight")
         return read_into(
             Contributions,
             folder / "rows.npz",
@@ -84,7 +87,24 @@ class Contributions:
             views=tuple(index["views"]),
             num_gaussians=index["num_gaussians"],
             gaussians_sha256=index["gaussians_sha256"],
+            min_weight=index["min_weight"],
         )
+
+
+def read_full_index(folder: Path, *entries: str) -> dict[str, Any]:
+    """Read a folder artifact's index and check that it has some entries.
+
+    Raises:
+        ArtifactError: there is none, or another version of the program wrote it.
+    """
+    index = read_index(folder)
+    if missing := [entry for entry in entries if entry not in index]:
+        raise ArtifactError(
+            f"{folder} is of another version",
+            expected=f"{', '.join(missing)} in {INDEX}",
+            fix="run its stage again",
+        )
+    return index
 
 
 def _mapped(path: Path) -> np.ndarray:

@@ -16,9 +16,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from hilsplat.language.mask_operator import MaskOperator, lifted_average, lifted_median
+from hilsplat.language.mask_operator import MaskOperator, MaskProducts, lifted_average, lifted_median
 from hilsplat.language.minimise import CHUNK, dot
-from hilsplat.language.quadratic import Quadratic, level_mass
+from hilsplat.language.quadratic import Quadratic, QuadraticProduct, level_mass
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class QuadraticProblem:
         weights: of the language loss, the clustering loss and the ridge.
     """
 
-    masks: MaskOperator
-    quadratic: Quadratic
+    masks: MaskProducts
+    quadratic: QuadraticProduct
     mass: Float32[np.ndarray, "N 3"]
     pixels: Float32[np.ndarray, " M"]
     latents: Float32[np.ndarray, "M D"]

@@ -8,6 +8,7 @@ non-zeros, W is kept and streamed instead. Both give the same products.
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import scipy.sparse as sp
@@ -119,6 +120,14 @@ class StackedWeights:
 
 
 Quadratic = Gram | StackedWeights
+
+
+@runtime_checkable
+class QuadraticProduct(Protocol):
+    """The product with G that the solver takes, whoever computes it."""
+
+    def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
+        """G_l F_l for every level."""
 
 
 def level_mass(quadratic: Quadratic) -> Float32[np.ndarray, "N 3"]:

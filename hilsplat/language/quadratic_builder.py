@@ -1,5 +1,6 @@
 """Sum the quadratic form of frozen geometry view by view, in bounded memory, and choose G or W."""
 
+import logging
 import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -9,10 +10,13 @@ from pathlib import Path
 import numpy as np
 import scipy.sparse as sp
 
-from hilsplat.base.artifacts import INDEX, atomic_folder, read_index, sha256_of_json, write_index
+from hilsplat.base.artifacts import INDEX, atomic_folder, read_index, read_npy, sha256_of_json, write_index
+from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
 from hilsplat.language.compiled import compiled
 from hilsplat.language.quadratic import Gram, Quadratic, StackedWeights
+
+logger = logging.getLogger(__name__)
 
 BLOCKS = 64
 """Blocks of rows in which G is built, one a thread at a time; the result does not depend on it. A block
@@ -209,11 +213,20 @@ class QuadraticCheckpoint:
         self._last = time.monotonic()
 
     def resume(self, builder: QuadraticBuilder) -> int:
-        """Put the builder where it was; returns the number of views it holds, 0 without a checkpoint."""
+        """Put the builder where it was; returns the number of views it holds, 0 without a checkpoint.
+
+        A checkpoint that lacks a file, as after the cache was pruned, is forgotten.
+        """
         if not (self._folder / INDEX).is_file():
             return 0
-        index = read_index(self._folder)
-        builder.restore({name: np.load(self._folder / f"{name}.npy") for name in index["arrays"]})
+        try:
+            index = read_index(self._folder)
+            state = {name: read_npy(self._folder / f"{name}.npy") for name in index["arrays"]}
+        except ArtifactError as error:
+            logger.warning("checkpoint of the contributions is incomplete and forgotten: %s", error)
+            self.forget()
+            return 0
+        builder.restore(state)
         return int(index["summed"])
 
     def offer(self, builder: QuadraticBuilder, summed: int) -> None:

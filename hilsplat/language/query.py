@@ -37,7 +37,7 @@ from hilsplat.language.tree_nodes import node_means
 from hilsplat.language.view_nodes import ViewNodes
 from hilsplat.language.view_store import ViewStore
 from hilsplat.scene.scene import Scene
-from hilsplat.settings import ContributionsSettings, EvaluateSettings
+from hilsplat.settings import EvaluateSettings
 from hilsplat.splat.gaussians import Gaussians
 
 CANONICAL: tuple[str, ...] = EvaluateSettings().canonical
@@ -114,7 +114,6 @@ class LanguageScene:
             template=settings.template,
             relevancy_scale=settings.relevancy_scale,
             node_select=settings.node_select,
-            min_weight=parts.contributions_settings().min_weight,
             threads=threads,
         )
 
@@ -131,7 +130,6 @@ class LanguageScene:
         template: str = "{}",
         relevancy_scale: float = RELEVANCY_SCALE,
         node_select: float = NODE_SELECT,
-        min_weight: float = ContributionsSettings().min_weight,
         threads: int = 1,
     ) -> "LanguageScene":
         """Read a scene's artifacts one by one and check that they belong together.
@@ -162,7 +160,7 @@ class LanguageScene:
             code,
             clip.embed_texts,
             lambda view: pixel_weights(
-                gaussians, scene.cameras[view], min_weight=min_weight, threads=threads
+                gaussians, scene.cameras[view], min_weight=tree.min_weight, threads=threads
             ),
             tuple(canonical),
             relevancy_scale,
@@ -384,8 +382,10 @@ class LanguageScene:
             for index in range(len(LEVELS)):
                 own = np.ascontiguousarray(self.language.features[:, index], np.float32)
                 has = (own != 0).any(axis=1).astype(np.float32)
-                pixels = np.flatnonzero(weights @ has > MIN_LATENT_SHARE)
-                shown.append((pixels, (weights[pixels] @ own).astype(np.float32)))
+                share = weights @ has
+                pixels = np.flatnonzero(share > MIN_LATENT_SHARE)
+                # Gaussians without a latent hold zeros, which a code would read as one: they do not count.
+                shown.append((pixels, ((weights[pixels] @ own) / share[pixels, None]).astype(np.float32)))
             return shown
 
         return self._views.get(

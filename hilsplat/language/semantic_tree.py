@@ -28,7 +28,7 @@ from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log
 from hilsplat.language.level_nodes import level_nodes
-from hilsplat.language.mask_rows import Contributions, mask_embeddings
+from hilsplat.language.mask_rows import Contributions, mask_embeddings, read_full_index
 from hilsplat.language.tree_boxes import node_boxes
 from hilsplat.language.tree_export import readable_nodes
 from hilsplat.language.tree_nodes import (
@@ -56,12 +56,13 @@ class SemanticTree:
         quality: pooled IoU of its masks across views, in [0, 1].
         views: number of views with a mask of it.
         node_of_gaussian: node of each Gaussian at each level, -1 for none.
-        membership: share of the Gaussian's visible weight that lies in its node's masks; 0 for those
-            that only joined because a child of the node holds them.
+        membership: share of the Gaussian's visible weight that lies in its node's masks, in [0, 1]; 0 for
+            those that only joined because a child of the node holds them, or have no node.
         node_of_mask: node that each mask (row of the contributions) fits, -1 for none.
         view_area_px: pixels of its masks in each view.
         view_names: the columns of `view_area_px`.
         gaussians_sha256: digest of the PLY the tree belongs to.
+        min_weight: weights that the contributions dropped; views are drawn with the same.
     """
 
     level: UInt8[np.ndarray, " T"]
@@ -78,6 +79,7 @@ class SemanticTree:
     view_area_px: Float32[np.ndarray, "T V"]
     view_names: tuple[str, ...]
     gaussians_sha256: str
+    min_weight: float
 
     def __len__(self) -> int:
         return len(self.level)
@@ -107,12 +109,13 @@ class SemanticTree:
             ArtifactError: it is missing, damaged or of another version.
         """
         folder = Path(folder)
-        index = read_index(folder)
+        index = read_full_index(folder, "gaussians_sha256", "min_weight")
         return read_into(
             SemanticTree,
             folder / "tree.npz",
             view_names=tuple(index["views"]),
             gaussians_sha256=index["gaussians_sha256"],
+            min_weight=index["min_weight"],
         )
 
 
@@ -162,7 +165,9 @@ def build_tree(
     num = len(levels)
     parent = node_parents(node_of_gaussian, levels, total_mass, settings.parent_coverage)
     if settings.nested:
-        node_of_gaussian = nest_nodes(node_of_gaussian, levels, parent)
+        nested = nest_nodes(node_of_gaussian, levels, parent)
+        membership[nested != node_of_gaussian] = 0
+        node_of_gaussian = nested
         renumber = renumbered_without_empty(node_of_gaussian, num)
         kept = np.flatnonzero(renumber[:num] != NONE)
         node_of_gaussian, cluster_of_mask = renumber[node_of_gaussian], renumber[cluster_of_mask]
@@ -193,6 +198,7 @@ def build_tree(
         view_area_px=view_area.astype(np.float32),
         view_names=contributions.views,
         gaussians_sha256=contributions.gaussians_sha256,
+        min_weight=contributions.min_weight,
     )
 
 
@@ -256,4 +262,5 @@ def run_semantic_tree(
                 masks_with_node=int((tree.node_of_mask >= 0).sum()),
                 masks=len(contributions),
                 gaussians_sha256=contributions.gaussians_sha256,
+                min_weight=contributions.min_weight,
             )

@@ -2,30 +2,50 @@
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float, Float32, Int32, Int64, UInt8
+from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt8
 
 from hilsplat.base.levels import LEVELS, NONE
 
 
 def gaussian_nodes(
-    cluster: Int64[np.ndarray, " M"], num_nodes: int, shares: sp.csr_matrix, min_share: float
+    cluster: Int64[np.ndarray, " M"],
+    num_nodes: int,
+    weights: sp.csr_matrix,
+    view: Int32[np.ndarray, " M"],
+    mass: Float32[np.ndarray, "V N"],
+    total_mass: Float64[np.ndarray, " N"],
+    min_share: float,
 ) -> tuple[Int32[np.ndarray, " N"], Float32[np.ndarray, " N"]]:
     """Give each Gaussian the node in which the largest share of its visible weight lies.
+
+    Masks of one view may overlap, and a node may have several there: a Gaussian counts in a view at most as
+    far as it is visible.
 
     Args:
         cluster: node of each mask of one level, -1 for none.
         num_nodes: number of nodes.
-        shares: weight of each Gaussian in each mask over its weight in all views.
+        weights: S of the masks.
+        view: of each mask.
+        mass: visible mass of each Gaussian in each view, px.
+        total_mass: sum of it, px.
         min_share: Gaussians whose best node holds no more than this stay without a node.
 
     Returns:
         node of each Gaussian, -1 for none (of equal shares the lowest node), and its share there.
     """
     inside = np.flatnonzero(cluster >= 0)
-    member = sp.csr_matrix((np.ones(len(inside)), (cluster[inside], inside)), shape=(num_nodes, len(cluster)))
-    per_node = (member @ shares.astype(np.float64)).tocoo()
-    node = np.full(shares.shape[1], NONE, np.int32)
-    membership = np.zeros(shares.shape[1], np.float32)
+    ones = np.ones(len(inside))
+    seen, of_pair = np.unique(cluster[inside] * len(mass) + view[inside], return_inverse=True)
+    pair_node, pair_view = np.divmod(seen, max(len(mass), 1))
+    in_pair = sp.csr_matrix((ones, (of_pair, inside)), shape=(len(seen), len(cluster)))
+    per_view = (in_pair @ weights.astype(np.float64)).tocoo()
+    capped = np.minimum(per_view.data, mass[pair_view[per_view.row], per_view.col])
+    per_node = sp.csr_matrix(
+        (capped / np.maximum(total_mass[per_view.col], 1e-12), (pair_node[per_view.row], per_view.col)),
+        shape=(num_nodes, weights.shape[1]),
+    ).tocoo()
+    node = np.full(weights.shape[1], NONE, np.int32)
+    membership = np.zeros(weights.shape[1], np.float32)
     order = np.lexsort((per_node.row, -per_node.data, per_node.col))
     column = per_node.col[order]
     first = np.flatnonzero(np.concatenate(([True], column[1:] != column[:-1]))[: len(column)])
@@ -180,11 +200,11 @@ def node_means(
     level: UInt8[np.ndarray, " T"],
     features: Float32[np.ndarray, "N 3 D"],
 ) -> Float32[np.ndarray, "T D"]:
-    """Mean feature of each node's Gaussians at its level."""
+    """Mean feature of each node's Gaussians at its level; those without one, all zeros, do not count."""
     sums = np.zeros((len(level), features.shape[2]))
     for each in LEVELS:
         own = node_of_gaussian[:, each.index]
-        seen = own >= 0
+        seen = (own >= 0) & (features[:, each.index] != 0).any(axis=1)
         counts = np.bincount(own[seen], minlength=len(level))
         for channel in range(features.shape[2]):
             total = np.bincount(own[seen], features[seen, each.index, channel], len(level))

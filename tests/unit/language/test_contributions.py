@@ -214,6 +214,21 @@ def test_a_killed_run_goes_on_from_its_checkpoint(two_boxes, monkeypatch):
     assert not list((folder / "cache").rglob("*.npy"))  # the checkpoint is gone
 
 
+def test_a_checkpoint_that_lost_a_file_costs_time_and_no_result(two_boxes, monkeypatch):
+    settings, folder = ContributionsSettings(keep="gram"), two_boxes.folder
+    arguments = (two_boxes.scene, two_boxes.ply, two_boxes.masks)
+    run_contributions(*arguments, folder / "whole", folder / "other cache", settings, 1)
+    monkeypatch.setattr(quadratic_builder, "CHECKPOINT_SECONDS", 0.0)
+    with monkeypatch.context() as killed:
+        killed.setattr(stage, "write_npz", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            run_contributions(*arguments, folder / "out", folder / "cache", settings, 1)
+    lost, *_ = sorted((folder / "cache").rglob("*.npy"))
+    lost.unlink()
+    run_contributions(*arguments, folder / "out", folder / "cache", settings, 1)
+    assert sha256_of_path(folder / "out") == sha256_of_path(folder / "whole")
+
+
 @pytest.mark.parametrize("keep", ["auto", "weights", "gram"])
 def test_a_builder_goes_on_from_its_state(keep, monkeypatch):
     parts = []

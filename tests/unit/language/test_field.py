@@ -1,5 +1,7 @@
 """The sparse solver against dense algebra and autograd, and the stage."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -10,6 +12,7 @@ from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.language.autoencoder import run_autoencoder
 from hilsplat.language.contrast import Contrast, ViewRelations, distinct, instance_term, part_term
 from hilsplat.language.contributions import painted_indicator
+from hilsplat.language.cuda_algebra import DeviceMasks, DeviceQuadratic
 from hilsplat.language.field import LanguageField, run_language
 from hilsplat.language.losses.clustering import clustering_loss
 from hilsplat.language.losses.latent_regression import latent_regression_loss
@@ -24,6 +27,7 @@ from hilsplat.settings import AutoencoderSettings, LanguageSettings, ReferenceSe
 from hilsplat.splat.gaussians import Gaussians
 
 PIXELS, GAUSSIANS, CHANNELS = 60, 12, 2
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
 class Toy:
@@ -196,6 +200,27 @@ def test_contrastive_weights_lower_their_terms():
     assert set(plain["gradient_norms"]) == {"language", "clustering", "instance", "part"}
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_device_solves_the_same_field(device):
+    toy = Toy((1.0, 0.3, 0.1))
+    settings = LanguageSettings(weight_instance=0.3, weight_part=0.1, lbfgs_steps=5)
+    contrast = toy.contrast(settings)
+    features, report = solve_field(toy.problem, contrast, settings)
+    moved = replace(
+        toy.problem,
+        masks=DeviceMasks.of(toy.problem.masks, device),
+        quadratic=DeviceQuadratic.of(toy.problem.quadratic, device),
+    )
+    halves = DeviceMasks.of(contrast.half_masks, device)
+    there = Contrast(moved.masks, halves, toy.pixels, toy.half_pixels, contrast.relations, contrast.settings)
+    on_device, told = solve_field(moved, there, settings)
+    assert on_device == pytest.approx(features, abs=1e-4)
+    for step in ("lifted", "after_cg", "after_lbfgs"):
+        assert told[step] == pytest.approx(report[step], rel=1e-3)
+    # losses are small differences of large sums: a device takes them in float64 too
+    assert told["lifted"]["language"] == pytest.approx(report["lifted"]["language"], rel=1e-9)
+
+
 def test_gaussians_that_masks_hardly_hold_keep_no_latent():
     features = np.ones((3, 3, 2), np.float32)
     mass = np.array([[4, 0.1, 4], [4, 2, 0], [0, 0, 0]], np.float32)
@@ -250,9 +275,9 @@ SMALL_MASKS = LanguageSettings(min_mask_px=4, weight_part=0.003)
 def test_stage_is_the_same_on_any_number_of_threads(boxes_with_latents):
     world, contributions, autoencoder = boxes_with_latents
     out = world.folder / "language.safetensors"
-    run_language(contributions, world.tree, autoencoder, out, SMALL_MASKS, 0, 1)
+    run_language(contributions, world.tree, autoencoder, out, SMALL_MASKS, 1)
     before = out.read_bytes()
-    run_language(contributions, world.tree, autoencoder, out, SMALL_MASKS, 1, 2)
+    run_language(contributions, world.tree, autoencoder, out, SMALL_MASKS, 2)
     assert out.read_bytes() == before
     field = LanguageField.load(out)
     assert field.features.shape == (96, 3, 3)
@@ -268,7 +293,7 @@ def test_the_median_start_and_pruning_are_options_of_the_stage(boxes_with_latent
     for name, more in (("plain", {}), ("median", {"start": "median"}), ("pruned", {"prune_cosine": 0.0})):
         out = world.folder / name / "language.safetensors"
         settings = SMALL_MASKS.model_copy(update=more)
-        run_language(contributions, world.tree, autoencoder, out, settings, 0, 1)
+        run_language(contributions, world.tree, autoencoder, out, settings, 1)
         reports[name] = read_json(out.with_suffix(".report.json"))
     assert reports["median"]["lifted"] != reports["plain"]["lifted"]
     assert reports["pruned"]["contrasted_masks"] < reports["plain"]["contrasted_masks"]
@@ -303,6 +328,4 @@ def test_tree_of_other_masks_is_refused(boxes_with_latents):
     world, contributions, autoencoder = boxes_with_latents
     np.savez(world.tree / "001.png.npz", parent=np.zeros(2, np.int32))
     with pytest.raises(MisalignedArtifactError, match=r"view 001.png belongs to other masks"):
-        run_language(
-            contributions, world.tree, autoencoder, world.folder / "l.safetensors", SMALL_MASKS, 0, 1
-        )
+        run_language(contributions, world.tree, autoencoder, world.folder / "l.safetensors", SMALL_MASKS, 1)

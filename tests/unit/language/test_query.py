@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from hilsplat.base.artifacts import write_json
-from hilsplat.base.errors import MisalignedArtifactError, SettingsError
+from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.base.provenance import provenance_path
 from hilsplat.language.autoencoder import load_code, run_autoencoder
@@ -45,7 +45,7 @@ def scene(tmp_path_factory) -> LanguageScene:
     settings = AutoencoderSettings(code="network", latent=4, epochs=1, min_steps=400, learning_rate=2e-3)
     run_autoencoder(world.clip, folder / "st", contributions, folder / "ae", settings, 0)
     run_language(
-        contributions, world.tree, folder / "ae", folder / "language.safetensors", LanguageSettings(), 0, 1
+        contributions, world.tree, folder / "ae", folder / "language.safetensors", LanguageSettings(), 1
     )
     rng = np.random.default_rng(9)
     vectors = {name: world.region_vectors[row] for row, (name, *_) in enumerate(REGIONS)}
@@ -139,6 +139,27 @@ def test_a_scene_opens_with_the_settings_it_was_evaluated_with(tmp_path):
     found = FinishedScene.locate(folder).evaluate_settings()
     assert found.canonical == ("thing", "surface")
     assert found.node_select == 0.9
+
+
+def test_a_variant_answers_with_the_field_it_was_scored_with_and_never_with_another(tmp_path):
+    folder = tmp_path / "results" / "synthetic" / "bear"
+    for part in ("semantic_tree", "autoencoder", "clip", "masks"):
+        (folder / "default" / part).mkdir(parents=True)
+    (folder / "scene").mkdir()
+    for name in ("gaussians.ply", "default/language.safetensors"):
+        (folder / name).touch()
+    (folder / "lifted").mkdir()  # begun, and killed
+    with pytest.raises(ArtifactError, match=r"lifted/language\.safetensors is missing"):
+        FinishedScene.locate(folder, "lifted")
+    inputs = {"language": {"path": "results/synthetic/bear/default/language.safetensors"}}
+    (folder / "theta").mkdir()
+    (folder / "theta/scores.csv").touch()
+    write_json(provenance_path(folder / "theta/scores.csv"), {"settings": {}, "inputs": inputs})
+    found = FinishedScene.locate(folder, "theta")
+    assert found.language == folder / "default/language.safetensors"
+    assert found.semantic_tree == folder / "default/semantic_tree"
+    with pytest.raises(ArtifactError, match="no variant 'x'"):
+        FinishedScene.locate(folder, "x")
 
 
 def test_a_scene_without_labels_opens_with_the_settings_of_its_panel(tmp_path):
@@ -288,6 +309,20 @@ def test_uncovered_pixels_get_the_least_relevancy(scene):
     for maps in (thin.field_relevancy(["A"], "000.png"), thin.node_relevancy_map(["A"], "000.png")):
         assert maps[0, 0, 0, 0] == maps[0, 0].min()
     assert not thin.node_masks("000.png", np.array([NODE["A"]]))[0, 0]
+
+
+def test_gaussians_without_a_latent_do_not_dilute_a_pixel(scene):
+    features = scene.language.features.copy()
+    features[::7] = 0
+    thin = replace(scene, language=replace(scene.language, features=features), _views=ViewStore())
+    weights = scene.view_weights("000.png").toarray()
+    has = (features[:, 0] != 0).any(axis=1)
+    share = weights[:, has].sum(axis=1)
+    pixels, latents = thin._view_latents("000.png")[0]
+    assert pixels.tolist() == np.flatnonzero(share > 0.5).tolist()
+    assert (share[pixels] < 0.99).any()
+    expected = weights[pixels] @ features[:, 0] / share[pixels, None]
+    assert latents == pytest.approx(expected, abs=1e-5)
 
 
 def test_field_image_has_one_colour_per_region(scene):

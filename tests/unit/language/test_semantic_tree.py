@@ -15,12 +15,25 @@ from tests.unit.language.two_boxes_world import HEIGHT, NUM_GAUSSIANS, REGIONS, 
 
 
 def test_gaussians_join_the_node_with_the_largest_share():
-    shares = sp.csr_matrix(np.array([[0.5, 0.1, 0.3], [0.4, 0.1, 0.0], [0.2, 0.0, 0.3]]))
+    weights = sp.csr_matrix(np.array([[5, 1, 3], [4, 1, 0], [2, 0, 3]], np.float32))
+    mass = np.array([[5, 5, 5], [5, 5, 5]], np.float32)
     # nodes: masks 0 and 1 are node 0, mask 2 is node 1
-    node, membership = gaussian_nodes(np.array([0, 0, 1]), 2, shares, 0.25)
+    node, membership = gaussian_nodes(
+        np.array([0, 0, 1]), 2, weights, np.array([0, 1, 1], np.int32), mass, np.full(3, 10.0), 0.25
+    )
     # 0.9 against 0.2; 0.2 is too little; a tie goes to the lower node
     assert node.tolist() == [0, -1, 0]
     assert membership == pytest.approx([0.9, 0, 0.3])
+
+
+def test_overlapping_masks_of_one_view_count_a_gaussian_once():
+    weights = sp.csr_matrix(np.array([[4, 2], [4, 0], [0, 2], [5, 3]], np.float32))
+    view = np.array([0, 0, 0, 1], np.int32)
+    mass = np.array([[4, 4], [6, 6]], np.float32)
+    # masks 0 and 1 are node 0, twice the same 4 of 4 px of Gaussian 0; mask 3 is node 1, with 5 of 6 px
+    node, membership = gaussian_nodes(np.array([0, 0, -1, 1]), 2, weights, view, mass, np.full(2, 10.0), 0.1)
+    assert node.tolist() == [1, 1]
+    assert membership == pytest.approx([0.5, 0.3])
 
 
 def test_a_double_that_shows_nothing_is_no_node():
