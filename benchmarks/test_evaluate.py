@@ -33,7 +33,7 @@ class Answers:
 
     node_relevancy_map = field_relevancy
 
-    def select_nodes(self, text, *, level=None, threshold=0.85, within=None):
+    def select_nodes(self, text, *, level=None, threshold=0.85):
         return SimpleNamespace(ids=np.array([list(self.regions).index(text)]), level=level)
 
     def select_path(self, path, *, level=None, threshold=0.85):

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.evaluate.pictures import (
     label_left,
@@ -56,8 +55,6 @@ def answer(
         SettingsError: level or answerer are unknown.
     """
     folder = Path(folder)
-    if answerer not in ("tree", "field"):
-        raise SettingsError(f"nothing answers as {answerer!r}", expected="tree or field", found=answerer)
     parts = FinishedScene.locate(folder, variant)
     scene = LanguageScene.open(folder, variant, threads=threads)
     hits = scene.query(text, level, answerer=answerer, limit=LISTED)
@@ -102,8 +99,10 @@ def query_panel(
         mask = (
             np.asarray(scene.node_masks(view, hits.ids)) if len(hits.ids) else np.zeros(image.shape[:2], bool)
         )
-        maps = scene.node_relevancy_map if answerer == "tree" else scene.field_relevancy
-        relevancy = np.asarray(maps([last], view))[0]
+        if answerer == "tree":
+            relevancy = scene.node_relevancy_map([last], view)[0]
+        else:
+            relevancy = scene.field_relevancy([last], view, exact=False)[0]
         low, high = float(relevancy.min()), float(relevancy.max())
         show(axes[0], image, view)
         label_left(axes[0], f"{scene.scene.split[view]} view")

@@ -217,7 +217,7 @@ def timed(
     size_hw = answers.scene.cameras[view].size_hw
 
     def by_field(text: str) -> object:
-        relevancy = answers.field_relevancy([text], view)[0]
+        relevancy = answers.field_relevancy([text], view, exact=False)[0]
         return relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)
 
     def by_tree(text: str) -> object:

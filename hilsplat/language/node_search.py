@@ -59,9 +59,7 @@ def margins(scores: Float[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     return np.log(probability / (1 - probability))
 
 
-def automatic_level(
-    tree: SemanticTree, scores: Float[np.ndarray, " n"], within: Int64[np.ndarray, " c"] | None = None
-) -> Level:
+def automatic_level(tree: SemanticTree, scores: Float[np.ndarray, " n"]) -> Level:
     """Level that a text most likely means: that of the best node; of equally good ones the coarsest.
 
     LangSplat's rule, asked of nodes instead of pixels. A node's vector is an average over views, and a
@@ -69,11 +67,9 @@ def automatic_level(
     highest of 100,000 pixels. Rules that climb to the parent of the best node, that standardise each
     level's scores or that ask siblings were all worse on development scenes (docs/tree.md).
     """
-    candidates = np.arange(len(tree)) if within is None else np.asarray(within)
-    if not len(candidates):
+    if not len(tree):
         return Level.WHOLE
-    best = candidates[scores[candidates] == scores[candidates].max()]
-    return Level(int(tree.level[best].min()))
+    return Level(int(tree.level[scores == scores.max()].min()))
 
 
 def search_path(

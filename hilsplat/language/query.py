@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import scipy.sparse as sp
@@ -175,7 +175,7 @@ class LanguageScene:
         text: str,
         level: str = "auto",
         *,
-        answerer: Answerer = "tree",
+        answerer: str = "tree",
         threshold: float | None = None,
         limit: int = 10,
     ) -> list[Hit]:
@@ -191,7 +191,8 @@ class LanguageScene:
             limit: answers at most.
 
         Raises:
-            SettingsError: the text is empty, the level is unknown, or a path has more texts than levels.
+            SettingsError: the text is empty, level or answerer are unknown, or a path has more texts than
+                levels.
         """
         hits = self.find(text, level, threshold, answerer)
         return [
@@ -200,13 +201,17 @@ class LanguageScene:
         ]
 
     def find(
-        self, text: str, level: str = "auto", threshold: float | None = None, answerer: Answerer = "tree"
+        self, text: str, level: str = "auto", threshold: float | None = None, answerer: str = "tree"
     ) -> NodeHits:
         """Like `query`, as rows of the tree."""
         path = tuple(part.strip() for part in text.split(PATH_SEPARATOR))
         if not all(path):
             raise SettingsError(
                 f"the query {text!r} holds no text", fix='write words, or "bear > head > nose"'
+            )
+        if answerer not in get_args(Answerer):
+            raise SettingsError(
+                f"nothing answers as {answerer!r}", expected=" or ".join(get_args(Answerer)), found=answerer
             )
         names = {each.label: each for each in LEVELS}
         if level != "auto" and level not in names:
@@ -224,7 +229,6 @@ class LanguageScene:
         *,
         level: Level | None,
         threshold: float | None = None,
-        within: Int64[np.ndarray, " c"] | None = None,
         answerer: Answerer = "tree",
     ) -> NodeHits:
         """Nodes whose margin, stretched to [0, 1] over the level's nodes, reaches the threshold.
@@ -233,16 +237,13 @@ class LanguageScene:
             text: the query.
             level: which nodes compete; None chooses it (see `automatic_level`).
             threshold: share of the range between the worst and the best node.
-            within: only these nodes compete, such as the children of another answer.
             answerer: as in `query`.
         """
         scores = self.node_relevancy([text], answerer)[0]
         if level is None:
-            level = automatic_level(self.tree, scores, within)
-        candidates = self.tree.nodes_of(level)
-        if within is not None:
-            candidates = np.intersect1d(candidates, within)
-        return best_nodes(scores, candidates, level, self.node_select if threshold is None else threshold)
+            level = automatic_level(self.tree, scores)
+        threshold = self.node_select if threshold is None else threshold
+        return best_nodes(scores, self.tree.nodes_of(level), level, threshold)
 
     def select_path(
         self,

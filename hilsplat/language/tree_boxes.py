@@ -70,7 +70,7 @@ def node_boxes(
     means: Float[np.ndarray, "N 3"],
     mass: Float[np.ndarray, " N"],
 ) -> tuple[Float32[np.ndarray, "T 3"], Float32[np.ndarray, "T 2 3"], Float32[np.ndarray, "T 5 3"]]:
-    """Centroid, axis-aligned and oriented box of every node's members, weighted by visible mass.
+    """Centroid and axes of every node's members, weighted by visible mass, and the boxes of their centres.
 
     Every node has a member (`tree_nodes.renumbered_without_empty`).
     """

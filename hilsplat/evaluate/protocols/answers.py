@@ -17,7 +17,7 @@ class QueryableScene(Protocol):
     def node_relevancy_map(self, texts, view):
         """Relevancy of the node at each pixel, (T, 3, H, W)."""
 
-    def select_nodes(self, text, level=None, threshold=0.85, within=None):
+    def select_nodes(self, text, level=None, threshold=0.85):
         """Nodes that answer a text, with the level they are of."""
 
     def select_path(self, texts, level=None, threshold=0.85):

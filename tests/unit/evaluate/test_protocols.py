@@ -47,7 +47,7 @@ class HandMade:
 
     node_relevancy_map = field_relevancy
 
-    def select_nodes(self, text, *, level=None, threshold=0.85, within=None):
+    def select_nodes(self, text, *, level=None, threshold=0.85):
         return SimpleNamespace(ids=np.array(self.answers.get((text, level), []), dtype=np.int64), level=level)
 
     def select_path(self, path, *, level=None, threshold=0.85):

@@ -87,8 +87,6 @@ def test_automatic_level_is_that_of_the_best_node_and_of_equals_the_coarsest(sce
     assert automatic_level(scene.tree, scores) == Level.SUBPART
     scores[NODE["A top"]] = 0.9
     assert automatic_level(scene.tree, scores) == Level.PART
-    within = np.array([NODE["B"], NODE["A"]])
-    assert automatic_level(scene.tree, scores, within) == Level.WHOLE
 
 
 def test_selection_is_by_margins_which_do_not_saturate():
@@ -196,12 +194,6 @@ def test_hits_tell_gaussians_and_an_oriented_box(scene):
     assert hit.oriented_box.size == pytest.approx((2.88, 1, 0), abs=0.15)
 
 
-def test_only_the_given_nodes_compete(scene):
-    children = scene.tree.children_of(np.array([NODE["B"]]))
-    hits = scene.select_nodes("A top", level=Level.PART, threshold=0.85, within=children)
-    assert hits.ids.tolist() == [NODE["B top"]]
-
-
 def test_path_goes_from_child_to_child(scene):
     hits = scene.select_path(("A", "A top", "A top left"), level=None, threshold=0.85)
     assert hits.ids.tolist() == [NODE["A top left"]]
@@ -275,6 +267,11 @@ def test_query_parses_paths_and_describes_hits(scene):
 def test_impossible_queries_say_why(scene, text, level, words):
     with pytest.raises(SettingsError, match=words):
         scene.query(text, level)
+
+
+def test_an_unknown_answerer_is_named(scene):
+    with pytest.raises(SettingsError, match="nothing answers as 'tre'"):
+        scene.query("A", answerer="tre")
 
 
 def test_node_masks_cover_their_region_in_an_unseen_view(scene):
