@@ -1,16 +1,28 @@
 """LangSplat: one field per level by itself, L1 between rendered and painted codes, no tree.
 
-The published code renders a random view per step and compares every labelled pixel (minghanqin/LangSplat
-`train.py`). Geometry is frozen, so what it renders is a product with fixed compositing weights; here these
-are computed once per view, and pixels are taken from a grid. `hilsplat.language.reference` is the same
-trainer without either short cut.
+The published code renders a random view per step, each once before any comes again, and compares every
+labelled pixel (minghanqin/LangSplat `train.py`). Geometry is frozen, so what it renders is a product with
+fixed compositing weights; here these are computed once per view.
+
+Departs from the published code:
+    - fewer steps, and pixels of a grid in place of all (`MethodSettings`);
+    - L1 is averaged over the labelled pixels of the grid; LangSplat averages over all pixels, the unlabelled
+      counting as 0, so that there a step of a view weighs as much as its masks cover;
+    - rendered codes are divided by alpha, as a query sees them, and pixels covered less than `MIN_ALPHA` are
+      left out; LangSplat compares what is premultiplied, wherever a mask is painted;
+    - codes of Gaussians are blended as they are; LangSplat scales each to unit length first;
+    - weights below `contributions.min_weight` are dropped.
+
+`hilsplat.language.reference` (loss `l1`) renders every step and takes all pixels and LangSplat's average over
+them. It is another trainer, not this one at full length: it draws views with replacement and trains the
+levels in one run; alpha and unit length are treated as here.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Int32, Int64
 
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
@@ -23,7 +35,7 @@ EPS = 1e-15
 
 
 @dataclass(frozen=True)
-class ViewRows:
+class LevelPixels:
     """Labelled pixels of one view at one level.
 
     Attributes:
@@ -35,34 +47,72 @@ class ViewRows:
     targets: Float32[np.ndarray, "p D"]
 
 
-def l1_step(features: Float32[np.ndarray, "N D"], rows: ViewRows) -> tuple[float, Float32[np.ndarray, "N D"]]:
+@dataclass(frozen=True)
+class ViewPixels:
+    """Covered pixels of one view that are labelled at any level; most are at all, so weights are held once.
+
+    Attributes:
+        weights: their compositing weights (pixels x Gaussians), rows summing to 1.
+        labels: row of the mask painted there at each level, -1 where there is none.
+        latents: code of each mask of the view.
+    """
+
+    weights: sp.csr_matrix
+    labels: Int32[np.ndarray, "p 3"]
+    latents: Float32[np.ndarray, "m D"]
+
+    @staticmethod
+    def of(
+        weights: sp.csr_matrix,
+        labels: Int32[np.ndarray, "P 3"],
+        latents: Float32[np.ndarray, "m D"],
+        grid: Int64[np.ndarray, " p"],
+    ) -> "ViewPixels":
+        """Take pixels of a grid from all P of a view."""
+        covered = np.diff(weights.indptr)[grid] > 0
+        pixels = grid[covered & (labels[grid] >= 0).any(axis=1)]
+        return ViewPixels(weights[pixels], labels[pixels], latents)
+
+    def is_labelled(self, level: Level) -> bool:
+        """Whether a mask of the level is painted anywhere."""
+        return bool((self.labels[:, level.index] >= 0).any())
+
+    def at(self, level: Level) -> LevelPixels:
+        """Copy what a level labels, in order."""
+        rows = np.flatnonzero(self.labels[:, level.index] >= 0)
+        return LevelPixels(self.weights[rows], self.latents[self.labels[rows, level.index]])
+
+
+def l1_step(
+    features: Float32[np.ndarray, "N D"], pixels: LevelPixels
+) -> tuple[float, Float32[np.ndarray, "N D"]]:
     """Mean absolute difference of rendered and painted codes, and its gradient by the features."""
-    apart = rows.weights @ features - rows.targets
+    apart = pixels.weights @ features - pixels.targets
     scale = np.float32(1 / max(apart.size, 1))
-    gradient = rows.weights.T @ (np.sign(apart) * scale)
+    gradient = pixels.weights.T @ (np.sign(apart) * scale)
     return float(np.abs(apart).sum(dtype=np.float64) * scale), gradient.astype(np.float32)
 
 
 def train_level(
-    views: list[ViewRows], num_gaussians: int, latent: int, settings: MethodSettings, seed: int
+    views: list[ViewPixels], level: Level, num_gaussians: int, settings: MethodSettings, seed: int
 ) -> Float32[np.ndarray, "N D"]:
     """Adam from zero, one random view per step (each once before any comes again).
 
     Args:
-        views: labelled pixels of the train views; views without any are left out by the caller.
+        views: train views in which the level labels a pixel, at least one.
+        level: that is trained.
         num_gaussians: N.
-        latent: D.
         settings: steps and rate.
         seed: of the order of views.
     """
-    features = np.zeros((num_gaussians, latent), np.float32)
+    features = np.zeros((num_gaussians, views[0].latents.shape[1]), np.float32)
     first, second = np.zeros_like(features), np.zeros_like(features)
     order = np.random.default_rng(seed)
     queue: list[int] = []
     for step in range(1, settings.steps + 1):
         if not queue:
             queue = list(order.permutation(len(views)))
-        _, gradient = l1_step(features, views[queue.pop()])
+        _, gradient = l1_step(features, views[queue.pop()].at(level))
         first += (1 - BETAS[0]) * (gradient - first)
         second += (1 - BETAS[1]) * (gradient * gradient - second)
         mean, spread = first / (1 - BETAS[0] ** step), second / (1 - BETAS[1] ** step)
@@ -73,22 +123,17 @@ def train_level(
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train the three levels one after the other, each with a seed of its own."""
     contributions, latents = inputs.contributions, inputs.latents
-    of_level: dict[Level, list[ViewRows]] = {level: [] for level in LEVELS}
+    views: list[ViewPixels] = []
     for number, view in enumerate(track(list(contributions.views), "weights of views")):
-        weights, labels = inputs.view_weights(view), inputs.view_labels(view)
         grid = grid_pixels(inputs.view_size_hw(view), settings.pixel_step)
-        covered = grid[np.diff(weights.indptr)[grid] > 0]
         own = latents[contributions.view == number]
-        for level in LEVELS:
-            pixels = covered[labels[covered, level.index] >= 0]
-            if len(pixels):
-                of_level[level].append(ViewRows(weights[pixels], own[labels[pixels, level.index]]))
-    shape = (contributions.num_gaussians, len(LEVELS), latents.shape[1])
-    features = np.zeros(shape, np.float32)
+        views.append(ViewPixels.of(inputs.view_weights(view), inputs.view_labels(view), own, grid))
+    num_gaussians = contributions.num_gaussians
+    features = np.zeros((num_gaussians, len(LEVELS), latents.shape[1]), np.float32)
     for level in track(list(LEVELS), "levels trained"):
-        if of_level[level]:
+        if labelled := [view for view in views if view.is_labelled(level)]:
             features[:, level.index] = train_level(
-                of_level[level], shape[0], shape[2], settings, seed + level.index
+                labelled, level, num_gaussians, settings, seed + level.index
             )
     return features
 
@@ -102,6 +147,8 @@ def grid_pixels(size_hw: tuple[int, int], step: int) -> Int64[np.ndarray, " p"]:
 METHOD = Method(
     "langsplat",
     "LangSplat",
-    "minghanqin/LangSplat train.py; departs: fewer steps, pixels of a grid, rendered codes divided by alpha",
+    "minghanqin/LangSplat train.py; departs: fewer steps, pixels of a grid, L1 averaged over labelled pixels "
+    "in place of all, rendered codes divided by alpha and thinly covered pixels left out, codes of Gaussians "
+    "not scaled to unit length, small compositing weights dropped",
     fit,
 )

@@ -16,10 +16,11 @@ from jaxtyping import Float32, Int32
 from hilsplat.language.autoencoder import load_latents
 from hilsplat.language.compositing import normalised_weights
 from hilsplat.language.contributions import label_maps
+from hilsplat.language.finished import require_same
 from hilsplat.language.mask_rows import Contributions
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.settings import ContributionsSettings, MethodSettings
+from hilsplat.settings import MethodSettings
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 
@@ -60,7 +61,7 @@ class MethodInputs:
         weights = pixel_weights(
             gaussians,
             scene.cameras[view],
-            min_weight=ContributionsSettings().min_weight,
+            min_weight=self.contributions.min_weight,
             threads=self.threads,
         )
         return normalised_weights(weights)
@@ -75,7 +76,9 @@ class MethodInputs:
 
     @cached_property
     def _loaded(self) -> tuple:
-        return load_ply(self.gaussians_ply), Scene.load(self.scene_folder)
+        scene = Scene.load(self.scene_folder)
+        require_same("contributions", scene.name, self.gaussians_ply, self.contributions.gaussians_sha256)
+        return load_ply(self.gaussians_ply), scene
 
 
 Fit = Callable[[MethodInputs, MethodSettings, int], np.ndarray]

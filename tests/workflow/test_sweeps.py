@@ -7,6 +7,7 @@ from collections import Counter
 import pytest
 
 from tests.workflow.conftest import Project, copy_project
+from tests.workflow.test_bad_input import noise_photos
 
 NONE = ("theta_variants=[]", "omega_variants=[]", "pruning_variants=[]", "ablation_variants=[]")
 MAIN = "main_variants=[default]"
@@ -81,6 +82,19 @@ def test_sweeps_take_the_scenes_that_are_named_for_them(plain):
     every = jobs(plain, "theta_variants=[theta-0.6,default]")
     other = jobs(plain, "theta_variants=[theta-0.6,default]", "sweep_scenes=[table-2]")
     assert (every["language"], other["language"]) == (2, 1)
+
+
+def test_a_run_of_photographs_leaves_the_tables_of_another_alone(plain, tmp_path):
+    source = noise_photos(tmp_path / "desk", 3)
+    sheet = plain.root / "config/scenes.tsv"
+    before = sheet.read_text()
+    sheet.write_text(before + f"photos\tdesk\tphotos\t{source}\tarbitrary\n")
+    command = [sys.executable, "-m", "snakemake", "-n", "--cores", "1", "--quiet", "rules"]
+    printed = plain.run(*command, "--config", "groups=[photos]", "only=[desk]").stdout
+    sheet.write_text(before)
+    planned = {line.split()[0] for line in printed.splitlines() if line.strip()}
+    assert {"poses", "semantic_tree", "language", "figures"} <= planned
+    assert not planned & {"table", "sweep_plot", "evaluate"}
 
 
 def test_an_unknown_method_stops_the_run_at_once(plain):

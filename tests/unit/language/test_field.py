@@ -23,6 +23,7 @@ from hilsplat.language.quadratic import StackedWeights
 from hilsplat.language.reference import rendered_loss, run_reference
 from hilsplat.language.semantic_tree import run_semantic_tree
 from hilsplat.language.solver import keep_labelled, solve_field
+from hilsplat.methods.method import MethodInputs
 from hilsplat.settings import AutoencoderSettings, LanguageSettings, ReferenceSettings, SemanticTreeSettings
 from hilsplat.splat.gaussians import Gaussians
 
@@ -297,6 +298,18 @@ def test_the_median_start_and_pruning_are_options_of_the_stage(boxes_with_latent
         reports[name] = read_json(out.with_suffix(".report.json"))
     assert reports["median"]["lifted"] != reports["plain"]["lifted"]
     assert reports["pruned"]["contrasted_masks"] < reports["plain"]["contrasted_masks"]
+
+
+def test_the_reference_trainer_and_baselines_refuse_other_gaussians(boxes_with_latents, monkeypatch):
+    world, contributions, autoencoder = boxes_with_latents
+    other = world.folder / "other.ply"
+    other.write_bytes(b"other")
+    monkeypatch.setattr("hilsplat.language.reference.load_ply", lambda path: None)
+    parts = (world.scene, other, world.masks, contributions, autoencoder)
+    with pytest.raises(MisalignedArtifactError, match=r"made for another other\.ply"):
+        run_reference(*parts, world.folder / "l.safetensors", ReferenceSettings(), "cpu", 0, 1)
+    with pytest.raises(MisalignedArtifactError, match=r"made for another other\.ply"):
+        MethodInputs(*parts).view_weights(world.views[0])
 
 
 def test_the_reference_trainer_lowers_its_loss(boxes_with_latents, monkeypatch):

@@ -11,9 +11,9 @@ import pytest
 import scipy.sparse as sp
 
 from hilsplat.base.errors import ArtifactError, SettingsError
-from hilsplat.methods import registry, stage
-from hilsplat.methods.langsplat import ViewRows, grid_pixels, l1_step, train_level
-from hilsplat.methods.lifted import lift
+from hilsplat.base.levels import Level
+from hilsplat.methods import langsplat, lifted, registry, stage
+from hilsplat.methods.langsplat import LevelPixels, ViewPixels, grid_pixels, l1_step, train_level
 from hilsplat.methods.method import Method
 from hilsplat.methods.registry import METHODS, OURS, method_of, require_method
 from hilsplat.settings import MethodSettings
@@ -21,44 +21,106 @@ from hilsplat.settings import MethodSettings
 EXTENDING = Path(__file__).parents[3] / "docs" / "extending.md"
 
 
+def fit_of(method, inputs, settings):
+    """The field of a method, from inputs that are no MethodInputs."""
+    return inspect.unwrap(method.fit)(inputs, settings, 0)
+
+
 def test_a_gaussian_gets_the_average_of_its_masks_weighed_by_their_share_of_it():
-    weights = sp.csr_matrix(np.array([[3.0, 0, 0], [1.0, 2.0, 0]], np.float32))
-    latents = np.array([[1.0, 0.0], [0.0, 1.0]], np.float32)
-    # Gaussian 0: (3 * (1, 0) + 1 * (0, 1)) / 4; Gaussian 1 lies in mask 1 alone; Gaussian 2 in none
-    assert lift(weights, latents).tolist() == [[0.75, 0.25], [0.0, 1.0], [0.0, 0.0]]
+    # masks of 4 px and 2 px of the wholes, one of 5 px of the parts, on three Gaussians
+    means = np.array([[0.75, 0, 0], [0.5, 0.5, 0], [0, 0, 1.0]], np.float32)
+    contributions = types.SimpleNamespace(
+        matrix={"A": sp.csr_matrix(means)}.get,
+        level=np.array([1, 1, 2], np.uint8),
+        pixels=np.array([4, 2, 5]),
+    )
+    latents = np.array([[1.0, 0.0], [0.0, 1.0], [0.5, 2.0]], np.float32)
+    inputs = types.SimpleNamespace(contributions=contributions, latents=latents)
+    features = fit_of(lifted.METHOD, inputs, MethodSettings(name="lifted"))
+    # Gaussian 0: (4 * 0.75 * (1, 0) + 2 * 0.5 * (0, 1)) / 4; Gaussian 1 lies in mask 1 alone; 2 in no whole
+    assert features[:, 0].tolist() == [[0.75, 0.25], [0.0, 1.0], [0.0, 0.0]]
+    assert features[:, 1].tolist() == [[0.0, 0.0], [0.0, 0.0], [0.5, 2.0]]
+    assert not features[:, 2].any()
 
 
 def test_l1_gradient_matches_finite_differences():
     rng = np.random.default_rng(0)
     weights = sp.csr_matrix(rng.random((5, 4)).astype(np.float32))
-    rows = ViewRows(weights, rng.random((5, 2)).astype(np.float32))
+    pixels = LevelPixels(weights, rng.random((5, 2)).astype(np.float32))
     features = rng.random((4, 2)).astype(np.float32)
-    _, gradient = l1_step(features, rows)
+    _, gradient = l1_step(features, pixels)
     for place in [(0, 0), (2, 1), (3, 0)]:
         up, down = features.copy(), features.copy()
         up[place] += 1e-3
         down[place] -= 1e-3
-        slope = (l1_step(up, rows)[0] - l1_step(down, rows)[0]) / 2e-3
+        slope = (l1_step(up, pixels)[0] - l1_step(down, pixels)[0]) / 2e-3
         assert gradient[place] == pytest.approx(slope, abs=2e-3)
+
+
+def all_whole(weights, latents):
+    """A view with a mask of the wholes, and a code, for each pixel."""
+    labels = np.full((len(latents), 3), -1, np.int32)
+    labels[:, Level.WHOLE.index] = np.arange(len(latents))
+    return ViewPixels(sp.csr_matrix(weights.astype(np.float32)), labels, latents.astype(np.float32))
 
 
 def test_l1_finds_the_median_of_what_a_gaussian_shows():
     # one Gaussian alone in three pixels with codes 0, 1 and 10: the squared optimum would be 11/3
-    rows = ViewRows(sp.csr_matrix(np.ones((3, 1), np.float32)), np.array([[0.0], [1.0], [10.0]], np.float32))
+    view = all_whole(np.ones((3, 1)), np.array([[0.0], [1.0], [10.0]]))
     settings = MethodSettings(name="langsplat", steps=2000, rate=0.005)
-    assert train_level([rows], 1, 1, settings, seed=0)[0, 0] == pytest.approx(1.0, abs=0.02)
+    assert train_level([view], Level.WHOLE, 1, settings, seed=0)[0, 0] == pytest.approx(1.0, abs=0.02)
 
 
 def test_training_is_the_same_for_the_same_seed_and_another_for_another():
     rng = np.random.default_rng(1)
-    views = [
-        ViewRows(sp.csr_matrix(rng.random((6, 3)).astype(np.float32)), rng.random((6, 2)).astype(np.float32))
-        for _ in range(4)
-    ]
+    views = [all_whole(rng.random((6, 3)), rng.random((6, 2))) for _ in range(4)]
     settings = MethodSettings(name="langsplat", steps=7)
-    first, again, other = (train_level(views, 3, 2, settings, seed) for seed in (0, 0, 3))
+    first, again, other = (train_level(views, Level.WHOLE, 3, settings, seed) for seed in (0, 0, 3))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
+
+
+def test_a_view_keeps_covered_pixels_of_the_grid_that_any_level_labels():
+    weights = sp.csr_matrix(np.float32([[1, 0], [2, 0], [0, 3], [0, 4], [0, 0]]))
+    labels = np.array([[-1, 0, -1], [0, 0, 0], [-1, -1, -1], [-1, -1, 0], [0, 0, 0]], np.int32)
+    view = ViewPixels.of(weights, labels, np.zeros((1, 1), np.float32), np.array([0, 2, 3, 4]))
+    # pixel 1 is not on the grid, 2 not labelled, 4 not covered
+    assert view.weights.toarray().tolist() == [[1, 0], [0, 4]]
+    assert view.labels.tolist() == [[-1, 0, -1], [-1, -1, 0]]
+
+
+def test_a_level_takes_the_pixels_that_it_labels():
+    labels = np.array([[1, -1, -1], [0, 2, -1], [-1, 0, -1]], np.int32)
+    latents = np.array([[0.5], [1.5], [2.5]], np.float32)
+    view = ViewPixels(sp.csr_matrix(np.diag(np.float32([1, 2, 3]))), labels, latents)
+    whole, part = view.at(Level.WHOLE), view.at(Level.PART)
+    assert whole.weights.toarray().tolist() == [[1, 0, 0], [0, 2, 0]]
+    assert whole.targets.tolist() == [[1.5], [0.5]]
+    assert part.weights.toarray().tolist() == [[0, 2, 0], [0, 0, 3]]
+    assert part.targets.tolist() == [[2.5], [0.5]]
+    assert [view.is_labelled(level) for level in (Level.WHOLE, Level.PART, Level.SUBPART)] == [
+        True,
+        True,
+        False,
+    ]
+
+
+def test_langsplat_trains_every_level_on_the_pixels_of_the_grid():
+    # one row of five pixels, every second one compared: 0, 2 and 4; pixel 4 is not covered
+    weights = sp.csr_matrix(np.array([[1, 0], [1, 0], [0, 1], [0, 1], [0, 0]], np.float32))
+    labels = np.array([[0, 2, -1], [1, 2, -1], [0, -1, -1], [1, 2, 1], [1, 1, 1]], np.int32)
+    inputs = types.SimpleNamespace(
+        contributions=types.SimpleNamespace(views=("a", "b"), num_gaussians=2, view=np.array([0, 1, 1, 1])),
+        latents=np.array([[9.0], [0.3], [5.0], [0.6]], np.float32),  # view b has the last three
+        view_weights=lambda view: weights,
+        view_labels=lambda view: labels if view == "b" else np.full((5, 3), -1, np.int32),
+        view_size_hw=lambda view: (1, 5),
+    )
+    settings = MethodSettings(name="langsplat", steps=900, rate=0.002, pixel_step=2)
+    features = fit_of(langsplat.METHOD, inputs, settings)[..., 0]
+    assert features[:, Level.WHOLE.index] == pytest.approx([0.3, 0.3], abs=0.01)
+    assert features[:, Level.PART.index] == pytest.approx([0.6, 0.0], abs=0.01)
+    assert features[:, Level.SUBPART.index].tolist() == [0, 0]
 
 
 def test_grid_takes_every_second_pixel_of_every_second_row():
