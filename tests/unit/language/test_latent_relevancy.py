@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 
-from hilsplat.language.autoencoder import train_autoencoder
+from hilsplat.language import projected_look_up
+from hilsplat.language.autoencoder import Autoencoder, train_autoencoder
 from hilsplat.language.latent_relevancy import LatentRelevancy
 from hilsplat.language.linear_code import LinearCode
+from hilsplat.language.projected_look_up import lost_for_error
 from hilsplat.settings import AutoencoderSettings
 
 
@@ -35,6 +38,23 @@ def blends(features, count):
     )
 
 
+@torch.no_grad()
+def pass_through(latent, channels):
+    """A network that decodes to the positive part of a latent, then zeros, at unit length."""
+    code = Autoencoder(channels, latent)
+    for layer in code.decoder:
+        if isinstance(layer, torch.nn.Linear):
+            layer.weight.copy_(torch.eye(*layer.weight.shape))
+            layer.bias.zero_()
+    return code
+
+
+def distance_from_kept(code, latents, placed):
+    """Of decoded vectors from what is kept of them: no unit text's cosine errs by more."""
+    kept = (placed.coordinates.T / projected_look_up.STEPS) @ placed.directions
+    return np.linalg.norm(code.decode_array(latents) - kept, axis=1)
+
+
 @pytest.mark.parametrize("latent", [3, 5])
 def test_look_up_of_a_network_is_within_two_thousandths_of_decoding(vectors, texts, latent):
     settings = AutoencoderSettings(code="network", latent=latent, epochs=1, min_steps=600)
@@ -46,8 +66,61 @@ def test_look_up_of_a_network_is_within_two_thousandths_of_decoding(vectors, tex
     assert np.ptp(exact) > 0.2  # there is something to get wrong
     assert np.abs(found - exact).max() < 2e-3
     assert len(placed.directions) < 32
+    assert distance_from_kept(code, latents, placed).max() < 8e-4  # 4 x 2e-3 / 10: so for any text
     two = LatentRelevancy(code, texts[:4], 10.0, threads=2)
     assert np.array_equal(two.fast(two.prepare(latents), texts[4:]), found)
+
+
+def view_with_an_object(height):
+    """50,000 px between two directions; 10 px, not of the sample of every 7th, rise into a third."""
+    share = np.linspace(0, 1, 50_000, dtype=np.float32)
+    latents = np.stack([share, 1 - share, np.zeros_like(share)], axis=1)
+    pixels = np.array([p for p in range(100, 115) if p % 7][:10])
+    latents[pixels] = [1, 0, height]
+    return latents, pixels
+
+
+def test_a_small_object_that_the_sample_missed_is_found():
+    latents, pixels = view_with_an_object(height=1)
+    code, axes = pass_through(3, 128), np.eye(128, dtype=np.float32)
+    fast = LatentRelevancy(code, axes[3:4], 10.0)
+    placed = fast.prepare(latents)
+    found = fast.fast(placed, axes[2:3])
+    # The object's cosine with the third axis is 1 / sqrt(2), all else's 0, and the phrase's 0 everywhere.
+    expected = np.full(50_000, 0.5)
+    expected[pixels] = 1 / (1 + np.exp(-10 / np.sqrt(2)))
+    assert np.abs(found - expected).max() < 2e-3
+    assert len(placed.directions) == 3
+    two = LatentRelevancy(code, axes[3:4], 10.0, threads=2)
+    assert np.array_equal(two.fast(two.prepare(latents), axes[2:3]), found)
+
+
+@pytest.mark.parametrize(("height", "directions"), [(6e-4, 2), (7e-4, 3)])
+def test_what_may_be_lost_gets_no_direction(height, directions):
+    # By hand: 4 x 2e-3 / 10 - sqrt(128) / (2 x 32767) = 6.27e-4
+    assert lost_for_error(10.0, 128) == pytest.approx(6.27e-4, abs=1e-6)
+    latents, _ = view_with_an_object(height)
+    code, axes = pass_through(3, 128), np.eye(128, dtype=np.float32)
+    fast = LatentRelevancy(code, axes[3:4], 10.0)
+    placed = fast.prepare(latents)
+    assert len(placed.directions) == directions
+    # At a tie with the phrase relevancy is steepest: nothing is worse than asking for what is lost.
+    assert np.abs(fast.fast(placed, axes[2:3]) - fast.exact(latents, axes[2:3])).max() < 2e-3
+
+
+def test_objects_missed_again_are_found_and_directions_end_with_the_channels(monkeypatch):
+    monkeypatch.setattr(projected_look_up, "SAMPLE", 4)
+    latents = np.zeros((4000, 8), np.float32)  # the sample takes every 1000th
+    latents[:, 0] = 1
+    latents[101:201, 1] = 1  # the sample of these 100 takes every 25th
+    latents[[103, 108, 111, 115, 119, 123], 2:] = np.eye(6)
+    code, axes = pass_through(8, 8), np.eye(8, dtype=np.float32)
+    fast = LatentRelevancy(code, axes[:1], 10.0)
+    placed = fast.prepare(latents)
+    assert distance_from_kept(code, latents, placed).max() < 8e-4
+    assert placed.directions @ placed.directions.T == pytest.approx(axes, abs=1e-6)
+    assert placed.nbytes == 8 * 4000 * 2 + 8 * 8 * 4 + 4000 * 4
+    assert placed.coordinates.base is None  # keeps nothing larger alive
 
 
 def test_a_level_without_a_pixel_has_no_answer(vectors, texts):
