@@ -34,6 +34,7 @@ def query(
             help="folder of panel.png and selection.ply; default: queries/TEXT in the scene's folder"
         ),
     ] = None,
+    device: Annotated[str, typer.Option(help="cpu or cuda: where the field is looked up")] = "cpu",
     threads: Threads = 2,
 ) -> None:
     """Ask a finished scene for a text: score, level, position, box, views; a panel PNG and a PLY."""
@@ -49,6 +50,7 @@ def query(
             views=views,
             answerer=answerer,
             out=out,
+            device=device,
             threads=threads,
         )
     )

@@ -3,10 +3,12 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.evaluate.pictures import (
     label_left,
@@ -17,6 +19,7 @@ from hilsplat.evaluate.pictures import (
     show_from_above,
 )
 from hilsplat.evaluate.scores import made_from_truth
+from hilsplat.language.device import ComputeDevice
 from hilsplat.language.finished import FinishedScene
 from hilsplat.language.hits import Hit
 from hilsplat.language.query import PATH_SEPARATOR, LanguageScene
@@ -36,6 +39,7 @@ def answer(
     views: int = 3,
     answerer: str = "tree",
     out: Path | None = None,
+    device: str = "cpu",
     threads: int = 1,
 ) -> str:
     """Ask a scene; write `panel.png` and `selection.ply`, and tell what was found.
@@ -48,15 +52,21 @@ def answer(
         views: views in the panel.
         answerer: "tree" or "field", see `LanguageScene.query`.
         out: folder of both files; by default `queries/<text>` in the scene's folder.
+        device: "cpu" or "cuda": where the field is looked up.
         threads: threads for rendering.
 
     Raises:
         ArtifactError: the scene is not finished.
-        SettingsError: level or answerer are unknown.
+        SettingsError: level, answerer or device are unknown.
+        DeviceError: cuda was asked for and torch finds no device.
     """
     folder = Path(folder)
+    if device not in get_args(ComputeDevice):
+        raise SettingsError(
+            f"device {device!r} is unknown", expected=" or ".join(get_args(ComputeDevice)), found=device
+        )
     parts = FinishedScene.locate(folder, variant)
-    scene = LanguageScene.open(folder, variant, threads=threads)
+    scene = LanguageScene.open(folder, variant, threads=threads, device=device)
     hits = scene.query(text, level, answerer=answerer, limit=LISTED)
     panel = (Path(out) if out is not None else folder / "queries" / file_name(text)) / "panel.png"
     shown = views_of(scene, hits, views)

@@ -12,12 +12,16 @@ import torch
 from jaxtyping import Float32
 
 from hilsplat.language.autoencoder import CHUNK_ROWS, Code, one_torch_thread
+from hilsplat.language.device import ComputeDevice, compute_device
+from hilsplat.language.device_look_up import PlacedOnDevice
 from hilsplat.language.linear_code import LinearCode
 from hilsplat.language.linear_look_up import LinearLookUp, PlacedLinear
 from hilsplat.language.projected_look_up import PlacedProjected, ProjectedLookUp
 from hilsplat.language.relevancy import relevancy
 
 PIXELS_AT_A_TIME = 1 << 16
+
+Placed = PlacedLinear | PlacedProjected | PlacedOnDevice
 
 
 class LatentRelevancy:
@@ -28,6 +32,7 @@ class LatentRelevancy:
         canonical: unit vectors of the generic phrases.
         scale: of the cosines.
         threads: pixels are shared among them; results do not depend on it.
+        device: "cpu", or "cuda": where the fast way runs; the same to rounding.
     """
 
     def __init__(
@@ -36,7 +41,9 @@ class LatentRelevancy:
         canonical: Float32[np.ndarray, "K C"],
         scale: float,
         threads: int = 1,
+        device: ComputeDevice = "cpu",
     ) -> None:
+        self._device = compute_device(device)
         self._code, self._canonical, self._scale, self._threads = code, canonical, scale, threads
         self.is_linear = isinstance(code, LinearCode)
         """Whether the fast way loses nothing but rounding."""
@@ -56,15 +63,17 @@ class LatentRelevancy:
         self._decode_in_parts(decode, len(latents))
         return out
 
-    def prepare(self, latents: Float32[np.ndarray, "P D"]) -> PlacedLinear | PlacedProjected:
+    def prepare(self, latents: Float32[np.ndarray, "P D"]) -> Placed:
         """What a look-up of these latents needs; once per view."""
         if isinstance(self._look_up, LinearLookUp):
-            return self._look_up.place(latents)
-        return self._look_up.place(latents, self._decode_in_parts)
+            placed = self._look_up.place(latents)
+        else:
+            placed = self._look_up.place(latents, self._decode_in_parts)
+        return placed if self._device == "cpu" else PlacedOnDevice.of(placed, self._device)
 
     def fast(
         self,
-        placed: PlacedLinear | PlacedProjected,
+        placed: Placed,
         texts: Float32[np.ndarray, "T C"],
     ) -> Float32[np.ndarray, "T P"]:
         """The fast way of this code; see the module for which that is.
@@ -75,6 +84,9 @@ class LatentRelevancy:
         """
         out = np.empty((len(texts), len(placed.generic)), np.float32)
         for text, row in zip(texts, out, strict=True):
+            if isinstance(placed, PlacedOnDevice):
+                row[:] = placed.relevancy(*self._look_up.text_weights(placed, text), self._scale)
+                continue
 
             def answer(span: slice, text: np.ndarray = text, row: np.ndarray = row) -> None:
                 self._look_up.look_up(placed, span, text, row[span])

@@ -25,6 +25,7 @@ from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.language.autoencoder import Code, autoencoder_file, load_code
 from hilsplat.language.compositing import normalised_weights
+from hilsplat.language.device import ComputeDevice, compute_device
 from hilsplat.language.field import LanguageField
 from hilsplat.language.field_colours import field_colours
 from hilsplat.language.finished import FinishedScene, require_same
@@ -69,6 +70,7 @@ class LanguageScene:
         relevancy_scale: scale of the cosines.
         node_select: share of the range of scores from which nodes are selected.
         threads: for look-ups.
+        device: "cpu" or "cuda", for look-ups of the field.
     """
 
     scene: Scene
@@ -82,11 +84,14 @@ class LanguageScene:
     relevancy_scale: float = RELEVANCY_SCALE
     threads: int = 1
     node_select: float = NODE_SELECT
+    device: ComputeDevice = "cpu"
     _views: ViewStore = field(default_factory=ViewStore, repr=False)
     _texts: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
 
     @staticmethod
-    def open(folder: Path | str, variant: str = "default", *, threads: int = 1) -> "LanguageScene":
+    def open(
+        folder: Path | str, variant: str = "default", *, threads: int = 1, device: ComputeDevice = "cpu"
+    ) -> "LanguageScene":
         """Open `results/<dataset>/<scene>` with the settings that made it.
 
         Canonical phrases, template, scale and selection threshold are those that the variant was evaluated
@@ -96,10 +101,12 @@ class LanguageScene:
             folder: of a finished scene.
             variant: named set of settings whose files answer.
             threads: for rasterising and look-ups.
+            device: "cpu" or "cuda": where the field is looked up (`field_relevancy` with exact=False).
 
         Raises:
             ArtifactError: the scene is not finished.
             MisalignedArtifactError: its parts do not belong together.
+            DeviceError: cuda was asked for and torch finds no device.
         """
         parts = FinishedScene.locate(Path(folder), variant)
         settings = parts.evaluate_settings()
@@ -115,6 +122,7 @@ class LanguageScene:
             relevancy_scale=settings.relevancy_scale,
             node_select=settings.node_select,
             threads=threads,
+            device=device,
         )
 
     @staticmethod
@@ -131,6 +139,7 @@ class LanguageScene:
         relevancy_scale: float = RELEVANCY_SCALE,
         node_select: float = NODE_SELECT,
         threads: int = 1,
+        device: ComputeDevice = "cpu",
     ) -> "LanguageScene":
         """Read a scene's artifacts one by one and check that they belong together.
 
@@ -166,6 +175,7 @@ class LanguageScene:
             relevancy_scale,
             threads,
             node_select,
+            compute_device(device),
         )
 
     # -- answers ----------------------------------------------------------------------------------
@@ -408,6 +418,7 @@ class LanguageScene:
             self.text_vectors(self.canonical),
             self.relevancy_scale,
             self.threads,
+            self.device,
         )
 
     @cached_property
