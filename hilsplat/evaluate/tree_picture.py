@@ -12,16 +12,22 @@ from hilsplat.language.finished import FinishedScene
 from hilsplat.language.query import LanguageScene
 from hilsplat.language.tree_export import readable_nodes, write_tree_ply
 
-CELL_PX = 72
+CELL_PX = 84
 GAP_PX = 6
-LABEL_PX = 14
-BLOCK_GAP_PX = 16
+LABEL_PX = 20
+BLOCK_GAP_PX = 18
+MARGIN_PX = 84
+"""On the left, for the names of the levels."""
+
+ROW_PX = CELL_PX + LABEL_PX + 2 * GAP_PX
 COLUMNS = 18
 """Leaves in a row of the picture; wholes are laid beside each other until it is full."""
 
 BACKGROUND = 250
 LINE = (150, 150, 150)
 TEXT = (40, 40, 40)
+FONT = 0  # cv2.FONT_HERSHEY_SIMPLEX
+FONT_SCALE = 0.5
 
 
 def export_tree(folder: Path, variant: str, out: Path, threads: int) -> str:
@@ -43,10 +49,8 @@ def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
     """Draw the tree: one row of crops per level, blocks of a whole and all below it side by side.
 
     Orphans of finer levels stand in blocks of their own at their level. A crop shows the node in the
-    view that shows it largest, the rest of that view dimmed; under it stand node and level.
+    view that shows it largest, the rest of that view dimmed; under it stands the node's number.
     """
-    import cv2
-
     tree = scene.tree
     roots = [node for level in LEVELS for node in tree.nodes_of(level) if tree.parent[node] == NONE]
     width_of = {int(root): _leaves(tree, int(root)) for root in roots}
@@ -56,42 +60,51 @@ def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
             rows.append([])
         rows[-1].append(root)
     step = CELL_PX + GAP_PX
-    height = len(LEVELS) * (CELL_PX + LABEL_PX + 2 * GAP_PX) + BLOCK_GAP_PX
-    columns = max([COLUMNS, *(sum(width_of[each] for each in row) for row in rows)])
-    most_blocks = max(len(row) for row in rows)
-    canvas = np.full(
-        (len(rows) * height, columns * step + most_blocks * BLOCK_GAP_PX + GAP_PX, 3), BACKGROUND, np.uint8
-    )
-
+    height = len(LEVELS) * ROW_PX + BLOCK_GAP_PX
+    width = max(sum(width_of[each] * step + BLOCK_GAP_PX for each in row) for row in rows)
+    canvas = np.full((len(rows) * height, MARGIN_PX + width, 3), BACKGROUND, np.uint8)
     placed: list[tuple[int, int, int]] = []
 
     def place(node: int, left: int, top: int) -> tuple[int, int]:
         """Place a node and what is below it, and draw its lines; returns its middle and the width used."""
         index = Level(int(tree.level[node])).index
-        y = top + index * (CELL_PX + LABEL_PX + 2 * GAP_PX)
+        y = top + index * ROW_PX
         kids, used, middles = tree.children_of(np.array([node])), 0, []
         for child in map(int, kids):
             middle, width = place(child, left + used, top)
             depth = Level(int(tree.level[child])).index - index
-            middles.append((middle, y + depth * (CELL_PX + LABEL_PX + 2 * GAP_PX)))
+            middles.append((middle, y + depth * ROW_PX))
             used += width
         used = max(used, step)
         x = left + (used - step) // 2
+        bar = y + CELL_PX + LABEL_PX + GAP_PX  # below it every child has columns of its own
         for middle, below in middles:
-            start = (x + CELL_PX // 2, y + CELL_PX + LABEL_PX)
-            cv2.line(canvas, start, (middle, below), LINE, 1, cv2.LINE_AA)
+            canvas[bar:below, middle] = LINE
+            canvas[bar, min(middle, x + CELL_PX // 2) : max(middle, x + CELL_PX // 2) + 1] = LINE
+        if middles:
+            canvas[bar - GAP_PX : bar, x + CELL_PX // 2] = LINE
         placed.append((node, x, y))
         return x + CELL_PX // 2, used
 
     for number, row in enumerate(rows):
-        left = GAP_PX
+        left, top = MARGIN_PX, number * height + GAP_PX
         for root in row:
-            left += place(root, left, number * height + GAP_PX)[1] + BLOCK_GAP_PX
-    for node, x, y in placed:  # over the lines
+            left += place(root, left, top)[1] + BLOCK_GAP_PX
+        for level in LEVELS:
+            _write(canvas, level.label, (MARGIN_PX // 2, top + level.index * ROW_PX + CELL_PX // 2 + 5))
+    for node, x, y in placed:
         canvas[y : y + CELL_PX, x : x + CELL_PX] = _crop(scene, node)
-        label, below = f"{node} {Level(int(tree.level[node])).label}", (x, y + CELL_PX + 11)
-        cv2.putText(canvas, label, below, cv2.FONT_HERSHEY_SIMPLEX, 0.33, TEXT, 1, cv2.LINE_AA)
+        _write(canvas, str(node), (x + CELL_PX // 2, y + CELL_PX + LABEL_PX - 5))
     return canvas
+
+
+def _write(canvas: UInt8[np.ndarray, "H W 3"], text: str, middle_xy: tuple[int, int]) -> None:
+    """Write a word, its base line's middle at a point."""
+    import cv2
+
+    (width, _), _ = cv2.getTextSize(text, FONT, FONT_SCALE, 1)
+    place = (middle_xy[0] - width // 2, middle_xy[1])
+    cv2.putText(canvas, text, place, FONT, FONT_SCALE, TEXT, 1, cv2.LINE_AA)
 
 
 def _leaves(tree, node: int) -> int:
@@ -99,7 +112,7 @@ def _leaves(tree, node: int) -> int:
     return sum(_leaves(tree, int(child)) for child in kids) if len(kids) else 1
 
 
-def _crop(scene: LanguageScene, node: int) -> UInt8[np.ndarray, "72 72 3"]:
+def _crop(scene: LanguageScene, node: int) -> UInt8[np.ndarray, "84 84 3"]:
     """The node where it is seen largest, square, the rest dimmed."""
     import cv2
 
