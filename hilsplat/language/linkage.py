@@ -78,11 +78,54 @@ def _merged_run(begin, end, first, neighbour, inter, extra, root, place_of, self
 
 
 @compiled
+def _best_neighbour(i, begin, end, neighbour, inter, extra, seen, members, place_of):
+    """The neighbour of the best pooled IoU in a run that `_merged_run` wrote, -1 for none, and that IoU.
+
+    Of equally good ones the lowest row. Takes the run's marks off `place_of`.
+    """
+    best, score = -1, -1.0
+    for k in range(begin, end):
+        j = neighbour[k]
+        place_of[j] = -1
+        union = extra[k]
+        for v in range(seen.shape[1]):
+            union += seen[i, v] * members[j, v] + seen[j, v] * members[i, v]
+        if union > 0.0:
+            pooled = inter[k] / union
+            if pooled > score or (pooled == score and j < best):
+                best, score = j, pooled
+    return best, score
+
+
+@compiled
+def _compacted(needed, alive, start, stop, neighbour, inter, extra):
+    """Copy the runs of living clusters to the begin of a pool with room for more; moves `start`, `stop`."""
+    living = 0
+    for i in range(len(alive)):
+        if alive[i]:
+            living += stop[i] - start[i]
+    room = max(len(neighbour), 2 * (living + needed))
+    new_neighbour, new_inter, new_extra = np.empty(room, np.int64), np.empty(room), np.empty(room)
+    used = 0
+    for i in range(len(alive)):
+        if alive[i]:
+            length = stop[i] - start[i]
+            new_neighbour[used : used + length] = neighbour[start[i] : stop[i]]
+            new_inter[used : used + length] = inter[start[i] : stop[i]]
+            new_extra[used : used + length] = extra[start[i] : stop[i]]
+            start[i], stop[i] = used, used + length
+            used += length
+    return new_neighbour, new_inter, new_extra, used
+
+
+@compiled
 def _link(indptr, indices, pair_inter, pair_extra, seen, members, threshold, root, within):
     """Merge in place; `root` ends as the lowest row of each mask's cluster.
 
     A cluster's neighbours lie in a pool, one run per cluster: the neighbour, the sum of intersections
-    and the sum of what the unions of stored pairs have beyond `seen`. Neighbours that were joined
+    (`inter`) and of what the unions of stored pairs have beyond `seen` (`extra`, not positive: what both
+    masks hold is counted twice in their sizes). The union of two clusters is then `extra` and, over views,
+    the sizes of each as seen there times the other's members there. Neighbours that were joined
     since a run was written are summed when it is next read. A merged cluster's run is written at the
     end of the pool, which is compacted when it is full.
     """
@@ -114,39 +157,17 @@ def _link(indptr, indices, pair_inter, pair_extra, seen, members, threshold, roo
             stop[top], _, _ = _merged_run(
                 start[top], stop[top], start[top], neighbour, inter, extra, root, place_of, top, top
             )
-            best[top], score[top] = -1, -1.0
-            for k in range(start[top], stop[top]):
-                j = neighbour[k]
-                place_of[j] = -1
-                total = extra[k]
-                for v in range(num_views):
-                    total += seen[top, v] * members[j, v] + seen[j, v] * members[top, v]
-                if total > 0.0:
-                    pooled = inter[k] / total
-                    if pooled > score[top] or (pooled == score[top] and j < best[top]):
-                        best[top], score[top], best_merges[top] = j, pooled, merges[j]
+            best[top], score[top] = _best_neighbour(
+                top, start[top], stop[top], neighbour, inter, extra, seen, members, place_of
+            )
+            if best[top] >= 0:
+                best_merges[top] = merges[best[top]]
             continue
         a, b = min(top, best[top]), max(top, best[top])
 
         needed = stop[a] - start[a] + stop[b] - start[b]
-        if used + needed > room:
-            living = 0
-            for i in range(num):
-                if alive[i]:
-                    living += stop[i] - start[i]
-            room = max(room, 2 * (living + needed))
-            new_neighbour, new_inter, new_extra = np.empty(room, np.int64), np.empty(room), np.empty(room)
-            used = 0
-            for i in range(num):
-                if alive[i]:
-                    length = stop[i] - start[i]
-                    new_neighbour[used : used + length] = neighbour[start[i] : stop[i]]
-                    new_inter[used : used + length] = inter[start[i] : stop[i]]
-                    new_extra[used : used + length] = extra[start[i] : stop[i]]
-                    start[i], stop[i] = used, used + length
-                    used += length
-            neighbour, inter, extra = new_neighbour, new_inter, new_extra
-
+        if used + needed > len(neighbour):
+            neighbour, inter, extra, used = _compacted(needed, alive, start, stop, neighbour, inter, extra)
         first = used
         used, joined_inter, joined_extra = _merged_run(
             start[a], stop[a], used, neighbour, inter, extra, root, place_of, a, b
