@@ -78,18 +78,19 @@ def mask_evidence(
         threads: rows are shared among them; the bytes do not depend on it.
         device: "cpu", or where torch forms the two products (see `cuda_algebra`).
     """
-    data = shares.data.astype(np.float64)
+
+    def like(values: np.ndarray) -> sp.csr_matrix:
+        return sp.csr_matrix((values, shares.indices, shares.indptr), shape=shares.shape, copy=False)
+
+    share = shares.data.astype(np.float64)
     weight = importance.astype(np.float64)[shares.indices]
-    sizes = weight * (np.square(data) if overlap == "tanimoto" else data)
-    shape = (shares.shape[0], shares.shape[0])
+    size = weight * (np.square(share) if overlap == "tanimoto" else share)
+    products = (like(share), like(weight * share), like(size), visible, view, min_covisible)
     if device == "cpu":
-        upper, seen = _evidence_by_loops(
-            shares, data, weight * data, sizes, visible, view, min_covisible, threads
-        )
+        upper, seen = _evidence_by_loops(*products, threads)
     else:
-        upper, seen = _evidence_by_torch(
-            shares, data, weight * data, sizes, visible, view, min_covisible, device
-        )
+        upper, seen = _evidence_by_torch(*products, device)
+    shape = (len(view), len(view))
     # Adding the transposed keeps the two patterns alike: every stored value is positive.
     matrices = (sp.csr_matrix((values, *upper[:2]), shape=shape) for values in upper[2:])
     intersection, union = (sp.csr_matrix(each + each.T) for each in matrices)
@@ -100,29 +101,36 @@ def mask_evidence(
 
 def _evidence_by_loops(
     shares: sp.csr_matrix,
-    data: np.ndarray,
-    weighted: np.ndarray,
-    sizes: np.ndarray,
+    weighted: sp.csr_matrix,
+    sizes: sp.csr_matrix,
     visible: Bool[np.ndarray, "V N"],
     view: Int32[np.ndarray, " M"],
     min_covisible: float,
     threads: int,
 ) -> tuple[tuple[np.ndarray, ...], Float64[np.ndarray, "M V"]]:
-    """Column of the larger row, row starts, intersection and union of pairs a < b; and `Evidence.seen`."""
+    """Pairs a < b that share Gaussians, and `Evidence.seen`.
+
+    Args:
+        shares: s; `weighted` is w s and `sizes` what each Gaussian adds to a mask's size, stored alike.
+        visible, view, min_covisible, threads: as in `mask_evidence`.
+
+    Returns:
+        (b, row starts, intersection, union) of the pairs, and sizes.
+    """
     num = shares.shape[0]
     seen_everywhere = np.zeros((num, len(visible)))
     flags = np.ascontiguousarray(visible.T).view(np.uint8)
-    columns = sp.csr_matrix((data, shares.indices, shares.indptr), shape=shares.shape).tocsc()
+    columns = shares.tocsc()
     rows = (shares.indptr, shares.indices)
     with ThreadPoolExecutor(max(1, threads)) as pool:
         ranges = list(pairwise([*range(0, num, ROWS_AT_A_TIME), num]))
-        list(pool.map(lambda span: _seen_sizes(*span, *rows, sizes, flags, seen_everywhere), ranges))
+        list(pool.map(lambda span: _seen_sizes(*span, *rows, sizes.data, flags, seen_everywhere), ranges))
         seen = _counted(seen_everywhere, view, min_covisible)
         column_arrays = (columns.indptr, columns.indices, columns.data)
         parts = list(
             pool.map(
                 lambda span: _shared_pairs(
-                    *span, *rows, weighted, *column_arrays, view, seen, seen_everywhere
+                    *span, *rows, weighted.data, *column_arrays, view, seen, seen_everywhere
                 ),
                 ranges,
             )
@@ -136,9 +144,8 @@ def _evidence_by_loops(
 
 def _evidence_by_torch(
     shares: sp.csr_matrix,
-    data: np.ndarray,
-    weighted: np.ndarray,
-    sizes: np.ndarray,
+    weighted: sp.csr_matrix,
+    sizes: sp.csr_matrix,
     visible: Bool[np.ndarray, "V N"],
     view: Int32[np.ndarray, " M"],
     min_covisible: float,
@@ -147,10 +154,7 @@ def _evidence_by_torch(
     """The same by torch."""
     from hilsplat.language.cuda_algebra import shared_pairs_on
 
-    def like(values: np.ndarray) -> sp.csr_matrix:
-        return sp.csr_matrix((values, shares.indices, shares.indptr), shape=shares.shape)
-
-    pairs, everywhere = shared_pairs_on(like(weighted), like(data), like(sizes), visible, view, device)
+    pairs, everywhere = shared_pairs_on(weighted, shares, sizes, visible, view, device)
     seen = _counted(everywhere, view, min_covisible)
     row = np.repeat(np.arange(len(view)), np.diff(pairs.indptr))
     column = pairs.indices
