@@ -423,6 +423,11 @@ class EvaluateSettings(Section):
     node_select: float = knob(
         0.95, "nodes above this share of the range of cosine margins are selected", ge=0, le=1
     )
+    ancestors: float = knob(
+        0.2,
+        "share of the mean margin of a node's ancestors that is added to its own where nodes compete",
+        ge=0,
+    )
     min_region_px: int = knob(60, "smaller true regions are not scored", unit="px", ge=1)
     methods: tuple[Literal["tree", "tree-path", "field"], ...] = knob(
         ("tree", "tree-path", "field"), "what answers; each becomes a row"

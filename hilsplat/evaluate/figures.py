@@ -103,6 +103,7 @@ def run_figures(
             canonical=evaluate.canonical,
             template=evaluate.template,
             relevancy_scale=evaluate.relevancy_scale,
+            ancestors=evaluate.ancestors,
             threads=threads,
         )
         truths = truths_of(scene, truth, labels, evaluate)

@@ -111,6 +111,7 @@ def run_evaluate(
                 canonical=settings.canonical,
                 template=settings.template,
                 relevancy_scale=settings.relevancy_scale,
+                ancestors=settings.ancestors,
                 threads=threads,
             )
             selections = Selections(answers, settings.node_select)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.language.relevancy import min_max
 from hilsplat.language.semantic_tree import SemanticTree
 
@@ -40,23 +40,54 @@ def best_nodes(
     level: Level,
     threshold: float,
     route: str = "flat",
+    added: Float64[np.ndarray, " n"] | None = None,
 ) -> NodeHits:
     """Candidates above the threshold of their own range, best first; of equals the lowest row.
 
     The range is that of the cosine margins behind the relevancies. Relevancies saturate: where a dozen
     nodes score between 0.9 and 0.99, all of them are near the top of a range that reaches down to 0.1.
+
+    Args:
+        scores: relevancy of every node.
+        candidates: nodes that compete.
+        level: theirs.
+        threshold: share of their range.
+        route: as in `NodeHits`.
+        added: to the margin of every node; None: nothing.
     """
     if not len(candidates):
         return NodeHits(np.zeros(0, np.int64), np.zeros(0, np.float32), level, route)
-    chosen = candidates[min_max(margins(scores[candidates])) >= threshold]
-    order = np.lexsort((chosen, -scores[chosen]))
-    return NodeHits(chosen[order].astype(np.int64), scores[chosen][order].astype(np.float32), level, route)
+    value = margins(scores[candidates])
+    if added is not None:
+        value = value + added[candidates]
+    kept = min_max(value) >= threshold
+    chosen, value = candidates[kept], value[kept]
+    chosen = chosen[np.lexsort((chosen, -value))].astype(np.int64)
+    return NodeHits(chosen, scores[chosen].astype(np.float32), level, route)
 
 
 def margins(scores: Float[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     """Cosine margins behind relevancies, times their scale: the logistic function undone."""
     probability = np.clip(scores.astype(np.float64), 1e-7, 1 - 1e-7)
     return np.log(probability / (1 - probability))
+
+
+def ancestor_margins(tree: SemanticTree, scores: Float[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """Mean margin of each node's ancestors: a knob of what answers to "kettle knob" is more likely meant.
+
+    A node without an ancestor gets the least margin of all, a whole 0: wholes have none and only compete with
+    each other. The share that is taken of it was chosen on development scenes (docs/tree.md).
+    """
+    margin = margins(scores)
+    total, count = np.zeros(len(tree)), np.zeros(len(tree))
+    above = tree.parent.astype(np.int64)
+    while (above != NONE).any():
+        has = above != NONE
+        total[has] += margin[above[has]]
+        count[has] += 1
+        above[has] = tree.parent[above[has]]
+    mean = np.where(count > 0, total / np.maximum(count, 1), margin.min(initial=0.0))
+    return np.where(tree.level == int(Level.WHOLE), 0.0, mean)
 
 
 def automatic_level(tree: SemanticTree, scores: Float[np.ndarray, " n"]) -> Level:

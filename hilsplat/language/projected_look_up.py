@@ -132,8 +132,8 @@ class ProjectedLookUp:
             along = directions @ vectors.T
             coordinates[:, span] = np.rint(along * STEPS)
             # 1 less the squares of the coordinates would not do: it is known to 1e-7, the square of 3e-4.
-            vectors -= along.T @ directions
-            lost[span] = np.sqrt(np.einsum("pc,pc->p", vectors, vectors))
+            rest = vectors - along.T @ directions
+            lost[span] = np.sqrt(np.einsum("pc,pc->p", rest, rest))
 
         in_parts(decode, len(latents))
         return coordinates, generic, lost

@@ -31,7 +31,7 @@ from hilsplat.language.field_colours import field_colours
 from hilsplat.language.finished import FinishedScene, require_same
 from hilsplat.language.hits import Hit
 from hilsplat.language.latent_relevancy import LatentRelevancy
-from hilsplat.language.node_search import NodeHits, automatic_level, best_nodes, search_path
+from hilsplat.language.node_search import NodeHits, ancestor_margins, automatic_level, best_nodes, search_path
 from hilsplat.language.relevancy import relevancy
 from hilsplat.language.semantic_tree import SemanticTree
 from hilsplat.language.tree_nodes import node_means
@@ -44,6 +44,7 @@ from hilsplat.splat.gaussians import Gaussians
 CANONICAL: tuple[str, ...] = EvaluateSettings().canonical
 RELEVANCY_SCALE: float = EvaluateSettings().relevancy_scale
 NODE_SELECT: float = EvaluateSettings().node_select
+ANCESTORS: float = EvaluateSettings().ancestors
 
 PATH_SEPARATOR = ">"
 
@@ -69,6 +70,7 @@ class LanguageScene:
         canonical: phrases that a text must beat.
         relevancy_scale: scale of the cosines.
         node_select: share of the range of scores from which nodes are selected.
+        ancestors: share of the mean margin of a node's ancestors that is added to its own.
         threads: for look-ups.
         device: "cpu" or "cuda", for look-ups of the field.
     """
@@ -84,6 +86,7 @@ class LanguageScene:
     relevancy_scale: float = RELEVANCY_SCALE
     threads: int = 1
     node_select: float = NODE_SELECT
+    ancestors: float = ANCESTORS
     device: ComputeDevice = "cpu"
     _views: ViewStore = field(default_factory=ViewStore, repr=False)
     _texts: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
@@ -94,7 +97,7 @@ class LanguageScene:
     ) -> "LanguageScene":
         """Open `results/<dataset>/<scene>` with the settings that made it.
 
-        Canonical phrases, template, scale and selection threshold are those that the variant was evaluated
+        Canonical phrases, template, scale and what selects nodes are those that the variant was evaluated
         with, read from its provenance; of a scene without labels those that its panel was drawn with.
 
         Args:
@@ -121,6 +124,7 @@ class LanguageScene:
             template=settings.template,
             relevancy_scale=settings.relevancy_scale,
             node_select=settings.node_select,
+            ancestors=settings.ancestors,
             threads=threads,
             device=device,
         )
@@ -138,6 +142,7 @@ class LanguageScene:
         template: str = "{}",
         relevancy_scale: float = RELEVANCY_SCALE,
         node_select: float = NODE_SELECT,
+        ancestors: float = ANCESTORS,
         threads: int = 1,
         device: ComputeDevice = "cpu",
     ) -> "LanguageScene":
@@ -175,6 +180,7 @@ class LanguageScene:
             relevancy_scale,
             threads,
             node_select,
+            ancestors,
             compute_device(device),
         )
 
@@ -243,6 +249,8 @@ class LanguageScene:
     ) -> NodeHits:
         """Nodes whose margin, stretched to [0, 1] over the level's nodes, reaches the threshold.
 
+        To a node's margin a share (`ancestors`) of the mean of its ancestors' is added.
+
         Args:
             text: the query.
             level: which nodes compete; None chooses it (see `automatic_level`).
@@ -253,7 +261,8 @@ class LanguageScene:
         if level is None:
             level = automatic_level(self.tree, scores)
         threshold = self.node_select if threshold is None else threshold
-        return best_nodes(scores, self.tree.nodes_of(level), level, threshold)
+        added = self.ancestors * ancestor_margins(self.tree, scores)
+        return best_nodes(scores, self.tree.nodes_of(level), level, threshold, added=added)
 
     def select_path(
         self,

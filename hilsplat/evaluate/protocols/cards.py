@@ -25,6 +25,9 @@ NODE_SELECT = 0.95
 
 Version 1 of the protocols that select nodes took 0.85 of the range of the relevancies themselves."""
 
+ANCESTORS = 0.2
+"""Share of the mean margin of a node's ancestors that is added to its own; version 2 added nothing."""
+
 Averaging = Literal["pairs", "classes", "levels", "views", "scenes", "pooled"]
 """How rows become a table's number.
 
@@ -104,15 +107,16 @@ LERF_LANGSPLAT = ProtocolCard(
 )
 TREE_NODES = ProtocolCard(
     "lerf/tree-nodes",
-    2,
+    3,
     MASK + LOCALIZATION,
     "pairs",
-    "3D nodes above 0.95 of the range of the nodes' cosine margins, rendered; level chosen by the tree",
+    "3D nodes above 0.95 of the range of the nodes' cosine margins with a fifth of their ancestors' mean, "
+    "rendered; level chosen by the tree",
     "ours",
 )
 LEVEL_GIVEN = ProtocolCard(
     "hierarchy/level-given",
-    2,
+    3,
     (*MASK, *LOCALIZATION, "best_threshold_iou", *CONSISTENCY),
     "levels",
     "as lerf/langsplat for maps and lerf/tree-nodes for nodes, at the level of the annotation",
@@ -121,7 +125,7 @@ LEVEL_GIVEN = ProtocolCard(
 )
 LEVEL_AUTO = ProtocolCard(
     "hierarchy/level-auto",
-    2,
+    3,
     (*MASK, *LOCALIZATION, *CONSISTENCY),
     "levels",
     "as lerf/langsplat for maps and lerf/tree-nodes for nodes, level chosen by the method",

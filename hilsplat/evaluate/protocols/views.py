@@ -30,6 +30,7 @@ from hilsplat.evaluate.metrics.relevancy_rule import (
 )
 from hilsplat.evaluate.protocols.answers import PackedMasks, QueryableScene, Selections
 from hilsplat.evaluate.protocols.cards import (
+    ANCESTORS,
     ANNOTATIONS,
     CANONICAL,
     LERF_LANGSPLAT,
@@ -75,6 +76,8 @@ def label_of(card: ProtocolCard, method: str, settings: EvaluateSettings) -> str
         words += RelevancyRule(rule.filter_px, rule.mix).departures(RelevancyRule())
         if settings.node_select != NODE_SELECT:
             words.append(f"node share {settings.node_select:g}")
+        if method == "tree" and settings.ancestors != ANCESTORS:
+            words.append(f"ancestors {settings.ancestors:g}")
     return card.labelled([*words, *relevancy_departures(settings)])
 
 

@@ -97,7 +97,7 @@ def test_consistency_rows_match_the_worked_example(tmp_path):
     scene, truth = worked_example(tmp_path)
     values = measured(scene, truth, methods=("tree", "tree-path"))
     for method, protocol in (("tree", "level-given"), ("tree", "level-auto"), ("tree-path", "path")):
-        key = (method, f"hierarchy/{protocol}@2", "", "")
+        key = (method, f"hierarchy/{protocol}@{2 if protocol == "path" else 3}", "", "")
         assert values[*key, "hc_containment"] == pytest.approx(0.9375)
         assert values[*key, "hc_literal"] == pytest.approx(0.27)
         assert values[*key, "hc_containment_pooled"] == pytest.approx(0.916667, abs=1e-6)
@@ -111,9 +111,9 @@ def test_consistency_rows_match_the_worked_example(tmp_path):
 def test_missing_answer_counts_zero_and_breaks_consistency(tmp_path):
     scene, truth = worked_example(tmp_path, without=("x",))
     values = measured(scene, truth, methods=("tree",))
-    assert values["tree", "hierarchy/level-given@2", "x", "subpart", "iou"] == 0
-    assert values["tree", "hierarchy/level-given@2", "A", "whole", "iou"] == 1
-    assert values["tree", "hierarchy/level-given@2", "", "", "hc_containment"] == pytest.approx(0.4375)
+    assert values["tree", "hierarchy/level-given@3", "x", "subpart", "iou"] == 0
+    assert values["tree", "hierarchy/level-given@3", "A", "whole", "iou"] == 1
+    assert values["tree", "hierarchy/level-given@3", "", "", "hc_containment"] == pytest.approx(0.4375)
 
 
 def test_regions_with_the_same_text_are_united(tmp_path):
@@ -125,7 +125,7 @@ def test_regions_with_the_same_text_are_united(tmp_path):
     assert truth.queries[0].boxes_xyxy.tolist() == [[0, 0, 3, 3], [6, 6, 9, 9]]
     scene = HandMade([mask_of((0, 4), (0, 4))], {("cup", Level.WHOLE): [0], ("cup", None): [0]})
     values = measured(scene, truth, methods=("tree",))
-    assert values["tree", "hierarchy/level-given@2", "cup", "whole", "iou"] == pytest.approx(0.5)
+    assert values["tree", "hierarchy/level-given@3", "cup", "whole", "iou"] == pytest.approx(0.5)
 
 
 def test_text_at_two_levels_is_one_category_and_two_queries(tmp_path):
@@ -174,7 +174,7 @@ def test_automatic_level_of_the_field_follows_the_highest_value(tmp_path):
     values = measured(scene, truth, methods=("field",), filter_px=1, majority=False)
     given, auto, lerf = (
         f"{name} (filter 1, no majority)"
-        for name in ("hierarchy/level-given@2", "hierarchy/level-auto@2", "lerf/langsplat@1")
+        for name in ("hierarchy/level-given@3", "hierarchy/level-auto@3", "lerf/langsplat@1")
     )
     key = ("cup", "whole", "iou")
     assert values["field", given, *key] == 1
@@ -224,7 +224,7 @@ def test_path_localization_looks_inside_the_parent(tmp_path):
     answers = {("bear",): [0], ("bear", "nose"): [1], ("nose", Level.PART): [1]}
     scene = HandMade([mask_of(*each) for each in regions], answers, {"nose": relevancy})
     values = measured(scene, truth, methods=("tree", "tree-path"), filter_px=1)
-    assert values["tree", "hierarchy/level-given@2 (filter 1)", "nose", "part", "localization_box"] == 0
+    assert values["tree", "hierarchy/level-given@3 (filter 1)", "nose", "part", "localization_box"] == 0
     assert values["tree-path", "hierarchy/path@2 (filter 1)", "nose", "part", "localization_box"] == 1
 
 
@@ -234,7 +234,7 @@ def test_perfect_tree_of_the_block_world_scores_one(block_world):
     truth = ViewTruth.of(block_world.annotations, view, size_hw, settings.min_region_px)
     selections = Selections(block_world.answers, settings.node_select)
     rows = list(measure_view(block_world.answers, selections, truth, view, size_hw, settings))
-    given = [row for row in rows if row.method == "tree" and row.protocol == "hierarchy/level-given@2"]
+    given = [row for row in rows if row.method == "tree" and row.protocol == "hierarchy/level-given@3"]
     ious = {row.query: row.value for row in given if row.metric == "iou"}
     assert ious == dict.fromkeys(("bear", "chest", "head", "lid", "nose"), 1.0)
     assert {row.value for row in given if row.metric in ("localization_box", "hc_containment")} == {1.0}
@@ -243,7 +243,7 @@ def test_perfect_tree_of_the_block_world_scores_one(block_world):
     field = {
         row.query: row.value
         for row in rows
-        if (row.method, row.protocol, row.metric) == ("field", "hierarchy/level-given@2", "iou")
+        if (row.method, row.protocol, row.metric) == ("field", "hierarchy/level-given@3", "iou")
     }
     assert field["bear"] > 0.9  # exact features; the filter rounds the corners
 
@@ -259,7 +259,7 @@ def score(**changes):
         "query": "cup",
         "level": "whole",
         "metric": "iou",
-        "protocol": "hierarchy/level-given@2",
+        "protocol": "hierarchy/level-given@3",
         "value": 0.5,
         "n": 1,
     }

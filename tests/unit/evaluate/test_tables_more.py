@@ -81,7 +81,7 @@ def test_seeds_of_a_variant_are_one_row_with_mean_and_spread(tmp_path):
 def test_view_consistency_stands_beside_the_level_given_rows(tmp_path):
     scores = [
         score("iou", 0.5),
-        score("iou", 0.5, protocol="hierarchy/level-auto@2"),
+        score("iou", 0.5, protocol="hierarchy/level-auto@3"),
         score("view_consistency", 0.8, protocol="world/view-consistency@1"),
         score("view_consistency", 0.6, protocol="world/view-consistency@1", query="mug"),
         score("view_consistency", 0.1, protocol="world/view-consistency@1", level="part"),

@@ -13,7 +13,7 @@ from hilsplat.base.provenance import provenance_path
 from hilsplat.language.autoencoder import load_code, run_autoencoder
 from hilsplat.language.field import LanguageField, run_language
 from hilsplat.language.finished import FinishedScene, require_same
-from hilsplat.language.node_search import automatic_level, best_nodes, search_path
+from hilsplat.language.node_search import ancestor_margins, automatic_level, best_nodes, search_path
 from hilsplat.language.query import LanguageScene
 from hilsplat.language.semantic_tree import SemanticTree, run_semantic_tree
 from hilsplat.language.view_store import ViewStore
@@ -97,6 +97,26 @@ def test_selection_is_by_margins_which_do_not_saturate():
     assert best_nodes(scores, every, Level.PART, 0.85).ids.tolist() == [3]
     assert best_nodes(scores, every, Level.PART, 0.5).ids.tolist() == [3, 2, 1]
     assert best_nodes(np.array([0.4, 0.9, 0.9]), np.arange(3), Level.PART, 0.95).ids.tolist() == [1, 2]
+
+
+def test_what_lies_in_a_likely_thing_is_ahead(scene):
+    margin = np.full(7, -1.0)
+    margin[[NODE["A"], NODE["A top"], NODE["A top left"]]] = 3.0, 1.0, 1.0
+    margin[[NODE["B"], NODE["B corner"]]] = 0.0, 1.1
+    scores = (1 / (1 + np.exp(-margin))).astype(np.float32)
+    added = ancestor_margins(scene.tree, scores)
+    # A top left lies in A top and A, B corner in B alone; wholes lie in nothing and add nothing
+    assert added[NODE["A top left"]] == pytest.approx(2.0, abs=1e-5)
+    assert added[NODE["B corner"]] == pytest.approx(0.0, abs=1e-5)
+    assert added[[NODE["A"], NODE["B"]]].tolist() == [0, 0]
+    subparts = scene.tree.nodes_of(Level.SUBPART)
+    assert best_nodes(scores, subparts, Level.SUBPART, 0.9).ids[0] == NODE["B corner"]
+    hits = best_nodes(scores, subparts, Level.SUBPART, 0.9, added=0.2 * added)
+    assert hits.ids.tolist() == [NODE["A top left"]]
+    assert hits.scores == pytest.approx(scores[[NODE["A top left"]]])  # told as it is
+    orphans = replace(scene.tree, parent=np.full(7, -1, np.int32))
+    least = ancestor_margins(orphans, scores)
+    assert least[scene.tree.level > 1] == pytest.approx(-1.0, abs=1e-5)
 
 
 def test_a_path_stays_inside_its_first_thing(scene):
