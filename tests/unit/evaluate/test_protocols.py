@@ -96,8 +96,8 @@ def test_fake_and_real_scene_fit_the_protocol(block_world):
 def test_consistency_rows_match_the_worked_example(tmp_path):
     scene, truth = worked_example(tmp_path)
     values = measured(scene, truth, methods=("tree", "tree-path"))
-    for method, protocol in (("tree", "level-given"), ("tree", "level-auto"), ("tree-path", "path")):
-        key = (method, f"hierarchy/{protocol}@{2 if protocol == "path" else 3}", "", "")
+    for method, protocol in (("tree", "level-given@3"), ("tree", "level-auto@3"), ("tree-path", "path@2")):
+        key = (method, f"hierarchy/{protocol}", "", "")
         assert values[*key, "hc_containment"] == pytest.approx(0.9375)
         assert values[*key, "hc_literal"] == pytest.approx(0.27)
         assert values[*key, "hc_containment_pooled"] == pytest.approx(0.916667, abs=1e-6)
