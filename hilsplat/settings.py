@@ -371,7 +371,7 @@ class MethodSettings(Section):
     """Who writes the field: the method of this repository, or a baseline (hilsplat/methods)."""
 
     name: str = knob("hilsplat", "hilsplat, or a name of hilsplat/methods/registry.py")
-    steps: int = knob(900, "langsplat: steps per level, one view each", ge=1, origin="LangSplat: 30000")
+    steps: int = knob(1800, "langsplat: steps per level, one view each", ge=1, origin="LangSplat: 30000")
     rate: float = knob(0.0025, "langsplat: step size of Adam", gt=0, origin="LangSplat")
     pixel_step: int = knob(
         2, "langsplat: every so many pixels of rows and columns are compared", ge=1, origin="LangSplat: 1"
