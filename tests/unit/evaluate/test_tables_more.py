@@ -78,6 +78,15 @@ def test_seeds_of_a_variant_are_one_row_with_mean_and_spread(tmp_path):
     assert "standard deviation over seeds" in forms[".md"]
 
 
+def test_annotations_are_one_row_whatever_the_seeds(tmp_path):
+    scores = [
+        score("hc_containment", 1.0, variant=variant, method="truth", protocol="hierarchy/annotations@1")
+        for variant in ("default", "paper", "paper.seed1", "paper.seed2")
+    ]
+    rows, _ = built(tmp_path, "hierarchy", scores)
+    assert len([row for row in rows if row["method"] == "annotations"]) == 1
+
+
 def test_view_consistency_stands_beside_the_level_given_rows(tmp_path):
     scores = [
         score("iou", 0.5),
