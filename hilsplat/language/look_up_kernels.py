@@ -4,27 +4,34 @@ import numpy as np
 
 from hilsplat.language.compiled import compiled
 
-BLOCK = 1024
-"""Pixels worked on at once, so that what they need stays in the nearest cache."""
+BLOCK = 2048
+"""Pixels worked on at once: their sums stay in the nearest cache, and the part of a channel that is read
+is long enough for the memory to be read ahead."""
 
 
 @compiled
 def _dots_of_block(channels, begin, end, offset, slope, out):
     """Offset and weighted sum of the channels of pixels begin..end, from the start of `out` on.
 
-    Four channels at a time, so that sums are read and written a quarter as often.
+    Eight channels at a time, so that sums are read and written an eighth as often.
     """
     for p in range(end - begin):
         out[p] = offset
-    fours = len(channels) // 4 * 4
-    for c in range(0, fours, 4):
-        a, b, d, e = slope[c], slope[c + 1], slope[c + 2], slope[c + 3]
-        row_a, row_b = channels[c, begin:end], channels[c + 1, begin:end]
-        row_d, row_e = channels[c + 2, begin:end], channels[c + 3, begin:end]
+    eights = len(channels) // 8 * 8
+    for c in range(0, eights, 8):
+        s, t, u, v = slope[c], slope[c + 1], slope[c + 2], slope[c + 3]
+        w, x, y, z = slope[c + 4], slope[c + 5], slope[c + 6], slope[c + 7]
+        row_s, row_t = channels[c, begin:end], channels[c + 1, begin:end]
+        row_u, row_v = channels[c + 2, begin:end], channels[c + 3, begin:end]
+        row_w, row_x = channels[c + 4, begin:end], channels[c + 5, begin:end]
+        row_y, row_z = channels[c + 6, begin:end], channels[c + 7, begin:end]
         for p in range(end - begin):
-            first = a * np.float32(row_a[p]) + b * np.float32(row_b[p])
-            out[p] += first + (d * np.float32(row_d[p]) + e * np.float32(row_e[p]))
-    for c in range(fours, len(channels)):
+            first = s * np.float32(row_s[p]) + t * np.float32(row_t[p])
+            second = u * np.float32(row_u[p]) + v * np.float32(row_v[p])
+            third = w * np.float32(row_w[p]) + x * np.float32(row_x[p])
+            fourth = y * np.float32(row_y[p]) + z * np.float32(row_z[p])
+            out[p] += (first + second) + (third + fourth)
+    for c in range(eights, len(channels)):
         row, weight = channels[c, begin:end], slope[c]
         for p in range(end - begin):
             out[p] += weight * np.float32(row[p])
