@@ -29,7 +29,7 @@ lint: $(STAMP)
 	snakemake --lint --configfile config/ci.yaml
 
 test: lint
-	python -m pytest
+	python -m pytest --numprocesses $(CORES) --dist loadgroup
 
 bench: $(STAMP)
 	OMP_NUM_THREADS=1 python -m pytest -c benchmarks/pytest.ini benchmarks

@@ -421,7 +421,11 @@ class EvaluateSettings(Section):
         origin="LangSplat: max",
     )
     node_select: float = knob(
-        0.95, "nodes above this share of the range of cosine margins are selected", ge=0, le=1
+        0.95,
+        "nodes above this share of the range of cosine margins are selected; those that look like the best may "
+        "lie three times as far below it",
+        ge=0,
+        le=1,
     )
     ancestors: float = knob(
         0.2,

@@ -28,6 +28,9 @@ def query(
     results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
     views: Annotated[int, typer.Option(min=1, max=8, help="views in the panel")] = 3,
     answerer: Annotated[str, typer.Option(help="tree, or field: the paper's")] = "tree",
+    view: Annotated[
+        str | None, typer.Option(help="ask only for what this view shows, such as 000.png")
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -49,6 +52,7 @@ def query(
             variant=variant,
             views=views,
             answerer=answerer,
+            view=view,
             out=out,
             device=device,
             threads=threads,

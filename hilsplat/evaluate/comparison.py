@@ -50,10 +50,12 @@ class Answerer:
         if self.method == "tree":
             size_hw = self.scene.scene.cameras[shown.view].size_hw
             if len(shown.path) > 1 and shown.level is None:  # a path that a person asks
-                hits = self.scene.select_path(shown.path, level=None, threshold=evaluate.node_select)
+                hits = self.scene.select_path(
+                    shown.path, level=None, threshold=evaluate.node_select, view=shown.view
+                )
             else:
                 hits = self.scene.select_nodes(
-                    shown.path[-1], level=shown.level, threshold=evaluate.node_select
+                    shown.path[-1], level=shown.level, threshold=evaluate.node_select, view=shown.view
                 )
             if not len(hits.ids):
                 return np.zeros(size_hw, dtype=bool)

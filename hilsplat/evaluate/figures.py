@@ -228,7 +228,9 @@ def draw_queries(
         field_mask, _ = relevancy_mask(SmoothedRelevancy.of(relevancy, rule), level, rule)
         pictures = [("tree", _node_mask(answers, row.view, hits))]
         if columns == 7:
-            path = answers.select_path(row.path, level=row.level, threshold=evaluate.node_select)
+            path = answers.select_path(
+                row.path, level=row.level, threshold=evaluate.node_select, view=row.view
+            )
             pictures.append(("tree, path", _node_mask(answers, row.view, path)))
         pictures.append(("field", field_mask))
         title = f"truth, {row.view}" if row.truth is not None else row.view
@@ -251,8 +253,8 @@ def draw_queries(
 
 def _hits(answers: LanguageScene, row: Shown, evaluate: EvaluateSettings) -> NodeHits:
     if row.level is None:
-        return answers.find(row.text, threshold=evaluate.node_select)
-    return answers.select_nodes(row.text, level=row.level, threshold=evaluate.node_select)
+        return answers.find(row.text, threshold=evaluate.node_select, view=row.view)
+    return answers.select_nodes(row.text, level=row.level, threshold=evaluate.node_select, view=row.view)
 
 
 def _node_mask(answers: LanguageScene, view: str, hits: NodeHits) -> Bool[np.ndarray, "H W"]:

@@ -22,6 +22,7 @@ from hilsplat.evaluate.scores import made_from_truth
 from hilsplat.language.device import ComputeDevice
 from hilsplat.language.finished import FinishedScene
 from hilsplat.language.hits import Hit
+from hilsplat.language.node_search import NodeHits
 from hilsplat.language.query import PATH_SEPARATOR, LanguageScene
 from hilsplat.language.tree_export import write_selection_ply
 from hilsplat.segment.masks import masks_label
@@ -38,6 +39,7 @@ def answer(
     variant: str = "default",
     views: int = 3,
     answerer: str = "tree",
+    view: str | None = None,
     out: Path | None = None,
     device: str = "cpu",
     threads: int = 1,
@@ -51,13 +53,14 @@ def answer(
         variant: whose files answer.
         views: views in the panel.
         answerer: "tree" or "field", see `LanguageScene.query`.
+        view: asks only for what it shows, and stands first in the panel; None: the whole scene.
         out: folder of both files; by default `queries/<text>` in the scene's folder.
         device: "cpu" or "cuda": where the field is looked up.
         threads: threads for rendering.
 
     Raises:
         ArtifactError: the scene is not finished.
-        SettingsError: level, answerer or device are unknown.
+        SettingsError: level, answerer, view or device are unknown.
         DeviceError: cuda was asked for and torch finds no device.
     """
     folder = Path(folder)
@@ -67,14 +70,14 @@ def answer(
         )
     parts = FinishedScene.locate(folder, variant)
     scene = LanguageScene.open(folder, variant, threads=threads, device=device)
-    hits = scene.query(text, level, answerer=answerer, limit=LISTED)
+    hits = scene.query(text, level, answerer=answerer, view=view, limit=LISTED)
     panel = (Path(out) if out is not None else folder / "queries" / file_name(text)) / "panel.png"
-    shown = views_of(scene, hits, views)
+    shown = list(dict.fromkeys([*([view] if view else []), *views_of(scene, hits, views)]))[:views]
     label = masks_label(parts.masks)
     note = f"; a diagnostic, masks made from the true labels: {label}" if made_from_truth(label) else ""
-    query_panel(scene, text, shown, panel, level=level, note=note, answerer=answerer)
+    found = scene.find(text, level, answerer=answerer, view=view)
+    query_panel(scene, text, found, shown, panel, note=note, answerer=answerer)
     selection = panel.with_name("selection.ply")
-    found = scene.find(text, level, answerer=answerer)
     write_selection_ply(parts.gaussians, scene.gaussians_of(found.ids), selection)
     return "\n".join([told(text, hits, scene.scene.unit) + note, f"wrote {panel} and {selection.name}"])
 
@@ -82,10 +85,10 @@ def answer(
 def query_panel(
     scene: LanguageScene,
     text: str,
+    hits: NodeHits,
     views: Sequence[str],
     out_png: Path,
     *,
-    level: str = "auto",
     note: str = "",
     answerer: str = "tree",
 ) -> None:
@@ -93,7 +96,6 @@ def query_panel(
 
     `note` stands in the title, after what was found. With the answerer "field", relevancy is the field's.
     """
-    hits = scene.find(text, level, answerer=answerer)
     last = text.split(PATH_SEPARATOR)[-1].strip()
     size_hw = scene.scene.cameras[views[0]].size_hw
     width_in, columns = 13.0, 5

@@ -222,7 +222,7 @@ def timed(
         return relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)
 
     def by_tree(text: str) -> object:
-        hits = answers.select_nodes(text, level=None, threshold=settings.node_select)
+        hits = answers.select_nodes(text, level=None, threshold=settings.node_select, view=view)
         return selections.mask(view, hits.ids, size_hw)
 
     asks = {"field": by_field, "tree": by_tree}

@@ -4,16 +4,27 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, NONE, Level
-from hilsplat.language.relevancy import min_max
 from hilsplat.language.semantic_tree import SemanticTree
 
-CHILD_BONUS = 0.1
-"""By how much what lies inside the answer before is ahead of other parts of the path's first thing: a share
-of the range of the level's margins."""
+ALIKE = 0.9
+"""Cosine of two nodes' vectors from which on they look like things of one kind."""
+
+ALIKE_REACH = 3.0
+"""How many times as far below the best answer as others nodes may lie that look like it."""
+
+OF_ANCESTORS = 0.5
+"""Share of how far an ancestor's margin lies below the best of its level, in the value of a path's node."""
+
+PLAUSIBLE = 0.25
+"""What lies in a node further below the best answer to a path's first text, in shares of the range, does not
+compete: a nose of what is no bear is no answer to "bear > nose"."""
+
+WITHOUT_ANCESTOR = 0.1
+"""Share of the range by which a missing ancestor counts as below the best."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +35,8 @@ class NodeHits:
         ids: rows of the semantic tree, best first.
         scores: their relevancies.
         level: the level that was searched.
-        route: how the best was reached: "flat", or on a path "child", "descendant" or "fallback" (the
-            whole level, as the nodes before hold nothing there).
+        route: how the best was reached: "flat", or on a path "child" (every text before has a node that holds
+            it, the last of them its parent), "descendant" (some have) or "fallback" (none has).
     """
 
     ids: Int64[np.ndarray, " n"]
@@ -36,34 +47,53 @@ class NodeHits:
 
 def best_nodes(
     scores: Float[np.ndarray, " n"],
+    vectors: Float32[np.ndarray, "n C"],
     candidates: Int64[np.ndarray, " c"],
     level: Level,
     threshold: float,
-    route: str = "flat",
+    shown: Bool[np.ndarray, " n"] | None = None,
     added: Float64[np.ndarray, " n"] | None = None,
 ) -> NodeHits:
-    """Candidates above the threshold of their own range, best first; of equals the lowest row.
+    """Candidates near the best one, and those a little further that look like it; best first, of equals the
+    lowest row.
 
-    The range is that of the cosine margins behind the relevancies. Relevancies saturate: where a dozen
-    nodes score between 0.9 and 0.99, all of them are near the top of a range that reaches down to 0.1.
+    Near is measured in the range of the cosine margins behind the relevancies. Relevancies saturate: where a
+    dozen nodes score between 0.9 and 0.99, all of them are near the top of a range that reaches down to 0.1.
 
     Args:
         scores: relevancy of every node.
-        candidates: nodes that compete.
+        vectors: unit vectors of every node, which tell what looks alike.
+        candidates: the nodes of a level; the range is theirs.
         level: theirs.
-        threshold: share of their range.
-        route: as in `NodeHits`.
+        threshold: share of the range below which a candidate is no answer; those that look like the best
+            may be `ALIKE_REACH` times as far below it.
+        shown: which nodes may answer; None: all.
         added: to the margin of every node; None: nothing.
     """
-    if not len(candidates):
-        return NodeHits(np.zeros(0, np.int64), np.zeros(0, np.float32), level, route)
-    value = margins(scores[candidates])
+    value = margins(scores)
     if added is not None:
-        value = value + added[candidates]
-    kept = min_max(value) >= threshold
-    chosen, value = candidates[kept], value[kept]
-    chosen = chosen[np.lexsort((chosen, -value))].astype(np.int64)
-    return NodeHits(chosen, scores[chosen].astype(np.float32), level, route)
+        value = value + added
+    may = candidates if shown is None else candidates[shown[candidates]]
+    step = np.ptp(value[candidates]) if len(candidates) else 0.0
+    chosen = _near_best(value, may, vectors, (1 - threshold) * step)
+    return NodeHits(chosen, scores[chosen].astype(np.float32), level)
+
+
+def _near_best(
+    value: Float64[np.ndarray, " n"],
+    candidates: Int64[np.ndarray, " c"],
+    vectors: Float32[np.ndarray, "n C"],
+    reach: float,
+) -> Int64[np.ndarray, " h"]:
+    """Candidates at most `reach` below the best, or `ALIKE_REACH` times that if they look like it."""
+    if not len(candidates):
+        return np.zeros(0, np.int64)
+    own = value[candidates]
+    below = own.max() - own
+    alike = vectors[candidates] @ vectors[candidates[own.argmax()]] >= ALIKE
+    kept = below <= np.where(alike, ALIKE_REACH, 1.0) * reach
+    chosen = candidates[kept]
+    return chosen[np.lexsort((chosen, below[kept]))].astype(np.int64)
 
 
 def margins(scores: Float[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
@@ -90,7 +120,9 @@ def ancestor_margins(tree: SemanticTree, scores: Float[np.ndarray, " n"]) -> Flo
     return np.where(tree.level == int(Level.WHOLE), 0.0, mean)
 
 
-def automatic_level(tree: SemanticTree, scores: Float[np.ndarray, " n"]) -> Level:
+def automatic_level(
+    tree: SemanticTree, scores: Float[np.ndarray, " n"], shown: Bool[np.ndarray, " n"] | None = None
+) -> Level:
     """Level that a text most likely means: that of the best node; of equally good ones the coarsest.
 
     LangSplat's rule, asked of nodes instead of pixels. A node's vector is an average over views, and a
@@ -98,36 +130,42 @@ def automatic_level(tree: SemanticTree, scores: Float[np.ndarray, " n"]) -> Leve
     highest of 100,000 pixels. Rules that climb to the parent of the best node, that standardise each
     level's scores or that ask siblings were all worse on development scenes (docs/tree.md).
     """
-    if not len(tree):
+    levels = tree.level if shown is None else tree.level[shown]
+    own = scores if shown is None else scores[shown]
+    if not len(levels):
         return Level.WHOLE
-    return Level(int(tree.level[scores == scores.max()].min()))
+    return Level(int(levels[own == own.max()].min()))
 
 
 def search_path(
     tree: SemanticTree,
     scores: Float[np.ndarray, "T n"],
+    vectors: Float32[np.ndarray, "n C"],
     path: tuple[str, ...],
     threshold: float,
     level: Level | None = None,
+    shown: Bool[np.ndarray, " n"] | None = None,
 ) -> NodeHits:
-    """Search each text inside the nodes that answered the one before: ("bear", "head", "nose").
+    """Search a node that answers the last text and lies in what answers the texts before: ("bear", "head",
+    "nose").
 
-    Each text is searched at a finer level than the one before, among the descendants of the first text's
-    nodes, where descendants of the last answer are a little ahead; where there are none, in the whole level.
-    Children of the last answer alone would lose what hangs under the wrong part, or under none
-    (docs/tree.md).
+    Every text has a level of its own. All nodes of the last text's level compete, each together with its
+    ancestors: a bear that answers to "bear" a little worse than a cushion does still has the better head and
+    nose. What lies in nothing like the first text does not compete (`PLAUSIBLE`), unless there is no more.
 
     A path shorter than there are levels leaves open which levels it means: a handle of a mug may be a part
     or a subpart, and the head of ("head", "nose") is no whole. All ways through the levels are searched.
-    Those that never had to search a whole level come first, and of these the one with the largest sum of
-    margins.
+    Those whose best answer has an ancestor for every text come first, and of these the one with the largest
+    sum of margins.
 
     Args:
         tree: nodes.
         scores: relevancy of every node to each text of the path.
+        vectors: as in `best_nodes`.
         path: the texts, coarse to fine.
-        threshold: as in `best_nodes`.
+        threshold: as in `best_nodes`; the range is that of the last text.
         level: of the last text; None: any that the path leaves room for.
+        shown: which nodes may answer; ancestors need not be shown. None: all.
 
     Raises:
         SettingsError: the path is empty or longer than the levels down to the last text's.
@@ -142,8 +180,8 @@ def search_path(
             found=f"{len(path)}",
             fix="name the object, then its part, then the part of the part",
         )
-    found = [_search_way(tree, scores, way, threshold) for way in ways]
-    return max(found, key=lambda way: (way.stayed_inside, way.margin)).hits
+    found = [_search_way(tree, scores, vectors, way, threshold, shown) for way in ways]
+    return max(found, key=lambda way: (way.complete, way.margin)).hits
 
 
 @dataclass(frozen=True)
@@ -152,50 +190,51 @@ class _Way:
 
     Attributes:
         hits: answers to the last text.
-        margin: sum of the margins of each text's best answer.
-        stayed_inside: every text had an answer, those behind the first inside the first thing.
+        margin: sum of the margins of the best answer and of its ancestors.
+        complete: there is an answer, and it has an ancestor for every text before.
     """
 
     hits: NodeHits
     margin: float
-    stayed_inside: bool
+    complete: bool
 
 
 def _search_way(
-    tree: SemanticTree, scores: Float[np.ndarray, "T n"], levels: tuple[Level, ...], threshold: float
-) -> _Way:
-    """Search the i-th text at the i-th of some levels."""
-    hits = first = best_nodes(scores[0], tree.nodes_of(levels[0]), levels[0], threshold)
-    steps = [hits]
-    for of_text, level in zip(scores[1:], levels[1:], strict=True):
-        nodes = tree.nodes_of(level)
-        ahead = np.intersect1d(nodes, tree.descendants_of(hits.ids))
-        inside = np.union1d(ahead, np.intersect1d(nodes, tree.descendants_of(first.ids)))
-        if len(inside):
-            chosen = _best_inside(of_text, nodes, inside, ahead, threshold)
-            route = "child" if tree.parent[chosen[0]] in hits.ids else "descendant"
-            hits = NodeHits(chosen, of_text[chosen].astype(np.float32), level, route)
-        else:
-            hits = best_nodes(of_text, nodes, level, threshold, "fallback")
-        steps.append(hits)
-    margin = sum(float(margins(step.scores[:1]).sum()) for step in steps)
-    return _Way(hits, margin, all(len(step.ids) and step.route != "fallback" for step in steps))
-
-
-def _best_inside(
-    scores: Float[np.ndarray, " n"],
-    nodes: Int64[np.ndarray, " l"],
-    inside: Int64[np.ndarray, " c"],
-    ahead: Int64[np.ndarray, " k"],
+    tree: SemanticTree,
+    scores: Float[np.ndarray, "T n"],
+    vectors: Float32[np.ndarray, "n C"],
+    levels: tuple[Level, ...],
     threshold: float,
-) -> Int64[np.ndarray, " h"]:
-    """Best of the nodes inside the path's first thing, best first; those `ahead` are so by `CHILD_BONUS`.
-
-    The threshold is taken on the range of the whole level: of two or three candidates the worst says nothing
-    about how near the second is to the best.
-    """
-    step = np.ptp(margins(scores[nodes]))
-    value = margins(scores[inside]) + CHILD_BONUS * step * np.isin(inside, ahead)
-    kept = value >= value.max() - (1 - threshold) * step
-    chosen = inside[kept]
-    return chosen[np.lexsort((chosen, -value[kept]))].astype(np.int64)
+    shown: Bool[np.ndarray, " n"] | None,
+) -> _Way:
+    """Search the last text at the last of some levels, each text before among the ancestors at its level."""
+    nodes, last = tree.nodes_of(levels[-1]), margins(scores[-1])
+    may = nodes if shown is None else nodes[shown[nodes]]
+    if not len(may):
+        return _Way(NodeHits(may, np.zeros(0, np.float32), levels[-1], "fallback"), -np.inf, False)
+    ancestors = tree.ancestors()
+    value, margin = last.copy(), last.copy()
+    plausible = np.ones(len(tree), np.bool_)
+    for number, (text, level) in enumerate(zip(scores[:-1], levels[:-1], strict=True)):
+        above, of_level = margins(text), tree.nodes_of(level)
+        best = above[of_level].max() if len(of_level) else 0.0
+        spread = np.ptp(above[of_level]) if len(of_level) else 0.0
+        holder = ancestors[:, level.index]
+        below = np.where(holder != NONE, best - above[holder], WITHOUT_ANCESTOR * spread)
+        value -= OF_ANCESTORS * below
+        margin += best - below
+        if number == 0:
+            plausible = below <= PLAUSIBLE * spread
+    if plausible[may].any():
+        may = may[plausible[may]]
+    chosen = _near_best(value, may, vectors, (1 - threshold) * np.ptp(last[nodes]))
+    holders = ancestors[chosen[0], [level.index for level in levels[:-1]]]
+    complete = bool((holders != NONE).all())
+    if not len(holders):
+        route = "flat"
+    elif complete and tree.parent[chosen[0]] == holders[-1]:
+        route = "child"
+    else:
+        route = "descendant" if (holders != NONE).any() else "fallback"
+    hits = NodeHits(chosen, scores[-1][chosen].astype(np.float32), levels[-1], route)
+    return _Way(hits, float(margin[chosen[0]]), complete)

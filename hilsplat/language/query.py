@@ -48,6 +48,9 @@ ANCESTORS: float = EvaluateSettings().ancestors
 
 PATH_SEPARATOR = ">"
 
+MIN_SHOWN_SHARE = 1e-4
+"""Of a view: less than a dozen pixels at 384 x 384 px show nothing."""
+
 MIN_LATENT_SHARE = 0.5
 """A pixel has a latent at a level where Gaussians with one make up more than this share of it."""
 
@@ -192,6 +195,7 @@ class LanguageScene:
         level: str = "auto",
         *,
         answerer: str = "tree",
+        view: str | None = None,
         threshold: float | None = None,
         limit: int = 10,
     ) -> list[Hit]:
@@ -202,22 +206,29 @@ class LanguageScene:
             level: "whole", "part", "subpart" or "auto"; of a path, that of its last text.
             answerer: "tree": nodes answer with their averaged CLIP vectors; "field": with what the
                 paper's field holds for their Gaussians, decoded.
+            view: name of a view, to ask only for what it shows; None: the whole scene.
             threshold: nodes above this share of the range between the level's worst and best node are
-                hits; None: the scene's own (`node_select`).
+                hits, and those that look like the best a little below it; None: the scene's own
+                (`node_select`).
             limit: answers at most.
 
         Raises:
-            SettingsError: the text is empty, level or answerer are unknown, or a path has more texts than
-                levels.
+            SettingsError: the text is empty, level, answerer or view are unknown, or a path has more texts
+                than levels.
         """
-        hits = self.find(text, level, threshold, answerer)
+        hits = self.find(text, level, threshold, answerer, view)
         return [
             Hit.of(self.tree, int(node), float(score), hits.route)
             for node, score in zip(hits.ids[:limit], hits.scores[:limit], strict=True)
         ]
 
     def find(
-        self, text: str, level: str = "auto", threshold: float | None = None, answerer: str = "tree"
+        self,
+        text: str,
+        level: str = "auto",
+        threshold: float | None = None,
+        answerer: str = "tree",
+        view: str | None = None,
     ) -> NodeHits:
         """Like `query`, as rows of the tree."""
         path = tuple(part.strip() for part in text.split(PATH_SEPARATOR))
@@ -234,10 +245,16 @@ class LanguageScene:
             raise SettingsError(
                 f"level {level!r} is unknown", expected=f"auto, {', '.join(names)}", found=level
             )
+        if view is not None and view not in self.scene.cameras.names:
+            raise SettingsError(
+                f"{self.scene.name} has no view {view!r}",
+                expected=f"one of {', '.join(self.scene.views()[:3])}, ... ({len(self.scene.views())} views)",
+                found=view,
+            )
         given = names.get(level)
         if len(path) > 1:
-            return self.select_path(path, level=given, threshold=threshold, answerer=answerer)
-        return self.select_nodes(path[0], level=given, threshold=threshold, answerer=answerer)
+            return self.select_path(path, level=given, threshold=threshold, answerer=answerer, view=view)
+        return self.select_nodes(path[0], level=given, threshold=threshold, answerer=answerer, view=view)
 
     def select_nodes(
         self,
@@ -246,23 +263,27 @@ class LanguageScene:
         level: Level | None,
         threshold: float | None = None,
         answerer: Answerer = "tree",
+        view: str | None = None,
     ) -> NodeHits:
-        """Nodes whose margin, stretched to [0, 1] over the level's nodes, reaches the threshold.
+        """Nodes whose margin is near that of the best, and those a little further that look like it.
 
-        To a node's margin a share (`ancestors`) of the mean of its ancestors' is added.
+        To a node's margin a share (`ancestors`) of the mean of its ancestors' is added; see `best_nodes`.
 
         Args:
             text: the query.
             level: which nodes compete; None chooses it (see `automatic_level`).
             threshold: share of the range between the worst and the best node.
             answerer: as in `query`.
+            view: as in `query`.
         """
         scores = self.node_relevancy([text], answerer)[0]
+        shown = None if view is None else self.nodes_shown(view)
         if level is None:
-            level = automatic_level(self.tree, scores)
+            level = automatic_level(self.tree, scores, shown)
         threshold = self.node_select if threshold is None else threshold
         added = self.ancestors * ancestor_margins(self.tree, scores)
-        return best_nodes(scores, self.tree.nodes_of(level), level, threshold, added=added)
+        nodes = self.tree.nodes_of(level)
+        return best_nodes(scores, self.node_vectors(answerer), nodes, level, threshold, shown, added)
 
     def select_path(
         self,
@@ -271,15 +292,28 @@ class LanguageScene:
         level: Level | None,
         threshold: float | None = None,
         answerer: Answerer = "tree",
+        view: str | None = None,
     ) -> NodeHits:
-        """Search each text inside the nodes that answered the one before; see `search_path`.
+        """Search what answers the last text and lies in what answers those before; see `search_path`.
 
         Raises:
             SettingsError: the path is empty or longer than the levels down to the last text's.
         """
         scores = self.node_relevancy(list(path), answerer) if path else np.zeros((0, len(self.tree)))
         threshold = self.node_select if threshold is None else threshold
-        return search_path(self.tree, scores, path, threshold, level)
+        shown = None if view is None else self.nodes_shown(view)
+        return search_path(self.tree, scores, self.node_vectors(answerer), path, threshold, level, shown)
+
+    def nodes_shown(self, view: str) -> Bool[np.ndarray, " n"]:
+        """Which nodes make up at least `MIN_SHOWN_SHARE` of a view."""
+
+        def measure() -> np.ndarray:
+            num = len(self.tree)
+            height, width = self.scene.cameras[view].size_hw
+            area_px = sum(self._view_nodes(view, level).area_px(num) for level in LEVELS)
+            return area_px >= MIN_SHOWN_SHARE * height * width
+
+        return self._views.get(("shown", view), measure, lambda kept: kept.nbytes)
 
     def gaussians_of(self, ids: Sequence[int] | Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " g"]:
         """Gaussians of any of the nodes."""
@@ -317,7 +351,11 @@ class LanguageScene:
 
     def node_relevancy(self, texts: Sequence[str], answerer: Answerer = "tree") -> Float32[np.ndarray, "T n"]:
         """Relevancy of every node to every text."""
-        return self.relevancy(self.tree.clip if answerer == "tree" else self._node_field_vectors, texts)
+        return self.relevancy(self.node_vectors(answerer), texts)
+
+    def node_vectors(self, answerer: Answerer = "tree") -> Float32[np.ndarray, "n C"]:
+        """Unit vectors by which nodes answer: their own, or what the field holds for their Gaussians."""
+        return self.tree.clip if answerer == "tree" else self._node_field_vectors
 
     def node_relevancy_map(self, texts: Sequence[str], view: str) -> Float32[np.ndarray, "T 3 H W"]:
         """Relevancy of the nodes a pixel shows, blended by its weights, at each level.

@@ -37,9 +37,3 @@ def relevancy(
         margin = scale * (part @ texts.T - generic[:, None])
         scores[:, start : start + CHUNK_ROWS] = (1 / (1 + np.exp(-margin))).T
     return scores
-
-
-def min_max(scores: Float[np.ndarray, " B"]) -> Float[np.ndarray, " B"]:
-    """Stretch scores to [0, 1]; equal scores all become 1."""
-    span = scores.max() - scores.min()
-    return (scores - scores.min()) / span if span > 0 else np.ones_like(scores)

@@ -101,6 +101,16 @@ class SemanticTree:
                 return found
             found = more
 
+    def ancestors(self) -> Int32[np.ndarray, "T 3"]:
+        """The node that holds each node at each level: itself at its own, -1 below it or where none does."""
+        found = np.full((len(self), len(LEVELS)), NONE, np.int32)
+        rows, above = np.arange(len(self)), np.arange(len(self), dtype=np.int32)
+        while len(rows):
+            found[rows, self.level[above] - 1] = above
+            above = self.parent[above]
+            rows, above = rows[above != NONE], above[above != NONE]
+        return found
+
     @staticmethod
     def load(folder: Path) -> "SemanticTree":
         """Read a finished semantic tree.

@@ -17,10 +17,10 @@ class QueryableScene(Protocol):
     def node_relevancy_map(self, texts, view):
         """Relevancy of the node at each pixel, (T, 3, H, W)."""
 
-    def select_nodes(self, text, level=None, threshold=0.85):
-        """Nodes that answer a text, with the level they are of."""
+    def select_nodes(self, text, level=None, threshold=0.85, view=None):
+        """Nodes that answer a text, with the level they are of; of those that a view shows, if given."""
 
-    def select_path(self, texts, level=None, threshold=0.85):
+    def select_path(self, texts, level=None, threshold=0.85, view=None):
         """Nodes that answer the last of a chain of texts, at a level or at the one that is chosen."""
 
     def node_masks(self, view, ids):
@@ -48,25 +48,28 @@ class PackedMasks:
 
 
 class Selections:
-    """Nodes chosen for texts and paths; they do not depend on the view, so each is chosen once."""
+    """Nodes chosen for texts and paths, once for a view or for the whole scene."""
 
     def __init__(self, scene: QueryableScene, threshold: float) -> None:
         self.scene, self.threshold = scene, threshold
         self._of: dict[tuple, np.ndarray] = {}
 
-    def text(self, text: str, level: Level | None) -> np.ndarray:
-        """Ids of the nodes that answer a text at a level, or at the level the tree chooses."""
-        key = (text, level)
+    def text(self, text: str, level: Level | None, view: str | None) -> np.ndarray:
+        """Ids of the nodes that answer a text at a level, or at the level the tree chooses.
+
+        Nodes that the view shows compete, as maps do; without a view those of the whole scene.
+        """
+        key = (text, level, view)
         if key not in self._of:
-            hits = self.scene.select_nodes(text, level=level, threshold=self.threshold)
+            hits = self.scene.select_nodes(text, level=level, threshold=self.threshold, view=view)
             self._of[key] = np.asarray(hits.ids)
         return self._of[key]
 
-    def path(self, texts: tuple[str, ...], level: Level | None) -> np.ndarray:
+    def path(self, texts: tuple[str, ...], level: Level | None, view: str) -> np.ndarray:
         """Ids of the nodes that answer the last of a chain of texts, at a level or at the one chosen."""
-        key = (texts, level)
+        key = (texts, level, view)
         if key not in self._of:
-            hits = self.scene.select_path(texts, level=level, threshold=self.threshold)
+            hits = self.scene.select_path(texts, level=level, threshold=self.threshold, view=view)
             self._of[key] = np.asarray(hits.ids)
         return self._of[key]
 

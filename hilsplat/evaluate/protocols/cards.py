@@ -21,9 +21,11 @@ RELEVANCY_SCALE = 10.0
 """Scale of the cosine in the relevancy (LERF, LangSplat)."""
 
 NODE_SELECT = 0.95
-"""Nodes above this share of the range of the cosine margins behind the relevancies answer a text.
+"""Nodes above this share of the range of the cosine margins behind the relevancies answer a text, and those
+that look like the best one three times as far below it.
 
-Version 1 of the protocols that select nodes took 0.85 of the range of the relevancies themselves."""
+Version 1 of the protocols that select nodes took 0.85 of the range of the relevancies themselves; up to
+version 3 looks did not count, and nodes of the whole scene competed in every view."""
 
 ANCESTORS = 0.2
 """Share of the mean margin of a node's ancestors that is added to its own; version 2 added nothing."""
@@ -107,16 +109,16 @@ LERF_LANGSPLAT = ProtocolCard(
 )
 TREE_NODES = ProtocolCard(
     "lerf/tree-nodes",
-    3,
+    4,
     MASK + LOCALIZATION,
     "pairs",
-    "3D nodes above 0.95 of the range of the nodes' cosine margins with a fifth of their ancestors' mean, "
-    "rendered; level chosen by the tree",
+    "3D nodes that the view shows, above 0.95 of the range of the level's cosine margins with a fifth of "
+    "their ancestors' mean, or above 0.85 and like the best (cosine 0.9), rendered; level chosen by the tree",
     "ours",
 )
 LEVEL_GIVEN = ProtocolCard(
     "hierarchy/level-given",
-    3,
+    4,
     (*MASK, *LOCALIZATION, "best_threshold_iou", *CONSISTENCY),
     "levels",
     "as lerf/langsplat for maps and lerf/tree-nodes for nodes, at the level of the annotation",
@@ -125,7 +127,7 @@ LEVEL_GIVEN = ProtocolCard(
 )
 LEVEL_AUTO = ProtocolCard(
     "hierarchy/level-auto",
-    3,
+    4,
     (*MASK, *LOCALIZATION, *CONSISTENCY),
     "levels",
     "as lerf/langsplat for maps and lerf/tree-nodes for nodes, level chosen by the method",
@@ -134,10 +136,19 @@ LEVEL_AUTO = ProtocolCard(
 )
 PATH = ProtocolCard(
     "hierarchy/path",
-    2,
+    3,
     (*MASK, *LOCALIZATION, *CONSISTENCY),
     "levels",
-    "3D nodes that answer the chain of texts from the whole down: more text than the paper gives",
+    "3D nodes that answer the chain of texts from the whole down, each with its ancestors; those the view "
+    "shows: more text than the paper gives",
+    "ours",
+)
+SCENE_WIDE = ProtocolCard(
+    "hierarchy/scene-wide",
+    1,
+    (*MASK, *CONSISTENCY),
+    "levels",
+    "as hierarchy/level-given for nodes, but those of the whole scene compete: one answer for all views",
     "ours",
 )
 ANNOTATIONS = ProtocolCard(
@@ -145,7 +156,7 @@ ANNOTATIONS = ProtocolCard(
 )
 VIEW_CONSISTENCY = ProtocolCard(
     "world/view-consistency",
-    1,
+    2,
     ("view_consistency",),
     "levels",
     "as hierarchy/level-given, in a view and its nearest neighbour; IoU over the surface points both show",
@@ -336,6 +347,7 @@ CARDS: tuple[ProtocolCard, ...] = (
     LEVEL_GIVEN,
     LEVEL_AUTO,
     PATH,
+    SCENE_WIDE,
     ANNOTATIONS,
     VIEW_CONSISTENCY,
 )

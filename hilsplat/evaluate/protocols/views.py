@@ -7,10 +7,12 @@
 | `hierarchy/level-given` | every (text, level) | field or tree, at the annotation's level |
 | `hierarchy/level-auto` | every (text, level) | field or tree, level chosen by the method |
 | `hierarchy/path` | every (text, level), asked as the chain of texts from the whole down | tree |
+| `hierarchy/scene-wide` | every (text, level) | tree, at the annotation's level, one answer for all views |
 | `hierarchy/annotations` | - | the annotations themselves, HC only: what perfect masks would score |
 
 A path holds one more piece of information than a flat query and is not the paper's protocol. A missing
-or empty prediction counts 0.
+or empty prediction counts 0. A field sees what a view shows, and so do the nodes that compete: all but
+`hierarchy/scene-wide` ask for what is in the picture.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -36,9 +38,11 @@ from hilsplat.evaluate.protocols.cards import (
     LERF_LANGSPLAT,
     LEVEL_AUTO,
     LEVEL_GIVEN,
+    MASK,
     NODE_SELECT,
     PATH,
     RELEVANCY_SCALE,
+    SCENE_WIDE,
     TREE_NODES,
     ProtocolCard,
 )
@@ -47,6 +51,9 @@ from hilsplat.evaluate.protocols.measured import Measured
 from hilsplat.evaluate.protocols.view_rows import mask_rows
 from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
 from hilsplat.settings import EvaluateSettings
+
+NO_POINTS = np.zeros((0, 2), np.int64)
+"""Where nothing is localized."""
 
 RELEVANCY_CHUNK_MIB = 512
 """Maps of so many texts are held at once: every chunk decodes the view anew."""
@@ -124,7 +131,7 @@ def measure_view(
     rule = rule_of(settings)
 
     def select(text: str, level: Level | None) -> np.ndarray:
-        return selections.mask(view, selections.text(text, level), size_hw)
+        return selections.mask(view, selections.text(text, level, view), size_hw)
 
     texts = [query.text for query in truth.categories]
     per_chunk = max(1, int(RELEVANCY_CHUNK_MIB * 2**20 / (2 * 3 * 4 * size_hw[0] * size_hw[1])))
@@ -155,6 +162,7 @@ def measure_view(
                 yield from _answer_rows(
                     "tree", TREE_NODES, smoothed, select, category, queries, settings, masks
                 )
+                yield from _scene_wide_rows(queries, settings, selections, view, masks)
                 if also is not None:
                     yield from also.add("tree", nodes[row], select(text, None), category, queries)
             if nodes is not None and "tree-path" in settings.methods:
@@ -211,6 +219,21 @@ def _answer_rows(
         masks.put(given_key(method, query, settings), given_mask)
 
 
+def _scene_wide_rows(
+    queries: Sequence[Query],
+    settings: EvaluateSettings,
+    selections: Selections,
+    view: str,
+    masks: PackedMasks,
+) -> Iterator[Measured]:
+    """The tree's answer in 3D, which knows of no view; maps, and so localization, are as with a view."""
+    protocol = label_of(SCENE_WIDE, "tree", settings)
+    for query in queries:
+        mask = selections.mask(view, selections.text(query.text, query.level, None), masks.size_hw)
+        yield from mask_rows("tree", query, protocol, mask, NO_POINTS, MASK)
+        masks.put(("tree", protocol, query.text, query.level), mask)
+
+
 def _path_rows(
     relevancy: np.ndarray,
     queries: Sequence[Query],
@@ -228,13 +251,13 @@ def _path_rows(
         mask = np.zeros(size_hw, dtype=bool)
         inside = np.zeros(size_hw, dtype=bool)
         for path in query.paths:
-            path_mask = selections.mask(view, selections.path(path, query.level), size_hw)
+            path_mask = selections.mask(view, selections.path(path, query.level, view), size_hw)
             masks.put(("tree-path", protocol, path), path_mask)
             mask |= path_mask
             if len(path) > 1:
                 is_full = len(path) == int(query.level)  # labels may lack a level in between
                 parent_level = Level(len(path) - 1) if is_full else None
-                inside |= selections.mask(view, selections.path(path[:-1], parent_level), size_hw)
+                inside |= selections.mask(view, selections.path(path[:-1], parent_level, view), size_hw)
         level_map = relevancy[query.level.index]
         filtered = mean_filter(np.where(inside, level_map, 0) if inside.any() else level_map, side_px)
         points, _ = peak_points(np.stack([filtered] * len(LEVELS)), query.level)
@@ -250,9 +273,11 @@ def _consistency_rows(truth: ViewTruth, masks: PackedMasks, settings: EvaluateSe
     lookups = {("truth", label_of(ANNOTATIONS, "truth", settings)): lambda path: truth.regions[path]}
     for method in ("field", "tree"):
         if method in settings.methods:
-            auto, given = ((method, label_of(card, method, settings)) for card in (LEVEL_AUTO, LEVEL_GIVEN))
+            auto = (method, label_of(LEVEL_AUTO, method, settings))
             lookups[auto] = lambda path, key=auto: masks.get((*key, path[-1]))
-            lookups[given] = lambda path, key=given: masks.get((*key, path[-1], Level(len(path))))
+            for card in (LEVEL_GIVEN, *([SCENE_WIDE] if method == "tree" else [])):
+                given = (method, label_of(card, method, settings))
+                lookups[given] = lambda path, key=given: masks.get((*key, path[-1], Level(len(path))))
     if "tree-path" in settings.methods:
         key = ("tree-path", label_of(PATH, "tree-path", settings))
         lookups[key] = lambda path, key=key: masks.get((*key, path))

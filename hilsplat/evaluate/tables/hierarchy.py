@@ -77,6 +77,8 @@ def hierarchy_table(sources: Sources) -> Table:
         "score low). HC anchored: share of the child inside the annotated parent. The row of the "
         "annotations gives what perfect masks would score.",
         "A path of texts asks whole > part > subpart: more information than the paper's protocol gives.",
+        "The field answers in each view by what that view shows, and so does the tree: nodes that the view "
+        "shows compete. Scene-wide: those of the whole scene do, one answer in 3D for all views.",
         "View consistency: of the surface points that two neighbouring views both show, IoU of those that "
         "the answer holds in one view and in the other, by exact geometry, level given; mean over texts of "
         "a level, then over levels. Texts that neither view answers there are left out. It measures "

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from hilsplat.base.levels import LEVELS
-from hilsplat.evaluate.protocols.cards import ANNOTATIONS, LEVEL_AUTO, LEVEL_GIVEN, PATH
+from hilsplat.evaluate.protocols.cards import ANNOTATIONS, LEVEL_AUTO, LEVEL_GIVEN, PATH, SCENE_WIDE
 from hilsplat.evaluate.scores import made_from_truth
 from hilsplat.evaluate.tables.rows import Block, Cell, Row
 
@@ -24,6 +24,7 @@ ANSWERS = {"field": "field", "tree": "tree", "tree-path": "tree, path", "truth":
 
 PROTOCOLS = {
     LEVEL_GIVEN.full_name: "level given",
+    SCENE_WIDE.full_name: "level given, scene-wide",
     LEVEL_AUTO.full_name: "level chosen",
     PATH.full_name: "path of texts",
     ANNOTATIONS.full_name: "reference",

@@ -77,7 +77,8 @@ def test_query_is_told_and_drawn(block_world, tmp_path):
     lines = told("bear > head", hits, "metre").splitlines()
     assert lines[0].startswith("1 answer to 'bear > head'")
     assert lines[2].split()[:3] == ["2", "part", "1.00"]
-    query_panel(block_world.answers, "bear > head", ["000.png", "001.png"], tmp_path / "panel.png")
+    answers, text = block_world.answers, "bear > head"
+    query_panel(answers, text, answers.find(text), ["000.png", "001.png"], tmp_path / "panel.png")
     assert (tmp_path / "panel.png").stat().st_size > 10_000
 
 

@@ -37,20 +37,25 @@ def mask_of(rows, columns):
 
 
 class HandMade:
-    """Answers that are written down: node i of `masks` answers the texts that name it."""
+    """Answers that are written down: node i of `masks` answers the texts that name it.
 
-    def __init__(self, masks, answers, relevancy=None):
+    `scene_wide` has those that differ where no view is given.
+    """
+
+    def __init__(self, masks, answers, relevancy=None, scene_wide=None):
         self.masks, self.answers, self.relevancy = masks, answers, relevancy or {}
+        self.scene_wide = scene_wide or {}
 
     def field_relevancy(self, texts, view):
         return np.stack([self.relevancy.get(text, np.zeros((3, *SIZE), np.float32)) for text in texts])
 
     node_relevancy_map = field_relevancy
 
-    def select_nodes(self, text, *, level=None, threshold=0.85):
-        return SimpleNamespace(ids=np.array(self.answers.get((text, level), []), dtype=np.int64), level=level)
+    def select_nodes(self, text, *, level=None, threshold=0.85, view=None):
+        answers = self.answers if view == "v.png" else self.answers | self.scene_wide
+        return SimpleNamespace(ids=np.array(answers.get((text, level), []), dtype=np.int64), level=level)
 
-    def select_path(self, path, *, level=None, threshold=0.85):
+    def select_path(self, path, *, level=None, threshold=0.85, view=None):
         return SimpleNamespace(ids=np.array(self.answers.get(path, []), dtype=np.int64))
 
     def node_masks(self, view, ids):
@@ -96,7 +101,12 @@ def test_fake_and_real_scene_fit_the_protocol(block_world):
 def test_consistency_rows_match_the_worked_example(tmp_path):
     scene, truth = worked_example(tmp_path)
     values = measured(scene, truth, methods=("tree", "tree-path"))
-    for method, protocol in (("tree", "level-given@3"), ("tree", "level-auto@3"), ("tree-path", "path@2")):
+    for method, protocol in (
+        ("tree", "level-given@4"),
+        ("tree", "level-auto@4"),
+        ("tree", "scene-wide@1"),
+        ("tree-path", "path@3"),
+    ):
         key = (method, f"hierarchy/{protocol}", "", "")
         assert values[*key, "hc_containment"] == pytest.approx(0.9375)
         assert values[*key, "hc_literal"] == pytest.approx(0.27)
@@ -111,9 +121,20 @@ def test_consistency_rows_match_the_worked_example(tmp_path):
 def test_missing_answer_counts_zero_and_breaks_consistency(tmp_path):
     scene, truth = worked_example(tmp_path, without=("x",))
     values = measured(scene, truth, methods=("tree",))
-    assert values["tree", "hierarchy/level-given@3", "x", "subpart", "iou"] == 0
-    assert values["tree", "hierarchy/level-given@3", "A", "whole", "iou"] == 1
-    assert values["tree", "hierarchy/level-given@3", "", "", "hc_containment"] == pytest.approx(0.4375)
+    assert values["tree", "hierarchy/level-given@4", "x", "subpart", "iou"] == 0
+    assert values["tree", "hierarchy/level-given@4", "A", "whole", "iou"] == 1
+    assert values["tree", "hierarchy/level-given@4", "", "", "hc_containment"] == pytest.approx(0.4375)
+
+
+def test_scene_wide_answers_know_of_no_view(tmp_path):
+    scene, truth = worked_example(tmp_path)
+    scene.scene_wide = {("x", Level.SUBPART): [4]}  # b1 is more like it, in another view
+    values = measured(scene, truth, methods=("tree",))
+    assert values["tree", "hierarchy/level-given@4", "x", "subpart", "iou"] == 1
+    assert values["tree", "hierarchy/scene-wide@1", "x", "subpart", "iou"] == 0
+    assert values["tree", "hierarchy/scene-wide@1", "A", "whole", "iou"] == 1
+    # as if x had no answer: of its mask none lies inside a1
+    assert values["tree", "hierarchy/scene-wide@1", "", "", "hc_containment"] == pytest.approx(0.4375)
 
 
 def test_regions_with_the_same_text_are_united(tmp_path):
@@ -125,7 +146,7 @@ def test_regions_with_the_same_text_are_united(tmp_path):
     assert truth.queries[0].boxes_xyxy.tolist() == [[0, 0, 3, 3], [6, 6, 9, 9]]
     scene = HandMade([mask_of((0, 4), (0, 4))], {("cup", Level.WHOLE): [0], ("cup", None): [0]})
     values = measured(scene, truth, methods=("tree",))
-    assert values["tree", "hierarchy/level-given@3", "cup", "whole", "iou"] == pytest.approx(0.5)
+    assert values["tree", "hierarchy/level-given@4", "cup", "whole", "iou"] == pytest.approx(0.5)
 
 
 def test_text_at_two_levels_is_one_category_and_two_queries(tmp_path):
@@ -174,7 +195,7 @@ def test_automatic_level_of_the_field_follows_the_highest_value(tmp_path):
     values = measured(scene, truth, methods=("field",), filter_px=1, majority=False)
     given, auto, lerf = (
         f"{name} (filter 1, no majority)"
-        for name in ("hierarchy/level-given@3", "hierarchy/level-auto@3", "lerf/langsplat@1")
+        for name in ("hierarchy/level-given@4", "hierarchy/level-auto@4", "lerf/langsplat@1")
     )
     key = ("cup", "whole", "iou")
     assert values["field", given, *key] == 1
@@ -224,8 +245,8 @@ def test_path_localization_looks_inside_the_parent(tmp_path):
     answers = {("bear",): [0], ("bear", "nose"): [1], ("nose", Level.PART): [1]}
     scene = HandMade([mask_of(*each) for each in regions], answers, {"nose": relevancy})
     values = measured(scene, truth, methods=("tree", "tree-path"), filter_px=1)
-    assert values["tree", "hierarchy/level-given@3 (filter 1)", "nose", "part", "localization_box"] == 0
-    assert values["tree-path", "hierarchy/path@2 (filter 1)", "nose", "part", "localization_box"] == 1
+    assert values["tree", "hierarchy/level-given@4 (filter 1)", "nose", "part", "localization_box"] == 0
+    assert values["tree-path", "hierarchy/path@3 (filter 1)", "nose", "part", "localization_box"] == 1
 
 
 def test_perfect_tree_of_the_block_world_scores_one(block_world):
@@ -234,7 +255,7 @@ def test_perfect_tree_of_the_block_world_scores_one(block_world):
     truth = ViewTruth.of(block_world.annotations, view, size_hw, settings.min_region_px)
     selections = Selections(block_world.answers, settings.node_select)
     rows = list(measure_view(block_world.answers, selections, truth, view, size_hw, settings))
-    given = [row for row in rows if row.method == "tree" and row.protocol == "hierarchy/level-given@3"]
+    given = [row for row in rows if row.method == "tree" and row.protocol == "hierarchy/level-given@4"]
     ious = {row.query: row.value for row in given if row.metric == "iou"}
     assert ious == dict.fromkeys(("bear", "chest", "head", "lid", "nose"), 1.0)
     assert {row.value for row in given if row.metric in ("localization_box", "hc_containment")} == {1.0}
@@ -243,7 +264,7 @@ def test_perfect_tree_of_the_block_world_scores_one(block_world):
     field = {
         row.query: row.value
         for row in rows
-        if (row.method, row.protocol, row.metric) == ("field", "hierarchy/level-given@3", "iou")
+        if (row.method, row.protocol, row.metric) == ("field", "hierarchy/level-given@4", "iou")
     }
     assert field["bear"] > 0.9  # exact features; the filter rounds the corners
 
@@ -259,7 +280,7 @@ def score(**changes):
         "query": "cup",
         "level": "whole",
         "metric": "iou",
-        "protocol": "hierarchy/level-given@3",
+        "protocol": "hierarchy/level-given@4",
         "value": 0.5,
         "n": 1,
     }

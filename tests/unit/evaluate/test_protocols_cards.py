@@ -26,7 +26,7 @@ from hilsplat.settings import EvaluateSettings
 DECIDED = {
     # full name: first eight digits of what `digest` makes of metrics, averaging, missing, rule and classes
     "lerf/langsplat@1": "704f6f3d",
-    "lerf/tree-nodes@3": "2cdcbb8d",
+    "lerf/tree-nodes@4": "2cdcbb8d",
     "lerf/langsplat-v2@1": "f209b912",
     "lerf/paper-filter@1": "128bc7c0",
     "lerf/paper-mean@1": "4fed36ea",
@@ -49,11 +49,12 @@ DECIDED = {
     "replica/opennerf@1": "2368b7a9",
     "replica/conceptgraphs@1": "d89e022d",
     "waymo/segmentation@1": "06e4086c",
-    "hierarchy/level-given@3": "02318fa5",
-    "hierarchy/level-auto@3": "d49b3f00",
-    "hierarchy/path@2": "2f58f979",
+    "hierarchy/level-given@4": "02318fa5",
+    "hierarchy/level-auto@4": "d49b3f00",
+    "hierarchy/path@3": "2f58f979",
+    "hierarchy/scene-wide@1": "a0529c13",
     "hierarchy/annotations@1": "30da2922",
-    "world/view-consistency@1": "c057895c",
+    "world/view-consistency@2": "c057895c",
 }
 
 
@@ -96,18 +97,18 @@ def test_classes_of_protocols_exist():
 def test_rows_name_what_settings_change():
     plain = EvaluateSettings()
     assert label_of(LERF_LANGSPLAT, "field", plain) == "lerf/langsplat@1"
-    assert label_of(TREE_NODES, "tree", plain) == "lerf/tree-nodes@3"
+    assert label_of(TREE_NODES, "tree", plain) == "lerf/tree-nodes@4"
     changed = EvaluateSettings(filter_px=20, threshold_on="raw", node_select=0.7, relevancy_scale=5)
     assert (
         label_of(LERF_LANGSPLAT, "field", changed) == "lerf/langsplat@1 (filter 20, raw, relevancy scale 5)"
     )
-    assert label_of(TREE_NODES, "tree", EvaluateSettings(ancestors=0)) == "lerf/tree-nodes@3 (ancestors 0)"
+    assert label_of(TREE_NODES, "tree", EvaluateSettings(ancestors=0)) == "lerf/tree-nodes@4 (ancestors 0)"
     # nodes are not thresholded, so the scale of the threshold changes nothing of theirs
-    expected = "hierarchy/level-given@3 (filter 20, node share 0.7, relevancy scale 5)"
+    expected = "hierarchy/level-given@4 (filter 20, node share 0.7, relevancy scale 5)"
     assert label_of(LEVEL_GIVEN, "tree", changed) == expected
-    assert label_of(LEVEL_GIVEN, "truth", changed) == "hierarchy/level-given@3"
+    assert label_of(LEVEL_GIVEN, "truth", changed) == "hierarchy/level-given@4"
     other = EvaluateSettings(canonical=("object", "scene"))
-    assert label_of(LEVEL_GIVEN, "tree", other) == "hierarchy/level-given@3 (canonical object+scene)"
+    assert label_of(LEVEL_GIVEN, "tree", other) == "hierarchy/level-given@4 (canonical object+scene)"
 
 
 def test_rows_lead_back_to_their_protocol():

@@ -35,6 +35,11 @@ NAMES = ("A", "B", "A top", "B top", "A bottom", "A top left", "B corner")
 NODE = {name: node for node, name in enumerate(NAMES)}
 
 
+def logistic(margin: np.ndarray) -> np.ndarray:
+    """Relevancies behind which the margins lie."""
+    return (1 / (1 + np.exp(-margin))).astype(np.float32)
+
+
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory) -> LanguageScene:
     folder = tmp_path_factory.mktemp("boxes")
@@ -90,28 +95,47 @@ def test_automatic_level_is_that_of_the_best_node_and_of_equals_the_coarsest(sce
 
 
 def test_selection_is_by_margins_which_do_not_saturate():
+    every, apart = np.arange(4), np.eye(4, dtype=np.float32)
     scores = np.array([0.1, 0.95, 0.98, 0.999])
-    every = np.arange(4)
     # the relevancies 0.95 to 0.999 all lie above 0.94 of their range; of the margins (-2.2, 2.9, 3.9,
     # 6.9) only the last lies above 0.85 of theirs
-    assert best_nodes(scores, every, Level.PART, 0.85).ids.tolist() == [3]
-    assert best_nodes(scores, every, Level.PART, 0.5).ids.tolist() == [3, 2, 1]
-    assert best_nodes(np.array([0.4, 0.9, 0.9]), np.arange(3), Level.PART, 0.95).ids.tolist() == [1, 2]
+    assert best_nodes(scores, apart, every, Level.PART, 0.85).ids.tolist() == [3]
+    assert best_nodes(scores, apart, every, Level.PART, 0.5).ids.tolist() == [3, 2, 1]
+    equal = best_nodes(np.array([0.4, 0.9, 0.9]), apart[:3], np.arange(3), Level.PART, 0.95)
+    assert equal.ids.tolist() == [1, 2]
+
+
+@pytest.mark.parametrize(("cosine", "found"), [(0.91, [3, 2]), (0.89, [3])])
+def test_what_looks_like_the_best_answer_may_lie_three_times_as_far_below(cosine, found):
+    margin = np.array([0.0, 7.0, 8.6, 10.0])  # of a range of 10: 0.05 is 0.5, three times that 1.5
+    vectors = np.eye(5, dtype=np.float32)[:4]
+    for node in (1, 2):
+        vectors[node] = cosine * vectors[3] + np.sqrt(1 - cosine**2) * np.eye(5)[4]
+    assert best_nodes(logistic(margin), vectors, np.arange(4), Level.PART, 0.95).ids.tolist() == found
+
+
+def test_only_what_is_shown_answers_in_the_range_of_all():
+    scores, apart = logistic(np.array([0.0, 9.4, 9.7, 10.0])), np.eye(4, dtype=np.float32)
+    shown = np.array([True, True, True, False])
+    hits = best_nodes(scores, apart, np.arange(4), Level.PART, 0.95, shown)
+    assert hits.ids.tolist() == [2, 1]  # within 0.05 of the range of all four, 10
+    assert not len(best_nodes(scores, apart, np.arange(4), Level.PART, 0.95, np.zeros(4, bool)).ids)
 
 
 def test_what_lies_in_a_likely_thing_is_ahead(scene):
     margin = np.full(7, -1.0)
     margin[[NODE["A"], NODE["A top"], NODE["A top left"]]] = 3.0, 1.0, 1.0
     margin[[NODE["B"], NODE["B corner"]]] = 0.0, 1.1
-    scores = (1 / (1 + np.exp(-margin))).astype(np.float32)
+    scores = logistic(margin)
     added = ancestor_margins(scene.tree, scores)
     # A top left lies in A top and A, B corner in B alone; wholes lie in nothing and add nothing
     assert added[NODE["A top left"]] == pytest.approx(2.0, abs=1e-5)
     assert added[NODE["B corner"]] == pytest.approx(0.0, abs=1e-5)
     assert added[[NODE["A"], NODE["B"]]].tolist() == [0, 0]
     subparts = scene.tree.nodes_of(Level.SUBPART)
-    assert best_nodes(scores, subparts, Level.SUBPART, 0.9).ids[0] == NODE["B corner"]
-    hits = best_nodes(scores, subparts, Level.SUBPART, 0.9, added=0.2 * added)
+    vectors = scene.tree.clip
+    assert best_nodes(scores, vectors, subparts, Level.SUBPART, 0.9).ids[0] == NODE["B corner"]
+    hits = best_nodes(scores, vectors, subparts, Level.SUBPART, 0.9, added=0.2 * added)
     assert hits.ids.tolist() == [NODE["A top left"]]
     assert hits.scores == pytest.approx(scores[[NODE["A top left"]]])  # told as it is
     orphans = replace(scene.tree, parent=np.full(7, -1, np.int32))
@@ -119,28 +143,56 @@ def test_what_lies_in_a_likely_thing_is_ahead(scene):
     assert least[scene.tree.level > 1] == pytest.approx(-1.0, abs=1e-5)
 
 
+def of_path(scene, *margins):
+    """Relevancies of a path's texts: -1 but for the nodes that are named."""
+    every = np.full((len(margins), len(NAMES)), -1.0)
+    for row, named in zip(every, margins, strict=True):
+        for name, value in named.items():
+            row[NODE[name]] = value
+    return logistic(every)
+
+
 def test_a_path_stays_inside_its_first_thing(scene):
-    scores = np.full((3, 7), 0.1, np.float32)
-    scores[0, NODE["A"]] = scores[1, NODE["A bottom"]] = 0.9
-    scores[2, NODE["A top left"]], scores[2, NODE["B corner"]] = 0.6, 0.9
-    hits = search_path(scene.tree, scores, ("A", "A bottom", "x"), 0.95)
+    scores = of_path(scene, {"A": 3.0}, {"A bottom": 2.0}, {"A top left": 0.4, "B corner": 2.2})
+    hits = search_path(scene.tree, scores, scene.tree.clip, ("A", "A bottom", "x"), 0.95)
     # the one subpart of A hangs under its top; that of B answers better, but is no part of A
-    assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "descendant")
+    assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "child")
 
 
-@pytest.mark.parametrize(
-    ("child_margin", "found", "route"), [(0.97, "B corner", "child"), (0.8, "A top left", "descendant")]
-)
-def test_a_child_of_the_last_answer_is_a_tenth_of_the_range_ahead(scene, child_margin, found, route):
+@pytest.fixture
+def three_wholes(scene) -> SemanticTree:
+    """B top is a whole of its own, with the least margin: wholes range from -1 to 4 in the tests below."""
     level, parent = scene.tree.level.copy(), scene.tree.parent.copy()
-    level[NODE["B top"]] = 3  # the third subpart, which spans the range of margins from 0 to 1
-    parent[NODE["B corner"]] = NODE["A bottom"]
-    margins = np.full((3, 7), -1.0)
-    margins[0, NODE["A"]] = margins[1, NODE["A bottom"]] = 1.0
-    margins[2, [NODE["A top left"], NODE["B corner"], NODE["B top"]]] = 1.0, child_margin, 0.0
-    scores = (1 / (1 + np.exp(-margins))).astype(np.float32)
-    hits = search_path(replace(scene.tree, level=level, parent=parent), scores, ("A", "A bottom", "x"), 0.95)
-    assert (hits.ids.tolist(), hits.route) == ([NODE[found]], route)
+    level[NODE["B top"]], parent[NODE["B top"]] = 1, -1
+    return replace(scene.tree, level=level, parent=parent)
+
+
+@pytest.mark.parametrize(("b_corner", "found"), [(2.4, "A top left"), (2.6, "B corner")])
+def test_a_node_competes_together_with_what_holds_it(scene, three_wholes, b_corner, found):
+    # A is best, B 1 below it, which counts half: 2.0 against b_corner - 0.5
+    scores = of_path(scene, {"A": 4.0, "B": 3.0}, {"A top left": 2.0, "B corner": b_corner})
+    hits = search_path(three_wholes, scores, scene.tree.clip, ("x", "y"), 0.99, Level.SUBPART)
+    assert hits.ids.tolist() == [NODE[found]]
+
+
+@pytest.mark.parametrize(("b", "found"), [(2.7, "A top left"), (2.8, "B corner")])
+def test_what_holds_no_likely_first_thing_does_not_compete(scene, three_wholes, b, found):
+    # a quarter of the range of 5 is 1.25
+    scores = of_path(scene, {"A": 4.0, "B": b}, {"A top left": 0.0, "B corner": 9.0})
+    hits = search_path(three_wholes, scores, scene.tree.clip, ("x", "y"), 0.99, Level.SUBPART)
+    assert hits.ids.tolist() == [NODE[found]]
+
+
+def test_a_missing_ancestor_counts_a_tenth_of_the_range(scene, three_wholes):
+    parent = three_wholes.parent.copy()
+    parent[NODE["B corner"]] = -1
+    tree = replace(three_wholes, parent=parent)
+    # of the range of 5 half a tenth, 0.25
+    for margin, found in ((2.2, "A top left"), (2.3, "B corner")):
+        scores = of_path(scene, {"A": 4.0}, {"A top left": 2.0, "B corner": margin})
+        hits = search_path(tree, scores, tree.clip, ("x", "y"), 0.99, Level.SUBPART)
+        assert hits.ids.tolist() == [NODE[found]]
+    assert hits.route == "fallback"
 
 
 def test_a_scene_opens_with_the_settings_it_was_evaluated_with(tmp_path):
@@ -243,12 +295,23 @@ def test_a_short_path_finds_its_levels_unless_one_is_given(scene, path, level, f
     assert hits.level == Level(int(scene.tree.level[NODE[found]]))
 
 
-def test_a_way_through_the_levels_that_stays_inside_goes_before_one_that_does_not(scene):
+def test_a_way_through_the_levels_with_every_ancestor_goes_before_one_without(scene):
     scores = np.full((2, 7), 0.1, np.float32)
-    scores[0, NODE["A"]], scores[0, NODE["B top"]] = 0.8, 0.9  # B top has no subpart to search
+    scores[0, NODE["A"]], scores[0, NODE["B top"]] = 0.8, 0.9  # B top holds no subpart
     scores[1, NODE["A top left"]], scores[1, NODE["B corner"]] = 0.6, 0.9
-    hits = search_path(scene.tree, scores, ("x", "y"), 0.95)
+    hits = search_path(scene.tree, scores, scene.tree.clip, ("x", "y"), 0.95)
     assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "descendant")
+
+
+@pytest.mark.parametrize("text", ["A top left", "A > A top left"])
+def test_a_view_answers_with_what_it_shows(scene, text):
+    assert scene.nodes_shown("000.png").all()
+    hidden = np.arange(7) != NODE["A top left"]
+    scene._views.get(("shown", "half"), lambda: hidden, lambda kept: 0)
+    named = replace(scene, scene=replace(scene.scene, cameras=replace(scene.scene.cameras, names=("half",))))
+    assert [hit.node for hit in named.query(text, "subpart", view="half")] == [NODE["B corner"]]
+    with pytest.raises(SettingsError, match="has no view 'x'"):
+        scene.query(text, view="x")
 
 
 def test_path_falls_back_to_any_descendant_of_the_object(scene):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilsplat.language.relevancy import min_max, relevancy
+from hilsplat.language.relevancy import relevancy
 
 
 def test_nearest_canonical_phrase_decides():
@@ -21,8 +21,3 @@ def test_as_close_as_the_nearest_phrase_scores_one_half():
 def test_rows_are_texts_and_columns_embeddings():
     assert relevancy(np.eye(3), np.eye(3)[:2], np.eye(3)[2:]).shape == (2, 3)
     assert relevancy(np.zeros((0, 3)), np.eye(3)[:2], np.eye(3)[2:]).shape == (2, 0)
-
-
-def test_min_max_of_equal_scores_is_one():
-    assert min_max(np.array([0.4, 0.4])).tolist() == [1, 1]
-    assert min_max(np.array([0.2, 0.4, 0.3])) == pytest.approx([0, 1, 0.5])
