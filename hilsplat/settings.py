@@ -422,8 +422,8 @@ class EvaluateSettings(Section):
     )
     node_select: float = knob(
         0.95,
-        "nodes above this share of the range of cosine margins are selected; what looks like the best may lie "
-        "three times as far below it",
+        "nodes above this share of the range of cosine margins are selected; what looks like the best may "
+        "lie three times as far below it",
         ge=0,
         le=1,
     )
