@@ -33,10 +33,10 @@ class Answers:
 
     node_relevancy_map = field_relevancy
 
-    def select_nodes(self, text, *, level=None, threshold=0.85):
+    def select_nodes(self, text, *, level=None, threshold=0.95, view=None):
         return SimpleNamespace(ids=np.array([list(self.regions).index(text)]), level=level)
 
-    def select_path(self, path, *, level=None, threshold=0.85):
+    def select_path(self, path, *, level=None, threshold=0.95, view=None):
         return self.select_nodes(path[-1])
 
     def node_masks(self, view, ids):

@@ -422,8 +422,8 @@ class EvaluateSettings(Section):
     )
     node_select: float = knob(
         0.95,
-        "nodes above this share of the range of cosine margins are selected; what looks like the best may "
-        "lie three times as far below it",
+        "nodes are selected that lie at most 1 less this of the range of their level's cosine margins below "
+        "the best one, and three times as far if they look like it",
         ge=0,
         le=1,
     )

@@ -75,11 +75,12 @@ def answer(
     shown = list(dict.fromkeys([*([view] if view else []), *views_of(scene, hits, views)]))[:views]
     label = masks_label(parts.masks)
     note = f"; a diagnostic, masks made from the true labels: {label}" if made_from_truth(label) else ""
+    asked = "" if view is None else f", of what {view} shows"
     found = scene.find(text, level, answerer=answerer, view=view)
-    query_panel(scene, text, found, shown, panel, note=note, answerer=answerer)
+    query_panel(scene, text, found, shown, panel, note=asked + note, answerer=answerer)
     selection = panel.with_name("selection.ply")
     write_selection_ply(parts.gaussians, scene.gaussians_of(found.ids), selection)
-    return "\n".join([told(text, hits, scene.scene.unit) + note, f"wrote {panel} and {selection.name}"])
+    return "\n".join([told(text, hits, scene.scene.unit, view) + note, f"wrote {panel} and {selection.name}"])
 
 
 def query_panel(
@@ -139,8 +140,10 @@ def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]
     return list(dict.fromkeys([*best, *spread, *every]))[:count]
 
 
-def told(text: str, hits: Sequence[Hit], unit: str) -> str:
-    """The answers in words."""
+def told(text: str, hits: Sequence[Hit], unit: str, view: str | None = None) -> str:
+    """The answers in words; with a view, to what was asked of it alone."""
+    if not hits and view is not None:
+        return f"no node that {view} shows answers {text!r}; try --level part or subpart, or no --view"
     if not hits:
         return f"no node of the scene answers {text!r}; try --level part or subpart"
     lengths = "metres" if unit == "metre" else "scene units"
@@ -158,7 +161,7 @@ def told(text: str, hits: Sequence[Hit], unit: str) -> str:
         )
     if hits[0].route == "fallback":
         lines.append(
-            "nothing of the kind lies inside the first answers: the whole scene was searched instead"
+            "nothing of the kind lies in what answers the first text: everything else was searched instead"
         )
     if hits[0].score < 0.5:
         lines.append("all scores are below 0.5: the scene may hold nothing of the kind")

@@ -1,10 +1,10 @@
-"""Choose nodes of the semantic tree by their scores: a level, several hits, a path with fall-backs."""
+"""Choose nodes of the semantic tree by their scores: a level, several hits, paths."""
 
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, NONE, Level
@@ -16,7 +16,7 @@ ALIKE = 0.9
 ALIKE_REACH = 3.0
 """How many times as far below the best answer as others nodes may lie that look like it."""
 
-OF_ANCESTORS = 0.5
+ANCESTORS_SHARE = 0.5
 """Share of how far an ancestor's margin lies below the best of its level, in the value of a path's node."""
 
 PLAUSIBLE = 0.25
@@ -35,8 +35,9 @@ class NodeHits:
         ids: rows of the semantic tree, best first.
         scores: their relevancies.
         level: the level that was searched.
-        route: how the best was reached: "flat", or on a path "child" (every text before has a node that holds
-            it, the last of them its parent), "descendant" (some have) or "fallback" (none has).
+        route: how the best was reached: "flat", or on a path "child" (it has an ancestor at the level of
+            every text before, the last of them its parent), "descendant" (at some, or the last is not its
+            parent) or "fallback" (at none, or nothing lies in what answers the first text).
     """
 
     ids: Int64[np.ndarray, " n"]
@@ -65,8 +66,8 @@ def best_nodes(
         vectors: unit vectors of every node, which tell what looks alike.
         candidates: the nodes of a level; the range is theirs.
         level: theirs.
-        threshold: share of the range below which a candidate is no answer; those that look like the best
-            may be `ALIKE_REACH` times as far below it.
+        threshold: answers lie at most 1 - threshold of the range below the best one of those shown, and
+            `ALIKE_REACH` times as far if they look like it.
         shown: which nodes may answer; None: all.
         added: to the margin of every node; None: nothing.
     """
@@ -74,8 +75,8 @@ def best_nodes(
     if added is not None:
         value = value + added
     may = candidates if shown is None else candidates[shown[candidates]]
-    step = np.ptp(value[candidates]) if len(candidates) else 0.0
-    chosen = _near_best(value, may, vectors, (1 - threshold) * step)
+    spread = np.ptp(value[candidates]) if len(candidates) else 0.0
+    chosen = _near_best(value, may, vectors, (1 - threshold) * spread)
     return NodeHits(chosen, scores[chosen].astype(np.float32), level)
 
 
@@ -96,7 +97,7 @@ def _near_best(
     return chosen[np.lexsort((chosen, below[kept]))].astype(np.int64)
 
 
-def margins(scores: Float[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+def margins(scores: Float[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
     """Cosine margins behind relevancies, times their scale: the logistic function undone."""
     probability = np.clip(scores.astype(np.float64), 1e-7, 1 - 1e-7)
     return np.log(probability / (1 - probability))
@@ -109,13 +110,10 @@ def ancestor_margins(tree: SemanticTree, scores: Float[np.ndarray, " n"]) -> Flo
     each other. The share that is taken of it was chosen on development scenes (docs/tree.md).
     """
     margin = margins(scores)
-    total, count = np.zeros(len(tree)), np.zeros(len(tree))
-    above = tree.parent.astype(np.int64)
-    while (above != NONE).any():
-        has = above != NONE
-        total[has] += margin[above[has]]
-        count[has] += 1
-        above[has] = tree.parent[above[has]]
+    ancestors = tree.ancestors()
+    above = (ancestors != NONE) & (ancestors != np.arange(len(tree))[:, None])
+    count = above.sum(axis=1)
+    total = np.where(above, margin[ancestors], 0.0).sum(axis=1)
     mean = np.where(count > 0, total / np.maximum(count, 1), margin.min(initial=0.0))
     return np.where(tree.level == int(Level.WHOLE), 0.0, mean)
 
@@ -151,7 +149,7 @@ def search_path(
 
     Every text has a level of its own. All nodes of the last text's level compete, each together with its
     ancestors: a bear that answers to "bear" a little worse than a cushion does still has the better head and
-    nose. What lies in nothing like the first text does not compete (`PLAUSIBLE`), unless there is no more.
+    nose. What lies in nothing like the first text does not compete (`PLAUSIBLE`), unless that leaves none.
 
     A path shorter than there are levels leaves open which levels it means: a handle of a mug may be a part
     or a subpart, and the head of ("head", "nose") is no whole. All ways through the levels are searched.
@@ -165,7 +163,8 @@ def search_path(
         path: the texts, coarse to fine.
         threshold: as in `best_nodes`; the range is that of the last text.
         level: of the last text; None: any that the path leaves room for.
-        shown: which nodes may answer; ancestors need not be shown. None: all.
+        shown: which nodes may answer; ancestors need not be shown, and are compared with what is shown or
+            holds something shown. None: all.
 
     Raises:
         SettingsError: the path is empty or longer than the levels down to the last text's.
@@ -180,8 +179,10 @@ def search_path(
             found=f"{len(path)}",
             fix="name the object, then its part, then the part of the part",
         )
-    found = [_search_way(tree, scores, vectors, way, threshold, shown) for way in ways]
-    return max(found, key=lambda way: (way.complete, way.margin)).hits
+    margin, ancestors = margins(scores), tree.ancestors()
+    found = [_search_way(tree, margin, ancestors, vectors, way, threshold, shown) for way in ways]
+    best = max(found, key=lambda way: (way.complete, way.margin))
+    return NodeHits(best.ids, scores[-1][best.ids].astype(np.float32), best.level, best.route)
 
 
 @dataclass(frozen=True)
@@ -189,52 +190,59 @@ class _Way:
     """What a path found at certain levels.
 
     Attributes:
-        hits: answers to the last text.
+        ids: answers to the last text, best first.
+        level: of the last text.
+        route: as in `NodeHits`.
         margin: sum of the margins of the best answer and of its ancestors.
-        complete: there is an answer, and it has an ancestor for every text before.
+        complete: the best answer lies in what answers the first text, and has an ancestor for every text.
     """
 
-    hits: NodeHits
+    ids: Int64[np.ndarray, " h"]
+    level: Level
+    route: str
     margin: float
     complete: bool
 
 
 def _search_way(
     tree: SemanticTree,
-    scores: Float[np.ndarray, "T n"],
+    margin: Float64[np.ndarray, "T n"],
+    ancestors: Int32[np.ndarray, "n 3"],
     vectors: Float32[np.ndarray, "n C"],
     levels: tuple[Level, ...],
     threshold: float,
     shown: Bool[np.ndarray, " n"] | None,
 ) -> _Way:
     """Search the last text at the last of some levels, each text before among the ancestors at its level."""
-    nodes, last = tree.nodes_of(levels[-1]), margins(scores[-1])
+    nodes, last = tree.nodes_of(levels[-1]), margin[-1]
     may = nodes if shown is None else nodes[shown[nodes]]
     if not len(may):
-        return _Way(NodeHits(may, np.zeros(0, np.float32), levels[-1], "fallback"), -np.inf, False)
-    ancestors = tree.ancestors()
-    value, margin = last.copy(), last.copy()
-    plausible = np.ones(len(tree), np.bool_)
-    for number, (text, level) in enumerate(zip(scores[:-1], levels[:-1], strict=True)):
-        above, of_level = margins(text), tree.nodes_of(level)
-        best = above[of_level].max() if len(of_level) else 0.0
-        spread = np.ptp(above[of_level]) if len(of_level) else 0.0
-        holder = ancestors[:, level.index]
-        below = np.where(holder != NONE, best - above[holder], WITHOUT_ANCESTOR * spread)
-        value -= OF_ANCESTORS * below
-        margin += best - below
-        if number == 0:
-            plausible = below <= PLAUSIBLE * spread
-    if plausible[may].any():
-        may = may[plausible[may]]
-    chosen = _near_best(value, may, vectors, (1 - threshold) * np.ptp(last[nodes]))
+        return _Way(may, levels[-1], "fallback" if len(levels) > 1 else "flat", -np.inf, False)
+    value, total = last.copy(), last.copy()
+    likely = np.ones(len(tree), np.bool_)
+    for text, (of_text, level) in enumerate(zip(margin[:-1], levels[:-1], strict=True)):
+        holder, of_level = ancestors[:, level.index], tree.nodes_of(level)
+        rivals = of_level
+        if shown is not None:
+            holding = np.zeros(len(tree), np.bool_)
+            holding[holder[may][holder[may] != NONE]] = True
+            rivals = of_level[(shown | holding)[of_level]]
+        best = of_text[rivals].max() if len(rivals) else 0.0
+        spread = np.ptp(of_text[of_level]) if len(of_level) else 0.0
+        below = np.where(holder != NONE, best - of_text[holder], WITHOUT_ANCESTOR * spread)
+        value -= ANCESTORS_SHARE * below
+        total += best - below
+        if text == 0:
+            likely = below <= PLAUSIBLE * spread
+    inside = bool(likely[may].any())
+    reach = (1 - threshold) * np.ptp(last[nodes])
+    chosen = _near_best(value, may[likely[may]] if inside else may, vectors, reach)
     holders = ancestors[chosen[0], [level.index for level in levels[:-1]]]
-    complete = bool((holders != NONE).all())
+    complete = inside and bool((holders != NONE).all())
     if not len(holders):
         route = "flat"
     elif complete and tree.parent[chosen[0]] == holders[-1]:
         route = "child"
     else:
-        route = "descendant" if (holders != NONE).any() else "fallback"
-    hits = NodeHits(chosen, scores[-1][chosen].astype(np.float32), levels[-1], route)
-    return _Way(hits, float(margin[chosen[0]]), complete)
+        route = "descendant" if inside and (holders != NONE).any() else "fallback"
+    return _Way(chosen, levels[-1], route, float(total[chosen[0]]), complete)

@@ -49,7 +49,7 @@ ANCESTORS: float = EvaluateSettings().ancestors
 PATH_SEPARATOR = ">"
 
 MIN_SHOWN_SHARE = 1e-4
-"""Of a view: less than a dozen pixels at 384 x 384 px show nothing."""
+"""Of a view: 14 px at 384 x 384 px show nothing."""
 
 MIN_LATENT_SHARE = 0.5
 """A pixel has a latent at a level where Gaussians with one make up more than this share of it."""
@@ -207,9 +207,9 @@ class LanguageScene:
             answerer: "tree": nodes answer with their averaged CLIP vectors; "field": with what the
                 paper's field holds for their Gaussians, decoded.
             view: name of a view, to ask only for what it shows; None: the whole scene.
-            threshold: nodes above this share of the range between the level's worst and best node are
-                hits, and those that look like the best a little below it; None: the scene's own
-                (`node_select`).
+            threshold: hits lie at most 1 - threshold of the range of the level's margins below the best
+                one (that the view shows), and three times as far if they look like it; None: the scene's
+                own (`node_select`).
             limit: answers at most.
 
         Raises:
@@ -305,7 +305,7 @@ class LanguageScene:
         return search_path(self.tree, scores, self.node_vectors(answerer), path, threshold, level, shown)
 
     def nodes_shown(self, view: str) -> Bool[np.ndarray, " n"]:
-        """Which nodes make up at least `MIN_SHOWN_SHARE` of a view."""
+        """Which nodes have a mask of at least `MIN_SHOWN_SHARE` of a view."""
 
         def measure() -> np.ndarray:
             num = len(self.tree)

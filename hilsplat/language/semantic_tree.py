@@ -92,15 +92,6 @@ class SemanticTree:
         """Direct children of any of the nodes."""
         return np.flatnonzero(np.isin(self.parent, nodes))
 
-    def descendants_of(self, nodes: Int64[np.ndarray, " t"]) -> Int64[np.ndarray, " c"]:
-        """Children, and children of children."""
-        found = self.children_of(nodes)
-        while True:
-            more = np.union1d(found, self.children_of(found))
-            if len(more) == len(found):
-                return found
-            found = more
-
     def ancestors(self) -> Int32[np.ndarray, "T 3"]:
         """The node that holds each node at each level: itself at its own, -1 below it or where none does."""
         found = np.full((len(self), len(LEVELS)), NONE, np.int32)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Bool, Float32, Float64, Int32, Int64
+from jaxtyping import Bool, Float32, Int32, Int64
 
 from hilsplat.language.compiled import compiled
 
@@ -43,9 +43,9 @@ class ViewNodes:
         """Memory held."""
         return sum(each.nbytes for each in (self.indptr, self.nodes, self.shares, self.covered))
 
-    def area_px(self, num_nodes: int) -> Float64[np.ndarray, " n"]:
-        """Pixels that each node makes up."""
-        return np.bincount(self.nodes, self.shares, num_nodes)
+    def area_px(self, num_nodes: int) -> Int64[np.ndarray, " n"]:
+        """Pixels of which each node makes up more than half."""
+        return np.bincount(self.nodes[self.shares > 0.5], minlength=num_nodes)
 
     def blend(self, values: Float32[np.ndarray, " n"], without: float) -> Float32[np.ndarray, " P"]:
         """Blend one value per node; Gaussians without a node have the value `without`.

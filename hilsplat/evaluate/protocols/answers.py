@@ -17,11 +17,11 @@ class QueryableScene(Protocol):
     def node_relevancy_map(self, texts, view):
         """Relevancy of the node at each pixel, (T, 3, H, W)."""
 
-    def select_nodes(self, text, level=None, threshold=0.85, view=None):
-        """Nodes that answer a text, with the level they are of; of those that a view shows, if given."""
+    def select_nodes(self, text, level=None, threshold=0.95, view=None):
+        """Nodes that answer a text, and their level. With a view only nodes that it shows compete."""
 
-    def select_path(self, texts, level=None, threshold=0.85, view=None):
-        """Nodes that answer the last of a chain of texts, at a level or at the one that is chosen."""
+    def select_path(self, texts, level=None, threshold=0.95, view=None):
+        """Nodes that answer the last of a chain of texts, at a level or at the one chosen; view as above."""
 
     def node_masks(self, view, ids):
         """Union of the rendered nodes in a view, (H, W)."""

@@ -21,14 +21,16 @@ RELEVANCY_SCALE = 10.0
 """Scale of the cosine in the relevancy (LERF, LangSplat)."""
 
 NODE_SELECT = 0.95
-"""Nodes above this share of the range of the cosine margins behind the relevancies answer a text, and those
-that look like the best one three times as far below it.
+"""Nodes answer a text that lie at most 1 less this of the range of the level's cosine margins below the best
+one that the view shows, and three times as far if they look like it.
 
-Version 1 of the protocols that select nodes took 0.85 of the range of the relevancies themselves; up to
-version 3 looks did not count, and nodes of the whole scene competed in every view."""
+`lerf/tree-nodes`, `hierarchy/level-given` and `-auto` took 0.85 of the range of the relevancies themselves in
+version 1. Up to version 3 of these, 2 of `hierarchy/path` and 1 of `world/view-consistency` looks did not
+count, and nodes of the whole scene competed in every view."""
 
 ANCESTORS = 0.2
-"""Share of the mean margin of a node's ancestors that is added to its own; version 2 added nothing."""
+"""Share of the mean margin of a node's ancestors that is added to its own, but on paths; version 2 of
+`lerf/tree-nodes`, `hierarchy/level-given` and `-auto` added nothing."""
 
 Averaging = Literal["pairs", "classes", "levels", "views", "scenes", "pooled"]
 """How rows become a table's number.
@@ -112,8 +114,9 @@ TREE_NODES = ProtocolCard(
     4,
     MASK + LOCALIZATION,
     "pairs",
-    "3D nodes that the view shows, above 0.95 of the range of the level's cosine margins with a fifth of "
-    "their ancestors' mean, or above 0.85 and like the best (cosine 0.9), rendered; level chosen by the tree",
+    "3D nodes that the view shows, at most 0.05 of the range of the level's cosine margins (with a fifth of "
+    "their ancestors' mean) below the best, or 0.15 and like it (cosine 0.9), rendered; level chosen by the "
+    "tree",
     "ours",
 )
 LEVEL_GIVEN = ProtocolCard(

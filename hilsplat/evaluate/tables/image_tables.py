@@ -35,7 +35,8 @@ def lerf_table(sources: Sources) -> Table:
         "All in %. mIoU and mBIoU are means over (view, text) pairs of a scene; Average is the mean of the "
         "scenes. Localization: the point of highest smoothed relevancy lies in a box of the text.",
         "lerf/langsplat: mean filter (30 px at a height of 730, scaled), min-max above 0.7, 7 x 7 majority, "
-        "level of the highest relevancy. lerf/tree-nodes: tree nodes, level chosen by the tree.",
+        "level of the highest relevancy. lerf/tree-nodes: tree nodes that the view shows, level chosen by "
+        "the tree.",
         "lerf-mask/gaussian-grouping: one mask per text and view, mean over the views of a text, then over "
         "texts; a missing prediction counts 0. On the stand-in the texts are those of whole objects, and "
         "the answers those of the row's method with the level chosen.",

@@ -1,5 +1,7 @@
 """Pictures are drawn for scenes with and without annotations, and show what they say."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -84,6 +86,13 @@ def test_query_is_told_and_drawn(block_world, tmp_path):
 
 def test_no_answer_is_said():
     assert told("unicorn", [], "metre").startswith("no node of the scene answers 'unicorn'")
+    assert told("unicorn", [], "metre", "000.png").startswith("no node that 000.png shows answers 'unicorn'")
+
+
+def test_a_path_that_ended_outside_its_first_thing_says_so(block_world):
+    (hit,) = block_world.answers.query("bear > head")
+    assert "everything else was searched" not in told("bear > head", [hit], "metre")
+    assert "everything else was searched" in told("bear > head", [replace(hit, route="fallback")], "metre")
 
 
 def test_file_names_hold_no_separators():

@@ -39,7 +39,7 @@ def mask_of(rows, columns):
 class HandMade:
     """Answers that are written down: node i of `masks` answers the texts that name it.
 
-    `scene_wide` has those that differ where no view is given.
+    `scene_wide` has those that differ where not this view is given.
     """
 
     def __init__(self, masks, answers, relevancy=None, scene_wide=None):
@@ -56,7 +56,8 @@ class HandMade:
         return SimpleNamespace(ids=np.array(answers.get((text, level), []), dtype=np.int64), level=level)
 
     def select_path(self, path, *, level=None, threshold=0.85, view=None):
-        return SimpleNamespace(ids=np.array(self.answers.get(path, []), dtype=np.int64))
+        answers = self.answers if view == "v.png" else self.answers | self.scene_wide
+        return SimpleNamespace(ids=np.array(answers.get(path, []), dtype=np.int64))
 
     def node_masks(self, view, ids):
         return np.any([self.masks[node] for node in ids], axis=0)
@@ -128,8 +129,12 @@ def test_missing_answer_counts_zero_and_breaks_consistency(tmp_path):
 
 def test_scene_wide_answers_know_of_no_view(tmp_path):
     scene, truth = worked_example(tmp_path)
-    scene.scene_wide = {("x", Level.SUBPART): [4]}  # b1 is more like it, in another view
-    values = measured(scene, truth, methods=("tree",))
+    scene.scene_wide = {
+        ("x", Level.SUBPART): [4],
+        ("A", "a1", "x"): [4],
+    }  # b1 is more like it, in another view
+    values = measured(scene, truth, methods=("tree", "tree-path"))
+    assert values["tree-path", "hierarchy/path@3", "x", "subpart", "iou"] == 1
     assert values["tree", "hierarchy/level-given@4", "x", "subpart", "iou"] == 1
     assert values["tree", "hierarchy/scene-wide@1", "x", "subpart", "iou"] == 0
     assert values["tree", "hierarchy/scene-wide@1", "A", "whole", "iou"] == 1

@@ -134,7 +134,7 @@ def test_a_level_without_a_pixel_has_no_answer(vectors, texts):
     assert fast.fast(fast.prepare(np.zeros((0, 3), np.float32)), texts[4:]).shape == (3, 0)
 
 
-@pytest.mark.parametrize("latent", [3, 8])
+@pytest.mark.parametrize("latent", [3, 8, 11])  # loops take eight channels at a time
 def test_linear_codes_need_no_decoding(vectors, texts, latent):
     code = LinearCode.fit(vectors, latent)
     fast = LatentRelevancy(code, texts[:4], 10.0)

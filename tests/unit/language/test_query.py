@@ -1,4 +1,4 @@
-"""Queries on the world with two boxes: flat, along a path, with every fall-back."""
+"""Queries on the world with two boxes: flat, along a path, of a view."""
 
 from dataclasses import replace
 
@@ -16,6 +16,7 @@ from hilsplat.language.finished import FinishedScene, require_same
 from hilsplat.language.node_search import ancestor_margins, automatic_level, best_nodes, search_path
 from hilsplat.language.query import LanguageScene
 from hilsplat.language.semantic_tree import SemanticTree, run_semantic_tree
+from hilsplat.language.view_nodes import ViewNodes
 from hilsplat.language.view_store import ViewStore
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import AutoencoderSettings, EvaluateSettings, LanguageSettings, SemanticTreeSettings
@@ -90,8 +91,11 @@ def test_automatic_level_is_that_of_the_best_node_and_of_equals_the_coarsest(sce
     scores = np.full(7, 0.2, np.float32)
     scores[[NODE["A top left"], NODE["A top"], NODE["A"]]] = 0.9, 0.8, 0.7
     assert automatic_level(scene.tree, scores) == Level.SUBPART
+    shown = np.arange(7) != NODE["A top left"]
+    assert automatic_level(scene.tree, scores, shown) == Level.PART
     scores[NODE["A top"]] = 0.9
     assert automatic_level(scene.tree, scores) == Level.PART
+    assert automatic_level(scene.tree, scores, np.zeros(7, bool)) == Level.WHOLE
 
 
 def test_selection_is_by_margins_which_do_not_saturate():
@@ -181,6 +185,25 @@ def test_what_holds_no_likely_first_thing_does_not_compete(scene, three_wholes, 
     scores = of_path(scene, {"A": 4.0, "B": b}, {"A top left": 0.0, "B corner": 9.0})
     hits = search_path(three_wholes, scores, scene.tree.clip, ("x", "y"), 0.99, Level.SUBPART)
     assert hits.ids.tolist() == [NODE[found]]
+
+
+def test_where_nothing_likely_holds_an_answer_everything_is_searched_and_told(scene, three_wholes):
+    # B top, the best whole, holds nothing, and all else is further below it than a quarter of the range
+    scores = of_path(scene, {"A": 1.0, "B": 0.0, "B top": 4.0}, {"A top left": 1.0, "B corner": 1.2})
+    hits = search_path(three_wholes, scores, scene.tree.clip, ("x", "y"), 0.99, Level.SUBPART)
+    assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "fallback")
+
+
+def test_what_a_view_does_not_show_is_no_rival_of_what_it_shows(scene, three_wholes):
+    parent = three_wholes.parent.copy()
+    parent[NODE["B corner"]] = -1
+    tree = replace(three_wholes, parent=parent)
+    # B top would leave A unlikely, and B corner, which nothing holds, the answer
+    scores = of_path(scene, {"A": 1.0, "B top": 4.0}, {}, {"A top left": 2.0, "B corner": 0.0})
+    for hidden, found in (("B", "B corner"), ("B top", "A top left")):
+        shown = np.arange(7) != NODE[hidden]
+        hits = search_path(tree, scores, tree.clip, ("x", "y", "z"), 0.99, shown=shown)
+        assert hits.ids.tolist() == [NODE[found]]
 
 
 def test_a_missing_ancestor_counts_a_tenth_of_the_range(scene, three_wholes):
@@ -310,8 +333,29 @@ def test_a_view_answers_with_what_it_shows(scene, text):
     scene._views.get(("shown", "half"), lambda: hidden, lambda kept: 0)
     named = replace(scene, scene=replace(scene.scene, cameras=replace(scene.scene.cameras, names=("half",))))
     assert [hit.node for hit in named.query(text, "subpart", view="half")] == [NODE["B corner"]]
+    named._views.get(("shown", "none"), lambda: np.zeros(7, bool), lambda kept: 0)
+    dark = replace(named, scene=replace(scene.scene, cameras=replace(scene.scene.cameras, names=("none",))))
+    assert dark.query(text, view="none") == []
     with pytest.raises(SettingsError, match="has no view 'x'"):
         scene.query(text, view="x")
+
+
+def test_a_view_shows_what_has_a_mask_there(scene, monkeypatch):
+    of_level = ViewNodes(
+        indptr=np.array([0, 2, 3, 3, 3]),
+        nodes=np.array([2, 3, 2], np.int32),
+        shares=np.array([0.4, 0.6, 0.9], np.float32),
+        covered=np.array([True, True, True, False]),
+    )
+    assert of_level.area_px(7).tolist() == [0, 0, 1, 1, 0, 0, 0]
+    empty = ViewNodes(
+        np.zeros(5, np.int64), np.zeros(0, np.int32), np.zeros(0, np.float32), np.zeros(4, bool)
+    )
+    assert empty.area_px(7).tolist() == [0] * 7
+    monkeypatch.setattr("hilsplat.language.query.MIN_SHOWN_SHARE", 8 / (HEIGHT * WIDTH))
+    shown = replace(scene, _views=ViewStore()).nodes_shown("000.png")
+    # B corner has 2 x 3 px, A top left 4 x 2
+    assert np.flatnonzero(~shown).tolist() == [NODE["B corner"]]
 
 
 def test_path_falls_back_to_any_descendant_of_the_object(scene):

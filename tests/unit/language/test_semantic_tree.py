@@ -1,5 +1,7 @@
 """Nodes of linked masks, and the tree of a world whose nodes are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -99,10 +101,16 @@ def test_two_boxes_give_exactly_their_regions(tree_of_boxes):
     assert (tree.quality > 0.7).all()
 
 
-def test_descendants_reach_past_missing_parts(tree_of_boxes):
+def test_children_and_ancestors_reach_past_missing_parts(tree_of_boxes):
     tree = SemanticTree.load(tree_of_boxes[1])
     assert tree.children_of(np.array([1])).tolist() == [3, 6]
-    assert tree.descendants_of(np.array([0])).tolist() == [2, 4, 5]
+    ancestors = tree.ancestors()
+    assert ancestors[0].tolist() == [0, -1, -1]
+    assert ancestors[3].tolist() == [1, 3, -1]
+    assert ancestors[5].tolist() == [0, 2, 5]
+    assert ancestors[6].tolist() == [1, -1, 6]  # straight under the whole
+    orphan = replace(tree, parent=np.where(np.arange(7) == 2, -1, tree.parent).astype(np.int32))
+    assert orphan.ancestors()[5].tolist() == [-1, 2, 5]
 
 
 def test_readable_tree_and_counts(tree_of_boxes):
