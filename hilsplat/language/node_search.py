@@ -223,10 +223,8 @@ def _search_way(
     for text, (of_text, level) in enumerate(zip(margin[:-1], levels[:-1], strict=True)):
         holder, of_level = ancestors[:, level.index], tree.nodes_of(level)
         rivals = of_level
-        if shown is not None:
-            holding = np.zeros(len(tree), np.bool_)
-            holding[holder[may][holder[may] != NONE]] = True
-            rivals = of_level[(shown | holding)[of_level]]
+        if shown is not None:  # what holds something that is shown may itself be hidden behind it
+            rivals = of_level[shown[of_level] | np.isin(of_level, holder[may])]
         best = of_text[rivals].max() if len(rivals) else 0.0
         spread = np.ptp(of_text[of_level]) if len(of_level) else 0.0
         below = np.where(holder != NONE, best - of_text[holder], WITHOUT_ANCESTOR * spread)
@@ -237,12 +235,17 @@ def _search_way(
     inside = bool(likely[may].any())
     reach = (1 - threshold) * np.ptp(last[nodes])
     chosen = _near_best(value, may[likely[may]] if inside else may, vectors, reach)
-    holders = ancestors[chosen[0], [level.index for level in levels[:-1]]]
+    best_one = chosen[0]
+    holders = ancestors[best_one, [level.index for level in levels[:-1]]]
     complete = inside and bool((holders != NONE).all())
+    route = _route(holders, int(tree.parent[best_one]), inside)
+    return _Way(chosen, levels[-1], route, float(total[best_one]), complete)
+
+
+def _route(holders: Int32[np.ndarray, " a"], parent: int, inside: bool) -> str:
+    """See `NodeHits`; `inside`: the best answer lies in what answers the first text."""
     if not len(holders):
-        route = "flat"
-    elif complete and tree.parent[chosen[0]] == holders[-1]:
-        route = "child"
-    else:
-        route = "descendant" if inside and (holders != NONE).any() else "fallback"
-    return _Way(chosen, levels[-1], route, float(total[chosen[0]]), complete)
+        return "flat"
+    if not inside or (holders == NONE).all():
+        return "fallback"
+    return "child" if (holders != NONE).all() and holders[-1] == parent else "descendant"
