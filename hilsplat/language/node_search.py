@@ -10,6 +10,8 @@ from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.language.semantic_tree import SemanticTree
 
+# These numbers were chosen on development scenes, with others beside them: docs/tree.md, "Asking".
+
 ALIKE = 0.9
 """Cosine of two nodes' vectors from which on they look like things of one kind."""
 

@@ -72,7 +72,7 @@ class LanguageScene:
         pixel_weights: compositing weights of a view (pixels x Gaussians).
         canonical: phrases that a text must beat.
         relevancy_scale: scale of the cosines.
-        node_select: share of the range of scores from which nodes are selected.
+        node_select: threshold of `query` where none is given.
         ancestors: share of the mean margin of a node's ancestors that is added to its own.
         threads: for look-ups.
         device: "cpu" or "cuda", for look-ups of the field.
@@ -272,7 +272,7 @@ class LanguageScene:
         Args:
             text: the query.
             level: which nodes compete; None chooses it (see `automatic_level`).
-            threshold: share of the range between the worst and the best node.
+            threshold: as in `query`.
             answerer: as in `query`.
             view: as in `query`.
         """
