@@ -25,20 +25,20 @@ from hilsplat.base.artifacts import atomic_folder, write_index, write_npy
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import track
 from hilsplat.base.tables import markdown_table
-from hilsplat.language.autoencoder import run_autoencoder
-from hilsplat.language.contributions import run_contributions
-from hilsplat.language.field import run_language
-from hilsplat.language.semantic_tree import run_semantic_tree
+from hilsplat.contributions.stage import run_contributions
+from hilsplat.field.autoencoder import run_autoencoder
+from hilsplat.field.field import run_field
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
+from hilsplat.segment.coverage_stage import run_coverage_tree
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.segment.tree_stage import run_tree
+from hilsplat.semantic_tree.tree import run_semantic_tree
 from hilsplat.settings import (
     AutoencoderSettings,
     ContributionsSettings,
-    LanguageSettings,
+    CoverageTreeSettings,
+    FieldSettings,
     SemanticTreeSettings,
-    TreeSettings,
 )
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.order import morton_order
@@ -50,7 +50,7 @@ ROWS = 20
 RADIUS = 0.38
 CHANNELS = 512
 MIN_AREA_PX = 50
-STAGES = ("tree", "contributions", "semantic_tree", "autoencoder", "language")
+STAGES = ("coverage_tree", "contributions", "semantic_tree", "autoencoder", "field")
 
 
 def made_gaussians(number: int) -> tuple[Gaussians, np.ndarray]:
@@ -161,7 +161,9 @@ def stages(out: Path, threads: int) -> dict[str, Callable[[], None]]:
     """What is timed."""
     code = AutoencoderSettings(code="pca", latent=16)
     return {
-        "tree": lambda: run_tree(out / "masks", out / "tree", TreeSettings()),
+        "coverage_tree": lambda: run_coverage_tree(
+            out / "masks", out / "coverage_tree", CoverageTreeSettings()
+        ),
         "contributions": lambda: run_contributions(
             out / "scene",
             out / "gaussians.ply",
@@ -182,12 +184,12 @@ def stages(out: Path, threads: int) -> dict[str, Callable[[], None]]:
         "autoencoder": lambda: run_autoencoder(
             out / "clip", out / "semantic_tree", out / "contributions", out / "autoencoder", code, 0
         ),
-        "language": lambda: run_language(
+        "field": lambda: run_field(
             out / "contributions",
-            out / "tree",
+            out / "coverage_tree",
             out / "autoencoder",
-            out / "language.safetensors",
-            LanguageSettings(),
+            out / "field.safetensors",
+            FieldSettings(),
             threads,
         ),
     }

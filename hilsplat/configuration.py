@@ -12,10 +12,11 @@ from hilsplat.settings import (
     AutoencoderSettings,
     ClipSettings,
     ContributionsSettings,
+    CoverageTreeSettings,
     EvaluateSettings,
+    FieldSettings,
     FiguresSettings,
     GaussiansSettings,
-    LanguageSettings,
     MasksSettings,
     MethodSettings,
     PerturbSettings,
@@ -24,7 +25,6 @@ from hilsplat.settings import (
     Section,
     SemanticTreeSettings,
     TrainingSettings,
-    TreeSettings,
     WorldSettings,
     knob,
 )
@@ -38,12 +38,12 @@ class StageSettings(Section):
     gaussians: GaussiansSettings = GaussiansSettings()
     masks: MasksSettings = MasksSettings()
     perturb: PerturbSettings = PerturbSettings()
-    tree: TreeSettings = TreeSettings()
+    coverage_tree: CoverageTreeSettings = CoverageTreeSettings()
     clip: ClipSettings = ClipSettings()
     contributions: ContributionsSettings = ContributionsSettings()
     semantic_tree: SemanticTreeSettings = SemanticTreeSettings()
     autoencoder: AutoencoderSettings = AutoencoderSettings()
-    language: LanguageSettings = LanguageSettings()
+    field: FieldSettings = FieldSettings()
     method: MethodSettings = MethodSettings()
     reference: ReferenceSettings = ReferenceSettings()
     evaluate: EvaluateSettings = EvaluateSettings()
@@ -96,12 +96,12 @@ def _known_keys(model: Any, path: list[str]) -> list[str]:
 VARIANT_SECTIONS = (
     "masks",
     "perturb",
-    "tree",
+    "coverage_tree",
     "clip",
     "contributions",
     "semantic_tree",
     "autoencoder",
-    "language",
+    "field",
     "method",
     "evaluate",
 )
@@ -109,12 +109,12 @@ VARIANT_SECTIONS = (
 
 UPSTREAM: dict[str, tuple[str, ...]] = {
     "masks": ("masks", "perturb"),
-    "tree": ("masks", "perturb", "tree"),
+    "coverage_tree": ("masks", "perturb", "coverage_tree"),
     "clip": ("masks", "perturb", "clip"),
     "contributions": ("masks", "perturb", "contributions"),
     "semantic_tree": ("masks", "perturb", "clip", "contributions", "semantic_tree"),
     "autoencoder": ("masks", "perturb", "clip", "contributions", "semantic_tree", "autoencoder"),
-    "language": VARIANT_SECTIONS[:-1],
+    "field": VARIANT_SECTIONS[:-1],
     "evaluate": VARIANT_SECTIONS,
 }
 """Sections that each variant stage depends on, through its inputs too."""

@@ -87,7 +87,7 @@ class GaussiansSettings(Section):
     sh_degree: int = knob(2, "degree of the colour's spherical harmonics", ge=0, le=3, origin="3DGS: 3")
     ssim_weight: float = knob(0.2, "weight of D-SSIM against L1", ge=0, le=1, origin="3DGS")
     # A tenth of the published steps must go as far: with the published step sizes, development
-    # scenes lose up to 1 dB (docs/fit.md). config/paper.yaml, with all steps, takes the published ones.
+    # scenes lose up to 1 dB (docs/splat.md). config/paper.yaml, with all steps, takes the published ones.
     means_rate: float = knob(
         1e-3, "first step size of the means", unit="extent of the cameras", gt=0, origin="3DGS: 1.6e-4"
     )
@@ -154,13 +154,16 @@ class MasksSettings(Section):
     stability_min: float = knob(
         0.5, "masks below are dropped", ge=0, le=1, origin="SAM: 0.95, LangSplat: 0.85"
     )
-    level_source: Literal["sam", "tree"] = knob(
+    level_source: Literal["sam", "coverage"] = knob(
         "sam",
-        "level of a mask: sam, the head (or scale) that gave it; tree, its depth among all masks of the view",
+        "level of a mask: sam: the head (or scale) that gave it; coverage: its depth in the coverage tree",
         origin="paper, LangSplat: sam",
     )
     level_theta: float = knob(
-        0.9, "share of a mask inside another one that makes it deeper; tree levels only", gt=0.5, lt=1
+        0.9,
+        "share of a mask inside another one that makes it deeper; level_source: coverage only",
+        gt=0.5,
+        lt=1,
     )
     stability_offset: float = knob(1.0, "logit offset of the stability test", gt=0, origin="SAM")
     box_nms_iou: float = knob(0.7, "box IoU above which the worse mask is dropped", gt=0, le=1, origin="SAM")
@@ -221,7 +224,7 @@ class PerturbSettings(Section):
     )
 
 
-class TreeSettings(Section):
+class CoverageTreeSettings(Section):
     """Coverage tree of each view."""
 
     theta: float = knob(0.9, "coverage threshold", unit="share", gt=0.5, lt=1, origin="paper: 0.9")
@@ -311,7 +314,7 @@ class AutoencoderSettings(Section):
         return self.code == "network"
 
 
-class LanguageSettings(Section):
+class FieldSettings(Section):
     """Language field: per Gaussian one latent for each level."""
 
     weight_language: float = knob(
@@ -320,8 +323,8 @@ class LanguageSettings(Section):
     weight_clustering: float = knob(0.0, "weight of L_h (Eq. 2)", ge=0, origin="paper: 1")
     weight_instance: float = knob(0.0, "weight of L_ins (Eq. 3), lambda_1", ge=0, origin="paper: e-6")
     weight_part: float = knob(0.01, "weight of L_part (Eq. 5), lambda_2", ge=0, origin="paper: e-5")
-    instance_mode: Literal["literal", "tree", "logratio"] = knob(
-        "tree", "reading of L_ins", origin="paper: literal"
+    instance_mode: Literal["literal", "coverage_tree", "logratio"] = knob(
+        "coverage_tree", "reading of L_ins", origin="paper: literal"
     )
     part_mode: Literal["literal", "disentangle"] = knob(
         "disentangle", "reading of L_part", origin="paper: literal"

@@ -5,7 +5,7 @@ rule evaluate:
         truth=truth_or_labels_of,
         gaussians="results/{dataset}/{scene}/gaussians.ply",
         semantic_tree=shared("semantic_tree", "semantic_tree"),
-        language=shared("language", "language.safetensors"),
+        field=shared("field", "field.safetensors"),
         autoencoder=shared("autoencoder", "autoencoder"),
         clip=shared("clip", "clip"),
         masks=shared("masks", "masks"),
@@ -27,7 +27,7 @@ rule evaluate:
         truth=truth_option_of,
     shell:
         "hilsplat evaluate --scene {input.scene} {params.truth} --gaussians {input.gaussians}"
-        " --semantic-tree {input.semantic_tree} --language {input.language}"
+        " --semantic-tree {input.semantic_tree} --field {input.field}"
         " --autoencoder {input.autoencoder} --clip {input.clip} --masks {input.masks}"
         " --dataset {wildcards.dataset} --name {wildcards.scene} --variant {wildcards.variant}"
         " --settings {params.settings:q} --threads {threads} --out {output.scores} --log {log}"

@@ -7,11 +7,11 @@ rule method:
         contributions=shared("contributions", "contributions"),
         autoencoder=shared("autoencoder", "autoencoder"),
     output:
-        language="results/{dataset}/{scene}/{variant}/language.safetensors",
+        field="results/{dataset}/{scene}/{variant}/field.safetensors",
     log:
-        "results/{dataset}/{scene}/{variant}/logs/language.log",
+        "results/{dataset}/{scene}/{variant}/logs/field.log",
     benchmark:
-        "results/{dataset}/{scene}/{variant}/benchmarks/language.jsonl"
+        "results/{dataset}/{scene}/{variant}/benchmarks/field.jsonl"
     wildcard_constraints:
         variant=any_of(variants_by_method(baselines=True)),
     conda:
@@ -28,4 +28,4 @@ rule method:
         "hilsplat method --scene {input.scene} --gaussians {input.gaussians} --masks {input.masks}"
         " --contributions {input.contributions} --autoencoder {input.autoencoder}"
         " --settings {params.settings:q} --seed {params.seed} --threads {threads}"
-        " --out {output.language} --log {log}"
+        " --out {output.field} --log {log}"

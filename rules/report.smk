@@ -8,7 +8,7 @@ rule figures:
         masks="results/{dataset}/{scene}/default/masks",
         clip="results/{dataset}/{scene}/default/clip",
         semantic_tree="results/{dataset}/{scene}/default/semantic_tree",
-        language="results/{dataset}/{scene}/default/language.safetensors",
+        field="results/{dataset}/{scene}/default/field.safetensors",
         autoencoder="results/{dataset}/{scene}/default/autoencoder",
     output:
         panel=report(
@@ -50,7 +50,7 @@ rule figures:
     shell:
         "hilsplat figures --scene {input.scene} {params.truth} --gaussians {input.gaussians}"
         " --fit {input.fit} --masks {input.masks} --clip {input.clip}"
-        " --semantic-tree {input.semantic_tree} --language {input.language}"
+        " --semantic-tree {input.semantic_tree} --field {input.field}"
         " --autoencoder {input.autoencoder} --queries {params.queries:q}"
         " --settings {params.settings:q} --evaluate {params.evaluate:q}"
         " --threads {threads} --out {output.panel} --log {log}"

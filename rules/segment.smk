@@ -25,22 +25,23 @@ rule masks:
         " --threads {threads} --cache {params.cache} --out {output.masks} --log {log}"
 
 
-rule tree:
+rule coverage_tree:
     input:
         masks=shared("masks", "masks"),
     output:
-        tree=directory("results/{dataset}/{scene}/{variant}/tree"),
+        coverage_tree=directory("results/{dataset}/{scene}/{variant}/coverage_tree"),
     log:
-        "results/{dataset}/{scene}/{variant}/logs/tree.log",
+        "results/{dataset}/{scene}/{variant}/logs/coverage_tree.log",
     benchmark:
-        "results/{dataset}/{scene}/{variant}/benchmarks/tree.jsonl"
+        "results/{dataset}/{scene}/{variant}/benchmarks/coverage_tree.jsonl"
     conda:
         ENVIRONMENT
     threads: 1
     resources:
         mem_mb=2000,
     params:
-        settings=settings_of("tree"),
-        code=code("tree"),
+        settings=settings_of("coverage_tree"),
+        code=code("coverage_tree"),
     shell:
-        "hilsplat tree --masks {input.masks} --settings {params.settings:q} --out {output.tree} --log {log}"
+        "hilsplat coverage-tree --masks {input.masks} --settings {params.settings:q}"
+        " --out {output.coverage_tree} --log {log}"

@@ -21,7 +21,7 @@ def code_hash(*modules: str, root: Path = ROOT) -> str:
     Digests of different Python minor versions differ.
 
     Args:
-        modules: dotted names inside the package, such as "hilsplat.language.field".
+        modules: dotted names inside the package, such as "hilsplat.field.field".
         root: folder of the package.
 
     Returns:

@@ -23,7 +23,7 @@ def evaluate(
     scene: PathIn,
     gaussians: PathIn,
     semantic_tree: PathIn,
-    language: PathIn,
+    field: PathIn,
     autoencoder: PathIn,
     clip: PathIn,
     masks: PathIn,
@@ -50,7 +50,7 @@ def evaluate(
         **({"truth": truth} if truth else {}),
         "gaussians": gaussians,
         "semantic_tree": semantic_tree,
-        "language": language,
+        "field": field,
         "autoencoder": autoencoder,
         "clip": clip,
         "masks": masks,
@@ -66,7 +66,7 @@ def evaluate(
             truth=truth,
             gaussians=gaussians,
             semantic_tree=semantic_tree,
-            language=language,
+            field=field,
             autoencoder=autoencoder,
             clip_folder=clip,
             masks_folder=masks,
@@ -110,7 +110,7 @@ def figures(
     masks: PathIn,
     clip: PathIn,
     semantic_tree: PathIn,
-    language: PathIn,
+    field: PathIn,
     autoencoder: PathIn,
     out: Annotated[Path, typer.Option(help="panel PNG; registration.png and fit.png go beside it")],
     truth: Annotated[Path | None, typer.Option(help="truth folder, where the scene has one")] = None,
@@ -129,11 +129,11 @@ def figures(
     from hilsplat.base.artifacts import atomic_path
 
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
-    inputs = {"scene": scene, "gaussians": gaussians, "masks": masks, "language": language}
+    inputs = {"scene": scene, "gaussians": gaussians, "masks": masks, "field": field}
     recorded = {"figures": section, "evaluate": protocol}
     with stage("figures", out, log, settings=recorded, threads=threads, inputs=inputs):
         from hilsplat.datasets.registry import open_labelled
-        from hilsplat.evaluate.figures import run_figures
+        from hilsplat.evaluate.figures.panel import run_figures
 
         for source, name in (
             (scene / "registration.png", "registration.png"),
@@ -147,7 +147,7 @@ def figures(
             masks_folder=masks,
             gaussians=gaussians,
             semantic_tree=semantic_tree,
-            language=language,
+            field=field,
             autoencoder=autoencoder,
             clip_folder=clip,
             out=out,
@@ -180,7 +180,7 @@ def comparison(
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
     with stage("comparison", out, log, settings=section, threads=threads):
         from hilsplat.datasets.registry import open_labelled
-        from hilsplat.evaluate.comparison import run_comparison
+        from hilsplat.evaluate.figures.comparison import run_comparison
 
         run_comparison(
             folder,
@@ -205,7 +205,7 @@ def sweep(
 ) -> None:
     """Plot a sweep from its table: the paper's curves, and ours."""
     with stage("sweep", out, log, inputs={"table": table}):
-        from hilsplat.evaluate.sweep_plot import run_sweep_plot
+        from hilsplat.evaluate.figures.sweep_plot import run_sweep_plot
 
         run_sweep_plot(name, table, out)
 
@@ -217,6 +217,6 @@ def efficiency(
 ) -> None:
     """Print where the time went, from the benchmark files of a run."""
     start_logging(None)
-    from hilsplat.evaluate.efficiency import run_efficiency
+    from hilsplat.evaluate.tables.efficiency import run_efficiency
 
     typer.echo(run_efficiency(results, out))

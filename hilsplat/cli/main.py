@@ -21,7 +21,8 @@ from hilsplat.cli.apps import app  # noqa: E402
 
 # In the order in which `hilsplat --help` lists their commands.
 # isort: off
-from hilsplat.cli import scene_commands, segment_commands, language_commands  # noqa: E402, F401
+from hilsplat.cli import scene_commands, segment_commands, embed_commands  # noqa: E402, F401
+from hilsplat.cli import field_commands  # noqa: E402, F401
 from hilsplat.cli import evaluate_commands, user_commands, cache_commands  # noqa: E402, F401
 from hilsplat.cli import world_commands, model_commands, dataset_commands  # noqa: E402, F401
 # isort: on

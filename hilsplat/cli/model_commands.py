@@ -21,7 +21,7 @@ from hilsplat.cli.stage import (
 def models_check(folder: Annotated[Path, typer.Argument(help="model folder")]) -> None:
     """Say what a model folder holds, and time one image."""
     start_logging(None)
-    from hilsplat.language.model_check import check_model
+    from hilsplat.embed.model_check import check_model
 
     typer.echo(check_model(folder))
 

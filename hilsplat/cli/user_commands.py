@@ -42,7 +42,7 @@ def query(
 ) -> None:
     """Ask a finished scene for a text: score, level, position, box, views; a panel PNG and a PLY."""
     start_logging(None)
-    from hilsplat.evaluate.query_panel import answer
+    from hilsplat.query.answer import answer
 
     typer.echo(
         answer(
@@ -72,7 +72,7 @@ def export(
 ) -> None:
     """Write the semantic tree of a finished scene: JSON, a PLY with nodes per Gaussian, a picture."""
     start_logging(None)
-    from hilsplat.evaluate.tree_picture import export_tree
+    from hilsplat.query.tree_picture import export_tree
 
     folder = results / scene
     typer.echo(export_tree(folder, variant, out or folder / "export" / variant, threads))

@@ -87,7 +87,7 @@ def world_inconsistency(
     truth, masks_folder = results / scene / "world" / "truth", results / scene / variant / "masks"
     target = out or masks_folder.with_name("consistency.csv")
     with stage("consistency", target, None, inputs={"truth": truth, "masks": masks_folder}):
-        from hilsplat.evaluate.world_consistency import run_consistency
+        from hilsplat.evaluate.diagnostics.world_consistency import run_consistency
 
         table = run_consistency(truth, masks_folder, target, neighbours)
     typer.echo(table)
@@ -108,13 +108,13 @@ def world_masks(
     truth, masks_folder = folder / "world" / "truth", folder / variant / "masks"
     target = out or masks_folder.with_name("masks_truth.png")
     with stage("mask_truth", target, log, inputs={"truth": truth, "masks": masks_folder}):
-        from hilsplat.evaluate.mask_truth import run_mask_truth
+        from hilsplat.evaluate.diagnostics.mask_truth import run_mask_truth
 
         table = run_mask_truth(folder / "scene", truth, masks_folder, target)
     typer.echo(table)
 
 
-@world_app.command("tree")
+@world_app.command("semantic-tree")
 def world_tree(
     scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has a tree")],
     variant: Annotated[str, typer.Option(help="variant whose tree is measured")] = "default",
@@ -127,7 +127,7 @@ def world_tree(
     semantic_tree, truth = folder / variant / "semantic_tree", folder / "world" / "truth"
     target = out or semantic_tree.with_name("tree_truth.csv")
     with stage("tree_truth", target, None, inputs={"truth": truth, "semantic_tree": semantic_tree}):
-        from hilsplat.evaluate.tree_truth import run_tree_truth
+        from hilsplat.evaluate.diagnostics.tree_truth import run_tree_truth
 
         table = run_tree_truth(
             folder / "scene", folder / "gaussians.ply", semantic_tree, truth, target, threads

@@ -7,16 +7,16 @@ from pathlib import Path
 
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.dataset import Dataset
-from hilsplat.datasets.hi import HI_3DOVS, HI_LERF
+from hilsplat.datasets.images.hi import HI_3DOVS, HI_LERF
+from hilsplat.datasets.images.lerf_mask import DATASET as LERF_MASK
+from hilsplat.datasets.images.lerf_ovs import DATASET as LERF_OVS
+from hilsplat.datasets.images.ovs3d import DATASET as OVS_3D
 from hilsplat.datasets.labelled import LabelledScene
-from hilsplat.datasets.labelled_points import PointScene
-from hilsplat.datasets.lerf_mask import DATASET as LERF_MASK
-from hilsplat.datasets.lerf_ovs import DATASET as LERF_OVS
-from hilsplat.datasets.ovs3d import DATASET as OVS_3D
-from hilsplat.datasets.replica import DATASET as REPLICA
-from hilsplat.datasets.scannet import DATASET as SCANNET
-from hilsplat.datasets.scannet import SCANNET200_DATASET as SCANNET200
-from hilsplat.datasets.waymo import DATASET as WAYMO
+from hilsplat.datasets.points.labelled_points import PointScene
+from hilsplat.datasets.points.replica import DATASET as REPLICA
+from hilsplat.datasets.points.scannet import DATASET as SCANNET
+from hilsplat.datasets.points.scannet import SCANNET200_DATASET as SCANNET200
+from hilsplat.datasets.waymo.reader import DATASET as WAYMO
 
 DATASETS: dict[str, Dataset] = {
     dataset.name: dataset

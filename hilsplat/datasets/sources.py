@@ -121,8 +121,8 @@ def export_images(name: str, data_root: Path, out: Path) -> int:
     Raises:
         SceneError: the scene's labels are on images, which need no export, or it cannot be read.
     """
-    from hilsplat.datasets.labelled_points import PointScene
-    from hilsplat.datasets.posed_images import write_posed_images
+    from hilsplat.datasets.points.labelled_points import PointScene
+    from hilsplat.datasets.points.posed_images import write_posed_images
     from hilsplat.datasets.registry import open_labels
 
     scene = open_labels(name, data_root)

@@ -7,7 +7,7 @@ from pathlib import Path
 from hilsplat.base.errors import SceneError
 from hilsplat.base.levels import Level
 from hilsplat.datasets.labelled import LabelledScene
-from hilsplat.datasets.labelled_points import PointScene
+from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.datasets.registry import dataset_of, open_labels
 from hilsplat.evaluate.protocols.cards import ProtocolCard, card_named
 

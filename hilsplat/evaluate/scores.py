@@ -47,11 +47,6 @@ class Score:
     n: int
 
 
-def made_from_truth(masks: str) -> bool:
-    """Whether a row's masks were made from true labels: a diagnostic that is no result."""
-    return masks.startswith("truth-perturbed")
-
-
 COLUMNS: tuple[str, ...] = tuple(field.name for field in fields(Score))
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 from hilsplat.base.artifacts import read_index
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.labelled import LabelledScene
-from hilsplat.datasets.labelled_points import PointScene
-from hilsplat.datasets.world_labels import labelled_points
-from hilsplat.evaluate.alignment import camera_error, scene_from_true
+from hilsplat.datasets.points.labelled_points import PointScene
+from hilsplat.datasets.synthetic.world_labels import labelled_points
 from hilsplat.evaluate.asked import Asked
-from hilsplat.evaluate.costs import time_queries, write_times
+from hilsplat.evaluate.diagnostics.alignment import camera_error, scene_from_true
+from hilsplat.evaluate.diagnostics.world_answers import measure_world_consistency
 from hilsplat.evaluate.instance_files import write_instances
 from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
@@ -23,9 +23,9 @@ from hilsplat.evaluate.protocols.scene_points import measure_scene_points
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import measure_view, relevancy_departures, rule_of
 from hilsplat.evaluate.scores import Score, write_scores
+from hilsplat.evaluate.tables.costs import time_queries, write_times
 from hilsplat.evaluate.truths import annotated_truths, labelled_truths
-from hilsplat.evaluate.world_answers import measure_world_consistency
-from hilsplat.language.query import LanguageScene
+from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import masks_label
@@ -45,7 +45,7 @@ def run_evaluate(
     truth: Path | None,
     gaussians: Path,
     semantic_tree: Path,
-    language: Path,
+    field: Path,
     autoencoder: Path,
     clip_folder: Path,
     masks_folder: Path,
@@ -69,7 +69,7 @@ def run_evaluate(
         truth: truth folder of a synthetic scene; None and no labels give a file with a header only.
         gaussians: 3DGS PLY.
         semantic_tree: semantic tree artifact.
-        language: language field.
+        field: language field.
         autoencoder: autoencoder artifact.
         clip_folder: mask embeddings; their index names the CLIP model, which embeds the texts.
         masks_folder: masks artifact; its index says what made the masks.
@@ -105,7 +105,7 @@ def run_evaluate(
                 scene_folder,
                 gaussians,
                 semantic_tree,
-                language,
+                field,
                 autoencoder,
                 Path(read_index(clip_folder)["model"]),
                 canonical=settings.canonical,

@@ -4,8 +4,8 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 
-from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.datasets.labelled import LabelledScene, check_label_size
+from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import EvaluateSettings

@@ -13,8 +13,8 @@ Departs from the published code:
     - codes of Gaussians are blended as they are; LangSplat scales each to unit length first;
     - weights below `contributions.min_weight` are dropped.
 
-`hilsplat.language.reference` (loss `l1`) renders every step and takes all pixels and LangSplat's average over
-them. It is another trainer, not this one at full length: it draws views with replacement and trains the
+`hilsplat.field.reference_trainer` (loss `l1`) renders every step and takes all pixels and LangSplat's average
+over them. It is another trainer, not this one at full length: it draws views with replacement and trains the
 levels in one run; alpha and unit length are treated as here.
 """
 

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float32
 
-from hilsplat.language.mask_operator import MaskOperator, lifted_average
+from hilsplat.contributions.mask_operator import MaskOperator, lifted_average
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.settings import MethodSettings
 

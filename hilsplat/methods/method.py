@@ -13,11 +13,11 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float32, Int32
 
-from hilsplat.language.autoencoder import load_latents
-from hilsplat.language.compositing import normalised_weights
-from hilsplat.language.contributions import label_maps
-from hilsplat.language.finished import require_same
-from hilsplat.language.mask_rows import Contributions
+from hilsplat.contributions.compositing import normalised_weights
+from hilsplat.contributions.rows import Contributions
+from hilsplat.contributions.stage import label_maps
+from hilsplat.field.autoencoder import load_latents
+from hilsplat.scene.finished import require_same
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import MethodSettings

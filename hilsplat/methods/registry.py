@@ -19,7 +19,7 @@ METHODS: dict[str, str] = {
 """Name -> module, whose `METHOD` it is."""
 
 OURS: str = MethodSettings().name
-"""The method of this repository, whose field the stage `language` solves."""
+"""The method of this repository, whose field the stage `field` solves."""
 
 
 def require_method(name: str) -> None:

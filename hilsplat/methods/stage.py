@@ -1,4 +1,4 @@
-"""The stage of a baseline: artifacts of a scene in, `language.safetensors` out."""
+"""The stage of a baseline: artifacts of a scene in, `field.safetensors` out."""
 
 from pathlib import Path
 
@@ -8,8 +8,8 @@ from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import stage_log
-from hilsplat.language.autoencoder import autoencoder_file
-from hilsplat.language.field import LanguageField
+from hilsplat.field.autoencoder import autoencoder_file
+from hilsplat.field.field import LanguageField
 from hilsplat.methods.method import MethodInputs
 from hilsplat.methods.registry import method_of
 from hilsplat.settings import MethodSettings
@@ -20,7 +20,7 @@ def run_method(inputs: MethodInputs, out: Path, settings: MethodSettings, seed: 
 
     Args:
         inputs: artifacts of the scene.
-        out: `language.safetensors`.
+        out: `field.safetensors`.
         settings: which method, and its knobs.
         seed: of everything random.
 

@@ -6,7 +6,7 @@ from jaxtyping import Bool, Int32, Int64, UInt8
 from hilsplat.base.errors import EmptyMaskError
 from hilsplat.base.levels import NONE
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.settings import TreeSettings
+from hilsplat.settings import CoverageTreeSettings
 
 
 def coverage_parents(
@@ -76,7 +76,7 @@ def depths(parent: Int32[np.ndarray, " M"]) -> UInt8[np.ndarray, " M"]:
 
 
 def coverage_tree(
-    masks: HierarchicalMasks, settings: TreeSettings
+    masks: HierarchicalMasks, settings: CoverageTreeSettings
 ) -> tuple[Int32[np.ndarray, " M"], UInt8[np.ndarray, " M"]]:
     """Parent (row or `NONE`) and depth (roots 1) of every mask of a view, always a forest."""
     level = masks.level if settings.parents == "coarser" else None

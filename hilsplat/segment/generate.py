@@ -12,11 +12,11 @@ from jaxtyping import Bool, Int32, Int64
 from hilsplat.base.levels import Level
 from hilsplat.segment import sam
 from hilsplat.segment.candidates import Candidates, crop_boxes
+from hilsplat.segment.coverage_levels import with_coverage_levels
 from hilsplat.segment.kernels import mended_runs, upscaled_runs
 from hilsplat.segment.masks import HierarchicalMasks, take_runs
 from hilsplat.segment.sam import HEADS, Frame, SamModel
 from hilsplat.segment.suppression import suppress_boxes, suppress_masks
-from hilsplat.segment.tree_levels import with_tree_levels
 from hilsplat.settings import MasksSettings
 
 CROP_EDGE_PX = 20
@@ -58,8 +58,8 @@ def masks_from_candidates(
             masks = masks.take(keep)
         streams.append(masks)
     pooled = HierarchicalMasks.concatenate(streams, size_hw)
-    if settings.level_source == "tree":
-        return with_tree_levels(pooled, settings)
+    if settings.level_source == "coverage":
+        return with_coverage_levels(pooled, settings)
     return suppress_masks(
         pooled,
         iou_max=settings.nms_iou,

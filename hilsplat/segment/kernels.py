@@ -6,14 +6,15 @@ picture per mask. Every loop is sequential: results do not depend on threads.
 
 from typing import no_type_check
 
-import numba
 import numpy as np
+
+from hilsplat.base.compiled import compiled
 
 BAND_WORDS = 2**17
 """64-bit words of masks that `shared_pixels` holds at once: 1 MiB stays in a core's cache."""
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 @no_type_check
 def _push(out, count, length):
     """Append a run; the buffer doubles where it is full."""
@@ -25,7 +26,7 @@ def _push(out, count, length):
     return out, count + 1
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 @no_type_check
 def upscaled_runs(
     logits, offsets, windows, rows, first_y, weight_y, first_x, weight_x, top, left, height, width
@@ -119,7 +120,7 @@ def upscaled_runs(
     return out[:count].copy(), out_offsets
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 @no_type_check
 def areas_and_boxes(runs, offsets, width):
     """Pixels and box (xyxy, end exclusive) of each run-length coded mask; both 0 for an empty one."""
@@ -146,7 +147,7 @@ def areas_and_boxes(runs, offsets, width):
     return area, boxes
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 @no_type_check
 def _root(parent, node):
     while parent[node] != node:
@@ -155,7 +156,7 @@ def _root(parent, node):
     return node
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 @no_type_check
 def _region_areas(row, start, stop, value, of, parent, area):
     """8-connected regions of the segments whose value is `of`: roots in `parent`, areas at the roots."""
@@ -189,7 +190,7 @@ def _region_areas(row, start, stop, value, of, parent, area):
             area[_root(parent, k)] += stop[k] - start[k]
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 @no_type_check
 def mended_runs(runs, offsets, width, min_area):
     """Fill holes and drop islands below `min_area` (8-connected); the largest island always stays.
@@ -251,7 +252,7 @@ def mended_runs(runs, offsets, width, min_area):
     return out[:count].copy(), out_offsets, changed
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 @no_type_check
 def _bits_set(word):
     """Ones of a 64-bit word."""
@@ -261,7 +262,7 @@ def _bits_set(word):
     return np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 @no_type_check
 def _set_bits(words, start, stop):
     """Set bits start..stop-1 of a row of 64-bit words."""
@@ -278,7 +279,7 @@ def _set_bits(words, start, stop):
     words[last] |= tail
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 @no_type_check
 def shared_pixels(runs, offsets, boxes, height, width):
     """Pixels that each pair of masks shares, int64 (M, M): ones of the conjunction of packed masks.
@@ -334,7 +335,7 @@ def shared_pixels(runs, offsets, boxes, height, width):
     return shared
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 @no_type_check
 def paint_runs(runs, offsets, order, canvas):
     """Write each row number of `order` into the flat canvas where its mask lies; later ones win."""
@@ -347,7 +348,7 @@ def paint_runs(runs, offsets, order, canvas):
             at = stop
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 @no_type_check
 def window_of_runs(runs, width, box):
     """A mask inside a box (xyxy), as booleans."""

@@ -2,11 +2,12 @@
 
 from typing import no_type_check
 
-import numba
 import numpy as np
 
+from hilsplat.base.compiled import compiled
 
-@numba.njit(nogil=True, cache=True)
+
+@compiled
 @no_type_check
 def quantise_logits(logits, per_unit, upper, lower, valid_h, valid_w):
     """Round logits to steps, and count what the tests of a mask need.
@@ -54,7 +55,7 @@ def quantise_logits(logits, per_unit, upper, lower, valid_h, valid_w):
     return steps, above[0], above[1], boxes
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 @no_type_check
 def edge_windows(steps, rows, boxes, reach):
     """The part of each mask's logits that says where its edge is, flat wherever no edge is near.

@@ -267,3 +267,8 @@ def masks_label(masks_folder: Path) -> str:
     if "label" in index:
         return str(index["label"])
     return Path(index["model"]).name if index["model"] else index["segmenter"]
+
+
+def made_from_truth(masks: str) -> bool:
+    """Whether masks with this label were made from true labels: a diagnostic that is no result."""
+    return masks.startswith("truth-perturbed")

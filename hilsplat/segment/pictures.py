@@ -148,7 +148,7 @@ def masks_overview(
         masks_folder: what the masks stage wrote.
         out_png: file to write; the trees go beside it as `<name>_tree.png`.
         view: view name; None takes the middle one of the views that have masks.
-        tree_folder: what the tree stage wrote; None draws no trees.
+        tree_folder: what the coverage_tree stage wrote; None draws no trees.
 
     Returns:
         the view's name.

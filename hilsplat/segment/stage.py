@@ -19,10 +19,10 @@ from hilsplat.scene.scene import Scene
 from hilsplat.segment import graph, kernels
 from hilsplat.segment import masks as masks_module
 from hilsplat.segment.candidates import Candidates, candidates_key, decode_candidates
+from hilsplat.segment.coverage_levels import with_coverage_levels
 from hilsplat.segment.generate import masks_from_candidates
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.sam import SamModel
-from hilsplat.segment.tree_levels import with_tree_levels
 from hilsplat.settings import MasksSettings
 
 logger = logging.getLogger(__name__)
@@ -106,4 +106,4 @@ def graph_masks(scene: Scene, view: str, cache: ViewCache, settings: MasksSettin
         lambda: graph.segment_graph(scene.image(view), settings.graph_scales, settings.min_area_px).arrays(),
     )
     masks = HierarchicalMasks.from_arrays(arrays)
-    return with_tree_levels(masks, settings) if settings.level_source == "tree" else masks
+    return with_coverage_levels(masks, settings) if settings.level_source == "coverage" else masks

@@ -9,9 +9,9 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
-from numba import njit
 from scipy.special import comb, expit, logit
 
+from hilsplat.base.compiled import compiled
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.optimise import FIELDS, Adam
 from hilsplat.splat.rasterise.cpu import Gradients, over_ranges
@@ -56,14 +56,14 @@ def scale_factor(
     return opacity / total
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 @no_type_check
 def noise_gate(opacity, dead_below):
     """Share of the noise that a Gaussian gets: 1/2 at the opacity of the dead, 0 for the opaque (Eq. 8)."""
     return 1.0 / (1.0 + np.exp(NOISE_SHARPNESS * (opacity - dead_below)))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 @no_type_check
 def _noise_rows(begin, end, means, log_scales, quats, logits, normal, dead_below, weight, extent):
     """Noise for rows begin..end, in place: weight x gate x covariance x normal, in units of the extent."""

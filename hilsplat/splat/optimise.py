@@ -5,8 +5,8 @@ from typing import no_type_check
 
 import numpy as np
 
+from hilsplat.base.compiled import compiled
 from hilsplat.settings import GaussiansSettings
-from hilsplat.splat.rasterise.compiling import kernel
 from hilsplat.splat.rasterise.cpu import Gradients, Parameters, over_ranges
 
 FIELDS = ("means", "log_scales", "quats", "opacity_logits", "sh")
@@ -25,7 +25,7 @@ def means_rate(settings: GaussiansSettings, progress: float) -> float:
     return settings.means_rate ** (1 - progress) * settings.means_rate_last**progress
 
 
-@kernel(error_model="numpy")
+@compiled(error_model="numpy")
 @no_type_check
 def _adam_rows(
     begin, end, values, gradients, first, second, rate, rate_rest, columns, head, root, one_minus1

@@ -9,7 +9,7 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float32
 
-from hilsplat.splat.rasterise.compiling import kernel
+from hilsplat.base.compiled import compiled
 from hilsplat.splat.rasterise.cpu import over_ranges
 from hilsplat.splat.rasterise.lanes import lanes, load, reciprocal, store
 
@@ -23,7 +23,7 @@ _SIDE = 16  # zero columns left and right of a padded row; at least 3 channels x
 _ZERO, _TWO = np.float32(0.0), np.float32(2.0)
 
 
-@kernel
+@compiled
 @no_type_check
 def _ssim_rows(begin, end, num, stride, image, target, slopes, ssim_sums, l1_sums):
     """SSIM of padded rows begin..end and, in `slopes`, its derivatives by mean, square and product.
@@ -97,7 +97,7 @@ def _ssim_rows(begin, end, num, stride, image, target, slopes, ssim_sums, l1_sum
         l1_sums[y] = total_l1
 
 
-@kernel
+@compiled
 @no_type_check
 def _gradient_rows(begin, end, num, stride, image, target, slopes, l1_weight, ssim_weight, gradient):
     """dL/dimage of rows begin..end: the slopes spread back over their windows, and the sign for L1."""

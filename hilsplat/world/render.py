@@ -9,10 +9,10 @@ from view to view, and the Gaussians would average it to mud.
 import math
 from typing import no_type_check
 
-import numba
 import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
+from hilsplat.base.compiled import compiled
 from hilsplat.scene.cameras import Camera
 from hilsplat.world.paints import srgb_from_linear
 from hilsplat.world.scenes.scene import Style, WorldScene
@@ -26,7 +26,6 @@ OCCLUSION_REACH = 0.55
 
 _LIFT = 2e-3  # rays start this far off the surface, scene units at scale 1
 _HASH_CELLS = 160.0  # cells per unit, at scale 1, of the hash that moves rays: about a pixel at 384 px
-_SETTINGS = {"cache": True, "nogil": True}
 
 
 def label_view(scene: WorldScene, camera: Camera) -> Int32[np.ndarray, "3 H W"]:
@@ -143,7 +142,7 @@ def _rays(camera: Camera, samples: int) -> tuple[np.ndarray, np.ndarray]:
     return np.ascontiguousarray(origins), np.ascontiguousarray(directions, dtype=np.float32)
 
 
-@numba.njit(**_SETTINGS)
+@compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _surfaces(
     prim,
@@ -202,7 +201,7 @@ def _surfaces(
         gloss[i, 0], gloss[i, 1] = material[8], material[9]
 
 
-@numba.njit(**_SETTINGS)
+@compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _cell(point, cells, salt):
     """Hash in [0, 1) of the small cell of space that a point lies in."""
@@ -214,7 +213,7 @@ def _cell(point, cells, salt):
     )
 
 
-@numba.njit(**_SETTINGS)
+@compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _light_rays(points, starts, light, samples, ray, rays_each, cells, toward, reach):
     """Direction and distance from each point to its stratum of the (horizontal, round) light."""
@@ -233,7 +232,7 @@ def _light_rays(points, starts, light, samples, ray, rays_each, cells, toward, r
         reach[i] = distance
 
 
-@numba.njit(**_SETTINGS)
+@compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _sky_rays(points, facets, samples, ray, rays_each, cells, toward):
     """A cosine-weighted direction of the hemisphere above each point, by stratum."""
@@ -255,7 +254,7 @@ def _sky_rays(points, facets, samples, ray, rays_each, cells, toward):
         toward[i, 2] = -c * sign * nx - s * ny + up * nz
 
 
-@numba.njit(**_SETTINGS)
+@compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _shade(
     prim,

@@ -14,7 +14,7 @@ from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.processes import in_processes
 from hilsplat.base.progress import stage_log, track
-from hilsplat.datasets.hierarchy import write_hierarchy
+from hilsplat.datasets.synthetic.hierarchy import write_hierarchy
 from hilsplat.settings import WorldSettings
 from hilsplat.world.lidar import scan_street
 from hilsplat.world.objects.catalogue import GENERATOR_VERSION

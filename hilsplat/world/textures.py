@@ -7,13 +7,12 @@ surface point has one colour in all views. That is what structure from motion an
 import math
 from typing import no_type_check
 
-import numba
 import numpy as np
 
-_SETTINGS = {"cache": True, "nogil": True}
+from hilsplat.base.compiled import compiled
 
 
-@numba.njit(**_SETTINGS)
+@compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def hash01(x: int, y: int, z: int, salt: int) -> float:
     """Number in [0, 1) of a lattice cell; a chain of 32-bit integer mixing steps."""
@@ -28,7 +27,7 @@ def hash01(x: int, y: int, z: int, salt: int) -> float:
     return h / 4294967296.0
 
 
-@numba.njit(**_SETTINGS)
+@compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def value_noise(x: float, y: float, z: float, salt: int) -> float:
     """Smoothly interpolated lattice noise in [0, 1)."""
@@ -42,7 +41,7 @@ def value_noise(x: float, y: float, z: float, salt: int) -> float:
     return (a * (1 - v) + b * v) * (1 - w) + (c * (1 - v) + d * v) * w
 
 
-@numba.njit(**_SETTINGS)
+@compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def fractal_noise(x: float, y: float, z: float, octaves: int, salt: int) -> float:
     """Sum of octaves of `value_noise`, each of half the size and amplitude, in [0, 1)."""
@@ -55,7 +54,7 @@ def fractal_noise(x: float, y: float, z: float, octaves: int, salt: int) -> floa
     return total / reach
 
 
-@numba.njit(**_SETTINGS)
+@compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def cell_noise(x: float, y: float, z: float, salt: int) -> tuple[float, float, float]:
     """Nearest and second nearest of one random point per cell (Worley).
@@ -80,7 +79,7 @@ def cell_noise(x: float, y: float, z: float, salt: int) -> tuple[float, float, f
     return math.sqrt(nearest), math.sqrt(second), identity
 
 
-@numba.njit(**_SETTINGS)
+@compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def step_between(value: float, low: float, high: float) -> float:
     """0 below `low`, 1 above `high`, smooth between."""
@@ -88,7 +87,7 @@ def step_between(value: float, low: float, high: float) -> float:
     return t * t * (3 - 2 * t)
 
 
-@numba.njit(**_SETTINGS)
+@compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
     """Texture at a point given in pattern cells.
@@ -161,7 +160,7 @@ def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
     )
 
 
-@numba.njit(**_SETTINGS)
+@compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def albedo(material: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Linear-light colour of a surface point.

@@ -9,7 +9,7 @@ from jaxtyping import Float32, Int32, Int64
 
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.datasets.hierarchy import AnnotatedNode
+from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
 from hilsplat.scene.cameras import Cameras
 from hilsplat.world.scenes.scene import WorldScene
 

@@ -25,17 +25,17 @@ def test_shipped_configurations_are_valid(project: Path, name: str) -> None:
 
 def test_a_misspelt_key_is_named_with_the_likely_one() -> None:
     with pytest.raises(SettingsError, match=r"tree\.thetaa: unknown key; did you mean 'theta'\?"):
-        parse_run({"tree": {"thetaa": 0.5}})
+        parse_run({"coverage_tree": {"thetaa": 0.5}})
 
 
 def test_a_misspelt_section_is_named() -> None:
-    with pytest.raises(SettingsError, match=r"langauge: unknown key; did you mean 'language'\?"):
-        parse_run({"langauge": {"omega": 2}})
+    with pytest.raises(SettingsError, match=r"feild: unknown key; did you mean 'field'\?"):
+        parse_run({"feild": {"omega": 2}})
 
 
 def test_a_value_out_of_range_is_named_with_place_and_value() -> None:
     with pytest.raises(SettingsError, match=r"tree\.theta: Input should be less than 1; found 2"):
-        parse_run({"tree": {"theta": 2}})
+        parse_run({"coverage_tree": {"theta": 2}})
 
 
 def test_a_variant_may_not_change_what_all_variants_share() -> None:
@@ -45,7 +45,7 @@ def test_a_variant_may_not_change_what_all_variants_share() -> None:
 
 def test_errors_inside_variants_name_the_variant() -> None:
     with pytest.raises(SettingsError, match=r"variants\.x\.tree\.theta: Input should be less than 1"):
-        parse_run({"variants": {"x": {"tree": {"theta": 3}}}})
+        parse_run({"variants": {"x": {"coverage_tree": {"theta": 3}}}})
 
 
 def test_an_unknown_variant_is_named() -> None:
@@ -56,8 +56,8 @@ def test_an_unknown_variant_is_named() -> None:
 def test_overrides_apply_in_order_group_then_scene_then_variant() -> None:
     run = parse_run(
         {
-            "overrides": {"g": {"tree": {"theta": 0.6}}, "d/s": {"tree": {"theta": 0.7}}},
-            "variants": {"v": {"tree": {"theta": 0.8}}},
+            "overrides": {"g": {"coverage_tree": {"theta": 0.6}}, "d/s": {"coverage_tree": {"theta": 0.7}}},
+            "variants": {"v": {"coverage_tree": {"theta": 0.8}}},
         }
     )
     assert run.stages().tree.theta == 0.9
@@ -86,7 +86,7 @@ def test_only_what_holds_something_random_is_repeated_per_seed() -> None:
     assert len(run.seeded("default", scopes=("photos",))) == 3
     assert [run.seed_of(name) for name in run.seeded("network")] == [0, 1, 2]
     assert not run.is_random("autoencoder", "langsplat")
-    assert run.is_random("language", "langsplat")
+    assert run.is_random("field", "langsplat")
     assert not run.is_random("semantic_tree", "network")
 
 
@@ -115,6 +115,6 @@ def test_the_paper_configuration_holds_the_papers_numbers(project: Path) -> None
     stages = run.stages("paper")
     assert stages.gaussians.iterations == 30_000
     assert stages.masks.points_per_side == 32
-    assert (stages.tree.theta, stages.language.omega) == (0.9, 10)
-    assert (stages.language.weight_instance, stages.language.weight_part) == (1e-6, 1e-5)
+    assert (stages.coverage_tree.theta, stages.field.omega) == (0.9, 10)
+    assert (stages.field.weight_instance, stages.field.weight_part) == (1e-6, 1e-5)
     assert stages.autoencoder.latent == 3

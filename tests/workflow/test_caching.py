@@ -4,16 +4,16 @@ import pytest
 
 from tests.workflow.conftest import Project
 
-AFTER_LANGUAGE = {"language", "evaluate", "table", "figures", "comparison", "sweep_plot"}
+AFTER_FIELD = {"field", "evaluate", "table", "figures", "comparison", "sweep_plot"}
 VARIANT_STAGES = {
     "masks",
-    "tree",
+    "coverage_tree",
     "clip",
     "contributions",
     "semantic_tree",
     "autoencoder",
     "method",
-} | AFTER_LANGUAGE
+} | AFTER_FIELD
 
 
 def test_nothing_is_planned_after_a_finished_run(copy_of_finished: Project) -> None:
@@ -21,7 +21,7 @@ def test_nothing_is_planned_after_a_finished_run(copy_of_finished: Project) -> N
 
 
 def test_a_comment_and_a_docstring_rerun_nothing(copy_of_finished: Project) -> None:
-    for path in ("hilsplat/segment/coverage.py", "hilsplat/language/field.py", "hilsplat/base/images.py"):
+    for path in ("hilsplat/segment/coverage.py", "hilsplat/field/field.py", "hilsplat/base/images.py"):
         file = copy_of_finished.root / path
         file.write_text(file.read_text() + "\n# a comment\n")
     copy_of_finished.edit(
@@ -33,8 +33,8 @@ def test_a_comment_and_a_docstring_rerun_nothing(copy_of_finished: Project) -> N
 @pytest.mark.parametrize(
     ("module", "expected"),
     [
-        ("hilsplat/language/field.py", AFTER_LANGUAGE | {"method"}),
-        ("hilsplat/language/clip_stage.py", VARIANT_STAGES - {"masks", "tree", "contributions"}),
+        ("hilsplat/field/field.py", AFTER_FIELD | {"method"}),
+        ("hilsplat/embed/stage.py", VARIANT_STAGES - {"masks", "coverage_tree", "contributions"}),
         ("hilsplat/evaluate/tables/hierarchy.py", {"table", "sweep_plot"}),
         ("hilsplat/methods/lifted.py", {"method", "evaluate", "table", "comparison"}),
     ],
@@ -49,25 +49,25 @@ def test_an_edit_reruns_its_stage_and_what_follows(
 
 def test_omega_reruns_fields_and_later_only(copy_of_finished: Project) -> None:
     copy_of_finished.edit("config/config.yaml", "omega: 10", "omega: 5")
-    assert copy_of_finished.planned() == AFTER_LANGUAGE
+    assert copy_of_finished.planned() == AFTER_FIELD
 
 
 def test_theta_reruns_trees_and_later_only(copy_of_finished: Project) -> None:
     copy_of_finished.edit("config/config.yaml", "theta: 0.9", "theta: 0.8")
-    assert copy_of_finished.planned() == {"tree"} | AFTER_LANGUAGE
+    assert copy_of_finished.planned() == {"coverage_tree"} | AFTER_FIELD
 
 
 def test_a_model_that_changed_reruns_what_reads_it(copy_of_finished: Project) -> None:
     card = copy_of_finished.root / "models/clip-tiny/config.json"
     card.write_text(card.read_text() + "\n")
-    assert copy_of_finished.planned() == VARIANT_STAGES - {"masks", "tree", "contributions"}
+    assert copy_of_finished.planned() == VARIANT_STAGES - {"masks", "coverage_tree", "contributions"}
 
 
 def test_variants_share_what_they_do_not_change(finished: Project) -> None:
     folder = finished.root / "results/synthetic/tiny"
-    assert (folder / "paper/language.safetensors").is_file()
+    assert (folder / "paper/field.safetensors").is_file()
     assert (folder / "paper/autoencoder").is_dir()
-    for shared in ("masks", "tree", "clip", "contributions", "semantic_tree"):
+    for shared in ("masks", "coverage_tree", "clip", "contributions", "semantic_tree"):
         assert not (folder / "paper" / shared).exists(), shared
 
 

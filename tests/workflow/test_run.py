@@ -14,7 +14,15 @@ TIMED = ("cost", "efficiency", "pruning")
 """Tables of times, which no two runs share."""
 POINTS = ("replica", "scannet", "waymo")
 """Tables that the tiny table stands in for nothing in."""
-LAST_BEFORE_EVALUATE = ("masks", "tree", "clip", "contributions", "semantic_tree", "autoencoder", "language")
+LAST_BEFORE_EVALUATE = (
+    "masks",
+    "coverage_tree",
+    "clip",
+    "contributions",
+    "semantic_tree",
+    "autoencoder",
+    "field",
+)
 
 
 def test_all_tables_and_figures_are_there(finished: Project) -> None:
@@ -65,7 +73,7 @@ def test_a_second_run_does_nothing(finished: Project) -> None:
 
 
 def test_every_artifact_has_provenance(finished: Project) -> None:
-    for name in (*LAST_BEFORE_EVALUATE[:-1], "language.safetensors", "scores.csv"):
+    for name in (*LAST_BEFORE_EVALUATE[:-1], "field.safetensors", "scores.csv"):
         path = finished.root / SCENE / "default" / f"{name}.provenance.json"
         record = json.loads(path.read_text())
         assert record["code"], name
@@ -88,7 +96,7 @@ def test_no_stage_before_evaluate_needs_the_truth(copy_of_finished: Project) -> 
     """Without the labels every stage runs again from its own recorded command, to the same bytes."""
     shutil.rmtree(copy_of_finished.root / SCENE / "world" / "truth")
     artifacts = ["scene", "gaussians.ply", *(f"default/{name}" for name in LAST_BEFORE_EVALUATE)]
-    artifacts[-1] = "default/language.safetensors"
+    artifacts[-1] = "default/field.safetensors"
     for name in artifacts:
         path = copy_of_finished.root / SCENE / name
         before = copy_of_finished.files(path) if path.is_dir() else path.read_bytes()
@@ -118,7 +126,16 @@ def test_the_paper_configuration_plans_every_stage_of_lerf(fresh: Callable[[], P
         (project.root / "data/lerf_ovs" / scene / "images/frame_00001.jpg").write_bytes(b"")
     command = [sys.executable, "-m", "snakemake", "-n", "--configfile", "config/paper.yaml"]
     planned = project.run(*command, "--config", "data_root=data").stdout
-    for stage in ("poses", "gaussians", "masks", "tree", "clip", "contributions", "language", "figures"):
+    for stage in (
+        "poses",
+        "gaussians",
+        "masks",
+        "coverage_tree",
+        "clip",
+        "contributions",
+        "field",
+        "figures",
+    ):
         assert f"rule {stage}:" in planned, stage
     skipped = project.run(*command, check=False)
     assert skipped.returncode != 0

@@ -35,12 +35,12 @@ def base(plain) -> Counter:
 def test_without_sweeps_every_stage_runs_once(base):
     stages = (
         "masks",
-        "tree",
+        "coverage_tree",
         "clip",
         "contributions",
         "semantic_tree",
         "autoencoder",
-        "language",
+        "field",
         "evaluate",
     )
     assert {stage: base[stage] for stage in stages} == dict.fromkeys(stages, 1)
@@ -52,20 +52,20 @@ def test_without_sweeps_every_stage_runs_once(base):
     [
         (
             "theta_variants=[theta-0.6,theta-0.7,theta-0.8,default]",
-            {"tree": 3, "language": 3, "evaluate": 3},
+            {"coverage_tree": 3, "field": 3, "evaluate": 3},
         ),
-        ("omega_variants=[omega-2,omega-10,omega-100,omega-1000]", {"language": 4, "evaluate": 4}),
-        ("pruning_variants=[default,pruned]", {"language": 1, "evaluate": 1}),
+        ("omega_variants=[omega-2,omega-10,omega-100,omega-1000]", {"field": 4, "evaluate": 4}),
+        ("pruning_variants=[default,pruned]", {"field": 1, "evaluate": 1}),
         (
             "ablation_variants=[no-hierarchy,clustering,clustering-part,default,all-losses]",
-            {"language": 4, "evaluate": 4},
+            {"field": 4, "evaluate": 4},
         ),
         # d = 3 needs a code of its own, which both share; baselines write the field by another rule
-        ("ablation_variants=[regression,paper]", {"autoencoder": 1, "language": 2, "evaluate": 2}),
+        ("ablation_variants=[regression,paper]", {"autoencoder": 1, "field": 2, "evaluate": 2}),
         ("main_variants=[default,langsplat,lifted]", {"autoencoder": 2, "method": 2, "evaluate": 2}),
         # only what is random is repeated: PCA and our solver are not
         ("seeds=3", {}),
-        ("seeds=3 main_variants=[default,paper]", {"autoencoder": 3, "language": 3, "evaluate": 3}),
+        ("seeds=3 main_variants=[default,paper]", {"autoencoder": 3, "field": 3, "evaluate": 3}),
         (
             "seeds=3 main_variants=[default,lifted,langsplat]",
             {"autoencoder": 4, "method": 4, "evaluate": 4},
@@ -81,7 +81,7 @@ def test_a_sweep_adds_its_own_stages_and_later_alone(plain, base, config, added)
 def test_sweeps_take_the_scenes_that_are_named_for_them(plain):
     every = jobs(plain, "theta_variants=[theta-0.6,default]")
     other = jobs(plain, "theta_variants=[theta-0.6,default]", "sweep_scenes=[table-2]")
-    assert (every["language"], other["language"]) == (2, 1)
+    assert (every["field"], other["field"]) == (2, 1)
 
 
 def test_a_run_of_photographs_leaves_the_tables_of_another_alone(plain, tmp_path):
@@ -93,7 +93,7 @@ def test_a_run_of_photographs_leaves_the_tables_of_another_alone(plain, tmp_path
     printed = plain.run(*command, "--config", "groups=[photos]", "only=[desk]").stdout
     sheet.write_text(before)
     planned = {line.split()[0] for line in printed.splitlines() if line.strip()}
-    assert {"poses", "semantic_tree", "language", "figures"} <= planned
+    assert {"poses", "semantic_tree", "field", "figures"} <= planned
     assert not planned & {"table", "sweep_plot", "evaluate"}
 
 

@@ -9,7 +9,7 @@ from hilsplat.base.levels import Level
 
 @runtime_checkable
 class QueryableScene(Protocol):
-    """What a scene must answer (`hilsplat.language.query.LanguageScene` does)."""
+    """What a scene must answer (`hilsplat.query.language_scene.LanguageScene` does)."""
 
     def field_relevancy(self, texts, view):
         """Rendered relevancy, (T, 3, H, W)."""

@@ -16,13 +16,13 @@ from jaxtyping import Float, Int32
 
 from hilsplat.base.levels import Level
 from hilsplat.datasets.classes.class_set import ClassSet
-from hilsplat.datasets.labelled_points import LABELLINGS, LabelledPoints
+from hilsplat.datasets.points.labelled_points import LABELLINGS, LabelledPoints
 from hilsplat.evaluate.metrics.instances import CLASS_STRIDE, InstanceMatches, InstanceScan, match_instances
 from hilsplat.evaluate.protocols import carry
 from hilsplat.evaluate.protocols.cards import INSTANCES, ProtocolCard
 from hilsplat.evaluate.protocols.measured import Measured
 from hilsplat.evaluate.protocols.points import measure_points
-from hilsplat.language.query import LanguageScene
+from hilsplat.query.language_scene import LanguageScene
 
 VOTE_RADIUS_M = 0.1
 """OpenGaussian-like votes come from Gaussians within 10 cm."""

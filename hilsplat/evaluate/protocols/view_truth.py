@@ -8,8 +8,8 @@ from jaxtyping import Bool, Int
 
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.datasets.hierarchy import HierarchyAnnotations
 from hilsplat.datasets.labelled import LabelledRegion
+from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.evaluate.metrics.localization import box_of
 
 

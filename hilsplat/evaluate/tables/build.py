@@ -7,11 +7,11 @@ from pathlib import Path
 
 from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import ArtifactError
-from hilsplat.evaluate.costs import read_costs
 from hilsplat.evaluate.instance_files import read_instances
 from hilsplat.evaluate.scores import read_scores
 from hilsplat.evaluate.tables.ablation import ablation_table, omega_table, theta_table
 from hilsplat.evaluate.tables.cost_tables import cost_table, efficiency_table, pruning_table
+from hilsplat.evaluate.tables.costs import read_costs
 from hilsplat.evaluate.tables.frame_tables import hi_3dovs_frames, hi_lerf_frames
 from hilsplat.evaluate.tables.hierarchy import hierarchy_table
 from hilsplat.evaluate.tables.html_page import as_html

@@ -8,9 +8,9 @@ import statistics
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
-from hilsplat.evaluate.costs import Cost
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
 from hilsplat.evaluate.tables.ablation import component_cells
+from hilsplat.evaluate.tables.costs import Cost
 from hilsplat.evaluate.tables.measured import ANSWERS, kind_and_title, row_name, with_seeds
 from hilsplat.evaluate.tables.reported import reported_block
 from hilsplat.evaluate.tables.rows import Block, Cell, Row, Table

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 
 from hilsplat.evaluate.protocols.cards import INSTANCES, card_of
 from hilsplat.evaluate.protocols.measured import Measured
-from hilsplat.evaluate.scores import made_from_truth
 from hilsplat.evaluate.tables.measured import (
     ANSWERS,
     TRUE_MASKS,
@@ -19,6 +18,7 @@ from hilsplat.evaluate.tables.measured import (
 from hilsplat.evaluate.tables.reported import reported_block
 from hilsplat.evaluate.tables.rows import Block, Cell, Row, Table
 from hilsplat.evaluate.tables.sources import Sources
+from hilsplat.segment.masks import made_from_truth
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -4,14 +4,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from hilsplat.evaluate.scores import made_from_truth
 from hilsplat.evaluate.tables.rows import Block, Table
+from hilsplat.segment.masks import made_from_truth
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from hilsplat.evaluate.costs import Cost
     from hilsplat.evaluate.metrics.instances import InstanceMatches
+    from hilsplat.evaluate.tables.costs import Cost
 
 STAND_IN_NOTE = (
     "Rows of a synthetic stand-in are measured on generated scenes with the models named under Masks. "

@@ -6,7 +6,7 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Int32, Int64
 
-from hilsplat.splat.rasterise.compiling import kernel
+from hilsplat.base.compiled import compiled
 
 TILE = 16
 """Side of a tile, px."""
@@ -47,7 +47,7 @@ class Tiles:
         return out
 
 
-@kernel
+@compiled
 @no_type_check
 def _depth_order(rows, keys):
     """Rows in order of ascending uint32 keys: least-significant-digit radix sort, 3 x 11 bits, stable."""
@@ -73,7 +73,7 @@ def _depth_order(rows, keys):
     return rows
 
 
-@kernel
+@compiled
 @no_type_check
 def _count(box, keys, tiles_x, tiles_y):
     """Depth order of what is drawn, and where each tile's list begins (summed from corners of boxes)."""
@@ -101,7 +101,7 @@ def _count(box, keys, tiles_x, tiles_y):
     return _depth_order(rows[:drawn], drawn_keys[:drawn]), tile_start
 
 
-@kernel
+@compiled
 @no_type_check
 def fill_lists(begin, end, base, tiles_x, order, tile_start, box, gaussian):
     """Write the lists of tiles begin..end; entry e goes to gaussian[e - base]."""

@@ -19,8 +19,8 @@ from typing import no_type_check
 
 import numpy as np
 
+from hilsplat.base.compiled import compiled
 from hilsplat.splat.rasterise.binning import TILE
-from hilsplat.splat.rasterise.compiling import kernel
 from hilsplat.splat.rasterise.lanes import (
     any_ge,
     exp2_negative,
@@ -54,7 +54,7 @@ LANES = 16
 PIXELS = BLOCKS * LANES
 
 
-@kernel(inline="always")
+@compiled(inline="always")
 @no_type_check
 def _start_tile(tile, tiles_x, height, width, transmittance, alive):
     """Full transmittance in the pixels inside the image; returns the tile's corner."""
@@ -69,14 +69,14 @@ def _start_tile(tile, tiles_x, height, width, transmittance, alive):
     return x0, y0
 
 
-@kernel(inline="always")
+@compiled(inline="always")
 @no_type_check
 def _pixel(x0, y0, block, lane):
     """Column and row of a lane's pixel."""
     return x0 + (block % 4) * 4 + lane % 4, y0 + (block // 4) * 4 + lane // 4
 
 
-@kernel(inline="always")
+@compiled(inline="always")
 @no_type_check
 def _any_alive(transmittance, alive):
     """Mark finished blocks; returns whether any block is unfinished."""
@@ -88,7 +88,7 @@ def _any_alive(transmittance, alive):
     return some
 
 
-@kernel(inline="always")
+@compiled(inline="always")
 @no_type_check
 def _blocks(box, i, x0, y0):
     """First and last block row, first and last block column of the tile that a Gaussian's box touches."""
@@ -100,7 +100,7 @@ def _blocks(box, i, x0, y0):
     )
 
 
-@kernel(inline="always")
+@compiled(inline="always")
 @no_type_check
 def _place(geometry, i, x0, y0):
     """Mean of a Gaussian from the tile's corner, and a, b, c, log2 of the peak alpha in all lanes."""
@@ -110,14 +110,14 @@ def _place(geometry, i, x0, y0):
     return mean_x, mean_y, a, b, c, lanes(geometry[i, 5])
 
 
-@kernel(inline="always")
+@compiled(inline="always")
 @no_type_check
 def _to_mean(mean, at, centres):
     """Distances of a block's pixel centres to the mean along an axis; `at` counts blocks."""
     return lanes(np.float32(mean - np.float32(4 * at))) - centres
 
 
-@kernel(inline="always")
+@compiled(inline="always")
 @no_type_check
 def _shine(exponent, transmittance, block):
     """Blend a Gaussian into a block: take its light; returns alpha uncut, alpha and the weight."""
@@ -130,7 +130,7 @@ def _shine(exponent, transmittance, block):
     return uncut, alpha, keep_gt(left, lanes(_STOP), weight)
 
 
-@kernel
+@compiled
 @no_type_check
 def blend(begin, end, base, tiles_x, tile_start, gaussian, geometry, box, colours, image, alpha):
     """Blend tiles: image (H, W, C) gets the premultiplied channels, alpha (H, W) the coverage."""
@@ -176,7 +176,7 @@ def blend(begin, end, base, tiles_x, tile_start, gaussian, geometry, box, colour
                         image[y, x, channel] = sums[at + LANES * (channel + 1)]
 
 
-@kernel(inline="always")
+@compiled(inline="always")
 @no_type_check
 def _load_gradients(x0, y0, stride, image, alpha, grad_image, grad_alpha, grads, to_come):
     """Gradients of a tile's pixels by block and channel, and R before the first Gaussian."""
@@ -198,7 +198,7 @@ def _load_gradients(x0, y0, stride, image, alpha, grad_image, grad_alpha, grads,
             to_come[block * LANES + lane] = total
 
 
-@kernel
+@compiled
 @no_type_check
 def blend_backward(
     begin,
@@ -299,7 +299,7 @@ def blend_backward(
                 slots[slot, MOMENTS + channel] = lane_sum(load(colour_sums, LANES * channel))
 
 
-@kernel
+@compiled
 @no_type_check
 def add_slots(begin, end, gaussian, slots, sums):
     """Add the slots of Gaussians begin..end to their sums, in the order of the entries."""
@@ -310,7 +310,7 @@ def add_slots(begin, end, gaussian, slots, sums):
                 sums[i, k] += slots[entry, k]
 
 
-@kernel
+@compiled
 @no_type_check
 def blend_weights(
     begin, end, base, tiles_x, size_hw, tile_start, gaussian, geometry, box, least, cursor, columns, weights
@@ -359,7 +359,7 @@ def blend_weights(
                                 weights[at] = buffer[lane]
 
 
-@kernel
+@compiled
 @no_type_check
 def sort_rows(begin, end, row_start, columns, weights):
     """Sort the entries of sparse rows begin..end by column (insertion sort; rows are short)."""

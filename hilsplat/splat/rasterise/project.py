@@ -15,8 +15,8 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float
 
+from hilsplat.base.compiled import compiled
 from hilsplat.scene.cameras import Camera
-from hilsplat.splat.rasterise.compiling import kernel
 
 NEAR = 0.01
 """Gaussians with a smaller depth are not drawn, scene units (gsplat: 0.01)."""
@@ -64,7 +64,7 @@ def pack_camera(camera: Camera) -> Float[np.ndarray, " 25"]:
     return np.array((*row, *camera.centre, *limits, height, width), dtype=np.float64)
 
 
-@kernel(inline="always")
+@compiled(inline="always")
 @no_type_check
 def _sh_basis(x, y, z, degree, basis):
     """Real spherical harmonics up to `degree` (at most 3) of a unit direction, 3DGS order and signs."""
@@ -90,7 +90,7 @@ def _sh_basis(x, y, z, degree, basis):
             basis[15] = -_C30 * x * (xx - 3.0 * yy)
 
 
-@kernel(inline="always")
+@compiled(inline="always")
 @no_type_check
 def _sh_slope(x, y, z, degree, slope):
     """Derivatives of `_sh_basis` by x, y, z (taken as independent): slope[k] = (d/dx, d/dy, d/dz)."""
@@ -119,7 +119,7 @@ def _sh_slope(x, y, z, degree, slope):
         slope[15, 0], slope[15, 1] = -_C30 * (3.0 * xx - 3.0 * yy), 6.0 * _C30 * x * y
 
 
-@kernel(inline="always")
+@compiled(inline="always")
 @no_type_check
 def _cam_from_gaussian(camera, quats, scales, i, axes, factor):
     """Rotation of Gaussian i into the camera (axes) and the same with columns scaled (factor)."""
@@ -139,7 +139,7 @@ def _cam_from_gaussian(camera, quats, scales, i, axes, factor):
     return w, x, y, z, norm
 
 
-@kernel
+@compiled
 @no_type_check
 def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, camera, geometry, box, colours):
     """Project Gaussians begin..end into a view.
@@ -225,7 +225,7 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
     return broken
 
 
-@kernel
+@compiled
 @no_type_check
 def project_backward(
     begin,

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32
 
 from hilsplat.base.levels import NONE
-from hilsplat.datasets.hierarchy import AnnotatedNode
+from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
 from hilsplat.world.objects.builder import ObjectModel
 from hilsplat.world.paints import Paint
 from hilsplat.world.shapes import Mesh, rotation_about

@@ -14,7 +14,7 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.processes import in_processes
 from hilsplat.base.progress import track
-from hilsplat.datasets.hierarchy import AnnotatedNode
+from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
 from hilsplat.world.objects.catalogue import (
     FURNITURE,
     GENERATOR_VERSION,

@@ -7,8 +7,8 @@ import pytest
 
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
-from hilsplat.datasets.hierarchy import AnnotatedNode, write_hierarchy
-from hilsplat.datasets.true_world import TrueWorld
+from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, write_hierarchy
+from hilsplat.datasets.synthetic.true_world import TrueWorld
 from hilsplat.scene.cameras import Cameras
 
 SIZE = (24, 40)

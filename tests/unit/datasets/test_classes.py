@@ -2,11 +2,11 @@
 
 import csv
 import itertools
-from pathlib import Path
 
 import pytest
 
 from hilsplat.datasets.classes import replica, scannet, scannet200, waymo
+from tests.conftest import PROJECT
 
 SETS = [
     value
@@ -66,7 +66,7 @@ def test_waymo_classes_are_1_to_22():
 
 @pytest.fixture
 def listed():
-    folder = Path(__file__).resolve().parents[4] / "shared" / "reference"
+    folder = PROJECT.parent / "shared" / "reference"
     if not folder.is_dir():
         pytest.skip("the companion lists are not beside the checkout (shared/reference)")
 

@@ -2,7 +2,6 @@
 
 import re
 import types
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +9,9 @@ import pytest
 from hilsplat.base.errors import SceneError
 from hilsplat.base.images import write_png
 from hilsplat.evaluate.protocols.cards import card_named
+from tests.conftest import PROJECT
 
-EXTENDING = Path(__file__).parents[3] / "docs" / "extending.md"
+EXTENDING = PROJECT / "docs" / "extending.md"
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from hilsplat.base.errors import SceneError
 from hilsplat.cli.main import app
 from hilsplat.datasets.published import FRAMES, LABEL_SIZES_WH, PAIRS, PROMPTS
 from hilsplat.datasets.registry import DATASETS, dataset_of
-from hilsplat.datasets.write_labelled import write_lerf_ovs
+from hilsplat.datasets.synthetic.write_labelled import write_lerf_ovs
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import scipy.sparse as sp
 
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.datasets.hierarchy import AnnotatedNode, HierarchyAnnotations, write_hierarchy
+from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations, write_hierarchy
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
@@ -57,10 +57,10 @@ def block_world(tmp_path_factory) -> BlockWorld:
     import torch
 
     from hilsplat.base.artifacts import write_index
-    from hilsplat.language.autoencoder import Autoencoder
-    from hilsplat.language.field import LanguageField
-    from hilsplat.language.query import LanguageScene
-    from hilsplat.language.semantic_tree import SemanticTree
+    from hilsplat.field.autoencoder import Autoencoder
+    from hilsplat.field.field import LanguageField
+    from hilsplat.query.language_scene import LanguageScene
+    from hilsplat.semantic_tree.tree import SemanticTree
     from hilsplat.splat.gaussians import Gaussians
 
     class Uncoded(Autoencoder):

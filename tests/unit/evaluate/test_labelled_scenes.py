@@ -50,7 +50,7 @@ def rows(block_world, monkeypatch, tmp_path):
             truth=truth,
             gaussians=folder / "gaussians.ply",
             semantic_tree=folder / "semantic_tree",
-            language=folder / "language.safetensors",
+            language=folder / "field.safetensors",
             autoencoder=folder / "autoencoder",
             clip_folder=folder / "clip",
             masks_folder=folder / "masks",

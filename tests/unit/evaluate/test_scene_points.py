@@ -5,9 +5,9 @@ import pytest
 
 from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.datasets.classes.class_set import ClassSet
-from hilsplat.datasets.labelled_points import LABELLINGS, LabelledPoints
-from hilsplat.evaluate.alignment import camera_error, scene_from_true
+from hilsplat.datasets.points.labelled_points import LABELLINGS, LabelledPoints
 from hilsplat.evaluate.asked import STAND_INS, Asked
+from hilsplat.evaluate.diagnostics.alignment import camera_error, scene_from_true
 from hilsplat.evaluate.instance_files import read_instances, write_instances
 from hilsplat.evaluate.metrics.instances import average_precision
 from hilsplat.evaluate.protocols.cards import card_named

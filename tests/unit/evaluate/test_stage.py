@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import pytest
 from PIL import Image
 
-from hilsplat.evaluate import figures, stage
+from hilsplat.evaluate import stage
+from hilsplat.evaluate.figures import panel
 from hilsplat.evaluate.scores import read_scores
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 
@@ -19,7 +20,7 @@ def opened(block_world, monkeypatch):
         asked.update(options, model=paths[-1].as_posix())
         return block_world.answers
 
-    for module in (stage, figures):
+    for module in (stage, panel):
         monkeypatch.setattr(module, "LanguageScene", SimpleNamespace(from_parts=open_scene))
     folder = block_world.folder
     arguments = {
@@ -28,7 +29,7 @@ def opened(block_world, monkeypatch):
         "masks_folder": folder / "masks",
         "gaussians": folder / "gaussians.ply",
         "semantic_tree": folder / "semantic_tree",
-        "language": folder / "language.safetensors",
+        "language": folder / "field.safetensors",
         "autoencoder": folder / "autoencoder",
         "clip_folder": folder / "clip",
         "threads": 1,
@@ -63,7 +64,7 @@ def test_scene_without_annotations_gives_a_header_only(opened, tmp_path):
 
 
 def test_panel_is_written(opened, tmp_path):
-    figures.run_figures(
+    panel.run_figures(
         **opened.arguments,
         out=tmp_path / "panel.png",
         settings=FiguresSettings(queries_per_level=1),

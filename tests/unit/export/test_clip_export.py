@@ -8,8 +8,8 @@ import pytest
 
 from hilsplat.base.clip_split import split_clip
 from hilsplat.base.errors import ModelError
-from hilsplat.language.clip import ClipModel
-from hilsplat.language.model_check import check_model
+from hilsplat.embed.clip import ClipModel
+from hilsplat.embed.model_check import check_model
 from hilsplat.segment.masks import HierarchicalMasks
 
 TOLERANCE = 1e-4

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilsplat.language.model_check import check_model
+from hilsplat.embed.model_check import check_model
 from hilsplat.segment.candidates import crop_boxes, decode_candidates
 from hilsplat.segment.generate import masks_from_candidates
 from hilsplat.segment.masks import HierarchicalMasks

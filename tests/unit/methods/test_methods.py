@@ -4,7 +4,6 @@ import inspect
 import re
 import sys
 import types
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,8 +16,9 @@ from hilsplat.methods.langsplat import LevelPixels, ViewPixels, grid_pixels, l1_
 from hilsplat.methods.method import Method
 from hilsplat.methods.registry import METHODS, OURS, method_of, require_method
 from hilsplat.settings import MethodSettings
+from tests.conftest import PROJECT
 
-EXTENDING = Path(__file__).parents[3] / "docs" / "extending.md"
+EXTENDING = PROJECT / "docs" / "extending.md"
 
 
 def fit_of(method, inputs, settings):
@@ -165,7 +165,7 @@ def test_a_method_that_returns_no_field_is_refused(tmp_path, monkeypatch, featur
     monkeypatch.setattr(stage, "method_of", lambda name: broken)
     with pytest.raises(ArtifactError, match="method lifted returned no language field"):
         run_method = inspect.unwrap(stage.run_method)  # the inputs here are no MethodInputs
-        run_method(inputs_of(tmp_path), tmp_path / "language.safetensors", MethodSettings(name="lifted"), 0)
+        run_method(inputs_of(tmp_path), tmp_path / "field.safetensors", MethodSettings(name="lifted"), 0)
 
 
 def test_the_method_of_the_documentation_runs_as_it_is_written(tmp_path, monkeypatch):

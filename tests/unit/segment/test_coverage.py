@@ -10,7 +10,7 @@ from hilsplat.base.errors import EmptyMaskError
 from hilsplat.base.levels import NONE
 from hilsplat.segment.coverage import coverage_parents, coverage_tree, depths
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.settings import TreeSettings
+from hilsplat.settings import CoverageTreeSettings
 
 shapes = st.tuples(st.integers(1, 8), st.just(3), st.just(4))
 nonempty_masks = hnp.arrays(bool, shapes).filter(lambda masks: masks.any(axis=(1, 2)).all())
@@ -82,12 +82,12 @@ def test_tree_from_runs_equals_tree_from_pixels(masks, parents):
     level = (np.arange(len(masks)) % 3 + 1).astype(np.uint8)
     scores = np.ones(len(masks), np.float32)
     packed = HierarchicalMasks.from_dense(masks, level, scores, scores)
-    parent, _ = coverage_tree(packed, TreeSettings(theta=0.8, parents=parents))
+    parent, _ = coverage_tree(packed, CoverageTreeSettings(theta=0.8, parents=parents))
     expected = coverage_parents(masks, 0.8, level if parents == "coarser" else None)
     np.testing.assert_array_equal(parent, expected)
 
 
 def test_a_view_without_masks_has_an_empty_tree():
     assert coverage_parents(np.zeros((0, 2, 2), bool), 0.9).shape == (0,)
-    parent, depth = coverage_tree(HierarchicalMasks.concatenate([], (2, 2)), TreeSettings())
+    parent, depth = coverage_tree(HierarchicalMasks.concatenate([], (2, 2)), CoverageTreeSettings())
     assert parent.shape == depth.shape == (0,)

@@ -9,12 +9,12 @@ from hilsplat.base.artifacts import read_index, read_npz, sha256_of_path
 from hilsplat.base.errors import ArtifactError, ModelError
 from hilsplat.base.images import read_image
 from hilsplat.base.onnx_models import Network, model_digest, open_model_folder
+from hilsplat.segment.coverage_stage import run_coverage_tree
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.pictures import THUMB_PX, masks_overview
 from hilsplat.segment.sam import SamModel
 from hilsplat.segment.stage import run_masks
-from hilsplat.segment.tree_stage import run_tree
-from hilsplat.settings import MasksSettings, TreeSettings
+from hilsplat.settings import CoverageTreeSettings, MasksSettings
 
 
 @pytest.fixture
@@ -70,13 +70,13 @@ def test_index_names_the_model_and_test_views_stay_out(make_scene, tmp_path, set
 
 def test_tree_hangs_discs_into_discs(make_scene, tmp_path, settings):
     run_masks(make_scene(views=2), tmp_path / "masks", tmp_path / "cache", settings, threads=1)
-    run_tree(tmp_path / "masks", tmp_path / "tree", TreeSettings())
-    arrays = read_npz(tmp_path / "tree" / "000.png.npz")
+    run_coverage_tree(tmp_path / "masks", tmp_path / "coverage_tree", CoverageTreeSettings())
+    arrays = read_npz(tmp_path / "coverage_tree" / "000.png.npz")
     masks = HierarchicalMasks.load(tmp_path / "masks" / "000.png.npz")
     assert arrays["parent"].dtype == np.int32
     assert arrays["depth"].dtype == np.uint8
     np.testing.assert_array_equal(arrays["depth"], masks.level)  # each subpart in a part in a whole
-    entry = read_index(tmp_path / "tree")["views"]["000.png"]
+    entry = read_index(tmp_path / "coverage_tree")["views"]["000.png"]
     assert (entry["roots"], entry["part_with_parent"], entry["subpart_with_parent"]) == (4, 4, 4)
 
 
@@ -89,8 +89,8 @@ def test_graph_segmenter_needs_no_model(make_scene, tmp_path):
 def test_overview_shows_the_photo_three_levels_and_the_trees(make_scene, tmp_path, settings):
     scene = make_scene(views=2)
     run_masks(scene, tmp_path / "masks", tmp_path / "cache", settings, threads=1)
-    run_tree(tmp_path / "masks", tmp_path / "tree", TreeSettings())
-    masks_overview(scene, tmp_path / "masks", tmp_path / "masks.png", tree_folder=tmp_path / "tree")
+    run_coverage_tree(tmp_path / "masks", tmp_path / "coverage_tree", CoverageTreeSettings())
+    masks_overview(scene, tmp_path / "masks", tmp_path / "masks.png", tree_folder=tmp_path / "coverage_tree")
     assert (tmp_path / "masks.png").stat().st_size > 1000
     # four chains of three discs: four rows of three thumbnails
     trees = read_image(tmp_path / "masks_tree.png")

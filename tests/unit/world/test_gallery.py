@@ -1,14 +1,13 @@
 """The pictures and the table of the manual show the world as it is."""
 
-from pathlib import Path
-
 import numpy as np
 from PIL import Image
 
 from hilsplat.world.gallery import class_table, draw_classes, draw_scenes
 from hilsplat.world.objects.catalogue import TABLETOP
+from tests.conftest import PROJECT
 
-MANUAL = Path(__file__).parents[3] / "docs" / "world.md"
+MANUAL = PROJECT / "docs" / "world.md"
 
 
 def test_the_table_of_classes_in_the_manual_is_that_of_the_catalogue():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilsplat.datasets.hierarchy import AnnotatedNode
+from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
 from hilsplat.scene.cameras import Camera
 from hilsplat.world.paints import Paint
 from hilsplat.world.render import depth_view, label_view, render_view

@@ -8,7 +8,7 @@ from hilsplat.base.artifacts import read_index, read_json, sha256_of_path
 from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.base.images import list_images, read_image
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.datasets.hierarchy import AnnotatedNode, HierarchyAnnotations
+from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations
 from hilsplat.scene.cameras import Cameras
 from hilsplat.settings import WorldSettings
 from hilsplat.world.objects.catalogue import GENERATOR_VERSION

@@ -7,7 +7,7 @@ import pytest
 from plyfile import PlyData
 
 from hilsplat.base.levels import LEVELS
-from hilsplat.datasets.hierarchy import AnnotatedNode
+from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
 from hilsplat.scene.cameras import Cameras
 from hilsplat.world.scenes.scene import Style, WorldScene
 from hilsplat.world.shapes import box

@@ -1,7 +1,5 @@
 """The committed small models are the files their cards describe, and they run."""
 
-from pathlib import Path
-
 import numpy as np
 import onnxruntime
 import pytest
@@ -20,9 +18,10 @@ from hilsplat.world.tiny.data import HEAD_LEVELS, LabelledViews, normalised
 from hilsplat.world.tiny.measure_sam import draw_regions
 from hilsplat.world.tiny.render import phrases_of, scene_of_seed
 from hilsplat.world.tiny.sam import FRAME_PX
+from tests.conftest import PROJECT
 from tests.unit.segment.plain import quantise, restore
 
-MODELS = Path(__file__).resolve().parents[4] / "models"
+MODELS = PROJECT / "models"
 NAMES = ("sam-tiny", "clip-tiny")
 
 

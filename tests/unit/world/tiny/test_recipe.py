@@ -5,7 +5,7 @@ import pytest
 
 from hilsplat.base.artifacts import read_json
 from hilsplat.base.errors import SceneError, SettingsError
-from hilsplat.datasets.hierarchy import AnnotatedNode
+from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
 from hilsplat.settings import TrainingSettings
 from hilsplat.world.tiny.card import RECORD, digests
 from hilsplat.world.tiny.render import MIXTURE, kind_of_seed, phrases_of, scene_of_seed, training_seeds

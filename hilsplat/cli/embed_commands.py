@@ -1,0 +1,72 @@
+"""CLIP vectors of masks, and the files of LangSplat."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilsplat.cli.apps import app, langsplat_app
+from hilsplat.cli.stage import (
+    DEFAULT_CACHE,
+    Cache,
+    Log,
+    PathIn,
+    PathOut,
+    Settings,
+    Threads,
+    section_of,
+    stage,
+)
+
+
+@app.command()
+def clip(
+    scene: PathIn,
+    masks: PathIn,
+    out: PathOut,
+    settings: Settings = "{}",
+    cache: Cache = DEFAULT_CACHE,
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Embed each mask with CLIP."""
+    section = section_of("clip", settings)
+    inputs = {"scene": scene, "masks": masks}
+    with stage("clip", out, log, settings=section, threads=threads, inputs=inputs):
+        from hilsplat.embed.stage import run_clip
+
+        run_clip(scene, masks, out, cache, section, threads)
+
+
+@langsplat_app.command("read")
+def langsplat_read(
+    scene: PathIn,
+    files: Annotated[Path, typer.Option(help="LangSplat's folder of _s.npy and _f.npy", show_default=False)],
+    masks: Annotated[Path, typer.Option(help="masks artifact to write", show_default=False)],
+    clip: Annotated[Path, typer.Option(help="clip artifact to write", show_default=False)],
+    resize: Annotated[bool, typer.Option(help="take maps of another size, nearest pixel")] = False,
+    settings: Annotated[
+        str, typer.Option(help="the clip section as JSON: the model that embeds texts")
+    ] = "{}",
+    log: Log = None,
+) -> None:
+    """Take masks and CLIP vectors that LangSplat's preprocessing made, in place of masks and clip."""
+    section = section_of("clip", settings)
+    inputs = {"scene": scene, "files": files}
+    with stage("langsplat", masks, log, inputs=inputs):
+        from hilsplat.embed.langsplat_files import read_masks
+
+        read_masks(scene, files, masks, resize)
+    with stage("langsplat", clip, log, settings=section, inputs={**inputs, "masks": masks}):
+        from hilsplat.embed.langsplat_files import read_clip
+
+        read_clip(scene, files, clip, resize, section)
+
+
+@langsplat_app.command("write")
+def langsplat_write(masks: PathIn, clip: PathIn, out: PathOut, log: Log = None) -> None:
+    """Write masks and CLIP vectors as LangSplat's preprocessing does."""
+    with stage("langsplat", out, log, inputs={"masks": masks, "clip": clip}):
+        from hilsplat.embed.langsplat_files import write_langsplat
+
+        write_langsplat(masks, clip, out)

@@ -1,0 +1,155 @@
+"""Contributions, semantic tree, language field, baselines."""
+
+from typing import Annotated
+
+import typer
+
+from hilsplat.cli.apps import app
+from hilsplat.cli.stage import (
+    DEFAULT_CACHE,
+    Cache,
+    Log,
+    PathIn,
+    PathOut,
+    Seed,
+    Settings,
+    Threads,
+    section_of,
+    stage,
+)
+
+
+@app.command()
+def contributions(
+    scene: PathIn,
+    gaussians: PathIn,
+    masks: PathIn,
+    out: PathOut,
+    settings: Settings = "{}",
+    cache: Cache = DEFAULT_CACHE,
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Weights of each Gaussian in each mask, from one pass over the views."""
+    section = section_of("contributions", settings)
+    inputs = {"scene": scene, "gaussians": gaussians, "masks": masks}
+    with stage("contributions", out, log, settings=section, threads=threads, inputs=inputs):
+        from hilsplat.contributions.stage import run_contributions
+
+        run_contributions(scene, gaussians, masks, out, cache, section, threads)
+
+
+@app.command("semantic-tree")
+def semantic_tree(
+    contributions: PathIn,
+    masks: PathIn,
+    clip: PathIn,
+    out: PathOut,
+    settings: Settings = "{}",
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Link the masks of all views into nodes at three levels."""
+    section = section_of("semantic_tree", settings)
+    inputs = {"contributions": contributions, "masks": masks, "clip": clip}
+    with stage("semantic_tree", out, log, settings=section, threads=threads, inputs=inputs):
+        from hilsplat.semantic_tree.tree import run_semantic_tree
+
+        run_semantic_tree(contributions, masks, clip, out, section, threads)
+
+
+@app.command()
+def autoencoder(
+    clip: PathIn,
+    semantic_tree: PathIn,
+    contributions: PathIn,
+    out: PathOut,
+    settings: Settings = "{}",
+    seed: Seed = 0,
+    log: Log = None,
+) -> None:
+    """Train the scene's autoencoder of CLIP vectors and encode the masks."""
+    section = section_of("autoencoder", settings)
+    inputs = {"clip": clip, "semantic_tree": semantic_tree, "contributions": contributions}
+    with stage("autoencoder", out, log, settings=section, seed=seed, inputs=inputs):
+        from hilsplat.field.autoencoder import run_autoencoder
+
+        run_autoencoder(clip, semantic_tree, contributions, out, section, seed)
+
+
+@app.command()
+def field(
+    contributions: PathIn,
+    coverage_tree: PathIn,
+    autoencoder: PathIn,
+    out: PathOut,
+    settings: Settings = "{}",
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Train the language field: regression, L_h, L_ins and L_part over three levels."""
+    section = section_of("field", settings)
+    inputs = {"contributions": contributions, "coverage_tree": coverage_tree, "autoencoder": autoencoder}
+    with stage("field", out, log, settings=section, threads=threads, inputs=inputs):
+        from hilsplat.field.field import run_field
+
+        run_field(contributions, coverage_tree, autoencoder, out, section, threads)
+
+
+@app.command("field-reference")
+def field_reference(
+    scene: PathIn,
+    gaussians: PathIn,
+    masks: PathIn,
+    contributions: PathIn,
+    autoencoder: PathIn,
+    out: PathOut,
+    settings: Settings = "{}",
+    device: Annotated[str, typer.Option(help="what rasterises: auto, cpu or cuda")] = "auto",
+    seed: Seed = 0,
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Train a field by rendering one random view per step: what the solver is compared with; slow."""
+    section = section_of("reference", settings)
+    inputs = {
+        "scene": scene,
+        "gaussians": gaussians,
+        "masks": masks,
+        "contributions": contributions,
+        "autoencoder": autoencoder,
+    }
+    with stage("reference", out, log, settings=section, seed=seed, threads=threads, inputs=inputs):
+        from hilsplat.field.reference_trainer import run_reference
+
+        run_reference(
+            scene, gaussians, masks, contributions, autoencoder, out, section, device, seed, threads
+        )
+
+
+@app.command()
+def method(
+    scene: PathIn,
+    gaussians: PathIn,
+    masks: PathIn,
+    contributions: PathIn,
+    autoencoder: PathIn,
+    out: PathOut,
+    settings: Settings = "{}",
+    seed: Seed = 0,
+    threads: Threads = 1,
+    log: Log = None,
+) -> None:
+    """Let a baseline write the language field: langsplat, lifted (settings: name)."""
+    section = section_of("method", settings)
+    inputs = {"scene": scene, "gaussians": gaussians, "masks": masks}
+    inputs |= {"contributions": contributions, "autoencoder": autoencoder}
+    from hilsplat.methods.registry import METHODS
+
+    also = (METHODS[section.name],) if section.name in METHODS else ()
+    with stage("method", out, log, settings=section, seed=seed, threads=threads, inputs=inputs, also=also):
+        from hilsplat.methods.method import MethodInputs
+        from hilsplat.methods.stage import run_method
+
+        parts = MethodInputs(scene, gaussians, masks, contributions, autoencoder, threads)
+        run_method(parts, out, section, seed)

@@ -1,0 +1,152 @@
+"""Mask means as a linear map of the field, its adjoint, and averages of latents over masks."""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float, Float32, Int64, UInt8
+
+from hilsplat.base.compiled import compiled
+
+MEDIAN_SOFTENING = 1e-4
+"""Least distance of a latent to the median, so that a step never divides by zero."""
+
+
+@runtime_checkable
+class MaskProducts(Protocol):
+    """The two products with A that the solver takes, whoever computes them."""
+
+    def means(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "M D"]:
+        """A F: mean rendered feature of each mask at its level."""
+
+    def spread(self, values: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "N 3 D"]:
+        """A' x at each level: the adjoint of `means`."""
+
+
+@dataclass(frozen=True)
+class MaskOperator:
+    """A for all levels: features of Gaussians to means of masks, and back.
+
+    A is used where it is (such as in its file): nothing of its size is copied.
+
+    Attributes:
+        indptr: of A in CSR form, as are `indices` and `data`; a row is a mask.
+        indices: Gaussians.
+        data: mean weights.
+        level_index: level of each mask, from 0.
+        num_gaussians: N.
+    """
+
+    indptr: np.ndarray
+    indices: np.ndarray
+    data: Float32[np.ndarray, " E"]
+    level_index: Int64[np.ndarray, " M"]
+    num_gaussians: int
+
+    @staticmethod
+    def of(A: sp.csr_matrix, level: UInt8[np.ndarray, " M"]) -> "MaskOperator":
+        """Take A (M x N) with the level of its rows."""
+        return MaskOperator(A.indptr, A.indices, A.data, level.astype(np.int64) - 1, A.shape[1])
+
+    def means(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "M D"]:
+        """A F: mean rendered feature of each mask at its level."""
+        out = np.zeros((len(self.level_index), features.shape[2]), features.dtype)
+        _means(self.indptr, self.indices, self.data, self.level_index, np.ascontiguousarray(features), out)
+        return out
+
+    def spread(self, values: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "N 3 D"]:
+        """A' x at each level: the adjoint of `means`."""
+        out = np.zeros((self.num_gaussians, 3, values.shape[1]), values.dtype)
+        _spread(self.indptr, self.indices, self.data, self.level_index, np.ascontiguousarray(values), out)
+        return out
+
+
+def lifted_average(
+    masks: MaskOperator,
+    mass: Float32[np.ndarray, "N 3"],
+    pixels: Float32[np.ndarray, " M"],
+    latents: Float32[np.ndarray, "M D"],
+) -> Float32[np.ndarray, "N 3 D"]:
+    """Average of the latents of the pixels that show a Gaussian, weighted by how much they show it.
+
+    Exact, one sparse product, and within about a tenth of the regression's optimum. Gaussians that
+    no labelled pixel shows get 0.
+    """
+    sums = masks.spread(pixels[:, None] * latents)
+    return np.where(mass[:, :, None] > 0, sums / np.maximum(mass, 1e-12)[:, :, None], np.float32(0))
+
+
+def lifted_median(
+    masks: MaskOperator,
+    pixels: Float32[np.ndarray, " M"],
+    latents: Float32[np.ndarray, "M D"],
+    start: Float32[np.ndarray, "N 3 D"],
+    steps: int = 15,
+) -> Float32[np.ndarray, "N 3 D"]:
+    """Geometric median of the same latents with the same weights: what LangSplat's L1 tends to.
+
+    Masks that merge or miss things pull an average away, a median hardly. Weiszfeld's iteration: each
+    step averages with weights over the distance to the point so far; one pass over A.
+
+    Args:
+        masks: A.
+        pixels: n.
+        latents: h.
+        start: the lifted average; Gaussians that no mask shows keep it.
+        steps: iterations; 15 bring it to about three digits.
+    """
+    features = np.ascontiguousarray(start, np.float32).copy()
+    for _ in range(steps):
+        sums = np.zeros(features.shape, np.float64)
+        weights = np.zeros(features.shape[:2], np.float64)
+        _median_step(
+            masks.indptr,
+            masks.indices,
+            masks.data,
+            masks.level_index,
+            pixels,
+            latents,
+            features,
+            sums,
+            weights,
+        )
+        seen = weights > 0
+        features[seen] = sums[seen] / weights[seen][:, None]
+    return features
+
+
+@compiled
+def _means(indptr, indices, data, level_index, features, out):
+    for m in range(len(level_index)):
+        level = level_index[m]
+        for k in range(indptr[m], indptr[m + 1]):
+            g, weight = indices[k], data[k]
+            for c in range(out.shape[1]):
+                out[m, c] += weight * features[g, level, c]
+
+
+@compiled
+def _spread(indptr, indices, data, level_index, values, out):
+    for m in range(len(level_index)):
+        level = level_index[m]
+        for k in range(indptr[m], indptr[m + 1]):
+            g, weight = indices[k], data[k]
+            for c in range(values.shape[1]):
+                out[g, level, c] += weight * values[m, c]
+
+
+@compiled
+def _median_step(indptr, indices, data, level_index, pixels, latents, features, sums, weights):
+    for m in range(len(level_index)):
+        level = level_index[m]
+        for k in range(indptr[m], indptr[m + 1]):
+            g = indices[k]
+            square = 0.0
+            for c in range(latents.shape[1]):
+                apart = np.float64(latents[m, c]) - features[g, level, c]
+                square += apart * apart
+            weight = np.float64(pixels[m]) * data[k] / max(np.sqrt(square), MEDIAN_SOFTENING)
+            weights[g, level] += weight
+            for c in range(latents.shape[1]):
+                sums[g, level, c] += weight * latents[m, c]

@@ -1,0 +1,192 @@
+"""The quadratic form of frozen geometry: G_l = sum over views of W' diag(valid_l) W.
+
+W holds the compositing weights of all pixels that have a mask at some level. G is stored once for
+all levels, as an upper triangle with three values per pair of Gaussians; where W has fewer
+non-zeros, W is kept and streamed instead. Both give the same products.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Bool, Float, Float32
+
+from hilsplat.base.artifacts import read_into, read_npz, write_npz
+from hilsplat.base.compiled import compiled
+from hilsplat.base.errors import ArtifactError
+from hilsplat.base.levels import LEVELS
+
+PRODUCT_PARTS = 4
+"""Parts of equally many pairs in which a product with G is summed. Fixed, so that the number of threads
+changes no byte; each part holds the sums of its rows and of those below."""
+
+
+@dataclass(frozen=True)
+class Gram:
+    """Upper triangle of G for all levels, with one pattern.
+
+    Attributes:
+        indptr: of the CSR pattern (N, N), as are `indices`; columns from the diagonal on.
+        values: G of each level at each pair of the pattern, float32.
+        threads: that share a product.
+    """
+
+    indptr: np.ndarray
+    indices: np.ndarray
+    values: Float32[np.ndarray, "E 3"]
+    threads: int = 1
+
+    @property
+    def nonzeros(self) -> int:
+        """Stored pairs of Gaussians."""
+        return len(self.indices)
+
+    @property
+    def num_gaussians(self) -> int:
+        """N."""
+        return len(self.indptr) - 1
+
+    def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
+        """G_l F_l for every level; summed in their precision, in one order on any number of threads."""
+        features = np.ascontiguousarray(features)
+        shares = np.linspace(0, self.nonzeros, PRODUCT_PARTS + 1)[1:-1]
+        edges = [0, *np.searchsorted(self.indptr, shares).tolist(), self.num_gaussians]
+
+        def part(begin: int, end: int) -> np.ndarray:
+            out = np.zeros_like(features[begin:])
+            _gram_product(begin, end, self.indptr, self.indices, self.values, features, out)
+            return out
+
+        with ThreadPoolExecutor(self.threads) as pool:
+            parts = list(pool.map(part, edges[:-1], edges[1:]))
+        total = parts[0]
+        for begin, rest in zip(edges[1:-1], parts[1:], strict=True):
+            total[begin:] += rest
+        return total
+
+    def save(self, path: Path) -> None:
+        """Write `G.npz`."""
+        write_npz(path, indptr=self.indptr, indices=self.indices, values=self.values)
+
+
+@dataclass(frozen=True)
+class StackedWeights:
+    """W of all labelled pixels of all views, and at which levels each pixel has a mask.
+
+    Attributes:
+        weights: CSR (P, N); rows sum to 1.
+        valid: whether a pixel has a mask at each level.
+    """
+
+    weights: sp.csr_matrix
+    valid: Bool[np.ndarray, "P 3"]
+
+    @property
+    def nonzeros(self) -> int:
+        """Stored weights."""
+        return self.weights.nnz
+
+    @property
+    def num_gaussians(self) -> int:
+        """N."""
+        return self.weights.shape[1]
+
+    def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
+        """W' diag(valid_l) W F_l for every level; summed in their precision, by one thread, in one order."""
+        out = np.zeros_like(features)
+        _weights_product(
+            self.weights.indptr,
+            self.weights.indices,
+            self.weights.data,
+            self.valid,
+            np.ascontiguousarray(features),
+            out,
+        )
+        return out
+
+    def save(self, path: Path) -> None:
+        """Write `W.npz`."""
+        write_npz(
+            path,
+            indptr=self.weights.indptr,
+            indices=self.weights.indices,
+            data=self.weights.data,
+            columns=np.array([self.weights.shape[1]]),
+            valid=self.valid,
+        )
+
+
+Quadratic = Gram | StackedWeights
+
+
+@runtime_checkable
+class QuadraticProduct(Protocol):
+    """The product with G that the solver takes, whoever computes it."""
+
+    def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
+        """G_l F_l for every level."""
+
+
+def level_mass(quadratic: Quadratic) -> Float32[np.ndarray, "N 3"]:
+    """Visible mass of each Gaussian in the labelled pixels of each level: G_l 1, as rows of W sum to 1."""
+    ones = np.ones((quadratic.num_gaussians, len(LEVELS), 1), np.float32)
+    return quadratic.product(ones)[:, :, 0]
+
+
+def load_quadratic(folder: Path, threads: int = 1) -> Quadratic:
+    """Read `G.npz` or `W.npz`, whichever the contributions stage kept.
+
+    Args:
+        folder: of the contributions.
+        threads: that share a product with G (one with W is one thread's).
+
+    Raises:
+        ArtifactError: neither is there.
+    """
+    if (folder / "G.npz").is_file():
+        return read_into(Gram, folder / "G.npz", threads=threads)
+    if (folder / "W.npz").is_file():
+        arrays = read_npz(folder / "W.npz")
+        shape = (len(arrays["indptr"]) - 1, int(arrays["columns"][0]))
+        matrix = sp.csr_matrix((arrays["data"], arrays["indices"], arrays["indptr"]), shape=shape)
+        return StackedWeights(matrix, arrays["valid"])
+    raise ArtifactError(f"{folder} holds neither G.npz nor W.npz", fix="run the contributions stage again")
+
+
+@compiled
+def _gram_product(begin, end, indptr, indices, values, features, out):
+    """Rows begin..end of the upper triangle and their mirror images; `out` starts with row `begin`."""
+    levels, channels = features.shape[1], features.shape[2]
+    for i in range(begin, end):
+        for k in range(indptr[i], indptr[i + 1]):
+            j = indices[k]
+            for level in range(levels):
+                value = values[k, level]
+                for c in range(channels):
+                    out[i - begin, level, c] += value * features[j, level, c]
+                if j != i:
+                    for c in range(channels):
+                        out[j - begin, level, c] += value * features[i, level, c]
+
+
+@compiled
+def _weights_product(indptr, indices, data, valid, features, out):
+    levels, channels = features.shape[1], features.shape[2]
+    rendered = np.zeros((levels, channels), features.dtype)
+    for p in range(len(indptr) - 1):
+        rendered[:] = 0
+        for k in range(indptr[p], indptr[p + 1]):
+            j, weight = indices[k], data[k]
+            for level in range(levels):
+                if valid[p, level]:
+                    for c in range(channels):
+                        rendered[level, c] += weight * features[j, level, c]
+        for k in range(indptr[p], indptr[p + 1]):
+            j, weight = indices[k], data[k]
+            for level in range(levels):
+                if valid[p, level]:
+                    for c in range(channels):
+                        out[j, level, c] += weight * rendered[level, c]

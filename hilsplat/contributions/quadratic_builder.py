@@ -1,0 +1,336 @@
+"""Sum the quadratic form of frozen geometry view by view, in bounded memory, and choose G or W."""
+
+import logging
+import shutil
+import time
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+
+from hilsplat.base.artifacts import INDEX, atomic_folder, read_index, read_npy, sha256_of_json, write_index
+from hilsplat.base.compiled import compiled
+from hilsplat.base.errors import ArtifactError
+from hilsplat.base.levels import LEVELS
+from hilsplat.contributions.quadratic import Gram, Quadratic, StackedWeights
+
+logger = logging.getLogger(__name__)
+
+BLOCKS = 64
+"""Blocks of rows in which G is built, one a thread at a time; the result does not depend on it. A block
+whose Gaussians a part does not show is left as it is, which a Morton order makes frequent."""
+
+CHUNK_WEIGHTS = 2**25
+"""Non-zeros of W that are gathered before they are added to G; 0.7 GiB while they are."""
+
+MAX_WEIGHTS = 2**28
+"""Non-zeros up to which W of all views is held in memory, 2 GiB."""
+
+CHECKPOINT_SECONDS = 300.0
+"""Time between two checkpoints of a long pass; short ones never write any."""
+
+
+class GramBuilder:
+    """Sums G over parts of W, such as one view's after another; memory grows with G alone.
+
+    Entries are summed in float64 in the order of the pixels, so the bytes depend neither on how the
+    pixels were parted nor on the number of threads.
+
+    Args:
+        num_gaussians: N.
+        threads: blocks of rows are shared among them.
+    """
+
+    def __init__(self, num_gaussians: int, threads: int) -> None:
+        edges = np.linspace(0, num_gaussians, BLOCKS + 1).astype(np.int64).tolist()
+        self._ranges = list(pairwise(edges))
+        self._threads = max(1, threads)
+        self._pixels = self._places = np.zeros(0, np.int32)
+        self._blocks = [_empty_block(end - begin) for begin, end in self._ranges]
+
+    @property
+    def nonzeros(self) -> int:
+        """Pairs of Gaussians so far."""
+        return sum(len(indices) for _, indices, _ in self._blocks)
+
+    def add(self, part: StackedWeights) -> None:
+        """Add W' diag(valid) W of further pixels; columns of W are sorted within rows."""
+        weights = part.weights
+        arrays = (weights.indptr, weights.indices, weights.data, part.valid)
+        columns = self._columns(weights)
+
+        def grow(block: int) -> None:
+            begin, end = self._ranges[block]
+            if columns[0][begin] == columns[0][end]:
+                return
+            self._blocks[block] = _grown_block(
+                begin, end, *arrays, *columns, *self._blocks[block], len(LEVELS)
+            )
+
+        with ThreadPoolExecutor(self._threads) as pool:
+            list(pool.map(grow, range(len(self._blocks))))
+
+    def _columns(self, weights: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where each Gaussian's weights lie: begins in the lists, pixels, and places in W.
+
+        From such a place on lie the columns of the upper triangle. The lists are used again for the next
+        part, for new memory costs more time than filling it.
+        """
+        dtype = np.int32 if weights.nnz < 2**31 else np.int64
+        if len(self._places) < weights.nnz or self._places.dtype != dtype:
+            self._pixels = np.empty(weights.nnz * 9 // 8, np.int32)
+            self._places = np.empty(len(self._pixels), dtype)
+        begins = np.zeros(weights.shape[1] + 1, np.int64)
+        _transpose(weights.indptr, weights.indices, begins, self._pixels, self._places)
+        return begins, self._pixels, self._places
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything that was summed, as arrays."""
+        names = ("indptr", "indices", "values")
+        return {
+            f"{name}_{number}": array
+            for number, block in enumerate(self._blocks)
+            for name, array in zip(names, block, strict=True)
+        }
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Go on from `state`."""
+        names = ("indptr", "indices", "values")
+        self._blocks = [
+            tuple(state[f"{name}_{number}"] for name in names) for number in range(len(self._blocks))
+        ]
+
+    def finish(self) -> Gram:
+        """G of everything added; the builder is empty afterwards."""
+        indptr = np.zeros(self._ranges[-1][1] + 1, np.int64)
+        indices = np.empty(self.nonzeros, np.int32)
+        values = np.empty((len(indices), len(LEVELS)), np.float32)
+        done = 0
+        for (begin, end), block in zip(self._ranges, range(len(self._blocks)), strict=True):
+            some_indptr, some_indices, some_values = self._blocks[block]
+            self._blocks[block] = _empty_block(end - begin)
+            indptr[begin + 1 : end + 1] = some_indptr[1:] + done
+            indices[done : done + len(some_indices)] = some_indices
+            values[done : done + len(some_indices)] = some_values
+            done += len(some_indices)
+        return Gram(indptr, indices, values)
+
+
+def _empty_block(rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of G without a pair: begins, columns, values."""
+    return np.zeros(rows + 1, np.int64), np.zeros(0, np.int32), np.zeros((0, len(LEVELS)))
+
+
+class QuadraticBuilder:
+    """Collects W part by part and keeps whichever of G and W has fewer non-zeros.
+
+    One product touches each of them equally often. W is let go of as soon as it has more non-zeros
+    than `MAX_WEIGHTS`, and G is kept then.
+
+    Args:
+        num_gaussians: N.
+        keep: "auto", or "gram" or "weights" to insist on one.
+        threads: for building G.
+    """
+
+    def __init__(self, num_gaussians: int, keep: str, threads: int) -> None:
+        self._num_gaussians = num_gaussians
+        self._gram = None if keep == "weights" else GramBuilder(num_gaussians, threads)
+        self._keeps_weights = keep != "gram"
+        self._may_drop = keep == "auto"
+        self._parts: list[StackedWeights] = []
+        self._waiting: list[StackedWeights] = []
+        self.weights_nonzeros = 0
+
+    def add(self, part: StackedWeights) -> None:
+        """Add the labelled pixels of a view."""
+        self.weights_nonzeros += part.nonzeros
+        if self._may_drop and self.weights_nonzeros > MAX_WEIGHTS:
+            self._parts, self._keeps_weights = [], False
+        if self._keeps_weights:
+            self._parts.append(part)
+        if self._gram is not None:
+            self._waiting.append(part)
+            if sum(each.nonzeros for each in self._waiting) >= CHUNK_WEIGHTS:
+                self._gram.add(stack_weights(self._waiting))
+                self._waiting = []
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything that was added, as arrays."""
+        out = {"nonzeros": np.array([self.weights_nonzeros, self._keeps_weights], np.int64)}
+        if self._gram is not None:
+            out |= {f"gram_{name}": array for name, array in self._gram.state().items()}
+        for name, parts in (("parts", self._parts), ("waiting", self._waiting)):
+            if parts:
+                stacked = stack_weights(parts)
+                out |= {f"{name}_valid": stacked.valid}
+                out |= {
+                    f"{name}_{what}": getattr(stacked.weights, what) for what in ("data", "indices", "indptr")
+                }
+        return out
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Go on from `state`; the result is the same bytes as without a stop."""
+        self.weights_nonzeros, self._keeps_weights = int(state["nonzeros"][0]), bool(state["nonzeros"][1])
+        if self._gram is not None:
+            prefix = "gram_"
+            self._gram.restore({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+        for name in ("parts", "waiting"):
+            if f"{name}_valid" not in state:
+                continue
+            arrays = tuple(state[f"{name}_{what}"] for what in ("data", "indices", "indptr"))
+            shape = (len(arrays[2]) - 1, self._num_gaussians)
+            part = StackedWeights(sp.csr_matrix(arrays, shape=shape), state[f"{name}_valid"])
+            (self._parts if name == "parts" else self._waiting).append(part)
+
+    def finish(self) -> Quadratic:
+        """G or W of everything added."""
+        if self._gram is None:
+            return stack_weights(self._parts)
+        if self._waiting:
+            self._gram.add(stack_weights(self._waiting))
+            self._waiting = []
+        if self._keeps_weights and self.weights_nonzeros < self._gram.nonzeros:
+            return stack_weights(self._parts)
+        return self._gram.finish()
+
+
+class QuadraticCheckpoint:
+    """What is summed so far, kept on disk while a long pass runs.
+
+    Args:
+        folder: where checkpoints lie.
+        keys: digests of what each view contributes, in order.
+        keep: which form is insisted on.
+    """
+
+    def __init__(self, folder: Path, keys: list[str], keep: str) -> None:
+        self._keys = keys
+        digest = sha256_of_json({"views": keys, "keep": keep, "max": MAX_WEIGHTS, "chunk": CHUNK_WEIGHTS})
+        self._folder = Path(folder) / digest
+        self._last = time.monotonic()
+
+    def resume(self, builder: QuadraticBuilder) -> int:
+        """Put the builder where it was; returns the number of views it holds, 0 without a checkpoint.
+
+        A checkpoint that lacks a file, as after the cache was pruned, is forgotten.
+        """
+        if not (self._folder / INDEX).is_file():
+            return 0
+        try:
+            index = read_index(self._folder)
+            state = {name: read_npy(self._folder / f"{name}.npy") for name in index["arrays"]}
+        except ArtifactError as error:
+            logger.warning("checkpoint of the contributions is incomplete and forgotten: %s", error)
+            self.forget()
+            return 0
+        builder.restore(state)
+        return int(index["summed"])
+
+    def offer(self, builder: QuadraticBuilder, summed: int) -> None:
+        """Write a checkpoint where the last one is old enough and views are left."""
+        if summed == len(self._keys) or time.monotonic() - self._last < CHECKPOINT_SECONDS:
+            return
+        state = builder.state()
+        with atomic_folder(self._folder) as folder:
+            for name, array in state.items():
+                np.save(folder / f"{name}.npy", array)
+            write_index(folder, {}, summed=summed, arrays=sorted(state))
+        self._last = time.monotonic()
+
+    def forget(self) -> None:
+        """Delete the checkpoint of a finished pass."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def stack_weights(parts: list[StackedWeights]) -> StackedWeights:
+    """One after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    matrix = sp.vstack([part.weights for part in parts], format="csr")
+    return StackedWeights(matrix, np.concatenate([part.valid for part in parts]))
+
+
+@compiled
+def _transpose(indptr, indices, begins, pixels, places):
+    """Begins of each column, and the row and place of its values; `begins` comes as zeros."""
+    for k in range(indptr[-1]):
+        begins[indices[k] + 1] += 1
+    begins[:] = np.cumsum(begins)
+    filled = begins[:-1].copy()
+    for p in range(len(indptr) - 1):
+        for k in range(indptr[p], indptr[p + 1]):
+            at = filled[indices[k]]
+            pixels[at] = p
+            places[at] = k
+            filled[indices[k]] += 1
+
+
+@compiled
+def _grown_block(
+    begin,
+    end,
+    indptr,
+    indices,
+    data,
+    valid,
+    begins,
+    pixels,
+    places,
+    old_indptr,
+    old_indices,
+    old_values,
+    levels,
+):
+    """Rows begin..end of G with the new pixels added to the old values; columns sorted."""
+    num = len(begins) - 1
+    seen = np.full(num, -1, np.int64)
+    sums = np.zeros((num, levels), np.float64)
+    found = np.empty(num, np.int32)
+    out_indptr = np.zeros(end - begin + 1, np.int64)
+    out_indices = np.empty(max(1024, 2 * len(old_indices)), np.int32)
+    out_values = np.empty((len(out_indices), levels), np.float64)
+    done = 0
+    for i in range(begin, end):
+        count = 0
+        for k in range(old_indptr[i - begin], old_indptr[i - begin + 1]):
+            j = old_indices[k]
+            seen[j] = i
+            found[count] = j
+            count += 1
+            for level in range(levels):
+                sums[j, level] = old_values[k, level]
+        known = count
+        for t in range(begins[i], begins[i + 1]):
+            p = pixels[t]
+            weight = np.float64(data[places[t]])
+            whole = weight if valid[p, 0] else 0.0
+            part = weight if valid[p, 1] else 0.0
+            subpart = weight if valid[p, 2] else 0.0
+            for k in range(places[t], indptr[p + 1]):
+                j = indices[k]
+                if seen[j] != i:
+                    seen[j] = i
+                    sums[j] = 0
+                    found[count] = j
+                    count += 1
+                value = np.float64(data[k])
+                sums[j, 0] += whole * value
+                sums[j, 1] += part * value
+                sums[j, 2] += subpart * value
+        if count > known:
+            found[:count] = np.sort(found[:count])
+        if done + count > len(out_indices):
+            room = 2 * (done + count)
+            more_indices, more_values = np.empty(room, np.int32), np.empty((room, levels), np.float64)
+            more_indices[:done], more_values[:done] = out_indices[:done], out_values[:done]
+            out_indices, out_values = more_indices, more_values
+        for place in range(count):
+            out_indices[done + place] = found[place]
+            for level in range(levels):
+                out_values[done + place, level] = sums[found[place], level]
+        done += count
+        out_indptr[i - begin + 1] = done
+    return out_indptr, out_indices[:done].copy(), out_values[:done].copy()

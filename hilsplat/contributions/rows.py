@@ -1,0 +1,146 @@
+"""The finished contributions of a scene: one row per mask of all train views."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float32, Int32, Int64, UInt8
+
+from hilsplat.base.artifacts import INDEX, read_index, read_into, read_npy
+from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.base.levels import Level
+from hilsplat.contributions.quadratic import Quadratic, load_quadratic
+from hilsplat.contributions.streams import HEADER_BYTES
+
+
+@dataclass(frozen=True)
+class Contributions:
+    """The finished stage: its rows in memory, its matrices read when asked for.
+
+    M rows are the masks of all train views, view by view, in each view's own order.
+
+    Attributes:
+        folder: the artifact.
+        views: train views in the order of `view`.
+        num_gaussians: N.
+        gaussians_sha256: digest of the PLY the weights belong to.
+        min_weight: smaller weights of a Gaussian at a pixel were dropped.
+        view: index of each row's view in `views`.
+        mask: row of the mask among its view's masks.
+        level: `Level` of the mask.
+        area_px: pixels of the raw mask.
+        pixels: pixels at which the mask is painted and the Gaussians cover the image, n.
+        half_pixels: those of them in the random half.
+    """
+
+    folder: Path
+    views: tuple[str, ...]
+    num_gaussians: int
+    gaussians_sha256: str
+    min_weight: float
+    view: Int32[np.ndarray, " M"]
+    mask: Int32[np.ndarray, " M"]
+    level: UInt8[np.ndarray, " M"]
+    area_px: Int64[np.ndarray, " M"]
+    pixels: Int64[np.ndarray, " M"]
+    half_pixels: Int64[np.ndarray, " M"]
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+    def rows_of(self, level: Level) -> Int64[np.ndarray, " m"]:
+        """Rows of a level, in order."""
+        return np.flatnonzero(self.level == int(level))
+
+    def matrix(self, name: str) -> sp.csr_matrix:
+        """`A`, `A_half` or `S` (M x N); read from the file as it is used, not held in memory."""
+        parts = (_mapped(self.folder / name / f"{part}.npy") for part in ("data", "indices", "indptr"))
+        return sp.csr_matrix(tuple(parts), shape=(len(self), self.num_gaussians), copy=False)
+
+    def mass(self) -> Float32[np.ndarray, "V N"]:
+        """Visible mass of each Gaussian in each train view, px; read as it is used."""
+        return _mapped(self.folder / "mass.npy")
+
+    def means(self) -> Float32[np.ndarray, "N 3"]:
+        """Centres of the Gaussians, scene units."""
+        return read_npy(self.folder / "means.npy")
+
+    def quadratic(self, threads: int = 1) -> Quadratic:
+        """Read G, or the stacked weights where those are smaller."""
+        return load_quadratic(self.folder, threads)
+
+    @staticmethod
+    def load(folder: Path) -> "Contributions":
+        """Read the rows of a finished contributions folder.
+
+        Raises:
+            ArtifactError: it is missing, damaged or of another version.
+        """
+        folder = Path(folder)
+        index = read_full_index(folder, "num_gaussians", "gaussians_sha256", "min_weight")
+        return read_into(
+            Contributions,
+            folder / "rows.npz",
+            folder=folder,
+            views=tuple(index["views"]),
+            num_gaussians=index["num_gaussians"],
+            gaussians_sha256=index["gaussians_sha256"],
+            min_weight=index["min_weight"],
+        )
+
+
+def read_full_index(folder: Path, *entries: str) -> dict[str, Any]:
+    """Read a folder artifact's index and check that it has some entries.
+
+    Raises:
+        ArtifactError: there is none, or another version of the program wrote it.
+    """
+    index = read_index(folder)
+    if missing := [entry for entry in entries if entry not in index]:
+        raise ArtifactError(
+            f"{folder} is of another version",
+            expected=f"{', '.join(missing)} in {INDEX}",
+            fix="run its stage again",
+        )
+    return index
+
+
+def _mapped(path: Path) -> np.ndarray:
+    """An array that stays in its file.
+
+    Raises:
+        ArtifactError: the file is missing or damaged.
+    """
+    try:
+        # A file without a single number cannot be mapped.
+        mode = "r" if path.stat().st_size > HEADER_BYTES else None
+        return np.load(path, mmap_mode=mode, allow_pickle=False).view(np.ndarray)
+    except FileNotFoundError as error:
+        raise ArtifactError(f"{path} is missing", fix="run the contributions stage again") from error
+    except (ValueError, OSError) as error:
+        raise ArtifactError(
+            f"{path} cannot be read: {error}", fix="delete the folder and run the contributions stage again"
+        ) from error
+
+
+def mask_embeddings(clip_folder: Path, contributions: Contributions) -> Float32[np.ndarray, "M C"]:
+    """CLIP vectors of all masks, in the contributions' row order.
+
+    Raises:
+        MisalignedArtifactError: a view has another number of vectors than masks.
+    """
+    parts = []
+    counts = np.bincount(contributions.view, minlength=len(contributions.views))
+    for view, count in zip(contributions.views, counts, strict=True):
+        vectors = read_npy(Path(clip_folder) / f"{view}.npy")
+        if len(vectors) != count:
+            raise MisalignedArtifactError(
+                f"CLIP vectors of view {view} do not belong to these contributions",
+                expected=f"{count} vectors, one per mask",
+                found=f"{len(vectors)} in {clip_folder}",
+                fix="run the clip and contributions stages again on the same masks",
+            )
+        parts.append(vectors.astype(np.float32))
+    return np.concatenate(parts)

@@ -1,0 +1,287 @@
+"""What the masks of all views say about each Gaussian while geometry is frozen.
+
+For a view with compositing weights W (pixels x Gaussians, rows divided by their sum) and the masks
+painted into one label map per level, B their indicator and n their areas:
+
+- A = diag(1/n) B W: the mean weight of each Gaussian in each mask; A F are the mask means,
+- G_l = sum over views of W' diag(valid_l) W (see `quadratic`),
+- A_half: A over a random half of each mask's pixels, for the part loss,
+- S = D W with the raw, overlapping masks D: how much of a Gaussian falls into a mask,
+- mass: how much of a Gaussian is visible in each view.
+
+Every loss of the language field, and the 3D semantic tree, need nothing else of the images.
+"""
+
+import hashlib
+import logging
+from dataclasses import dataclass
+from functools import cache as cache_calls
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Int32, Int64
+
+from hilsplat.base.artifacts import (
+    INDEX,
+    ViewCache,
+    atomic_folder,
+    read_index,
+    sha256_of_bytes,
+    sha256_of_file,
+    sha256_of_json,
+    write_index,
+    write_npz,
+)
+from hilsplat.base.code_hash import code_hash
+from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.base.levels import LEVELS
+from hilsplat.base.progress import stage_log, track
+from hilsplat.contributions.compositing import normalised_weights, visible_mass
+from hilsplat.contributions.quadratic import Gram, StackedWeights
+from hilsplat.contributions.quadratic_builder import QuadraticBuilder, QuadraticCheckpoint
+from hilsplat.contributions.streams import ArrayStream, MatrixStream
+from hilsplat.scene.cameras import Camera
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.settings import ContributionsSettings
+from hilsplat.splat.ply import load_ply
+from hilsplat.splat.rasterise.api import pixel_weights
+from hilsplat.splat.rasterise.device import choose_device
+
+logger = logging.getLogger(__name__)
+
+MATRICES = ("A", "A_half", "S")
+
+
+def label_maps(masks: HierarchicalMasks) -> Int32[np.ndarray, "P 3"]:
+    """Row of the painted mask at each pixel and level, -1 where there is none."""
+    return np.stack([masks.label_map(level).reshape(-1) for level in LEVELS], axis=1)
+
+
+def painted_indicator(labels: Int32[np.ndarray, "P 3"], num_masks: int, pixels: np.ndarray) -> sp.csr_matrix:
+    """B: one row per mask, ones at the given pixels where it is painted (float64)."""
+    rows, columns = [], []
+    for index in range(labels.shape[1]):
+        row = labels[:, index]
+        chosen = np.flatnonzero((row >= 0) & pixels)
+        rows.append(row[chosen])
+        columns.append(chosen)
+    row, column = np.concatenate(rows), np.concatenate(columns)
+    return sp.csr_matrix((np.ones(len(row)), (row, column)), shape=(num_masks, len(labels)))
+
+
+def mask_means(
+    indicator: sp.csr_matrix, weights: sp.csr_matrix
+) -> tuple[sp.csr_matrix, Int64[np.ndarray, " M"]]:
+    """diag(1/n) B W with the weights in float64, and n; a mask without a pixel has an empty row."""
+    pixels = np.diff(indicator.indptr).astype(np.int64)
+    scale = sp.diags(1.0 / np.maximum(pixels, 1))
+    return _single(scale @ (indicator @ weights)), pixels
+
+
+def raw_indicator(masks: HierarchicalMasks, pixels: np.ndarray) -> sp.csr_matrix:
+    """D: one row per raw mask, ones at the given pixels; masks may overlap."""
+    columns, lengths = [], []
+    for row in range(len(masks)):
+        inside = np.flatnonzero(masks.dense(np.array([row]))[0].reshape(-1) & pixels)
+        columns.append(inside)
+        lengths.append(len(inside))
+    indptr = np.concatenate(([0], np.cumsum(lengths))).astype(np.int64)
+    column = np.concatenate(columns) if columns else np.zeros(0, np.int64)
+    height, width = masks.size_hw
+    return sp.csr_matrix((np.ones(len(column)), column, indptr), shape=(len(masks), height * width))
+
+
+def random_half(view: str, pixels: int) -> np.ndarray:
+    """A fair coin per pixel, fixed by the view's name."""
+    seed = int.from_bytes(hashlib.sha256(view.encode()).digest()[:8], "little")
+    return np.random.default_rng(seed).random(pixels) < 0.5
+
+
+def view_contributions(view: str, weights: sp.csr_matrix, masks: HierarchicalMasks) -> dict[str, np.ndarray]:
+    """All matrices of one view but W, as plain arrays (`A_data`, `A_indices`, `A_indptr`, ...).
+
+    Args:
+        view: its name, which fixes the random halves.
+        weights: normalised weights (see `normalised_weights`).
+        masks: the view's masks.
+    """
+    covered = np.diff(weights.indptr) > 0
+    labels = label_maps(masks)
+    num_masks = len(masks)
+    half = covered & random_half(view, len(covered))
+    exact = weights.astype(np.float64)
+    A, pixels = mask_means(painted_indicator(labels, num_masks, covered), exact)
+    A_half, half_pixels = mask_means(painted_indicator(labels, num_masks, half), exact)
+    S = _single(raw_indicator(masks, covered) @ exact)
+    arrays = {
+        "pixels": pixels,
+        "half_pixels": half_pixels,
+        "mass": visible_mass(weights),
+    }
+    for name, matrix in (("A", A), ("A_half", A_half), ("S", S)):
+        arrays |= {f"{name}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr")}
+    return arrays
+
+
+def labelled_rows(weights: sp.csr_matrix, labels: Int32[np.ndarray, "P 3"]) -> StackedWeights:
+    """The rows of W that have Gaussians and a mask at some level."""
+    valid = (labels >= 0) & (np.diff(weights.indptr) > 0)[:, None]
+    rows = np.flatnonzero(valid.any(axis=1))
+    return StackedWeights(weights[rows], valid[rows])
+
+
+@dataclass(frozen=True)
+class _View:
+    """One train view: its masks, and the digest of everything its matrices depend on."""
+
+    name: str
+    masks_path: Path
+    key: str
+
+    def masks(self, camera: Camera) -> HierarchicalMasks:
+        """Read the masks and check their size."""
+        masks = HierarchicalMasks.load(self.masks_path)
+        if masks.size_hw != camera.size_hw:
+            raise MisalignedArtifactError(
+                f"masks of view {self.name} do not fit its camera",
+                expected=f"{camera.size_hw[0]} x {camera.size_hw[1]} (height x width)",
+                found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
+                fix="run the masks stage again",
+            )
+        return masks
+
+
+def run_contributions(
+    scene_folder: Path,
+    gaussians_ply: Path,
+    masks_folder: Path,
+    out: Path,
+    cache: Path,
+    settings: ContributionsSettings,
+    threads: int,
+) -> None:
+    """One pass over the train views: write A, A_half, S, mass, and G or W.
+
+    Views are worked on one by one and their rows go to disk at once; memory holds one view, G as far as it
+    is summed, and the weights that wait to be added to it (`quadratic_builder`). A killed run finds
+    finished views' matrices in the cache, and G as it was at most `CHECKPOINT_SECONDS` (and one view)
+    before; W of views that G lacks is rasterised again.
+
+    Raises:
+        MisalignedArtifactError: masks and images differ in size.
+        ArtifactError: no train view has masks.
+    """
+    scene = Scene.load(scene_folder)
+    gaussians = load_ply(gaussians_ply)
+    gaussians_sha256 = sha256_of_file(gaussians_ply)
+    device = choose_device(settings.device)
+    read_index(masks_folder)
+    about = {
+        "code": code_hash("hilsplat.contributions.stage"),
+        "device": device,
+        "gaussians": gaussians_sha256,
+        "min_weight": settings.min_weight,
+    }
+    views = [_view(scene, name, Path(masks_folder), about) for name in scene.views("train")]
+    store = ViewCache(Path(cache) / "contributions")
+    checkpoint = QuadraticCheckpoint(store.folder / "partial", [view.key for view in views], settings.keep)
+    rows: dict[str, list[np.ndarray]] = {
+        name: [] for name in ("view", "mask", "level", "area_px", "pixels", "half_pixels")
+    }
+    with stage_log("contributions", scene.name) as counts, atomic_folder(out) as folder:
+        builder = QuadraticBuilder(len(gaussians), settings.keep, threads)
+        summed = checkpoint.resume(builder)
+        matrices = {name: MatrixStream(folder / name) for name in MATRICES}
+        with ArrayStream(folder / "mass.npy", np.float32, len(gaussians)) as mass:
+            for number, view in enumerate(track(views, "contributions of views")):
+                camera = scene.cameras[view.name]
+                masks = view.masks(camera)
+
+                @cache_calls
+                def weights(camera: Camera = camera) -> sp.csr_matrix:
+                    raw = pixel_weights(
+                        gaussians, camera, min_weight=settings.min_weight, threads=threads, device=device
+                    )
+                    return normalised_weights(raw)
+
+                part = store.get(
+                    view.key,
+                    lambda view=view, weights=weights, masks=masks: view_contributions(
+                        view.name, weights(), masks
+                    ),
+                )
+                for name, matrix in matrices.items():
+                    matrix.append(*(part[f"{name}_{what}"] for what in ("data", "indices", "indptr")))
+                mass.append(part["mass"][None])
+                rows["view"].append(np.full(len(masks), number, np.int32))
+                rows["mask"].append(np.arange(len(masks), dtype=np.int32))
+                rows["level"].append(masks.level)
+                rows["area_px"].append(masks.area_px)
+                rows["pixels"].append(part["pixels"])
+                rows["half_pixels"].append(part["half_pixels"])
+                if number >= summed:
+                    builder.add(labelled_rows(weights(), label_maps(masks)))
+                    checkpoint.offer(builder, number + 1)
+        for matrix in matrices.values():
+            matrix.close()
+        if not sum(len(part) for part in rows["view"]):
+            raise ArtifactError(
+                f"no train view of {scene.name} has a mask",
+                fix="loosen masks.predicted_iou_min or masks.stability_min, then run the masks stage again",
+            )
+        np.save(folder / "means.npy", gaussians.means.detach().numpy().astype(np.float32))
+        write_npz(folder / "rows.npz", **{name: np.concatenate(values) for name, values in rows.items()})
+        quadratic = builder.finish()
+        kept = "G" if isinstance(quadratic, Gram) else "W"
+        quadratic.save(folder / f"{kept}.npz")
+        counts |= {
+            "views": len(views),
+            "masks": sum(len(part) for part in rows["view"]),
+            "kept": kept,
+            "nonzeros": quadratic.nonzeros,
+            "nonzeros of W": builder.weights_nonzeros,
+            "from_cache": store.hits,
+        }
+        write_index(
+            folder,
+            {view.name: {"masks": len(part)} for view, part in zip(views, rows["view"], strict=True)},
+            scene=scene.name,
+            num_gaussians=len(gaussians),
+            gaussians_sha256=gaussians_sha256,
+            min_weight=settings.min_weight,
+            masks_sha256=sha256_of_file(Path(masks_folder) / INDEX),
+            num_masks=counts["masks"],
+            quadratic=kept,
+            nonzeros={
+                **{name: matrix.nonzeros for name, matrix in matrices.items()},
+                "W": builder.weights_nonzeros,
+                kept: quadratic.nonzeros,
+            },
+        )
+    checkpoint.forget()
+
+
+def _view(scene: Scene, name: str, masks_folder: Path, about: dict) -> _View:
+    path = masks_folder / f"{name}.npz"
+    camera = scene.cameras[name]
+    key = sha256_of_json(
+        {
+            **about,
+            "masks": sha256_of_file(path),
+            "camera": sha256_of_bytes(camera.cam_from_world.tobytes(), camera.K.tobytes()),
+            "view": name,
+        }
+    )
+    return _View(name, path, key)
+
+
+def _single(matrix: sp.spmatrix) -> sp.csr_matrix:
+    """float32 CSR with sorted int32 columns."""
+    matrix = sp.csr_matrix(matrix)
+    matrix.sort_indices()
+    return sp.csr_matrix(
+        (matrix.data.astype(np.float32), matrix.indices.astype(np.int32), matrix.indptr.astype(np.int64)),
+        shape=matrix.shape,
+    )

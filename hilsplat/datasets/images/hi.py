@@ -1,0 +1,207 @@
+"""Hi-LERF and Hi-3DOVS: labels at three levels on images of LERF-OVS and 3D-OVS.
+
+The paper publishes frames and levels but no labels and no format. Ours is the label file of LERF-OVS with
+three more keys per object: `id`, unique in the file; `level`, 1 whole, 2 part, 3 subpart; `parent`, the id
+of an object one level up, or null. `segmentation` may be a list of polygons. Images are those of the other
+data set, in its folder beside this one.
+
+A frame without image or label, a parent that is none, a child outside its parent: reported, never fatal.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from hilsplat.base.errors import SceneError
+from hilsplat.base.levels import Level
+from hilsplat.datasets.dataset import Dataset, SceneReport
+from hilsplat.datasets.images.isat import IsatFile, IsatObject, read_isat
+from hilsplat.datasets.images.lerf_ovs import label_files
+from hilsplat.datasets.labelled import (
+    LabelledRegion,
+    LabelledScene,
+    check_label_size,
+    image_size_hw,
+    images_by_stem,
+    missing_frames,
+    report_of,
+)
+from hilsplat.datasets.published import FRAMES
+
+IMAGES_OF = {"hi_lerf": "lerf_ovs", "hi_3dovs": "3d_ovs"}
+"""Folder of the images of each, beside its own."""
+
+OUTSIDE_SHARE = 0.01
+"""So much of a child may lie outside its parent: rasterised borders."""
+
+
+def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
+    """Read the labels of a scene: one region per object, several may share a text.
+
+    Args:
+        dataset: "hi_lerf" or "hi_3dovs".
+        root: the folder of that name; the images' data set lies beside it.
+        scene: such as "figurines".
+
+    Raises:
+        SceneError: images or labels are missing, or a label file cannot be used.
+    """
+    root = Path(root)
+    HI_DATASETS[dataset].require(root, scene)
+    source = root.parent / IMAGES_OF[dataset] / scene
+    images = images_by_stem(source / "images")
+    warnings: list[str] = []
+    views: dict[str, tuple[LabelledRegion, ...]] = {}
+    files = label_files(root / "label" / scene)
+    for view, path in files.items():
+        if view not in images:
+            warnings.append(f"label file {path} has no image in {source / 'images'}: left out")
+            continue
+        labels = read_isat(path)
+        warnings.extend(labels.warnings)
+        size = check_label_size(f"label file {path}", labels.size_hw, image_size_hw(images[view]))
+        if size:
+            warnings.append(size)
+        objects = by_id(labels)
+        parents = parents_of(labels, objects, warnings)
+        warnings.extend(nesting_violations(labels, objects, parents))
+        views[view] = tuple(
+            LabelledRegion(
+                thing.category,
+                labels.size_hw,
+                lambda thing=thing, size_hw=labels.size_hw: thing.mask(size_hw),
+                thing.box_xyxy[None],
+                Level(thing.keys["level"]),
+                path_of(number, objects, parents),
+            )
+            for number, thing in objects.items()
+        )
+    listed = FRAMES[dataset].get(scene, ())
+    for what, present in (("image", images), ("label", files)):
+        sentence = missing_frames(what, listed, present)
+        if sentence:
+            warnings.append(sentence)
+    prompts = tuple(sorted({region.text for regions in views.values() for region in regions}))
+    return LabelledScene(dataset, scene, images, source, views, prompts, tuple(warnings))
+
+
+def by_id(labels: IsatFile) -> dict[int, IsatObject]:
+    """Objects of a file by `id`.
+
+    Raises:
+        SceneError: an id is missing or taken, or a level is not 1, 2 or 3.
+    """
+    objects: dict[int, IsatObject] = {}
+    for row, thing in enumerate(labels.objects):
+        where = f"{labels.path}, object {row} ({thing.category})"
+        number, level = thing.keys.get("id"), thing.keys.get("level")
+        if type(number) is not int or number in objects:
+            raise SceneError(
+                f"{where}: id cannot be used",
+                expected="a whole number that no other object of the file has",
+                found=repr(number),
+                fix="number the objects of the file",
+            )
+        if type(level) is not int or level not in list(Level):
+            raise SceneError(
+                f"{where}: level cannot be used",
+                expected="1 (whole), 2 (part) or 3 (subpart)",
+                found=repr(level),
+                fix="correct it; plain LERF-OVS labels have no levels and belong below lerf_ovs/label",
+            )
+        objects[number] = thing
+    return objects
+
+
+def parents_of(
+    labels: IsatFile, objects: Mapping[int, IsatObject], warnings: list[str]
+) -> dict[int, int | None]:
+    """Parent id of every object; None where it has none or names one that cannot be its parent."""
+    parents: dict[int, int | None] = {}
+    for number, thing in objects.items():
+        parent, level = thing.keys.get("parent"), thing.keys["level"]
+        parents[number] = None
+        if parent is None:
+            continue
+        where = f"{labels.path.name}, id {number} ({thing.category})"
+        if parent not in objects:
+            warnings.append(f"{where}: its parent {parent!r} does not exist")
+        elif objects[parent].keys["level"] != level - 1:
+            found = objects[parent].keys["level"]
+            warnings.append(f"{where}, level {level}: its parent {parent} is of level {found}")
+        else:
+            parents[number] = parent
+    return parents
+
+
+def nesting_violations(
+    labels: IsatFile, objects: Mapping[int, IsatObject], parents: Mapping[int, int | None]
+) -> list[str]:
+    """A sentence for every child of which more than `OUTSIDE_SHARE` lies outside its parent."""
+    masks = {number: thing.mask(labels.size_hw) for number, thing in objects.items()}
+    sentences = []
+    for number, parent in parents.items():
+        if parent is None:
+            continue
+        area_px = np.count_nonzero(masks[number])
+        outside = np.count_nonzero(masks[number] & ~masks[parent])
+        if outside > OUTSIDE_SHARE * area_px:
+            sentences.append(
+                f"{labels.path.name}, id {number} ({objects[number].category}): {outside / area_px:.1%} of "
+                f"it lies outside its parent {parent} ({objects[parent].category})"
+            )
+    return sentences
+
+
+def path_of(
+    number: int, objects: Mapping[int, IsatObject], parents: Mapping[int, int | None]
+) -> tuple[str, ...]:
+    """Texts from the outermost known ancestor down to an object; parents lie a level higher, so it ends."""
+    texts = []
+    step: int | None = number
+    while step is not None:
+        texts.append(objects[step].category)
+        step = parents[step]
+    return tuple(reversed(texts))
+
+
+def _layout(folder: str, images: str, frame: str) -> str:
+    return f"""\
+{folder}/
+  label/<scene>/{frame}.json ...      our format (docs/datasets.md)
+{images}/
+  <scene>/images, sparse              as of that data set
+"""
+
+
+def _dataset(name: str, title: str, frame: str) -> Dataset:
+    """Both share everything but names."""
+
+    def open_scene(root: Path, scene: str) -> LabelledScene:
+        return open_hi(name, root, scene)
+
+    def check_scene(root: Path, scene: str) -> SceneReport:
+        return report_of(open_scene(root, scene))
+
+    images = IMAGES_OF[name]
+    return Dataset(
+        name=name,
+        title=title,
+        labels="images",
+        folder=name,
+        scenes=tuple(FRAMES[name]),
+        licence="labels unpublished; images as of the data set they come from",
+        terms="Write your own labels in our format; the images' own terms hold.",
+        citation="Hi-LSplat (frames and levels)",
+        layout=_layout(name, images, frame),
+        required=lambda scene: (f"label/{scene}", f"../{images}/{scene}/images"),
+        open=open_scene,
+        check=check_scene,
+        label_places=lambda scene: (f"label/{scene}/*.json",),
+    )
+
+
+HI_LERF = _dataset("hi_lerf", "Hi-LERF", "frame_00041")
+HI_3DOVS = _dataset("hi_3dovs", "Hi-3DOVS", "01")
+HI_DATASETS: dict[str, Dataset] = {dataset.name: dataset for dataset in (HI_LERF, HI_3DOVS)}

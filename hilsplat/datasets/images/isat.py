@@ -1,0 +1,220 @@
+"""Label files of the ISAT annotation tool, which the labels of LERF-OVS come in.
+
+`objects` is a list; of each object `category` is the text, `segmentation` one polygon as a list of [x, y]
+(we also read a list of polygons), `bbox` [x1, y1, x2, y2]. `group` is no key: it restarts and repeats.
+Unknown keys are passed over.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from hilsplat.base.artifacts import write_json
+from hilsplat.base.errors import SceneError
+from hilsplat.datasets.images.polygons import fill_polygon, outside_px
+
+SLACK_PX = 1.0
+"""Vertices may lie this far outside, and boxes differ from their polygons by this much, unsaid."""
+
+
+@dataclass(frozen=True, eq=False)
+class IsatObject:
+    """One annotated object.
+
+    Attributes:
+        category: its text, verbatim.
+        polygons: vertices, px; the region is the union of the filled polygons.
+        box_xyxy: annotated box, borders included, whole pixels inside it.
+        keys: all keys of the file.
+    """
+
+    category: str
+    polygons: tuple[Float[np.ndarray, "_ 2"], ...]
+    box_xyxy: Int64[np.ndarray, " 4"]
+    keys: Mapping[str, Any]
+
+    def mask(self, size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+        """Rasterise (see `polygons.fill_polygon`)."""
+        return np.any([fill_polygon(polygon, size_hw) for polygon in self.polygons], axis=0)
+
+
+@dataclass(frozen=True, eq=False)
+class IsatFile:
+    """The objects of one image.
+
+    Attributes:
+        path: the file.
+        size_hw: size of the image that was annotated, px.
+        objects: in the order of the file.
+        warnings: oddities, each a sentence that names file and object.
+    """
+
+    path: Path
+    size_hw: tuple[int, int]
+    objects: tuple[IsatObject, ...]
+    warnings: tuple[str, ...] = field(default=())
+
+
+def read_isat(path: Path) -> IsatFile:
+    """Read and check one label file.
+
+    Raises:
+        SceneError: it is no JSON, a key is missing or of another kind, a polygon lies wholly outside the
+            image, or a box is [x, y, width, height].
+    """
+    path = Path(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise SceneError(
+            f"label file {path} cannot be read: {error}",
+            expected="JSON with info and objects",
+            fix="unpack the labels again",
+        ) from error
+    if not isinstance(content, dict) or not isinstance(content.get("objects"), list):
+        raise SceneError(
+            f"label file {path} has no list `objects`",
+            expected="an ISAT file: info, objects",
+            found=f"keys {', '.join(content)}" if isinstance(content, dict) else type(content).__name__,
+            fix="labels of other tools (labelme, COCO) must be converted",
+        )
+    info = content.get("info")
+    size = [info.get(key) for key in ("height", "width")] if isinstance(info, dict) else [None, None]
+    if not all(isinstance(side, int) and side > 0 for side in size):
+        raise SceneError(
+            f"label file {path} does not say how large its image is",
+            expected="info.width and info.height, px",
+            found=f"height {size[0]!r}, width {size[1]!r}",
+            fix="export the labels again",
+        )
+    size_hw = (int(size[0]), int(size[1]))
+    warnings: list[str] = []
+    name = info.get("name")
+    if isinstance(name, str) and name and Path(name).stem != path.stem:
+        warnings.append(f"{path.name} says that it belongs to {name}; taken for {path.stem}")
+    objects = tuple(
+        _read_object(f"{path}, object {number}", entry, size_hw, warnings)
+        for number, entry in enumerate(content["objects"])
+    )
+    return IsatFile(path, size_hw, objects, tuple(warnings))
+
+
+def _read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: list[str]) -> IsatObject:
+    if not isinstance(entry, dict):
+        raise SceneError(f"{where} is no object", found=repr(entry)[:80], fix="export the labels again")
+    category = entry.get("category")
+    if not isinstance(category, str) or not category.strip():
+        raise SceneError(
+            f"{where} has no category", found=repr(category), fix="give it the text that asks for it"
+        )
+    where = f"{where} ({category})"
+    if not isinstance(entry.get("iscrowd", 0), bool | int):  # 0 in some files, false in others
+        raise SceneError(f"{where}: iscrowd is no number", found=repr(entry["iscrowd"]), fix="write 0 or 1")
+    polygons = _polygons(where, entry.get("segmentation"))
+    height, width = size_hw
+    for polygon in polygons:
+        low, high = polygon.min(axis=0), polygon.max(axis=0)
+        if high[0] < 0 or high[1] < 0 or low[0] >= width or low[1] >= height:
+            raise SceneError(
+                f"{where}: a polygon lies outside the image",
+                expected=f"x below {width}, y below {height}",
+                found=f"x {low[0]:g} to {high[0]:g}, y {low[1]:g} to {high[1]:g}",
+                fix="use labels and images of one size and release",
+            )
+        if len(polygon) < 3:
+            warnings.append(f"{where}: a polygon has {len(polygon)} vertices; taken as a line")
+    if (reach := outside_px(polygons, size_hw)) > SLACK_PX:
+        warnings.append(f"{where}: a polygon reaches {reach:g} px outside the image; clipped")
+    return IsatObject(category, polygons, _box(where, entry.get("bbox"), polygons, warnings), entry)
+
+
+def _polygons(where: str, value: Any) -> tuple[Float[np.ndarray, "_ 2"], ...]:
+    """One polygon, or a list of polygons, of [x, y] pairs."""
+    expected = "a list of [x, y] pairs, or a list of such lists"
+    try:
+        nested = isinstance(value[0][0], list)
+        polygons = tuple(np.array(points, dtype=np.float64) for points in (value if nested else [value]))
+    except (TypeError, IndexError, KeyError, ValueError) as error:
+        raise SceneError(
+            f"{where}: segmentation is no polygon",
+            expected=expected,
+            found=repr(value)[:80],
+            fix="export the labels again; flat COCO lists x1, y1, x2, ... are another format",
+        ) from error
+    for polygon in polygons:
+        if polygon.ndim != 2 or polygon.shape[1] != 2 or not np.isfinite(polygon).all():
+            raise SceneError(
+                f"{where}: segmentation is no polygon",
+                expected=expected,
+                found=f"numbers of shape {polygon.shape}",
+                fix="export the labels again",
+            )
+    return polygons
+
+
+def _box(
+    where: str, value: Any, polygons: tuple[Float[np.ndarray, "_ 2"], ...], warnings: list[str]
+) -> Int64[np.ndarray, " 4"]:
+    """Whole pixels of the annotated box [x1, y1, x2, y2]; of the polygon's extent where there is none."""
+    points = np.concatenate(polygons)
+    extent = np.concatenate([points.min(axis=0), points.max(axis=0)])
+    try:
+        box = extent if value is None else np.array(value, dtype=np.float64)
+        usable = box.shape == (4,) and bool(np.isfinite(box).all())
+    except (TypeError, ValueError):
+        usable = False
+    if not usable:
+        raise SceneError(
+            f"{where}: bbox cannot be used", expected="[x1, y1, x2, y2]", found=repr(value), fix="correct it"
+        )
+    if np.abs(box - extent).max() > SLACK_PX:
+        as_sizes = np.concatenate([box[:2], box[:2] + box[2:]])
+        if np.abs(as_sizes - extent).max() <= SLACK_PX or (box[2:] < box[:2]).any():
+            raise SceneError(
+                f"{where}: bbox is not [x1, y1, x2, y2]",
+                expected=f"{extent.tolist()}, the polygon's extent",
+                found=f"{box.tolist()}, as if it were [x, y, width, height]",
+                fix="convert the boxes, or remove bbox: the polygon's extent then takes its place",
+            )
+        warnings.append(f"{where}: bbox {box.tolist()} differs from the polygon's extent {extent.tolist()}")
+    # Tests ask x1 <= x <= x2 of whole numbers x: rounding inwards keeps every answer.
+    return np.concatenate([np.ceil(box[:2]), np.floor(box[2:])]).astype(np.int64)
+
+
+def write_isat(path: Path, image: str, size_hw: tuple[int, int], objects: list[dict[str, Any]]) -> None:
+    """Write a label file in the same layout.
+
+    Args:
+        path: the file.
+        image: name of its image.
+        size_hw: size of the image, px.
+        objects: keys of each object; `category` and `segmentation` at least.
+    """
+    info = {"name": image, "width": size_hw[1], "height": size_hw[0], "depth": 3, "note": ""}
+    write_json(path, {"info": info, "objects": objects})
+
+
+def isat_object(category: str, polygons: list[np.ndarray], area_px: int, **keys: Any) -> dict[str, Any]:
+    """Keys of one object as the tool writes them: a single polygon is not nested."""
+    points = np.concatenate(polygons)
+    lists = [
+        # A single pixel or a line repeats its last vertex: a polygon has three.
+        [[float(x), float(y)] for x, y in [*polygon, *[polygon[-1]] * (3 - len(polygon))]]
+        for polygon in polygons
+    ]
+    return {
+        "category": category,
+        "group": 1,
+        "segmentation": lists[0] if len(lists) == 1 else lists,
+        "area": float(area_px),
+        "layer": 1.0,
+        "bbox": [float(n) for n in (*points.min(axis=0), *points.max(axis=0))],
+        "iscrowd": 0,
+        "note": "",
+        **keys,
+    }

@@ -1,0 +1,146 @@
+"""LERF-OVS: four scenes of LERF with the labels of LangSplat.
+
+Polygons per labelled image; objects of one category in one image are one region with several boxes, and a
+view is asked only for the categories that are labelled there. Labels lie in `label/<scene>`, beside the
+scenes. Images are found by name, never by position: LangSplat's own evaluation counts renderings, which
+shifts when an image before was not registered.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hilsplat.base.errors import SceneError
+from hilsplat.datasets.dataset import Dataset, SceneReport
+from hilsplat.datasets.images.isat import IsatFile, IsatObject, read_isat
+from hilsplat.datasets.labelled import (
+    LabelledRegion,
+    LabelledScene,
+    check_label_size,
+    image_size_hw,
+    images_by_stem,
+    missing_frames,
+    report_of,
+    unlisted_texts,
+)
+from hilsplat.datasets.published import FRAMES, PAIRS, PROMPTS
+
+LAYOUT = """\
+lerf_ovs/
+  figurines/  ramen/  teatime/  waldo_kitchen/
+    images/frame_00001.jpg ...        undistorted
+    sparse/0/{cameras,images,points3D}.bin
+  label/
+    figurines/frame_00041.json ...    (+ .jpg, not read)
+"""
+
+
+def open_scene(root: Path, scene: str) -> LabelledScene:
+    """Read the labels of a scene; masks are rasterised when asked for.
+
+    Args:
+        root: the folder `lerf_ovs`.
+        scene: such as "figurines".
+
+    Raises:
+        SceneError: a part of the scene is missing, a label file cannot be used, or a labelled frame has
+            no image.
+    """
+    root = Path(root)
+    DATASET.require(root, scene)
+    images = images_by_stem(root / scene / "images")
+    files = label_files(root / "label" / scene)
+    orphans = sorted(set(files) - set(images))
+    if orphans:
+        raise SceneError(
+            f"labelled frames of {scene} have no image: {', '.join(orphans)}",
+            expected=f"an image of that name in {root / scene / 'images'}",
+            found=f"{len(images)} images, {next(iter(images))} to {list(images)[-1]}",
+            fix="unpack the images again; those of another release are numbered otherwise",
+        )
+    warnings: list[str] = []
+    views: dict[str, tuple[LabelledRegion, ...]] = {}
+    for view, path in files.items():
+        labels = read_isat(path)
+        warnings.extend(labels.warnings)
+        size = check_label_size(f"label file {path}", labels.size_hw, image_size_hw(images[view]))
+        if size:
+            warnings.append(size)
+        views[view] = merged_regions(labels)
+    prompts = tuple(sorted({region.text for regions in views.values() for region in regions}))
+    listed = FRAMES["lerf_ovs"].get(scene, ())
+    for sentence in (
+        missing_frames("label", listed, views),
+        unlisted_texts(prompts, PROMPTS["lerf_ovs"].get(scene, ())),
+    ):
+        if sentence:
+            warnings.append(sentence)
+    read = LabelledScene("lerf_ovs", scene, images, root / scene, views, prompts, tuple(warnings))
+    if set(views) == set(listed) and read.num_pairs != PAIRS[scene]:
+        counted = f"{read.num_pairs} pairs of frame and category, published figures imply {PAIRS[scene]}"
+        read = LabelledScene("lerf_ovs", scene, images, root / scene, views, prompts, (*warnings, counted))
+    return read
+
+
+def label_files(folder: Path) -> dict[str, Path]:
+    """Label files of a folder by frame.
+
+    Raises:
+        SceneError: there is none.
+    """
+    files = {path.stem: path for path in sorted(Path(folder).glob("*.json")) if path.name[0] != "."}
+    if not files:
+        raise SceneError(
+            f"{folder} has no label file",
+            expected="one .json per labelled frame",
+            found=", ".join(sorted(path.name for path in Path(folder).glob("*"))[:5]) or "nothing",
+            fix="unpack the labels again, or move them up if they lie in a folder below",
+        )
+    return files
+
+
+def merged_regions(labels: IsatFile) -> tuple[LabelledRegion, ...]:
+    """One region per category, the union of its objects, with the boxes of all of them."""
+    objects: dict[str, list[IsatObject]] = {}
+    for thing in labels.objects:
+        objects.setdefault(thing.category, []).append(thing)
+    return tuple(
+        LabelledRegion(
+            category,
+            labels.size_hw,
+            lambda same=same: union_mask(same, labels.size_hw),
+            np.stack([thing.box_xyxy for thing in same]),
+            None,
+            (category,),
+        )
+        for category, same in objects.items()
+    )
+
+
+def union_mask(objects: Sequence[IsatObject], size_hw: tuple[int, int]) -> np.ndarray:
+    """Union of objects, rasterised."""
+    return np.any([thing.mask(size_hw) for thing in objects], axis=0)
+
+
+def check_scene(root: Path, scene: str) -> SceneReport:
+    """Read everything of a scene."""
+    return report_of(open_scene(root, scene))
+
+
+DATASET = Dataset(
+    name="lerf_ovs",
+    title="LERF-OVS",
+    labels="images",
+    folder="lerf_ovs",
+    scenes=("figurines", "ramen", "teatime", "waldo_kitchen"),
+    licence="none stated for images and labels",
+    terms="Take it for research use only, and do not redistribute.",
+    citation="images: Kerr et al., LERF, ICCV 2023; labels: Qin et al., LangSplat, CVPR 2024",
+    layout=LAYOUT,
+    required=lambda scene: (f"{scene}/images", f"{scene}/sparse", f"label/{scene}"),
+    open=open_scene,
+    check=check_scene,
+    protocols=("lerf/langsplat-v2", "lerf/paper-filter", "lerf/paper-mean"),
+    label_places=lambda scene: (f"label/{scene}/*.json",),
+)

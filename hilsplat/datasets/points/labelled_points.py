@@ -1,0 +1,90 @@
+"""Points that a benchmark labels: vertices of a mesh, returns of a lidar."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int32
+
+from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.datasets.classes.class_set import ClassSet
+from hilsplat.datasets.classes.replica import REPLICA_48, REPLICA_51
+from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_15, SCANNET_19, SCANNET_20
+from hilsplat.datasets.classes.scannet200 import SCANNET200, SCANNET200_INSTANCES
+from hilsplat.datasets.classes.waymo import WAYMO_22
+from hilsplat.datasets.points.posed_images import PosedImage
+
+LABELLINGS: dict[str, tuple[ClassSet, ...]] = {
+    "nyu40": (SCANNET_20, SCANNET_19, SCANNET_15, SCANNET_10),
+    "scannet200": (SCANNET200, SCANNET200_INSTANCES),
+    "replica": (REPLICA_51, REPLICA_48),
+    "waymo": (WAYMO_22,),
+}
+"""Meaning of the class ids in a data set's files -> sets of classes that are evaluated on them."""
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledPoints:
+    """P points with their true classes, in the frame of the scene's cameras.
+
+    Attributes:
+        xyz: places, metres.
+        class_id: class as the data set's files number it; 0 where undefined.
+        instance_id: from 1; 0 for none. Means nothing across files.
+        labelling: what `class_id` means, a key of `LABELLINGS`.
+        faces: corners of triangles, rows of `xyz`; None where the points are no mesh.
+        visible: whether a camera sees the point; None where the files do not tell.
+    """
+
+    xyz: Float[np.ndarray, "P 3"]
+    class_id: Int32[np.ndarray, " P"]
+    instance_id: Int32[np.ndarray, " P"]
+    labelling: str
+    faces: Int32[np.ndarray, "F 3"] | None = None
+    visible: Bool[np.ndarray, " P"] | None = None
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    def labels(self, classes: ClassSet) -> Int32[np.ndarray, " P"]:
+        """Labels 1 .. K in the order of a set of classes, 0 where it lacks the class.
+
+        Raises:
+            MisalignedArtifactError: the set is not defined on this data set's ids.
+        """
+        fitting = LABELLINGS[self.labelling]
+        if classes not in fitting:
+            raise MisalignedArtifactError(
+                f"classes {classes.name} are not defined on {self.labelling} labels",
+                expected=" or ".join(each.name for each in fitting),
+                found=classes.name,
+                fix="take the protocol of this data set",
+            )
+        return classes.labels(self.class_id)
+
+
+@dataclass(frozen=True, eq=False)
+class PointScene:
+    """A scene of a data set whose points are labelled.
+
+    Attributes:
+        name: as the data set writes it.
+        images: posed images; what cannot be used (frames without a pose) is not among them.
+        truth: per labelling, the labelled points. Reading it is for `evaluate` alone.
+        warnings: what was passed over or read otherwise than written, each a sentence.
+    """
+
+    name: str
+    images: tuple[PosedImage, ...]
+    truth: Mapping[str, LabelledPoints]
+    warnings: tuple[str, ...] = ()
+
+    def facts(self) -> dict[str, object]:
+        """What was read, in words and numbers."""
+        facts: dict[str, object] = {"posed images": len(self.images)}
+        for labelling, points in self.truth.items():
+            facts[f"{labelling} points"] = len(points)
+            facts[f"{labelling} points with a class"] = int((points.class_id > 0).sum())
+            facts[f"{labelling} classes"] = len(np.unique(points.class_id[points.class_id > 0]))
+            facts[f"{labelling} instances"] = len(np.unique(points.instance_id[points.instance_id > 0]))
+        return facts

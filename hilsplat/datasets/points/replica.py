@@ -1,0 +1,249 @@
+"""Replica: rendered sequences in three layouts, the labelled quad mesh, and labels per vertex as text.
+
+| | NICE-SLAM | Semantic-NeRF, vMAP |
+|---|---|---|
+| images | `results/frame000000.jpg` | `rgb/rgb_0.png` |
+| depth | `results/depth000000.png`, metres x 6553.5 | `depth/depth_0.png`, millimetres |
+| poses | `traj.txt` | `traj_w_c.txt` |
+| lens | `cam_params.json` beside the sequence, else 600 of 1200 px | focal length half the width |
+
+Poses are camera-to-world in OpenCV axes, 16 numbers per line.
+"""
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32
+from PIL import Image, UnidentifiedImageError
+
+from hilsplat.base.errors import ImageError, SceneError
+from hilsplat.base.files import list_images
+from hilsplat.datasets.classes.replica import SCENES
+from hilsplat.datasets.dataset import Dataset, SceneReport
+from hilsplat.datasets.points.labelled_points import PointScene
+from hilsplat.datasets.points.numbered import by_number, size_of_image
+from hilsplat.datasets.points.point_files import UNPACK_AGAIN, listing, read_json_object, read_numbers
+from hilsplat.datasets.points.posed_images import HALF_PIXEL, PosedImage, cam_from_world_of
+from hilsplat.datasets.points.replica_mesh import read_labelled_mesh, read_semantic_mesh
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a sequence keeps its frames.
+
+    Attributes:
+        colour: folder of the images and prefix of their names.
+        depth: likewise; may be the same folder.
+        poses: file of poses.
+        depth_per_metre: value of a depth image at one metre.
+    """
+
+    colour: tuple[str, str]
+    depth: tuple[str, str]
+    poses: str
+    depth_per_metre: float
+
+
+NICE_SLAM = Layout(("results", "frame"), ("results", "depth"), "traj.txt", 6553.5)
+SEMANTIC_NERF = Layout(("rgb", "rgb_"), ("depth", "depth_"), "traj_w_c.txt", 1000.0)
+
+
+def layout_of(folder: Path) -> Layout:
+    """Which layout a sequence has, by its file of poses.
+
+    Raises:
+        SceneError: it has none.
+    """
+    for layout in (NICE_SLAM, SEMANTIC_NERF):
+        if (folder / layout.poses).is_file() and (folder / layout.colour[0]).is_dir():
+            return layout
+    inner = sorted(path.parent for name in ("traj.txt", "traj_w_c.txt") for path in folder.glob(f"*/{name}"))
+    raise SceneError(
+        f"{folder} holds no rendered sequence",
+        expected="traj.txt with results/, or traj_w_c.txt with rgb/",
+        found=listing(folder),
+        fix=f"name the folder {inner[0]}" if inner else "unpack the rendered sequences there",
+    )
+
+
+def intrinsics(size_hw: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
+    """K of every rendering of Replica: focal length half the width, centre in the middle.
+
+    The files' own centre, 599.5 of 1200 px, counts pixel centres from 0.
+    """
+    height, width = size_hw
+    return np.array([[width / 2, 0.0, width / 2], [0.0, width / 2, height / 2], [0.0, 0.0, 1.0]])
+
+
+def read_lens(folder: Path, image: Path) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
+    """K and the size it is for: of `cam_params.json` beside a NICE-SLAM sequence, else Replica's own.
+
+    Raises:
+        SceneError: the file is damaged.
+    """
+    path = folder.parent / "cam_params.json"
+    if layout_of(folder) is not NICE_SLAM or not path.is_file():
+        size_hw = size_of_image(image)
+        return intrinsics(size_hw), size_hw
+    camera = read_json_object(path, ("camera",))["camera"]
+    try:
+        fx, fy, cx, cy = (float(camera[key]) for key in ("fx", "fy", "cx", "cy"))
+        size_hw = int(camera["h"]), int(camera["w"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise SceneError(
+            f"{path} cannot be read: {error!r}",
+            expected="numbers w, h, fx, fy, cx, cy under the key camera",
+            fix=UNPACK_AGAIN,
+        ) from error
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]) + HALF_PIXEL, size_hw
+
+
+def frames_of(folder: Path, part: tuple[str, str]) -> list[tuple[int, Path]]:
+    """Numbered images with exactly the prefix, by number; colour visualisations beside them are not."""
+    place, prefix = part
+    paths = [
+        path
+        for path in list_images(folder / place)
+        if path.stem.startswith(prefix) and path.stem.removeprefix(prefix).isdecimal()
+    ]
+    return by_number(paths, prefix)
+
+
+def read_images(folder: Path, every: int = 1) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
+    """Posed images of a rendered sequence, by frame number.
+
+    Line n of the poses is frame n; lines without an image are passed over.
+
+    Returns:
+        The images and a sentence for each thing that was passed over.
+
+    Raises:
+        SceneError: no layout fits, there are frames beyond the last pose, or no frame at all.
+    """
+    layout = layout_of(folder)
+    path = folder / layout.poses
+    poses = read_numbers(path, 16).reshape(-1, 4, 4)
+    frames = frames_of(folder, layout.colour)
+    beyond = [number for number, _ in frames if number >= len(poses)]
+    if beyond or not frames:
+        raise SceneError(
+            f"{path} does not fit the images in {folder / layout.colour[0]}",
+            expected="one line per frame, or more",
+            found=f"{len(poses)} lines, {len(frames)} images"
+            + (f", the first without a line is frame {beyond[0]}" if beyond else ""),
+            fix=UNPACK_AGAIN,
+        )
+    K, size_hw = read_lens(folder, frames[0][1])
+    images = tuple(
+        PosedImage(
+            image.name, image, cam_from_world_of(poses[number], f"{path}, line {number + 1}"), K, size_hw
+        )
+        for number, image in frames[::every]
+    )
+    more = len(poses) - len(frames)
+    return images, (f"{more} poses have no image and are passed over",) if more else ()
+
+
+def read_depth(folder: Path, number: int) -> Float32[np.ndarray, "H W"]:
+    """Depth of a frame along the optical axis, metres; 0 where nothing is (windows, mirrors).
+
+    Raises:
+        SceneError: the sequence or the frame is missing.
+        ImageError: the image cannot be read.
+    """
+    layout = layout_of(folder)
+    path = dict(frames_of(folder, layout.depth)).get(number)
+    if path is None:
+        raise SceneError(f"frame {number} of {folder} has no depth image", fix=UNPACK_AGAIN)
+    try:
+        with Image.open(path) as image:
+            values = np.asarray(image)
+    except (UnidentifiedImageError, OSError) as error:
+        raise ImageError(f"depth image {path} cannot be read: {error}", fix=UNPACK_AGAIN) from error
+    return (values / layout.depth_per_metre).astype(np.float32)
+
+
+def sequence_folder(root: Path, scene: str) -> Path:
+    """The rendered sequence of a scene: `room0/` (NICE-SLAM), `room_0/imap/00` (vMAP) or `room_0/Sequence_1`.
+
+    Raises:
+        SceneError: none of them is there.
+    """
+    places = (scene.replace("_", ""), f"{scene}/imap/00", f"{scene}/Sequence_1")
+    for place in places:
+        if (Path(root) / place).is_dir():
+            return Path(root) / place
+    raise SceneError(
+        f"{scene} has no rendered sequence in {root}",
+        expected=" or ".join(f"{place}/" for place in places),
+        found=listing(Path(root)),
+        fix="unpack the rendered sequences there",
+    )
+
+
+def open_scene(root: Path, scene: str, every: int = 1) -> PointScene:
+    """Read a scene: the sequence, and the labels of the original release or, without it, of OpenNeRF.
+
+    Args:
+        root: the data set's folder.
+        scene: as the release writes it, such as room_0.
+        every: take each n-th frame.
+
+    Raises:
+        SceneError: something is missing, damaged or does not fit together.
+    """
+    habitat, short = Path(root) / scene / "habitat", scene.replace("_", "")
+    text = Path(root) / f"semantic_labels_{short}.txt"
+    if habitat.is_dir():
+        truth = read_semantic_mesh(habitat)
+    elif text.is_file():
+        instances = Path(root) / f"instance_labels_{short}.txt"
+        truth = read_labelled_mesh(
+            Path(root) / f"{short}_mesh.ply", text, instances if instances.is_file() else None
+        )
+    else:
+        raise SceneError(
+            f"{scene} of Replica has no labels in {root}",
+            expected=f"{scene}/habitat/mesh_semantic.ply, or {text.name} with {short}_mesh.ply",
+            found=listing(Path(root)),
+            fix="unpack the original release there",
+        )
+    images, warnings = read_images(sequence_folder(root, scene), every)
+    for warning in warnings:
+        logger.warning("%s: %s", scene, warning)
+    return PointScene(scene, images, {"replica": truth}, warnings)
+
+
+def check_scene(root: Path, scene: str) -> SceneReport:
+    """Read everything of a scene and say what was found."""
+    found = open_scene(root, scene)
+    return SceneReport(found.facts(), found.warnings)
+
+
+DATASET = Dataset(
+    name="replica",
+    title="Replica",
+    labels="points",
+    folder="replica",
+    scenes=SCENES,
+    licence="Replica Research Terms",
+    terms="Non-commercial research and education only; do not pass the data on.",
+    citation="Straub et al., The Replica Dataset: A Digital Replica of Indoor Spaces, arXiv 1906.05797, 2019",
+    layout="""replica/
+  room_0/                        the original release
+    habitat/mesh_semantic.ply
+    habitat/info_semantic.json
+  cam_params.json                lens of the renderings, optional
+  room0/                         the renderings of NICE-SLAM, or room_0/imap/00 (vMAP), room_0/Sequence_1
+    traj.txt
+    results/frame000000.jpg depth000000.png ...""",
+    required=lambda scene: (f"{scene}/habitat/mesh_semantic.ply", f"{scene}/habitat/info_semantic.json"),
+    open=open_scene,
+    check=check_scene,
+    protocols=("replica/per-scene", "replica/opennerf", "replica/conceptgraphs"),
+    label_places=lambda scene: (f"{scene}/habitat/*",),
+)

@@ -1,0 +1,86 @@
+"""Write a scene in Replica's layout, so that its reader can be held to something known."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Int32
+
+from hilsplat.base.artifacts import atomic_folder, write_json, write_text
+from hilsplat.base.images import write_png
+from hilsplat.datasets.classes.replica import NAMES
+from hilsplat.datasets.points.point_files import write_ply
+from hilsplat.datasets.points.posed_images import HALF_PIXEL, PosedImage
+from hilsplat.datasets.points.replica import NICE_SLAM
+
+UNDEFINED, NO_OBJECT = -1, -2
+"""Class of an object that none of Replica's fits, and of object 0, which is none."""
+
+
+def write_semantic_mesh(
+    habitat: Path,
+    xyz: Float32[np.ndarray, "P 3"],
+    faces: Int32[np.ndarray, "F 3"],
+    object_of_face: Int32[np.ndarray, " F"],
+    classes: Sequence[int],
+) -> None:
+    """Write `mesh_semantic.ply` and `info_semantic.json` of a scene.
+
+    Args:
+        habitat: the folder `<scene>/habitat`.
+        xyz: vertices, metres.
+        faces: triangles; each becomes a quad whose last corner occurs twice.
+        object_of_face: row of `classes`, -1 for none. In the files objects count from 1.
+        classes: Replica's class id of each object, 0 where it has none for it.
+    """
+    places = {axis: xyz[:, column] for column, axis in enumerate("xyz")}
+    colours = dict.fromkeys(("red", "green", "blue"), np.full(len(xyz), 128, dtype=np.uint8))
+    quads = faces[:, [0, 1, 2, 2]]
+    of_face = (object_of_face + 1).astype(np.int32)
+    labels = [NO_OBJECT, *(number or UNDEFINED for number in classes)]
+    objects = [
+        {"id": row, "class_id": number, "class_name": NAMES.get(number, "undefined")}
+        for row, number in enumerate(labels)
+        if row
+    ]
+    info = {
+        "classes": [{"id": n, "name": name, "children": [], "parents": []} for n, name in NAMES.items()],
+        "gravity_dir": [0.0, 0.0, -1.0],
+        "id_to_label": labels,
+        "objects": objects[::-1],  # real files do not sort them either
+    }
+    with atomic_folder(habitat) as folder:
+        write_ply(folder / "mesh_semantic.ply", {**places, **colours}, quads, {"object_id": of_face})
+        write_text(folder / "info_semantic.json", json.dumps(info, indent=1))
+
+
+def write_sequence(
+    folder: Path, images: Sequence[PosedImage], depths: Sequence[Float32[np.ndarray, "H W"]] = ()
+) -> None:
+    """Write a sequence in the layout of NICE-SLAM: `traj.txt`, `results/`, and `cam_params.json` beside it.
+
+    Args:
+        folder: such as `room0`; the lens in the folder above is that of all its sequences.
+        images: image files with their cameras, in order; all share K and size.
+        depths: depth of each image, metres; none or one per image.
+    """
+    K, (height, width) = images[0].K - HALF_PIXEL, images[0].size_hw
+    lens = {"w": width, "h": height, "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    write_json(
+        Path(folder).parent / "cam_params.json", {"camera": {**lens, "scale": NICE_SLAM.depth_per_metre}}
+    )
+    with atomic_folder(folder) as temporary:
+        place, prefix = NICE_SLAM.colour
+        lines = []
+        for number, image in enumerate(images):
+            assert isinstance(image.image, Path)
+            target = temporary / place / f"{prefix}{number:06d}{image.image.suffix}"
+            target.parent.mkdir(exist_ok=True)
+            target.write_bytes(image.image.read_bytes())
+            lines.append(" ".join(repr(float(value)) for value in image.world_from_cam.ravel()))
+        for number, depth in enumerate(depths):
+            place, prefix = NICE_SLAM.depth
+            values = np.where(np.isfinite(depth), depth * NICE_SLAM.depth_per_metre, 0).round()
+            write_png(temporary / place / f"{prefix}{number:06d}.png", values.astype(np.uint16))
+        write_text(temporary / NICE_SLAM.poses, "\n".join(lines) + "\n")

@@ -1,0 +1,361 @@
+"""ScanNet v2 and ScanNet200: exported frames, the evaluated mesh, NYU40 and ScanNet200 labels, instances.
+
+The layout is the one that ScanNet distributes, with the frames exported from `.sens` by its own reader:
+`color/<n>.jpg`, `pose/<n>.txt` (camera-to-world, OpenCV axes), `intrinsic/intrinsic_color.txt`.
+"""
+
+import csv
+import logging
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int32
+
+from hilsplat.base.errors import SceneError
+from hilsplat.base.files import list_images
+from hilsplat.datasets.classes.scannet import OPENGAUSSIAN_SCENES
+from hilsplat.datasets.classes.scannet200 import SCANNET200
+from hilsplat.datasets.dataset import Dataset, SceneReport
+from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
+from hilsplat.datasets.points.numbered import by_number, size_of_image
+from hilsplat.datasets.points.point_files import (
+    UNPACK_AGAIN,
+    ply_column,
+    ply_faces,
+    ply_places,
+    read_json_object,
+    read_matrix,
+    read_ply,
+    require_file,
+)
+from hilsplat.datasets.points.posed_images import HALF_PIXEL, PosedImage, cam_from_world_of
+
+logger = logging.getLogger(__name__)
+
+LABEL_TABLE = "scannetv2-labels.combined.tsv"
+SAME_PLACE_M = 1e-4
+"""The labelled mesh repeats the vertices of the plain one; printed or rounded copies may differ by this."""
+
+
+@dataclass(frozen=True)
+class LabelTable:
+    """Meaning of raw categories.
+
+    Attributes:
+        nyu40: raw category -> NYU40 id, 0 where the table gives none.
+        scannet200: raw category -> id, 0 where it is none of the 200.
+    """
+
+    nyu40: dict[str, int]
+    scannet200: dict[str, int]
+
+
+def scan_folder(root: Path, scan: str) -> Path:
+    """The folder of a scan, `scans/<scan>` below the data set's folder.
+
+    Raises:
+        SceneError: it is not there, one level too deep, or holds an archive of frames not yet exported.
+    """
+    folder = Path(root) / "scans" / scan
+    for wrong in (folder / scan, Path(root) / scan, Path(root) / "scans" / "scans" / scan):
+        if not (folder / f"{scan}_vh_clean_2.ply").is_file() and wrong.is_dir():
+            raise SceneError(
+                f"scan {scan} lies in the wrong place",
+                expected=folder,
+                found=wrong,
+                fix=f"move {wrong} to {folder}",
+            )
+    if (folder / f"{scan}.sens").is_file() and not (folder / "color").is_dir():
+        raise SceneError(
+            f"the frames of {scan} are still inside {scan}.sens",
+            expected=f"color/, pose/ and intrinsic/ in {folder}",
+            fix="export them with ScanNet's SensReader: --export_color_images --export_poses "
+            "--export_intrinsics",
+        )
+    return folder
+
+
+def read_label_table(path: Path) -> LabelTable:
+    """Read `scannetv2-labels.combined.tsv`.
+
+    `nyu40id` follows from the raw category, not from the id: ids 107 and 188 have rows with two.
+
+    Raises:
+        SceneError: missing, without one of the three columns, or with an id that is no number.
+    """
+    require_file(path, f"download {LABEL_TABLE} of ScanNet's release into the data set's folder")
+    nyu40, scannet200 = {}, {}
+    with path.open(encoding="utf-8", newline="") as stream:
+        rows = csv.DictReader(stream, delimiter="\t")
+        needed = {"id", "raw_category", "nyu40id"}
+        if not needed <= set(rows.fieldnames or ()):
+            raise SceneError(
+                f"{path} is no table of ScanNet's labels",
+                expected="tab-separated columns id, raw_category, nyu40id",
+                found=", ".join(rows.fieldnames or ())[:120] or "an empty file",
+                fix="download the latest table of the release again",
+            )
+        for row in rows:
+            try:
+                number, broad = int(row["id"] or 0), int(row["nyu40id"] or 0)
+            except ValueError as error:
+                raise SceneError(f"{path}, line {rows.line_num}: {error}", fix=UNPACK_AGAIN) from error
+            nyu40[row["raw_category"]] = broad
+            scannet200[row["raw_category"]] = number if number in SCANNET200.ids else 0
+    return LabelTable(nyu40, scannet200)
+
+
+def read_scan_info(path: Path) -> dict[str, str]:
+    """Read `<scan>.txt`: lines `key = value`, not every value a number."""
+    lines = require_file(path).read_text(encoding="utf-8").splitlines()
+    pairs = (line.split(" = ", 1) for line in lines if " = " in line)
+    return {key.strip(): value.strip() for key, value in pairs}
+
+
+def axis_alignment(info: dict[str, str], where: str) -> Float[np.ndarray, "4 4"]:
+    """The matrix that turns a scan's walls to the axes.
+
+    Raises:
+        SceneError: the scan has none (test scans) or a damaged one.
+    """
+    words = info.get("axisAlignment", "").split()
+    try:
+        return np.array([float(word) for word in words]).reshape(4, 4)
+    except ValueError as error:
+        raise SceneError(
+            f"{where} has no usable axisAlignment",
+            expected="16 numbers",
+            found=f"{len(words)} words",
+            fix="leave mesh and poses as they are (aligned=False)",
+        ) from error
+
+
+def read_images(folder: Path, scan: str, every: int = 1) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
+    """Posed colour images, by frame number; frames that tracking lost are passed over.
+
+    ScanNet counts pixel centres from 0 (the depth camera's centre is 319.5 of 640), hence half a pixel
+    is added to the centre of K.
+
+    Args:
+        folder: of the scan.
+        scan: its name.
+        every: take each n-th frame in the order of their numbers, lost ones included in the count.
+
+    Returns:
+        The images and a sentence for each thing that was passed over.
+
+    Raises:
+        SceneError: a folder is missing, a name is no number, or no frame has a pose.
+    """
+    if not (folder / "color").is_dir():
+        raise SceneError(
+            f"{folder} has no folder color/",
+            expected="color/, pose/ and intrinsic/ exported from the .sens file",
+            found=", ".join(sorted(path.name for path in folder.iterdir())[:8]) or "an empty folder",
+            fix="export the frames with ScanNet's SensReader",
+        )
+    frames = by_number(list_images(folder / "color"))
+    K = read_matrix(folder / "intrinsic" / "intrinsic_color.txt")[:3, :3] + HALF_PIXEL
+    lost, without, images = [], [], []
+    size_hw = _stated_size(folder, scan, frames[0][1]) if frames else (0, 0)
+    for number, path in frames[::every]:
+        pose = folder / "pose" / f"{number}.txt"
+        if not pose.is_file():
+            without.append(number)
+            continue
+        world_from_cam = read_matrix(pose)
+        if not np.isfinite(world_from_cam).all():
+            lost.append(number)
+            continue
+        images.append(PosedImage(path.name, path, cam_from_world_of(world_from_cam, str(pose)), K, size_hw))
+    if not images:
+        raise SceneError(
+            f"no frame of {scan} can be used",
+            expected="images in color/ with a finite matrix each in pose/",
+            found=f"{len(frames)} images; {len(without)} without a pose, {len(lost)} lost by tracking",
+            fix="export poses and images again",
+        )
+    warnings = []
+    if lost:
+        warnings.append(f"{len(lost)} frames were lost by tracking (infinite poses) and are passed over")
+    if without:
+        warnings.append(
+            f"{len(without)} images have no file in pose/ and are passed over, first {without[0]}"
+        )
+    return tuple(images), tuple(warnings)
+
+
+def _stated_size(folder: Path, scan: str, image: Path) -> tuple[int, int]:
+    """Size that the intrinsics are for: of the scan's text file, else of its first image."""
+    if (folder / f"{scan}.txt").is_file():
+        info = read_scan_info(folder / f"{scan}.txt")
+        if "colorHeight" in info and "colorWidth" in info:
+            return int(info["colorHeight"]), int(info["colorWidth"])
+    return size_of_image(image)
+
+
+def read_truth(
+    folder: Path, scan: str, table: LabelTable
+) -> tuple[dict[str, LabelledPoints], tuple[str, ...]]:
+    """Labels of the vertices of the evaluated mesh, in NYU40 and ScanNet200 ids, with instances.
+
+    NYU40 ids are those of `.labels.ply`; ScanNet200 ids and instances (objectId + 1) come from the
+    aggregation. A vertex that two groups claim belongs to the later one, as in the official exporter.
+
+    Raises:
+        SceneError: files are missing, damaged or do not belong together.
+    """
+    mesh_path = folder / f"{scan}_vh_clean_2.ply"
+    label_path = folder / f"{scan}_vh_clean_2.labels.ply"
+    mesh, labelled = read_ply(mesh_path, 3), read_ply(label_path, 3)
+    xyz, faces = ply_places(mesh_path, mesh), ply_faces(mesh_path, mesh)
+    nyu40 = ply_column(label_path, labelled, "vertex", "label").astype(np.int32)
+    same = ply_places(label_path, labelled)
+    if len(nyu40) != len(xyz) or not np.allclose(same, xyz, atol=SAME_PLACE_M):
+        raise SceneError(
+            f"{label_path.name} does not belong to {mesh_path.name} of {scan}",
+            expected=f"the same {len(xyz)} vertices in the same order",
+            found=f"{len(nyu40)} vertices" if len(nyu40) != len(xyz) else "vertices elsewhere",
+            fix="take both files from the same release",
+        )
+    if nyu40.size and nyu40.max() > 40:
+        raise SceneError(f"{label_path} holds no NYU40 labels", expected="0 to 40", found=int(nyu40.max()))
+    fine, instance, unknown = _from_aggregation(folder, scan, table, len(xyz))
+    warnings = []
+    if unknown:
+        listed = ", ".join(f"{name} ({count})" for name, count in sorted(unknown.items()))
+        warnings.append(f"categories that {LABEL_TABLE} lacks have no ScanNet200 class: {listed}")
+    points = LabelledPoints(xyz, nyu40, instance, "nyu40", faces)
+    return {"nyu40": points, "scannet200": replace(points, class_id=fine, labelling="scannet200")}, tuple(
+        warnings
+    )
+
+
+def _from_aggregation(
+    folder: Path, scan: str, table: LabelTable, num_points: int
+) -> tuple[Int32[np.ndarray, " P"], Int32[np.ndarray, " P"], Counter]:
+    """ScanNet200 id and instance of each vertex, and the raw categories without an entry in the table."""
+    segments_path = folder / f"{scan}_vh_clean_2.0.010000.segs.json"
+    segments = np.asarray(read_json_object(segments_path, ("segIndices",))["segIndices"])
+    if segments.shape != (num_points,) or segments.dtype.kind != "i":
+        raise SceneError(
+            f"{segments_path} does not belong to the mesh of {scan}",
+            expected=f"a whole number for each of {num_points} vertices",
+            found=f"{segments.size} values of type {segments.dtype}",
+            fix="take the file of the decimated mesh (vh_clean_2)",
+        )
+    path = folder / f"{scan}.aggregation.json"
+    fine, instance = np.zeros((2, num_points), dtype=np.int32)
+    unknown: Counter = Counter()
+    for row, group in enumerate(read_json_object(path, ("segGroups",))["segGroups"]):
+        try:
+            category, number = str(group["label"]), int(group["objectId"]) + 1
+            members = np.asarray(group["segments"], dtype=np.int64)
+        except (KeyError, TypeError, ValueError) as error:
+            raise SceneError(
+                f"{path}, group {row}: cannot be read: {error!r}",
+                expected="objectId, label and a list of segments",
+                fix=UNPACK_AGAIN,
+            ) from error
+        rows = np.isin(segments, members)
+        if not rows.any():
+            raise SceneError(
+                f"{path}, group {row} ({category}): none of its segments is in {segments_path.name}",
+                fix="take the aggregation of the decimated mesh, not that of the full one",
+            )
+        if category not in table.scannet200:
+            unknown[category] += 1
+        fine[rows], instance[rows] = table.scannet200.get(category, 0), number
+    return fine, instance, unknown
+
+
+def open_scan(root: Path, scan: str, every: int = 1, aligned: bool = False) -> PointScene:
+    """Read a scan.
+
+    Args:
+        root: folder with `scans/` and the table of labels.
+        scan: such as scene0000_00.
+        every: take each n-th frame.
+        aligned: turn mesh and poses together by the scan's axisAlignment. Neither is by default.
+
+    Raises:
+        SceneError: something is missing, damaged or does not fit together.
+    """
+    folder = scan_folder(root, scan)
+    DATASET.require(root, scan)
+    truth, of_labels = read_truth(folder, scan, read_label_table(Path(root) / LABEL_TABLE))
+    images, of_images = read_images(folder, scan, every)
+    if aligned:
+        turn = axis_alignment(read_scan_info(folder / f"{scan}.txt"), scan)
+        images = tuple(
+            replace(image, cam_from_world=image.cam_from_world @ np.linalg.inv(turn)) for image in images
+        )
+        xyz = (truth["nyu40"].xyz @ turn[:3, :3].T + turn[:3, 3]).astype(np.float32)
+        truth = {labelling: replace(points, xyz=xyz) for labelling, points in truth.items()}
+    for warning in (*of_images, *of_labels):
+        logger.warning("%s: %s", scan, warning)
+    return PointScene(scan, images, truth, (*of_images, *of_labels))
+
+
+def check_scan(root: Path, scan: str) -> SceneReport:
+    """Read everything of a scan and say what was found."""
+    scene = open_scan(root, scan)
+    return SceneReport(scene.facts(), scene.warnings)
+
+
+DATASET = Dataset(
+    name="scannet",
+    title="ScanNet v2",
+    labels="points",
+    folder="scannet",
+    scenes=OPENGAUSSIAN_SCENES,
+    licence="code MIT; data under the ScanNet Terms of Use",
+    terms="A signed agreement, research use only; never pass on scans or label files made from them.",
+    citation="Dai et al., ScanNet: Richly-annotated 3D Reconstructions of Indoor Scenes, CVPR 2017; "
+    "ScanNet200: Rozenberszki et al., Language-Grounded Indoor 3D Semantic Segmentation, ECCV 2022",
+    layout="""scannet/
+  scannetv2-labels.combined.tsv
+  scans/
+    scene0000_00/
+      color/0.jpg 1.jpg ...            exported from the .sens file
+      pose/0.txt 1.txt ...
+      intrinsic/intrinsic_color.txt
+      scene0000_00_vh_clean_2.ply
+      scene0000_00_vh_clean_2.labels.ply
+      scene0000_00_vh_clean_2.0.010000.segs.json
+      scene0000_00.aggregation.json
+      scene0000_00.txt                 optional: size of the images, axisAlignment""",
+    required=lambda scan: tuple(
+        f"scans/{scan}/{name}"
+        for name in (
+            "color",
+            "pose",
+            "intrinsic/intrinsic_color.txt",
+            f"{scan}_vh_clean_2.ply",
+            f"{scan}_vh_clean_2.labels.ply",
+            f"{scan}_vh_clean_2.0.010000.segs.json",
+            f"{scan}.aggregation.json",
+        )
+    ),
+    open=open_scan,
+    check=check_scan,
+    protocols=(
+        "scannet/opengaussian-19",
+        "scannet/opengaussian-15",
+        "scannet/opengaussian-10",
+        "scannet200/opengaussian",
+        "scannet200/instances",
+    ),
+    label_places=lambda scan: (
+        LABEL_TABLE,
+        f"scans/{scan}/{scan}_vh_clean_2.labels.ply",
+        f"scans/{scan}/{scan}_vh_clean_2.0.010000.segs.json",
+        f"scans/{scan}/{scan}.aggregation.json",
+    ),
+)
+
+SCANNET200_DATASET = replace(DATASET, name="scannet200", title="ScanNet200")
+"""The same scans and files with other labels. The paper does not say which scans it scored with 200 classes:
+the ten, or the benchmark's validation scans (`classes.scannet_splits.VALIDATION_SCANS`)."""

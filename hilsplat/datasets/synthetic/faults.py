@@ -1,0 +1,331 @@
+"""Faults put into true masks: what a segmenter does wrong, one knob per kind of mistake.
+
+Every decision is a random number that belongs to a name (seed, scene, kind of fault, view, node), so it
+depends neither on the order of views nor on other kinds of faults, and a higher probability adds faults of
+its kind to those of a lower one: sweeps over a knob compare like with like.
+"""
+
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int32
+
+from hilsplat.base.artifacts import sha256_of_json
+from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.settings import PerturbSettings
+
+REACH = 3.0
+"""A boundary moves at most this many standard deviations."""
+
+WAVES = 48
+"""Plane waves that a boundary's displacement is the sum of."""
+
+Borders = dict[int, dict[int, int]]
+"""Node -> touching sibling -> length of their common border, px."""
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Random numbers by name, the same in any order and on any number of threads.
+
+    Attributes:
+        seed: seed of the faults.
+        scene: `<dataset>/<scene>`.
+    """
+
+    seed: int
+    scene: str
+
+    def generator(self, *name: str | int) -> np.random.Generator:
+        """Generator that belongs to a name."""
+        digest = sha256_of_json([self.seed, self.scene, *name])
+        return np.random.default_rng(int(digest[:32], 16))
+
+    def chance(self, *name: str | int) -> float:
+        """Number in [0, 1) that belongs to a name; an event of probability p happens where it is below p."""
+        return int(sha256_of_json([self.seed, self.scene, *name])[:13], 16) / 16**13
+
+
+@dataclass(frozen=True)
+class TrueNodes:
+    """What the faults need to know of a scene as a whole.
+
+    Attributes:
+        nodes: all nodes by id.
+        background: ids of the surroundings, which are never merged.
+        partner: per node the sibling with which it shares the longest border over all views: the one
+            that a systematic merge joins it with. Nodes without a touching sibling are absent.
+    """
+
+    nodes: tuple[AnnotatedNode, ...]
+    background: frozenset[int]
+    partner: Mapping[int, int]
+
+    @staticmethod
+    def of(
+        nodes: tuple[AnnotatedNode, ...],
+        background: Collection[int],
+        labels: Iterable[Int32[np.ndarray, "3 H W"]],
+    ) -> "TrueNodes":
+        """Measure the borders in all views.
+
+        Args:
+            nodes: all nodes by id.
+            background: ids of the surroundings.
+            labels: per view the node id per level and pixel, -1 for none.
+        """
+        total: Borders = defaultdict(lambda: defaultdict(int))
+        alone = TrueNodes(nodes, frozenset(background), {})
+        for view in labels:
+            for level in LEVELS:
+                for node, around in sibling_borders(view[level.index], alone).items():
+                    for other, length in around.items():
+                        total[node][other] += length
+        return TrueNodes(
+            nodes, alone.background, {node: longest_border(around) for node, around in sorted(total.items())}
+        )
+
+
+def sibling_borders(labels: Int32[np.ndarray, "H W"], truth: TrueNodes) -> Borders:
+    """Common borders of nodes of one level that have the same parent; the surroundings are left out."""
+    borders: Borders = defaultdict(lambda: defaultdict(int))
+    for first, second in ((labels[:, :-1], labels[:, 1:]), (labels[:-1], labels[1:])):
+        differ = (first != second) & (first != NONE) & (second != NONE)
+        pairs = np.stack([first[differ], second[differ]], axis=1)
+        for (a, b), length in zip(*np.unique(pairs, axis=0, return_counts=True), strict=True):
+            a, b = int(a), int(b)
+            siblings = truth.nodes[a].parent == truth.nodes[b].parent
+            if siblings and not {a, b} & truth.background:
+                borders[a][b] += int(length)
+                borders[b][a] += int(length)
+    return {node: dict(around) for node, around in borders.items()}
+
+
+def longest_border(around: Mapping[int, int]) -> int:
+    """The neighbour with the longest border; of equal ones the lower id."""
+    return min(around, key=lambda other: (-around[other], other))
+
+
+def merged_groups(
+    ids: Sequence[int], borders: Borders, truth: TrueNodes, view: str, draws: Draws, settings: PerturbSettings
+) -> list[tuple[int, ...]]:
+    """Nodes of one level that a view shows as one mask, each group ascending.
+
+    A node starts a merge of its own with probability `merge`, with the touching sibling of the longest
+    border. A node drawn for a systematic merge joins its `partner` in `systematic_share` of the views in
+    which the two touch.
+    """
+    owner = {node: node for node in ids}
+
+    def find(node: int) -> int:
+        while owner[node] != node:
+            node = owner[node]
+        return node
+
+    for node in ids:
+        around = {other: length for other, length in borders.get(node, {}).items() if other in owner}
+        if not around:
+            continue
+        wrong = []
+        if draws.chance("merge", view, node) < settings.merge:
+            wrong.append(longest_border(around))
+        if truth.partner.get(node) in around and systematic("merge", node, view, draws, settings):
+            wrong.append(truth.partner[node])
+        for other in wrong:
+            low, high = sorted((find(node), find(other)))
+            owner[high] = low
+    groups: dict[int, list[int]] = defaultdict(list)
+    for node in ids:
+        groups[find(node)].append(node)
+    return [tuple(sorted(group)) for _, group in sorted(groups.items())]
+
+
+def systematic(fault: str, node: int, view: str, draws: Draws, settings: PerturbSettings) -> bool:
+    """Whether a systematic fault ("merge" or "missing") of a node happens in a view."""
+    probability = getattr(settings, f"systematic_{fault}")
+    return (
+        draws.chance(f"systematic {fault}", node) < probability
+        and draws.chance(f"systematic {fault}", node, view) < settings.systematic_share
+    )
+
+
+def cut_in_two(
+    mask: Bool[np.ndarray, "H W"], generator: np.random.Generator
+) -> tuple[Bool[np.ndarray, "H W"], ...]:
+    """Both sides of a straight line that leaves 30 to 70 % of the mask on either side.
+
+    Returns:
+        the two pieces; the mask alone where it is too small to be cut.
+    """
+    angle, share = generator.uniform(0, np.pi), generator.uniform(0.3, 0.7)
+    y, x = np.nonzero(mask)
+    along = x * np.cos(angle) + y * np.sin(angle)
+    near = along <= np.quantile(along, share)
+    if near.all() or not near.any():
+        return (mask,)
+    first = np.zeros_like(mask)
+    first[y[near], x[near]] = True
+    return first, mask & ~first
+
+
+def displaced(
+    mask: Bool[np.ndarray, "H W"],
+    amplitude_px: float | int,
+    smooth_px: float | int,
+    generator: np.random.Generator,
+) -> Bool[np.ndarray, "H W"]:
+    """Move a mask's boundary along its normal by a smooth random amount.
+
+    A pixel stays or becomes inside where its signed distance to the boundary (positive inside, half a
+    pixel next to it) exceeds `amplitude_px` times a random field of unit variance. The field is a sum of
+    plane waves, so it depends on the place alone and not on the amplitude: with the same generator a
+    larger amplitude changes all pixels that a smaller one changes, and more.
+
+    Args:
+        mask: not empty.
+        amplitude_px: standard deviation of the displacement; 0 returns the mask itself.
+        smooth_px: standard deviation of the field's correlation, as of a Gaussian.
+        generator: of the field.
+
+    Returns:
+        the new mask, never empty: inwards the boundary moves at most half the way to the innermost
+        pixel, so thin things become thinner and do not vanish. Image borders are no boundary.
+    """
+    if amplitude_px == 0:
+        return mask
+    waves = generator.normal(0, 1 / smooth_px, (WAVES, 2))
+    phases = generator.uniform(0, 2 * np.pi, WAVES)
+    reach = REACH * amplitude_px
+    margin = int(np.ceil(reach)) + 1
+    ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    top, left = max(0, ys[0] - margin), max(0, xs[0] - margin)
+    crop = np.s_[top : ys[-1] + 1 + margin, left : xs[-1] + 1 + margin]
+    inside = mask[crop]
+    if inside.all():
+        return mask  # the mask fills the view
+    distance = np.where(inside, _distance(inside) - 0.5, 0.5 - _distance(~inside))
+    y, x = np.nonzero(np.abs(distance) < reach)
+    field = np.cos((x + left)[:, None] * waves[:, 0] + (y + top)[:, None] * waves[:, 1] + phases).sum(axis=1)
+    shift = np.clip(amplitude_px * np.sqrt(2 / WAVES) * field, -reach, min(reach, float(distance.max()) / 2))
+    moved = inside.copy()
+    moved[y, x] = distance[y, x] > shift
+    result = mask.copy()
+    result[crop] = moved
+    return result
+
+
+def _distance(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Distance of each inside pixel to the nearest outside one, between centres, px; 0 outside."""
+    return cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+
+
+def beside(level: Level, up: bool) -> Level:
+    """The level next to a level; part has one on either side."""
+    if level is not Level.PART:
+        return Level.PART
+    return Level.WHOLE if up else Level.SUBPART
+
+
+def faulty_masks(
+    labels: Int32[np.ndarray, "3 H W"],
+    truth: TrueNodes,
+    view: str,
+    draws: Draws,
+    settings: PerturbSettings,
+    min_area_px: int,
+) -> tuple[HierarchicalMasks, dict[str, int]]:
+    """One view's masks: the true regions, with faults in this order.
+
+    1. Dropped views, missing levels.
+    2. Merges: a group of nodes becomes one mask (`merged_groups`).
+    3. Missing masks; in a group the lowest node decides, systematic faults of any of its nodes count.
+    4. Splits (`cut_in_two`), then the boundary (`displaced`), each mask by itself, so that masks begin to
+       overlap and to leave gaps.
+    5. Wrong levels: whole becomes part, subpart becomes part, part becomes either.
+
+    `predicted_iou` is the IoU of the mask with the true region it covers best among its nodes', plus
+    noise; `stability` is the middle of that IoU and 1, plus noise; both are clipped to [0, 1]. A
+    systematic merge is thus doubted as much as any other; a mask at the wrong level is not doubted.
+    SAM's thresholds and suppressions are not applied: what is asked for is what is written.
+
+    Args:
+        labels: node id per level and pixel, -1 for none.
+        truth: nodes of the scene.
+        view: view name.
+        draws: random numbers of the scene.
+        settings: the faults.
+        min_area_px: true regions that are smaller give no mask.
+
+    Returns:
+        the masks in `content_order`, and how many of each fault were put in.
+    """
+    counts = dict.fromkeys(("missing_levels", "merged", "missing", "split", "wrong_level"), 0)
+    found: list[tuple[np.ndarray, Level, float, float]] = []
+    dropped = draws.chance("dropped view", view) < settings.dropped_views
+    for level in LEVELS if not dropped else ():
+        if draws.chance("missing level", view, level.label) < settings.missing_level[level.index]:
+            counts["missing_levels"] += 1
+            continue
+        of_level = labels[level.index]
+        ids = _visible(of_level, truth, settings, min_area_px)
+        borders = sibling_borders(of_level, truth)
+        for group in merged_groups(ids, borders, truth, view, draws, settings):
+            lead = group[0]
+            counts["merged"] += len(group) - 1
+            if draws.chance("missing", view, lead) < settings.missing[level.index] or any(
+                systematic("missing", node, view, draws, settings) for node in group
+            ):
+                counts["missing"] += 1
+                continue
+            pieces: tuple[np.ndarray, ...] = (np.isin(of_level, group),)
+            if draws.chance("split", view, lead) < settings.split:
+                pieces = cut_in_two(pieces[0], draws.generator("cut", view, lead))
+                counts["split"] += len(pieces) - 1
+            for number, piece in enumerate(pieces):
+                name = (view, lead, number)
+                mask = piece
+                if settings.boundary_px:
+                    field = draws.generator("boundary", *name)
+                    mask = displaced(piece, settings.boundary_px, settings.boundary_smooth_px, field)
+                stands_at = level
+                if draws.chance("wrong level", *name) < settings.wrong_level:
+                    stands_at = beside(level, up=draws.chance("which level", *name) < 0.5)
+                    counts["wrong_level"] += 1
+                quality = max(_iou(mask, of_level == node) for node in group)
+                found.append((mask, stands_at, *_scores(quality, draws, settings, name)))
+    masks = HierarchicalMasks.from_dense(
+        np.array([each[0] for each in found], bool).reshape(len(found), *labels.shape[1:]),
+        np.array([int(each[1]) for each in found], np.uint8),
+        np.array([each[2] for each in found], np.float32),
+        np.array([each[3] for each in found], np.float32),
+    )
+    return masks.take(masks.content_order()), {"dropped": int(dropped), **counts}
+
+
+def _visible(
+    of_level: Int32[np.ndarray, "H W"], truth: TrueNodes, settings: PerturbSettings, min_area_px: int
+) -> list[int]:
+    """Nodes of a level that are large enough in a view to be masked, ascending."""
+    areas = zip(*np.unique(of_level, return_counts=True), strict=True)
+    ids = [int(node) for node, area_px in areas if node != NONE and area_px >= min_area_px]
+    return [node for node in ids if settings.background or node not in truth.background]
+
+
+def _scores(
+    quality: float, draws: Draws, settings: PerturbSettings, name: tuple[str | int, ...]
+) -> tuple[float, float]:
+    """Predicted IoU and stability of a mask whose true IoU is `quality`."""
+    noise = (0.0, 0.0)
+    if settings.score_noise:
+        noise = settings.score_noise * draws.generator("scores", *name).standard_normal(2)
+    scores = (quality + noise[0], (1 + quality) / 2 + noise[1])
+    return min(1.0, max(0.0, scores[0])), min(1.0, max(0.0, scores[1]))
+
+
+def _iou(mask: Bool[np.ndarray, "H W"], region: Bool[np.ndarray, "H W"]) -> float:
+    return np.count_nonzero(mask & region) / np.count_nonzero(mask | region)

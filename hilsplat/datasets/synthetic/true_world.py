@@ -1,0 +1,145 @@
+"""A finished synthetic scene as source for writers of data set layouts.
+
+Readers are tested on scenes that were written here: what is read must be what is true.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float64, UInt8
+from PIL import Image
+
+from hilsplat.base.artifacts import atomic_path
+from hilsplat.base.errors import SceneError
+from hilsplat.base.images import read_image
+from hilsplat.base.levels import Level
+from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
+from hilsplat.scene.cameras import Camera, Cameras
+from hilsplat.scene.colmap import pycolmap
+
+MAX_POINTS = 5000
+"""Sparse points that are written into a COLMAP model, taken evenly from the mesh."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrueWorld:
+    """Images, true cameras and annotations of a synthetic scene.
+
+    Attributes:
+        images: folder of images, by view name.
+        cameras: the true cameras.
+        annotations: what is annotated in each view.
+        points_xyz: places on the surface that cameras see, scene units; none without a mesh.
+    """
+
+    images: Path
+    cameras: Cameras
+    annotations: HierarchyAnnotations
+    points_xyz: Float64[np.ndarray, "P 3"]
+
+    @staticmethod
+    def open(folder: Path) -> "TrueWorld":
+        """Read a folder that the world stage wrote: `images/` and `truth/`.
+
+        Raises:
+            ArtifactError: a part is missing or damaged.
+        """
+        folder = Path(folder)
+        truth = folder / "truth"
+        cameras, annotations = Cameras.load(truth / "cameras.npz"), HierarchyAnnotations.load(truth)
+        mesh = truth / "mesh.ply"
+        points = _mesh_points(mesh) if mesh.is_file() else np.zeros((0, 3))
+        return TrueWorld(folder / "images", cameras, annotations, points)
+
+    def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
+        """Pixels of a view."""
+        return read_image(self.images / view)
+
+    def nodes(self, view: str, level: Level | None = None) -> dict[str, tuple[int, ...]]:
+        """Annotated and visible nodes of a view by text, of one level or of all; texts sorted."""
+        found: dict[str, list[int]] = {}
+        for one in Level if level is None else (level,):
+            labels = self.annotations.label_image(view, one)
+            for text, ids in self.annotations.texts(view, one).items():
+                seen = [node for node in ids if (labels == node).any()]
+                if seen:
+                    found.setdefault(text, []).extend(seen)
+        return {text: tuple(found[text]) for text in sorted(found)}
+
+    def mask(self, view: str, nodes: Iterable[int]) -> Bool[np.ndarray, "H W"]:
+        """Union of nodes of any levels."""
+        return np.any([self.annotations.mask(view, [node]) for node in nodes], axis=0)
+
+
+def _mesh_points(path: Path) -> Float64[np.ndarray, "P 3"]:
+    from plyfile import PlyData
+
+    vertex = PlyData.read(path)["vertex"].data
+    seen = vertex[vertex["views"] > 0]
+    xyz = np.stack([seen[axis] for axis in ("x", "y", "z")], axis=1).astype(np.float64)
+    return xyz[:: max(1, -(-len(xyz) // MAX_POINTS))]
+
+
+def write_image(path: Path, pixels: UInt8[np.ndarray, "H W 3"] | UInt8[np.ndarray, "H W"]) -> None:
+    """Write an image in the format of its suffix: .png exact, .jpg at quality 95, as photographs come."""
+    with atomic_path(path) as temporary:
+        image = Image.fromarray(np.ascontiguousarray(pixels))
+        image.save(temporary, **({"quality": 95} if path.suffix == ".jpg" else {}))
+
+
+def write_mask(path: Path, mask: Bool[np.ndarray, "H W"]) -> None:
+    """Write a mask as grey PNG, 0 and 255."""
+    write_image(path, mask.astype(np.uint8) * np.uint8(255))
+
+
+def write_sparse(
+    folder: Path, cameras: Sequence[Camera], names: Sequence[str], points_xyz: Float64[np.ndarray, "P 3"]
+) -> None:
+    """Write a COLMAP model (binary) of pinhole cameras and grey points.
+
+    Args:
+        folder: such as `<scene>/sparse/0`.
+        cameras: one per image.
+        names: name of the image of each camera.
+        points_xyz: points, without tracks.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    model = pycolmap.Reconstruction()
+    for number, (camera, name) in enumerate(zip(cameras, names, strict=True), start=1):
+        K = camera.K
+        lens = pycolmap.Camera(
+            model="PINHOLE",
+            width=camera.size_hw[1],
+            height=camera.size_hw[0],
+            params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
+            camera_id=number,
+        )
+        model.add_camera_with_trivial_rig(lens)
+        image = pycolmap.Image(name=name, camera_id=number, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.cam_from_world[:3]))
+    for xyz in points_xyz:
+        model.add_point3D(xyz, pycolmap.Track(), np.full(3, 128, np.uint8))
+    model.write(folder)
+
+
+def chosen_views(world: TrueWorld, views: Sequence[str]) -> Sequence[str]:
+    """The views, checked.
+
+    Raises:
+        SceneError: the world has no such view.
+    """
+    unknown = sorted(set(views) - set(world.cameras.names))
+    if unknown:
+        raise SceneError(
+            f"the world in {world.images.parent} has no view {', '.join(unknown)}",
+            expected=f"views from {world.cameras.names[0]} to {world.cameras.names[-1]}",
+            fix="name views as its images are named",
+        )
+    return views
+
+
+def stems_from(world: TrueWorld, pattern: str, first: int) -> Mapping[str, str]:
+    """New stem per view, numbered in camera order: ("frame_{:05d}", 1) gives frame_00001, ..."""
+    return {view: pattern.format(row) for row, view in enumerate(world.cameras.names, start=first)}

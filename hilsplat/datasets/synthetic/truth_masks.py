@@ -1,0 +1,140 @@
+"""The diagnostic segmenter `truth-perturbed`: masks from the true labels of a synthetic scene.
+
+It tells errors of the method from errors of the small segmenter. It is the one place before `evaluate`
+where annotations are read, and never a default: the rule and the command hand the truth over only where
+the settings ask for it, the index says what was done, and every row built on such masks carries
+`SEGMENTER` in its column of masks.
+"""
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int32
+
+from hilsplat.base.artifacts import atomic_folder, read_index, read_json, write_index
+from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.levels import LEVELS
+from hilsplat.base.parallel import in_order
+from hilsplat.base.progress import stage_log, track
+from hilsplat.datasets.synthetic.faults import Draws, TrueNodes, faulty_masks
+from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.stage import train_views
+from hilsplat.settings import PerturbSettings
+
+logger = logging.getLogger(__name__)
+
+SEGMENTER = "truth-perturbed"
+"""Name of the segmenter, with which the label of its masks begins."""
+
+FAULTS = (
+    "boundary_px",
+    "merge",
+    "split",
+    "missing",
+    "missing_level",
+    "wrong_level",
+    "dropped_views",
+    "systematic_merge",
+    "systematic_missing",
+)
+"""Knobs of `PerturbSettings` that change masks; where all are 0 the masks are the truth."""
+
+
+def run_truth_masks(
+    scene_folder: Path,
+    truth: Path,
+    out: Path,
+    settings: PerturbSettings,
+    min_area_px: int,
+    threads: int,
+) -> None:
+    """Write masks of every training view from the true labels, with faults (see `faults.faulty_masks`).
+
+    Args:
+        scene_folder: the `Scene` artifact.
+        truth: the truth folder of a synthetic scene: annotations, and `scene.json`, which names the
+            surroundings.
+        out: folder to write: `<view>.npz` (`HierarchicalMasks`) and `index.json`, as the masks stage
+            does; the index also holds the faults asked for and, per view, how many were put in.
+        settings: the faults.
+        min_area_px: true regions that are smaller give no mask (`masks.min_area_px`).
+        threads: views worked on at once; the result does not depend on it.
+
+    Raises:
+        MisalignedArtifactError: label images are of another size than the cameras.
+        ArtifactError: the truth folder is missing or incomplete.
+    """
+    scene = Scene.load(scene_folder)
+    views = train_views(scene)
+    read_index(truth)
+    annotations = HierarchyAnnotations.load(truth)
+    background = read_json(Path(truth) / "scene.json")["background"]
+    nodes = TrueNodes.of(
+        annotations.nodes, background, (true_labels(annotations, view) for view in annotations.views)
+    )
+    draws = Draws(settings.seed, scene.name)
+    label = faults_label(settings)
+    with stage_log("masks", scene.name) as counts:
+        logger.warning("masks %s: %s, made from the TRUE labels: a diagnostic, no result", scene.name, label)
+
+        def segment(view: str) -> tuple[HierarchicalMasks, dict[str, int]]:
+            labels = true_labels(annotations, view)
+            expected = scene.cameras[view].size_hw
+            if labels.shape[1:] != expected:
+                raise MisalignedArtifactError(
+                    f"label image of view {view} does not fit its camera",
+                    expected=f"{expected[0]} x {expected[1]} (height x width)",
+                    found=f"{labels.shape[1]} x {labels.shape[2]}",
+                    fix="run poses without shrinking the images (poses.max_side_px)",
+                )
+            return faulty_masks(labels, nodes, view, draws, settings, min_area_px)
+
+        index: dict[str, Any] = {}
+        with atomic_folder(out) as folder:
+            found = in_order(segment, views, threads)
+            for view, (masks, faults) in zip(views, track(found, "masks of views", len(views)), strict=True):
+                masks.save(folder / f"{view}.npz")
+                index[view] = {level.label: len(masks.rows_of(level)) for level in LEVELS}
+                index[view]["faults"] = faults
+            write_index(
+                folder,
+                index,
+                scene=scene.name,
+                segmenter=SEGMENTER,
+                model=None,
+                model_sha256=None,
+                label=label,
+                perturb=settings.model_dump(mode="json"),
+            )
+        counts.update(
+            views=len(views),
+            **{level.label: sum(entry[level.label] for entry in index.values()) for level in LEVELS},
+        )
+
+
+def true_labels(annotations: HierarchyAnnotations, view: str) -> Int32[np.ndarray, "3 H W"]:
+    """Node id per level and pixel, -1 where the level has none."""
+    return np.stack([annotations.label_image(view, level) for level in LEVELS])
+
+
+def faults_label(settings: PerturbSettings) -> str:
+    """How rows name these masks: the segmenter, then "exact", or what differs from the defaults.
+
+    Example:
+        >>> faults_label(PerturbSettings(merge=0.2))
+        'truth-perturbed (merge 0.2)'
+    """
+    if not any(np.any(getattr(settings, fault)) for fault in FAULTS):
+        return f"{SEGMENTER} (exact)"
+    usual = PerturbSettings()
+    changed = []
+    for name in PerturbSettings.model_fields:
+        value = getattr(settings, name)
+        if value != getattr(usual, name):
+            text = "/".join(f"{each:g}" for each in value) if isinstance(value, tuple) else f"{value}"
+            changed.append(f"{name} {text}")
+    return f"{SEGMENTER} ({', '.join(changed)})" if changed else SEGMENTER

@@ -1,0 +1,61 @@
+"""Labelled points of a synthetic scene: what ScanNet, ScanNet200, Replica and Waymo would label in it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int32
+
+from hilsplat.base.artifacts import read_npz
+from hilsplat.base.errors import SceneError
+from hilsplat.datasets.points.labelled_points import LabelledPoints
+from hilsplat.datasets.points.point_files import ply_column, read_ply
+from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
+from hilsplat.datasets.synthetic.world_points import LabelledMesh, replica_id, scannet_ids, waymo_labels
+
+
+def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
+    """Points with classes by labelling, in the frame of the world's true cameras, metres.
+
+    Args:
+        world: what the world stage wrote.
+        kind: "room": vertices of the mesh that a camera sees, as a scanner would not know the others;
+            labellings nyu40, scannet200 and replica. "street": returns of the lidar; labelling waymo.
+
+    Raises:
+        SceneError: the world is of another kind.
+        ArtifactError: a file is missing or damaged.
+    """
+    world = Path(world)
+    if kind == "street":
+        return {"waymo": _lidar(world)}
+    if kind != "room":
+        raise SceneError(
+            f"a world of kind {kind!r} has no labelled points", expected="room or street", fix="leave it out"
+        )
+    mesh = LabelledMesh.open(world)
+    path = world / "truth" / "mesh.ply"
+    seen = ply_column(path, read_ply(path, 3), "vertex", "views") > 0
+    whole, xyz = mesh.whole[seen], mesh.xyz[seen].astype(np.float64)
+    ids = [scannet_ids(text) for text in mesh.texts]
+    instance = (whole + 1).astype(np.int32)
+    fine = _of_nodes([fine for fine, _ in ids], whole)
+    nyu40 = LabelledPoints(xyz, _of_nodes([broad for _, broad in ids], whole), instance, "nyu40")
+    replica = _of_nodes([replica_id(text) for text in mesh.texts], whole)
+    return {
+        "nyu40": nyu40,
+        "scannet200": replace(nyu40, class_id=fine, labelling="scannet200"),
+        "replica": replace(nyu40, class_id=replica, labelling="replica"),
+    }
+
+
+def _of_nodes(class_of_node: list[int], node: Int32[np.ndarray, " P"]) -> Int32[np.ndarray, " P"]:
+    """Class of each point's node; 0 for points of none."""
+    return np.array([*class_of_node, 0], dtype=np.int32)[node]
+
+
+def _lidar(world: Path) -> LabelledPoints:
+    scan = read_npz(world / "truth" / "lidar.npz")
+    nodes = HierarchyAnnotations.load(world / "truth").nodes
+    labels = waymo_labels(scan["node_ids"], [node.text for node in nodes])
+    return LabelledPoints(scan["points"].astype(np.float64), labels[:, 1], labels[:, 0], "waymo")

@@ -1,0 +1,150 @@
+"""What Waymo records of one moment, whichever kind of file it came from."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32, Int32
+
+from hilsplat.base.errors import SceneError
+from hilsplat.datasets.classes.waymo import WAYMO_22
+from hilsplat.datasets.points.labelled_points import LabelledPoints
+from hilsplat.datasets.points.posed_images import PosedImage
+from hilsplat.datasets.waymo.geometry import WaymoCamera, range_image_points, to_world
+
+CAMERAS = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
+"""Numbered from 1 in the files."""
+TOP = 1
+"""The lidar on the roof: the only one with labels and with a pose per pixel."""
+INSTANCE, CLASS = 0, 1
+"""Channels of a label image."""
+
+
+@dataclass(frozen=True, eq=False)
+class LidarReturn:
+    """One return of the top lidar.
+
+    Attributes:
+        image: range (metres, not positive where there is no return), intensity, elongation, no-label zone.
+        labels: instance and class; None where the frame is not labelled.
+        projection: first camera, x, y, second camera, x, y; camera 0 is none. None where not stored.
+    """
+
+    image: Float32[np.ndarray, "H W 4"]
+    labels: Int32[np.ndarray, "h w 2"] | None  # h = H, w = W, which `frame_points` checks
+    projection: Int32[np.ndarray, "i j 6"] | None  # likewise
+
+
+@dataclass(frozen=True, eq=False)
+class LidarFrame:
+    """One turn of the top lidar.
+
+    Attributes:
+        timestamp_micros: of the frame.
+        world_from_vehicle: the frame's pose.
+        vehicle_from_lidar: pose of the lidar on the vehicle.
+        inclinations: of the rows, radian, highest first.
+        pixel_pose: roll, pitch, yaw, x, y, z of the vehicle in the world at each pixel, of both returns.
+        returns: first and, where there is one, second return.
+    """
+
+    timestamp_micros: int
+    world_from_vehicle: Float[np.ndarray, "4 4"]
+    vehicle_from_lidar: Float[np.ndarray, "4 4"]
+    inclinations: Float[np.ndarray, " h"]  # h = H, which `frame_points` checks
+    pixel_pose: Float32[np.ndarray, "H W 6"]
+    returns: tuple[LidarReturn, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class CameraShot:
+    """One image.
+
+    Attributes:
+        timestamp_micros: of its frame.
+        camera: which camera took it.
+        encoded: jpeg.
+        world_from_vehicle: pose of the vehicle when the image was taken, not that of the frame.
+    """
+
+    timestamp_micros: int
+    camera: WaymoCamera
+    encoded: bytes
+    world_from_vehicle: Float[np.ndarray, "4 4"]
+
+
+def frame_points(frame: LidarFrame, segment_from_world: Float[np.ndarray, "4 4"]) -> LabelledPoints:
+    """Labelled points of a frame: first return, then second, each row by row.
+
+    Raises:
+        SceneError: images of a return differ in size, or a class is unknown.
+    """
+    xyz, labels, visible = [], [], []
+    for number, part in enumerate(frame.returns, start=1):
+        if part.labels is None:
+            continue
+        where = f"return {number} of the top lidar at {frame.timestamp_micros}"
+        sizes = {part.image.shape[:2], part.labels.shape[:2], frame.pixel_pose.shape[:2]}
+        sizes |= {part.projection.shape[:2]} if part.projection is not None else set()
+        if len(sizes) > 1 or len(frame.inclinations) != part.image.shape[0]:
+            raise SceneError(
+                f"{where}: ranges, labels, poses and projections do not belong together",
+                expected="images of one size and an inclination per row",
+                found=f"{sorted(sizes)}, {len(frame.inclinations)} inclinations",
+                fix="download all components of the segment from the same release",
+            )
+        hit = part.image[..., 0] > 0
+        places = to_world(
+            range_image_points(
+                part.image[..., 0].astype(np.float64), frame.inclinations, frame.vehicle_from_lidar
+            ),
+            frame.pixel_pose,
+        )[hit]
+        xyz.append(places @ segment_from_world[:3, :3].T + segment_from_world[:3, 3])
+        labels.append(part.labels[hit])
+        if part.projection is not None:
+            visible.append(part.projection[hit][:, 0] > 0)
+    if not xyz:
+        xyz, labels = [np.zeros((0, 3))], [np.zeros((0, 2), np.int32)]
+    of_point = np.concatenate(labels).astype(np.int32)
+    classes = of_point[:, CLASS]
+    if classes.size and (classes.min() < 0 or classes.max() > max(WAYMO_22.ids)):
+        raise SceneError(
+            f"labels of the top lidar at {frame.timestamp_micros} have an unknown class",
+            expected=f"0 to {max(WAYMO_22.ids)}",
+            found=f"{classes.min()} to {classes.max()}",
+            fix="use the 3D semantic segmentation of release 1.4.3 or 2.0.1",
+        )
+    return LabelledPoints(
+        np.concatenate(xyz),
+        classes.copy(),
+        of_point[:, INSTANCE].copy(),
+        "waymo",
+        visible=np.concatenate(visible) if visible and len(visible) == len(xyz) else None,
+    )
+
+
+def joined_points(frames: Iterable[LabelledPoints]) -> LabelledPoints:
+    """Points of several frames as one; visibility stays where every frame tells it."""
+    parts = list(frames)
+    seen = [part.visible for part in parts if part.visible is not None]
+    return LabelledPoints(
+        np.concatenate([part.xyz for part in parts]),
+        np.concatenate([part.class_id for part in parts]),
+        np.concatenate([part.instance_id for part in parts]),
+        "waymo",
+        visible=np.concatenate(seen) if len(seen) == len(parts) else None,
+    )
+
+
+def shot_image(shot: CameraShot, segment_from_world: Float[np.ndarray, "4 4"]) -> PosedImage:
+    """An image with its camera in the frame of the segment; named after time and camera."""
+    in_segment = segment_from_world @ shot.world_from_vehicle
+    return PosedImage(
+        f"{shot.timestamp_micros}_{shot.camera.name}.jpg",
+        shot.encoded,
+        shot.camera.cam_from_world(in_segment),
+        shot.camera.K,
+        shot.camera.size_hw,
+        shot.camera.distortion,
+    )

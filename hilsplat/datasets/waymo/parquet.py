@@ -1,0 +1,243 @@
+"""Waymo v2 (2.0.1): one parquet file per component and segment, read by pyarrow."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from hilsplat.base.errors import SceneError
+from hilsplat.datasets.points.point_files import UNPACK_AGAIN, listing
+from hilsplat.datasets.waymo.frames import CAMERAS, TOP, CameraShot, LidarFrame, LidarReturn
+from hilsplat.datasets.waymo.geometry import WaymoCamera, beam_inclinations
+
+COMPONENTS = (
+    "camera_image",
+    "camera_calibration",
+    "lidar",
+    "lidar_calibration",
+    "lidar_pose",
+    "lidar_segmentation",
+    "vehicle_pose",
+)
+"""Tags that are needed; `lidar_camera_projection` is read where it is there."""
+INTRINSIC = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
+FRAME, LASER, CAMERA = "key.frame_timestamp_micros", "key.laser_name", "key.camera_name"
+
+
+def component_path(split: Path, tag: str, segment: str) -> Path:
+    """File of a component: `<split>/<tag>/<segment>.parquet`."""
+    return Path(split) / tag / f"{segment}.parquet"
+
+
+def read_component(
+    split: Path, tag: str, segment: str, columns: list[str], only: dict[str, list[int]] | None = None
+) -> list[dict[str, Any]]:
+    """Rows of a component in the order of the file: lists as arrays, other values as they are.
+
+    Args:
+        split: folder such as `validation`.
+        tag: name of the component.
+        segment: context name.
+        columns: names, keys included.
+        only: values that a column may have; other rows are not decoded.
+
+    Raises:
+        SceneError: the file is missing, damaged, or lacks a column.
+    """
+    import pyarrow as pa
+    import pyarrow.dataset as dataset
+    import pyarrow.parquet as parquet
+
+    path = component_path(split, tag, segment)
+    if not path.is_file():
+        raise SceneError(
+            f"component {tag} of segment {segment} is missing",
+            expected=path,
+            found=listing(path.parent),
+            fix=f"download {tag}/{segment}.parquet of the same release",
+        )
+    try:
+        known = parquet.read_schema(path).names
+        lacking = [name for name in columns if name not in known]
+        if lacking:
+            raise SceneError(
+                f"{path} is not the component {tag} of release 2",
+                expected=", ".join(lacking),
+                found=", ".join(known[:12]),
+                fix="download the component again",
+            )
+        keep = None
+        for name, values in (only or {}).items():
+            condition = dataset.field(name).isin(values)
+            keep = condition if keep is None else keep & condition
+        table = dataset.dataset(path, format="parquet").to_table(columns=columns, filter=keep)
+    except (pa.ArrowInvalid, OSError) as error:
+        raise SceneError(
+            f"{path} cannot be read: {error}",
+            found=f"a file of {path.stat().st_size} bytes",
+            fix=UNPACK_AGAIN,
+        ) from error
+    values = {name: [_plain(value) for value in table.column(name)] for name in columns}
+    return [{name: values[name][row] for name in columns} for row in range(table.num_rows)]
+
+
+def _plain(value: Any) -> Any:
+    """A cell: an array for a list, None for a null."""
+    if not value.is_valid:
+        return None
+    listed = getattr(value, "values", None)
+    return value.as_py() if listed is None else listed.to_numpy(zero_copy_only=False)
+
+
+def _image(row: dict[str, Any], name: str, depth: int, where: str) -> np.ndarray | None:
+    """A range image of H x W x depth; None where it is null."""
+    values, shape = row[f"{name}.values"], row[f"{name}.shape"]
+    if values is None or shape is None:
+        return None
+    shape = tuple(int(size) for size in shape)
+    if len(shape) != 3 or shape[2] != depth or np.prod(shape) != len(values):
+        raise SceneError(
+            f"{where}: {name} has the wrong shape",
+            expected=f"height x width x {depth}",
+            found=f"{len(values)} values for {' x '.join(map(str, shape))}",
+            fix=UNPACK_AGAIN,
+        )
+    return values.reshape(shape)
+
+
+def labelled_frames(split: Path, segment: str) -> tuple[int, ...]:
+    """Time stamps of the frames that carry labels, in order."""
+    rows = read_component(split, "lidar_segmentation", segment, [FRAME, LASER], {LASER: [TOP]})
+    return tuple(sorted(row[FRAME] for row in rows))
+
+
+def vehicle_poses(split: Path, segment: str) -> dict[int, Float[np.ndarray, "4 4"]]:
+    """The vehicle's pose in the world at each frame, in order."""
+    name = "[VehiclePoseComponent].world_from_vehicle.transform"
+    rows = read_component(split, "vehicle_pose", segment, [FRAME, name])
+    return dict(sorted((row[FRAME], row[name].reshape(4, 4)) for row in rows))
+
+
+def lidar_frames(split: Path, segment: str) -> Iterator[LidarFrame]:
+    """The labelled frames of a segment, in order.
+
+    Raises:
+        SceneError: a component is missing or damaged, or they do not belong together.
+    """
+    poses = vehicle_poses(split, segment)
+    calibration = "[LiDARCalibrationComponent]"
+    place, beams = f"{calibration}.extrinsic.transform", f"{calibration}.beam_inclination"
+    columns = [place, f"{beams}.min", f"{beams}.max", f"{beams}.values"]
+    lidar = read_component(split, "lidar_calibration", segment, [LASER, *columns], {LASER: [TOP]})
+    if len(lidar) != 1:
+        raise SceneError(
+            f"lidar_calibration of {segment} has {len(lidar)} rows for the top lidar", fix=UNPACK_AGAIN
+        )
+    vehicle_from_lidar = lidar[0][place].reshape(4, 4)
+    projected = component_path(split, "lidar_camera_projection", segment).is_file()
+    for time in labelled_frames(split, segment):
+        where = f"segment {segment}, frame {time}"
+        ranges = _top(split, segment, "lidar", "LiDARComponent", time, 2)
+        labels = _top(split, segment, "lidar_segmentation", "LiDARSegmentationLabelComponent", time, 2)
+        cells = (
+            _top(split, segment, "lidar_camera_projection", "LiDARCameraProjectionComponent", time, 2)
+            if projected
+            else None
+        )
+        pose = _top(split, segment, "lidar_pose", "LiDARPoseComponent", time, 1)
+        pixel_pose = _image(pose, "[LiDARPoseComponent].range_image_return1", 6, where)
+        if time not in poses or pixel_pose is None:
+            raise SceneError(f"{where} has labels but no pose", fix=UNPACK_AGAIN)
+        returns = []
+        for number in (1, 2):
+            image = _image(ranges, f"[LiDARComponent].range_image_return{number}", 4, where)
+            name = f"[LiDARSegmentationLabelComponent].range_image_return{number}"
+            label = _image(labels, name, 2, where)
+            name = f"[LiDARCameraProjectionComponent].range_image_return{number}"
+            cell = _image(cells, name, 6, where) if cells is not None else None
+            if image is not None:
+                returns.append(
+                    LidarReturn(
+                        image.astype(np.float32),
+                        None if label is None else label.astype(np.int32),
+                        None if cell is None else cell.astype(np.int32),
+                    )
+                )
+        inclinations = beam_inclinations(
+            lidar[0][f"{beams}.values"],
+            lidar[0][f"{beams}.min"],
+            lidar[0][f"{beams}.max"],
+            pixel_pose.shape[0],
+        )
+        yield LidarFrame(
+            time,
+            poses[time],
+            vehicle_from_lidar,
+            inclinations,
+            pixel_pose.astype(np.float32),
+            tuple(returns),
+        )
+
+
+def _top(split: Path, segment: str, tag: str, component: str, time: int, returns: int) -> dict[str, Any]:
+    """The row of the top lidar at a time."""
+    names = [f"[{component}].range_image_return{number + 1}" for number in range(returns)]
+    columns = [f"{name}.{part}" for name in names for part in ("values", "shape")]
+    rows = read_component(split, tag, segment, [FRAME, LASER, *columns], {FRAME: [time], LASER: [TOP]})
+    if len(rows) != 1:
+        raise SceneError(
+            f"component {tag} of segment {segment} does not fit lidar_segmentation",
+            expected=f"one row of the top lidar at {time}",
+            found=f"{len(rows)}",
+            fix="download all components of the segment from the same release",
+        )
+    return rows[0]
+
+
+def cameras(split: Path, segment: str) -> dict[int, WaymoCamera]:
+    """The cameras of the car, by number from 1."""
+    base = "[CameraCalibrationComponent]"
+    inner = [f"{base}.intrinsic.{name}" for name in INTRINSIC]
+    place, width, height = f"{base}.extrinsic.transform", f"{base}.width", f"{base}.height"
+    rows = read_component(split, "camera_calibration", segment, [CAMERA, *inner, place, width, height])
+    return {
+        row[CAMERA]: WaymoCamera(
+            CAMERAS[row[CAMERA] - 1],
+            np.array([row[name] for name in inner], dtype=np.float64),
+            row[place].reshape(4, 4),
+            (row[height], row[width]),
+        )
+        for row in rows
+    }
+
+
+def camera_shots(split: Path, segment: str, every: int = 1) -> Iterator[CameraShot]:
+    """Images by time, then camera.
+
+    Args:
+        split: folder such as `validation`.
+        segment: context name.
+        every: take each n-th frame, all its cameras.
+
+    Raises:
+        SceneError: a component is missing or damaged, or a camera has no calibration.
+    """
+    known = cameras(split, segment)
+    pose = "[CameraImageComponent].pose.transform"
+    rows = read_component(split, "camera_image", segment, [FRAME, CAMERA])
+    strange = sorted({row[CAMERA] for row in rows} - set(known))
+    if strange:
+        raise SceneError(
+            f"segment {segment} has images of cameras without a calibration",
+            expected=", ".join(map(str, sorted(known))),
+            found=", ".join(map(str, strange)),
+            fix="download camera_image and camera_calibration from the same release",
+        )
+    for time in sorted({row[FRAME] for row in rows})[::every]:
+        columns = [FRAME, CAMERA, "[CameraImageComponent].image", pose]
+        of_frame = read_component(split, "camera_image", segment, columns, {FRAME: [time]})
+        for row in sorted(of_frame, key=lambda row: row[CAMERA]):
+            encoded = row["[CameraImageComponent].image"]
+            yield CameraShot(time, known[row[CAMERA]], encoded, row[pose].reshape(4, 4))

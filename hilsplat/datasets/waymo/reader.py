@@ -1,0 +1,164 @@
+"""Waymo perception: labelled points of the top lidar and the images of the five cameras of a segment.
+
+Release 2.0.1 (parquet) or 1.4.3 (TFRecord), which hold the same. Coordinates are those of the vehicle at
+the segment's first frame: the files' world lies kilometres from its origin, too far for float32.
+"""
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hilsplat.base.errors import SceneError
+from hilsplat.datasets.dataset import Dataset, SceneReport
+from hilsplat.datasets.points.labelled_points import PointScene
+from hilsplat.datasets.points.point_files import listing
+from hilsplat.datasets.waymo import parquet, records
+from hilsplat.datasets.waymo.frames import frame_points, joined_points, shot_image
+
+logger = logging.getLogger(__name__)
+
+SPLITS = ("validation", "training")
+"""Where a segment is looked for. Labels of the testing split are not public."""
+RECORD = "individual_files_{split}_segment-{segment}_with_camera_labels.tfrecord"
+"""Name of a segment's file in release 1; the prefix up to `segment-` may be missing."""
+
+
+def find_parquet(root: Path, segment: str) -> Path | None:
+    """The split folder that holds a segment in release 2, None where none does."""
+    for split in SPLITS:
+        if parquet.component_path(Path(root) / split, "lidar_segmentation", segment).is_file():
+            return Path(root) / split
+    return None
+
+
+def find_record(root: Path, segment: str) -> Path | None:
+    """The file of a segment in release 1, in the folder or a split's folder; None where there is none."""
+    for split in SPLITS:
+        whole = RECORD.format(split=split, segment=segment)
+        for name in (whole, whole.removeprefix(f"individual_files_{split}_")):
+            for folder in (Path(root) / split, Path(root)):
+                if (folder / name).is_file():
+                    return folder / name
+    return None
+
+
+def segments_of(root: Path) -> tuple[str, ...]:
+    """Segments with labels that are below the data set's folder."""
+    found = set()
+    for split in SPLITS:
+        found |= {path.stem for path in (Path(root) / split).glob("lidar_segmentation/*.parquet")}
+    for path in (*Path(root).glob("*.tfrecord"), *Path(root).glob("*/*.tfrecord")):
+        found.add(path.stem.split("segment-")[-1].removesuffix("_with_camera_labels"))
+    return tuple(sorted(found))
+
+
+def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
+    """Read a segment: all labelled frames of the top lidar, both returns, and the images.
+
+    Args:
+        root: the data set's folder.
+        segment: context name, such as 10023947602400723454_1120_000_1140_000.
+        every: take the images of each n-th frame; labelled frames are all read.
+
+    Raises:
+        SceneError: the segment is missing or damaged, or has no labelled frame.
+    """
+    split, record = find_parquet(root, segment), find_record(root, segment)
+    if split is not None:
+        poses = parquet.vehicle_poses(split, segment)
+        if not poses:
+            raise SceneError(f"component vehicle_pose of segment {segment} is empty", fix="download it again")
+        first = next(iter(poses.values()))
+        frames = parquet.lidar_frames(split, segment)
+        shots = parquet.camera_shots(split, segment, every)
+        release = "2"
+    elif record is not None:
+        first = records.first_pose(record)
+        frames, shots = records.lidar_frames(record), records.camera_shots(record, every)
+        release = "1"
+    else:
+        wrong = sorted(Path(root).glob(f"*/*/*/{segment}.parquet"))
+        raise SceneError(
+            f"segment {segment} is not in {root}",
+            expected=f"<split>/lidar_segmentation/{segment}.parquet, split one of {', '.join(SPLITS)}",
+            found=f"{wrong[0]}, one level too deep" if wrong else listing(Path(root)),
+            fix=f"move {wrong[0].parents[1]} to {Path(root)}"
+            if wrong
+            else "download all components of the segment, or its .tfrecord; testing has no labels",
+        )
+    segment_from_world = np.linalg.inv(first)
+    points = [frame_points(frame, segment_from_world) for frame in frames]
+    if not points:
+        raise SceneError(
+            f"segment {segment} has no frame with labels of the top lidar",
+            fix="take a segment of the 3D semantic segmentation; release 1.3.2 or later has them",
+        )
+    images = tuple(shot_image(shot, segment_from_world) for shot in shots)
+    truth = joined_points(points)
+    logger.info(
+        "segment %s: release %s, %d labelled frames, %d points, %d images",
+        segment, release, len(points), len(truth), len(images),
+    )  # fmt: skip
+    warnings = []
+    if any(image.distortion[4] for image in images):
+        warnings.append("the lenses have a k3, which poses cannot import: undistort the images first")
+    if truth.visible is None:
+        warnings.append("lidar_camera_projection is missing: it is not known which points a camera sees")
+    return PointScene(segment, images, {"waymo": truth}, tuple(warnings))
+
+
+def check_segment(root: Path, segment: str) -> SceneReport:
+    """Read everything of a segment, the images of every tenth frame, and say what was found."""
+    found = open_segment(root, segment, every=10)
+    facts = found.facts()
+    truth = found.truth["waymo"]
+    if truth.visible is not None:
+        facts["waymo points that a camera sees"] = int(truth.visible.sum())
+    return SceneReport(facts, found.warnings)
+
+
+@dataclass(frozen=True)
+class Segments(Dataset):
+    """A data set of which the paper names no scenes: the segments that are there are its scenes."""
+
+    def found(self, root: Path) -> tuple[str, ...]:
+        """Segments with labels below the folder."""
+        return segments_of(root)
+
+    def missing(self, root: Path, scene: str) -> tuple[str, ...]:
+        """What a segment lacks; nothing where it came as a file of release 1."""
+        if find_record(root, scene) is not None:
+            return ()
+        split = find_parquet(root, scene)
+        places = self.required(scene)
+        if split is not None:
+            places = tuple(place.replace(f"{SPLITS[0]}/", f"{split.name}/", 1) for place in places)
+        return tuple(place for place in places if not (Path(root) / place).is_file())
+
+    def _has_begun(self, root: Path) -> bool:
+        return bool(segments_of(root))
+
+
+DATASET = Segments(
+    name="waymo",
+    title="Waymo Open Dataset, 3D semantic segmentation",
+    labels="points",
+    folder="waymo",
+    scenes=(),
+    licence="code Apache-2.0; data under the Waymo Dataset License Agreement for Non-Commercial Use",
+    terms="Non-commercial use after registering; do not pass the data on.",
+    citation="Sun et al., Scalability in Perception for Autonomous Driving: Waymo Open Dataset, CVPR 2020",
+    layout="""waymo/
+  validation/                          release 2.0.1, one parquet file per component and segment
+    camera_image/<segment>.parquet
+    camera_calibration/  lidar/  lidar_calibration/  lidar_pose/  lidar_segmentation/  vehicle_pose/
+    lidar_camera_projection/           optional: which points a camera sees
+  individual_files_validation_segment-<segment>_with_camera_labels.tfrecord     or release 1.4.3""",
+    required=lambda segment: tuple(f"{SPLITS[0]}/{tag}/{segment}.parquet" for tag in parquet.COMPONENTS),
+    open=open_segment,
+    check=check_segment,
+    protocols=("waymo/segmentation",),
+    label_places=lambda segment: (f"*/lidar_segmentation/{segment}.parquet",),
+)

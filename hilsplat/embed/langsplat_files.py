@@ -1,0 +1,223 @@
+"""LangSplat's files of masks and vectors, read and written (its preprocessing, `language_features/`).
+
+Of an image `a.jpg` there are two plain arrays:
+    a_s.npy  float32 (4, H, W): row of `a_f.npy` at each pixel, -1 where there is none;
+    a_f.npy  float32 (N, C): a CLIP vector per mask.
+The four maps are default, s, m, l: all heads mixed, then from fine to coarse. Rows count through all
+four. A name is cut at its first dot.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float16, Float32, Int64
+
+from hilsplat.base.artifacts import atomic_folder, read_index, read_npy, write_index, write_npy
+from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.progress import stage_log, track
+from hilsplat.embed.clip import ClipModel, unit
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.masks import HierarchicalMasks, runs_of_labels
+from hilsplat.segment.stage import train_views
+from hilsplat.settings import ClipSettings
+
+MAPS: tuple[Level | None, ...] = (None, Level.SUBPART, Level.PART, Level.WHOLE)
+"""What the four maps hold, in their order; the first mixes all levels."""
+
+
+def stem_of(view: str) -> str:
+    """Name of a view's files: cut at the first dot, as LangSplat does."""
+    return view.split(".")[0]
+
+
+def _stems(views: list[str]) -> dict[str, str]:
+    """Stem of each view.
+
+    Raises:
+        ArtifactError: two views share one.
+    """
+    stems = {view: stem_of(view) for view in views}
+    twins = [view for view in views if list(stems.values()).count(stems[view]) > 1]
+    if twins:
+        raise ArtifactError(
+            f"LangSplat's files cannot tell views apart: {', '.join(twins[:4])}",
+            expected="names that differ before their first dot",
+            fix="rename the images",
+        )
+    return stems
+
+
+def read_view(
+    folder: Path, view: str, size_hw: tuple[int, int], resize: bool
+) -> tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]:
+    """Masks and vectors of one view, rows in `content_order`.
+
+    The map of mixed levels is left out. What another mask of the same level was painted over is lost
+    in these files. They hold no scores: predicted IoU and stability are 1.
+
+    Args:
+        folder: with `<stem>_s.npy` and `<stem>_f.npy`.
+        view: its name.
+        size_hw: of the view.
+        resize: take maps of another size, nearest pixel.
+
+    Raises:
+        ArtifactError: a file is missing, damaged, pickled, or not as described above.
+        MisalignedArtifactError: the maps are of another size, and `resize` is off.
+    """
+    maps_path, vectors_path = (folder / f"{stem_of(view)}_{kind}.npy" for kind in "sf")
+    maps, vectors = read_npy(maps_path), read_npy(vectors_path)
+    if maps.ndim != 3 or len(maps) != len(MAPS):
+        raise ArtifactError(
+            f"{maps_path} is no LangSplat map",
+            expected="an array of shape (4, height, width): default, s, m, l",
+            found=f"shape {maps.shape}",
+        )
+    if vectors.ndim != 2 or vectors.dtype.kind != "f" or not np.isfinite(vectors).all():
+        raise ArtifactError(
+            f"{vectors_path} holds no vectors",
+            expected="finite floating-point numbers of shape (masks, channels)",
+            found=f"{vectors.dtype} of shape {vectors.shape}",
+        )
+    finite = bool(np.isfinite(maps).all())
+    labels = np.where(np.isfinite(maps), maps, -2).astype(np.int64)
+    if not finite or (labels != maps).any() or labels.min() < -1 or labels.max() >= len(vectors):
+        raise ArtifactError(
+            f"{maps_path} does not belong to {vectors_path.name}",
+            expected=f"whole numbers from -1 to {len(vectors) - 1}, a row each",
+            found=f"numbers from {maps.min():g} to {maps.max():g}",
+            fix="take both files from one run of the preprocessing",
+        )
+    if labels.shape[1:] != size_hw:
+        if not resize:
+            raise MisalignedArtifactError(
+                f"{maps_path} and view {view} differ in size",
+                expected=f"{size_hw} (height, width)",
+                found=f"{labels.shape[1:]}",
+                fix="give --resize (nearest pixel), or make both at one size; LangSplat shrinks to 1080 rows",
+            )
+        at = [
+            ((np.arange(n) + 0.5) * m / n).astype(int) for n, m in zip(size_hw, labels.shape[1:], strict=True)
+        ]
+        labels = labels[:, at[0][:, None], at[1][None, :]]
+    parts, rows = [], []
+    for place, level in enumerate(MAPS):
+        if level is None:
+            continue
+        chosen = np.unique(labels[place])
+        chosen = chosen[chosen >= 0]
+        ones = np.ones(len(chosen), np.float32)
+        runs, offsets = runs_of_labels(labels[place], chosen)
+        levels = np.full(len(chosen), int(level), np.uint8)
+        parts.append(HierarchicalMasks.from_runs(runs, offsets, levels, ones, ones, size_hw))
+        rows.append(chosen)
+    masks = HierarchicalMasks.concatenate(parts, size_hw)
+    order = masks.content_order()
+    return masks.take(order), unit(vectors[np.concatenate(rows)[order]].astype(np.float32)).astype(np.float16)
+
+
+def _read_all(
+    scene: Scene, folder: Path, resize: bool
+) -> dict[str, tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]]:
+    """Every training view.
+
+    Raises:
+        ArtifactError: views without files.
+    """
+    stems = _stems(train_views(scene))
+    missing = [view for view, stem in stems.items() if not (folder / f"{stem}_s.npy").is_file()]
+    if missing:
+        raise ArtifactError(
+            f"{folder} lacks the maps of {len(missing)} of {len(stems)} training views of {scene.name}",
+            expected=", ".join(f"{stems[view]}_s.npy" for view in missing[:5]),
+            found=", ".join(sorted(path.name for path in folder.glob("*_s.npy"))[:5]) or "none",
+            fix="name LangSplat's folder language_features of the same images",
+        )
+    return {
+        view: read_view(folder, view, scene.cameras[view].size_hw, resize)
+        for view in track(list(stems), "LangSplat's files")
+    }
+
+
+def read_masks(scene_folder: Path, files: Path, out: Path, resize: bool) -> None:
+    """Write LangSplat's masks as the masks stage would: `<view>.npz` and `index.json`."""
+    scene = Scene.load(scene_folder)
+    with stage_log("langsplat masks", scene.name) as counts, atomic_folder(out) as folder:
+        index = {}
+        for view, (masks, _) in _read_all(scene, files, resize).items():
+            masks.save(folder / f"{view}.npz")
+            index[view] = {level.label: len(masks.rows_of(level)) for level in LEVELS}
+        write_index(folder, index, scene=scene.name, segmenter="langsplat", model=None, model_sha256=None)
+        counts.update(views=len(index))
+
+
+def read_clip(scene_folder: Path, files: Path, out: Path, resize: bool, settings: ClipSettings) -> None:
+    """Write LangSplat's vectors as the clip stage would: `<view>.npy`, rows as in `read_masks`.
+
+    Raises:
+        MisalignedArtifactError: the vectors are of another width than those of `settings.model`, which
+            must embed the texts.
+    """
+    scene = Scene.load(scene_folder)
+    model = ClipModel.load(Path(settings.model))
+    with stage_log("langsplat clip", scene.name) as counts, atomic_folder(out) as folder:
+        index = {}
+        for view, (_, vectors) in _read_all(scene, files, resize).items():
+            model.require_width(vectors.shape[1], f"{files / stem_of(view)}_f.npy")
+            write_npy(folder / f"{view}.npy", vectors)
+            index[view] = {"masks": len(vectors)}
+        write_index(
+            folder,
+            index,
+            scene=scene.name,
+            dim=model.width,
+            model=settings.model,
+            model_sha256=model.digest,
+            background="langsplat",
+            context=0.0,
+        )
+        counts.update(views=len(index), dim=model.width)
+
+
+def maps_of(
+    masks: HierarchicalMasks,
+) -> tuple[Float32[np.ndarray, "4 H W"], Int64[np.ndarray, " N"]]:
+    """LangSplat's four maps of a view, and which mask each row of its vectors belongs to.
+
+    The map of mixed levels holds all masks, large to small.
+    """
+    maps, rows = [], []
+    count = 0
+    for level in MAPS:
+        mine = np.arange(len(masks)) if level is None else masks.rows_of(level)
+        labels = masks.label_map(level)
+        maps.append(np.where(labels >= 0, count + np.searchsorted(mine, labels), -1))
+        rows.append(mine)
+        count += len(mine)
+    return np.stack(maps).astype(np.float32), np.concatenate(rows)
+
+
+def write_langsplat(masks_folder: Path, clip_folder: Path, out: Path) -> None:
+    """Write `<stem>_s.npy` and `<stem>_f.npy` of every view that has masks.
+
+    Raises:
+        MisalignedArtifactError: masks and vectors have other rows.
+    """
+    index = read_index(masks_folder)
+    stems = _stems(list(index["views"]))
+    with stage_log("langsplat write", index["scene"]) as counts, atomic_folder(out) as folder:
+        for view, stem in stems.items():
+            masks = HierarchicalMasks.load(Path(masks_folder) / f"{view}.npz")
+            vectors = read_npy(Path(clip_folder) / f"{view}.npy")
+            if len(vectors) != len(masks):
+                raise MisalignedArtifactError(
+                    f"masks and vectors of view {view} differ",
+                    expected=f"{len(masks)} vectors, one per mask",
+                    found=f"{len(vectors)}",
+                    fix="run the clip stage again",
+                )
+            maps, rows = maps_of(masks)
+            write_npy(folder / f"{stem}_s.npy", maps)
+            write_npy(folder / f"{stem}_f.npy", vectors[rows].astype(np.float32))
+        counts.update(views=len(stems))

@@ -1,0 +1,107 @@
+"""The stage `clip`: one CLIP vector per mask of every training view."""
+
+from pathlib import Path
+
+import numpy as np
+
+from hilsplat.base import crops, onnx_models
+from hilsplat.base.artifacts import (
+    ViewCache,
+    atomic_folder,
+    read_index,
+    sha256_of_file,
+    sha256_of_json,
+    write_index,
+    write_npy,
+)
+from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.parallel import in_order
+from hilsplat.base.progress import stage_log, track
+from hilsplat.embed import clip
+from hilsplat.embed.clip import ClipModel
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.settings import ClipSettings
+
+
+def run_clip(
+    scene_folder: Path, masks_folder: Path, out: Path, cache: Path, settings: ClipSettings, threads: int
+) -> None:
+    """Embed every mask of every training view.
+
+    Args:
+        scene_folder: the `Scene` artifact.
+        masks_folder: what the masks stage wrote.
+        out: folder to write: `<view>.npy`, float16 (M, C) unit vectors with rows as the masks, and
+            `index.json` with the number C and the model.
+        cache: folder of the view cache.
+        settings: model and cropping.
+        threads: views worked on at once; the result does not depend on it.
+
+    Raises:
+        MisalignedArtifactError: the masks are of other views or sizes than the scene's.
+    """
+    scene = Scene.load(scene_folder)
+    views = list(read_index(masks_folder)["views"])
+    model = ClipModel.load(Path(settings.model))
+    view_cache = ViewCache(Path(cache) / "clip")
+    code = [sha256_of_file(Path(module.__file__)) for module in (clip, crops, onnx_models)]
+
+    def embed(view: str) -> np.ndarray:
+        masks_path = Path(masks_folder) / f"{view}.npz"
+        key = sha256_of_json(
+            {
+                "image": sha256_of_file(scene.image_path(view)),
+                "masks": sha256_of_file(masks_path),
+                "model": model.digest,
+                "providers": model.vision.providers,
+                "settings": settings.model_dump(exclude={"model"}),
+                "code": code,
+            }
+        )
+
+        def compute() -> dict[str, np.ndarray]:
+            masks = HierarchicalMasks.load(masks_path)
+            if masks.size_hw != scene.cameras[view].size_hw:
+                raise MisalignedArtifactError(
+                    f"masks of view {view} of {scene.name} do not fit its camera",
+                    expected=f"{scene.cameras[view].size_hw} (height, width)",
+                    found=f"{masks.size_hw}",
+                    fix="run the masks stage again for this scene",
+                )
+            return {"clip": model.embed_masks(scene.image(view), masks, settings)}
+
+        return view_cache.get(key, compute)["clip"]
+
+    strangers = sorted(set(views) - set(scene.views("train")))
+    if strangers:
+        raise MisalignedArtifactError(
+            f"masks in {masks_folder} are not of the training views of {scene.name}",
+            expected=f"only views among its {len(scene.views('train'))} training views",
+            found=", ".join(strangers[:5]),
+            fix="run the masks stage again for this scene",
+        )
+    with stage_log("clip", scene.name) as counts, atomic_folder(out) as folder:
+        index: dict[str, dict[str, int]] = {}
+        found = in_order(embed, views, threads)
+        dimensions = 0
+        for view, vectors in zip(views, track(found, "CLIP of views", len(views)), strict=True):
+            write_npy(folder / f"{view}.npy", vectors)
+            index[view] = {"masks": len(vectors)}
+            dimensions = vectors.shape[1]
+        write_index(
+            folder,
+            index,
+            scene=scene.name,
+            dim=dimensions,
+            model=settings.model,
+            model_sha256=model.digest,
+            background=settings.background,
+            context=settings.context,
+        )
+        counts.update(
+            views=len(views),
+            masks=sum(entry["masks"] for entry in index.values()),
+            dim=dimensions,
+            from_cache=view_cache.hits,
+        )

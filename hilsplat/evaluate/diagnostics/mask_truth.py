@@ -1,0 +1,196 @@
+"""How well the masks of a synthetic scene's views fit the true regions: a diagnostic, no table reads it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Int64
+from matplotlib import colormaps
+from matplotlib.cm import ScalarMappable
+from matplotlib.figure import Figure
+
+from hilsplat.base.artifacts import read_index
+from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.progress import stage_log, track
+from hilsplat.base.tables import markdown_table, write_csv
+from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
+from hilsplat.query.pictures import grey, save_png_and_pdf, show
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.masks import HierarchicalMasks, masks_label
+from hilsplat.segment.overlaps import region_ious
+from hilsplat.segment.pictures import paint_level
+
+LEAST_PX = 100
+"""Smaller regions are not asked for."""
+FIT_IOU = 0.5
+COLUMNS = ("scene", "masks", "level", "views", "regions", "best_iou", "recall", "masks_a_view", "precision")
+COLOURS = "RdYlGn"
+
+
+@dataclass(frozen=True)
+class ViewFit:
+    """Masks of one level of one view against the true regions of that level.
+
+    Attributes:
+        ids: true nodes with a region of at least `LEAST_PX`.
+        best: IoU of the best mask of each, 0 where there is no mask.
+        masks: number of masks.
+        fitting: masks with an IoU of at least 0.5 with some region, however small.
+    """
+
+    ids: Int64[np.ndarray, " r"]
+    best: Float32[np.ndarray, " r"]
+    masks: int
+    fitting: int
+
+
+def fit_of_view(masks: HierarchicalMasks, truth: HierarchyAnnotations, view: str) -> dict[Level, ViewFit]:
+    """Compare masks with the true regions, level by level.
+
+    Raises:
+        MisalignedArtifactError: the masks are of another size than the labels.
+    """
+    found = {}
+    for level in LEVELS:
+        labels = truth.label_image(view, level)
+        if labels.shape != tuple(masks.size_hw):
+            raise MisalignedArtifactError(
+                f"masks of view {view} do not fit its label images",
+                expected=f"{labels.shape[0]} x {labels.shape[1]} (height x width)",
+                found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
+                fix="run poses without shrinking the images (poses.max_side_px), then masks again",
+            )
+        rows = masks.rows_of(level)
+        ids, areas, ious = region_ious(labels, masks.dense(rows))
+        scored = areas >= LEAST_PX
+        best = ious[scored].max(axis=1, initial=0)
+        fitting = int((ious.max(axis=0, initial=0) >= FIT_IOU).sum())
+        found[level] = ViewFit(ids[scored], best, len(rows), fitting)
+    return found
+
+
+def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, out: Path) -> str:
+    """Write a table of all views, and a picture of a middling view and the worst one.
+
+    Args:
+        scene_folder: scene artifact.
+        truth_folder: truth of the synthetic scene.
+        masks_folder: masks artifact of any segmenter.
+        out: PNG to write, a PDF beside it; the table goes there as CSV.
+
+    Returns:
+        the rows as a Markdown table.
+
+    Raises:
+        ArtifactError: an artifact is missing, or the scene is not synthetic.
+        MisalignedArtifactError: the masks are of another size than the labels.
+    """
+    scene, index = Scene.load(scene_folder), read_index(masks_folder)
+    truth = HierarchyAnnotations.load(truth_folder)
+    with stage_log("mask_truth", scene.name) as counts:
+        fits = {
+            view: fit_of_view(HierarchicalMasks.load(Path(masks_folder) / f"{view}.npz"), truth, view)
+            for view in track(list(index["views"]), "views compared")
+        }
+        counts["views"] = len(fits)
+        rows = [table_row(scene.name, masks_label(masks_folder), level, fits) for level in LEVELS]
+        figure = draw_fits(scene, truth, Path(masks_folder), fits, middling_and_worst(fits))
+        save_png_and_pdf(figure, out)
+        write_csv(Path(out).with_suffix(".csv"), COLUMNS, rows)
+    return markdown_table(COLUMNS, rows, 3)
+
+
+def table_row(scene: str, masks: str, level: Level, fits: Mapping[str, dict[Level, ViewFit]]) -> list[str]:
+    """One level over all views; means over regions, not over views."""
+    own = [fit[level] for fit in fits.values()]
+    best = np.concatenate([fit.best for fit in own]) if own else np.zeros(0)
+    number = sum(fit.masks for fit in own)
+    shares = (
+        best.mean() if len(best) else np.nan,
+        (best >= FIT_IOU).mean() if len(best) else np.nan,
+        number / max(1, len(own)),
+        sum(fit.fitting for fit in own) / number if number else np.nan,
+    )
+    iou, recall, masks_a_view, precision = shares
+    return [
+        scene,
+        masks,
+        level.label,
+        str(len(own)),
+        str(len(best)),
+        f"{iou:.4f}",
+        f"{recall:.4f}",
+        f"{masks_a_view:.1f}",
+        f"{precision:.4f}",
+    ]
+
+
+def middling_and_worst(fits: Mapping[str, dict[Level, ViewFit]]) -> list[str]:
+    """The view whose mean over all regions is the median, and the one where it is lowest."""
+
+    def mean_of(view: str) -> float:
+        best = np.concatenate([fit.best for fit in fits[view].values()])
+        return float(best.mean()) if len(best) else 1.0
+
+    order = sorted(fits, key=lambda view: (mean_of(view), view))
+    return list(dict.fromkeys([order[len(order) // 2], order[0]])) if order else []
+
+
+def draw_fits(
+    scene: Scene,
+    truth: HierarchyAnnotations,
+    masks_folder: Path,
+    fits: Mapping[str, dict[Level, ViewFit]],
+    views: list[str],
+) -> Figure:
+    """Per view two rows: its masks by level, and below each the true regions coloured by their best IoU."""
+    wide = 1 + len(LEVELS)
+    example = scene.cameras[views[0]].size_hw if views else (1, 1)
+    height_in = 3.1 * example[0] / example[1] + 0.3
+    figure = Figure(figsize=(3.1 * wide, max(1, 2 * len(views)) * height_in), layout="constrained")
+    axes = figure.subplots(max(1, 2 * len(views)), wide, squeeze=False)
+    for each in axes.flat:
+        each.set_axis_off()
+    for number, view in enumerate(views):
+        image = scene.image(view)
+        masks = HierarchicalMasks.load(masks_folder / f"{view}.npz")
+        above, below = axes[2 * number], axes[2 * number + 1]
+        above[0].set_axis_on()
+        show(above[0], image, f"{view}: {('a middling view', 'the worst view')[number]}")
+        for level in LEVELS:
+            fit = fits[view][level]
+            column = 1 + level.index
+            for row in (above, below):
+                row[column].set_axis_on()
+            show(above[column], paint_level(image, masks, level), f"{level.label}: {fit.masks} masks")
+            recall = f", {(fit.best >= FIT_IOU).sum()} found" if len(fit.best) else ""
+            mean = f", mean IoU {fit.best.mean():.2f}" if len(fit.best) else ""
+            show(
+                below[column],
+                paint_fits(image, truth.label_image(view, level), fit),
+                f"{len(fit.best)} regions{recall}{mean}",
+            )
+        bar = figure.colorbar(
+            ScalarMappable(cmap=COLOURS),
+            cax=below[0].inset_axes((0.1, 0.5, 0.8, 0.05)),
+            orientation="horizontal",
+        )
+        bar.ax.tick_params(labelsize=7)
+        bar.set_label("IoU of a true region with\nthe mask that fits it best", fontsize=8)
+    return figure
+
+
+def paint_fits(image: np.ndarray, labels: np.ndarray, fit: ViewFit) -> np.ndarray:
+    """True regions coloured by the IoU of the best mask, outlined; what is not asked for stays grey."""
+    painted = 0.5 * grey(image)
+    for node, value in zip(fit.ids, fit.best, strict=True):
+        colour = np.array(colormaps[COLOURS](float(value))[:3]) * 255
+        inside = labels == node
+        painted[inside] = 0.3 * grey(image)[inside] + 0.7 * colour
+    edge = np.zeros(labels.shape, dtype=bool)
+    edge[:, 1:] |= labels[:, 1:] != labels[:, :-1]
+    edge[1:] |= labels[1:] != labels[:-1]
+    painted[edge] = 255
+    return painted.clip(0, 255).astype(np.uint8)

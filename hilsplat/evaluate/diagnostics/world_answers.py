@@ -1,0 +1,135 @@
+"""Do answers cover the same surface in neighbouring views? Measured on a synthetic scene's exact geometry."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
+
+from hilsplat.base.levels import LEVELS
+from hilsplat.evaluate.diagnostics.consistency import SharedPoints, neighbours, shared_points, thinned
+from hilsplat.evaluate.metrics.masks import iou
+from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
+from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
+from hilsplat.evaluate.protocols.cards import VIEW_CONSISTENCY
+from hilsplat.evaluate.protocols.measured import Measured
+from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
+from hilsplat.evaluate.protocols.views import given_key, label_of, rule_of
+from hilsplat.query.language_scene import LanguageScene
+from hilsplat.scene.cameras import Cameras
+from hilsplat.settings import EvaluateSettings
+from hilsplat.world.mesh import TrueMesh
+
+METHODS = ("field", "tree")
+MaskOf = Callable[[str, str, Query], Bool[np.ndarray, "H W"]]
+"""(method, view, query) -> answer at the query's level."""
+
+
+def measure_world_consistency(
+    answers: LanguageScene,
+    selections: Selections,
+    truths: Mapping[str, Callable[[], ViewTruth]],
+    answered: Mapping[str, PackedMasks],
+    truth: Path,
+    settings: EvaluateSettings,
+) -> Iterator[tuple[str, Measured]]:
+    """Rows of `world/view-consistency`: each annotated view against the view that stands nearest to it.
+
+    Nothing is measured without the true mesh (labels of a photographed scene).
+
+    Args:
+        answers: the scene.
+        selections: its chosen nodes.
+        truths: annotated views.
+        answered: answers that were given in them (`views.measure_view`).
+        truth: truth folder of a synthetic scene.
+        settings: methods, the map rule, how many texts.
+    """
+    if not (Path(truth) / "mesh.ply").is_file():
+        return
+    true = Cameras.load(Path(truth) / "cameras.npz")
+    mesh = TrueMesh.load(Path(truth) / "mesh.ply")
+    views = [view for view in answers.scene.cameras.names if view in set(true.names)]
+    nearest = dict(neighbours(true, views, 1))
+    for view in truths:
+        if view not in nearest:
+            continue
+        pair = (view, nearest[view])
+        points = thinned(
+            shared_points(true[pair[0]], mesh.depth(true[pair[0]]), true[pair[1]], mesh.depth(true[pair[1]]))
+        )
+        queries = spread(truths[view]().queries, settings.consistency_texts)
+        mask_of = answers_of(answers, selections, answered, pair, queries, settings)
+        for row in consistency_rows(pair, points, queries, mask_of, settings):
+            yield view, row
+
+
+def spread(queries: Sequence[Query], per_level: int) -> list[Query]:
+    """At most so many texts per level, evenly from the largest region to the smallest."""
+    chosen = []
+    for level in LEVELS:
+        same = [query for query in queries if query.level is level]
+        same.sort(key=lambda query: (-int(np.count_nonzero(query.truth)), query.text))
+        count = min(per_level, len(same))
+        chosen += [same[number * len(same) // count] for number in range(count)]
+    return chosen
+
+
+def answers_of(
+    answers: LanguageScene,
+    selections: Selections,
+    answered: Mapping[str, PackedMasks],
+    pair: tuple[str, str],
+    queries: Sequence[Query],
+    settings: EvaluateSettings,
+) -> MaskOf:
+    """Answers to some texts in two views, level given; most of those in annotated views are known already."""
+
+    def is_kept(view: str, query: Query) -> bool:
+        return view in answered and given_key("field", query, settings) in answered[view]
+
+    rule = rule_of(settings)
+    maps: dict[str, dict[str, np.ndarray]] = {}
+    for view in pair if "field" in settings.methods else ():
+        missing = [query.text for query in queries if not is_kept(view, query)]
+        if missing:
+            texts = list(dict.fromkeys(missing))
+            maps[view] = dict(zip(texts, answers.field_relevancy(texts, view), strict=True))
+
+    def mask_of(method: str, view: str, query: Query) -> Bool[np.ndarray, "H W"]:
+        if method == "tree":
+            size_hw = answers.scene.cameras[view].size_hw
+            return selections.mask(view, selections.text(query.text, query.level, view), size_hw)
+        if is_kept(view, query):
+            return answered[view].get(given_key(method, query, settings))
+        smoothed = SmoothedRelevancy.of(maps[view][query.text], rule)
+        return relevancy_mask(smoothed, query.level, rule)[0]
+
+    return mask_of
+
+
+def consistency_rows(
+    pair: tuple[str, str],
+    points: SharedPoints,
+    queries: Sequence[Query],
+    mask_of: MaskOf,
+    settings: EvaluateSettings,
+) -> Iterator[Measured]:
+    """IoU over shared points of the answers in two views.
+
+    Texts that neither view answers there are left out; `n` is the number of points in the union.
+    """
+    for method in METHODS:
+        if method not in settings.methods:
+            continue
+        protocol = label_of(VIEW_CONSISTENCY, method, settings)
+        for query in queries:
+            assert query.level is not None
+            here = mask_of(method, pair[0], query).reshape(-1)[points.pixel_a]
+            there = mask_of(method, pair[1], query).reshape(-1)[points.pixel_b]
+            union = int(np.count_nonzero(here | there))
+            if union:
+                value = iou(here[None], there[None])
+                yield Measured(
+                    method, query.text, query.level.label, "view_consistency", protocol, value, union
+                )

@@ -1,0 +1,105 @@
+"""View consistency of masks on a synthetic scene, measured with its exact geometry."""
+
+import logging
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
+
+from hilsplat.base.artifacts import read_index
+from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.tables import markdown_table, write_csv
+from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
+from hilsplat.evaluate.diagnostics.consistency import Agreement, measure_consistency, neighbours
+from hilsplat.scene.cameras import Cameras
+from hilsplat.segment.masks import HierarchicalMasks, masks_label
+from hilsplat.world.mesh import TrueMesh
+
+logger = logging.getLogger(__name__)
+
+TRUTH = "true regions"
+"""How the table names what no masks can beat: the labels themselves, one pixel of border off."""
+
+COLUMNS = (
+    "scene",
+    "masks",
+    "level",
+    "view_pairs",
+    "masks_compared",
+    "best_iou",
+    "disagreement",
+    "joined_disagreement",
+)
+
+
+def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> str:
+    """Measure how consistently the masks of neighbouring views cut the same surface.
+
+    Args:
+        truth: truth folder of the scene: true cameras, mesh and labels.
+        masks_folder: masks artifact of any segmenter.
+        out: CSV to write, one row per level for the masks and for the true regions, which give the
+            measure's floor (pixels at borders).
+        count: neighbours of each view.
+
+    Returns:
+        the rows as a Markdown table.
+
+    Raises:
+        ArtifactError: a folder is missing or incomplete, or fewer than two views have masks.
+        MisalignedArtifactError: masks are of another size than the true cameras.
+    """
+    index = read_index(masks_folder)
+    views = list(index["views"])
+    if len(views) < 2:
+        raise ArtifactError(f"{masks_folder} has masks of {len(views)} view", expected="two views or more")
+    cameras = Cameras.load(Path(truth) / "cameras.npz")
+    mesh = TrueMesh.load(Path(truth) / "mesh.ply")
+    annotations = HierarchyAnnotations.load(truth)
+    pairs = neighbours(cameras, views, count)
+
+    @lru_cache(maxsize=2 * count + 2)
+    def depth_of(view: str) -> np.ndarray:
+        return mesh.depth(cameras[view])
+
+    @lru_cache(maxsize=2 * count + 2)
+    def loaded(view: str) -> HierarchicalMasks:
+        masks = HierarchicalMasks.load(Path(masks_folder) / f"{view}.npz")
+        expected = cameras[view].size_hw
+        if masks.size_hw != expected:
+            raise MisalignedArtifactError(
+                f"masks of view {view} do not fit its true camera",
+                expected=f"{expected[0]} x {expected[1]} (height x width)",
+                found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
+                fix="run poses without shrinking the images (poses.max_side_px), then masks again",
+            )
+        return masks
+
+    def masks_of(view: str, level: Level) -> Bool[np.ndarray, "M H W"]:
+        masks = loaded(view)
+        return masks.dense(masks.rows_of(level))
+
+    rows = []
+    for name, source in (
+        (masks_label(masks_folder), masks_of),
+        (TRUTH, lambda view, level: true_masks(annotations, view, level)),
+    ):
+        measured = measure_consistency(cameras, pairs, depth_of, source)
+        rows += [_row(index["scene"], name, level, measured[level]) for level in LEVELS]
+    write_csv(out, COLUMNS, rows)
+    return markdown_table(COLUMNS, rows, 3)
+
+
+def true_masks(annotations: HierarchyAnnotations, view: str, level: Level) -> Bool[np.ndarray, "M H W"]:
+    """True regions of a view at a level, surroundings included, one per visible node."""
+    labels = annotations.label_image(view, level)
+    ids = np.unique(labels[labels >= 0])
+    return labels[None] == ids[:, None, None]
+
+
+def _row(scene: str, masks: str, level: Level, agreement: Agreement) -> list[str]:
+    shares = (agreement.best_iou, agreement.disagreement, agreement.joined_disagreement)
+    numbers = [str(agreement.pairs), str(agreement.masks), *(f"{share:.4f}" for share in shares)]
+    return [scene, masks, level.label, *numbers]

@@ -1,0 +1,228 @@
+"""Figures of the paper: queries by method, one query over four views, features at three levels."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
+from matplotlib.figure import Figure
+
+from hilsplat.base.errors import SettingsError
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.progress import stage_log, track
+from hilsplat.datasets.labelled import LabelledScene
+from hilsplat.evaluate.figures.panel import Shown, annotated_rows, free_rows, truths_of
+from hilsplat.evaluate.metrics.masks import iou
+from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
+from hilsplat.evaluate.protocols.view_truth import ViewTruth
+from hilsplat.evaluate.protocols.views import rule_of
+from hilsplat.evaluate.tables.measured import row_name
+from hilsplat.query.language_scene import LanguageScene
+from hilsplat.query.pictures import label_left, paint_answer, save_png_and_pdf, show
+from hilsplat.scene.scene import Scene
+from hilsplat.settings import EvaluateSettings, FiguresSettings
+
+logger = logging.getLogger(__name__)
+
+WIDTH_IN = 13.0
+VIEWS = 4
+"""Views of the figure that shows one query over several."""
+
+
+@dataclass(frozen=True)
+class Answerer:
+    """One method that is compared.
+
+    Attributes:
+        title: as tables name its rows.
+        method: "tree" or "field".
+        scene: the variant's scene.
+    """
+
+    title: str
+    method: str
+    scene: LanguageScene
+
+    def mask(self, shown: Shown, evaluate: EvaluateSettings) -> Bool[np.ndarray, "H W"]:
+        """Answer to a query in its view, at its level where it has one."""
+        if self.method == "tree":
+            size_hw = self.scene.scene.cameras[shown.view].size_hw
+            if len(shown.path) > 1 and shown.level is None:  # a path that a person asks
+                hits = self.scene.select_path(
+                    shown.path, level=None, threshold=evaluate.node_select, view=shown.view
+                )
+            else:
+                hits = self.scene.select_nodes(
+                    shown.path[-1], level=shown.level, threshold=evaluate.node_select, view=shown.view
+                )
+            if not len(hits.ids):
+                return np.zeros(size_hw, dtype=bool)
+            return np.asarray(self.scene.node_masks(shown.view, hits.ids))
+        rule = rule_of(evaluate)
+        relevancy = np.asarray(self.scene.field_relevancy([shown.path[-1]], shown.view))[0]
+        return relevancy_mask(SmoothedRelevancy.of(relevancy, rule), shown.level, rule)[0]
+
+
+def run_comparison(
+    folder: Path,
+    variants: Sequence[str],
+    names: Mapping[str, str],
+    out: Path,
+    settings: FiguresSettings,
+    evaluate: EvaluateSettings,
+    truth: Path | None = None,
+    labels: LabelledScene | None = None,
+    queries: Sequence[str] = (),
+    threads: int = 1,
+) -> None:
+    """Draw the three figures of a scene, each as PNG and PDF.
+
+    Args:
+        folder: `results/<dataset>/<scene>`, finished under every variant.
+        variants: compared; "default" answers by its tree and its field, others by their field.
+        names: variant -> how tables name it.
+        out: PNG of the comparison; `views.png` and `features.png` are written beside it.
+        settings: how much is shown.
+        evaluate: how answers are made.
+        truth: truth folder of a synthetic scene.
+        labels: labels of a published data set, in its place.
+        queries: texts to show where there is neither.
+        threads: threads for rendering.
+
+    Raises:
+        SettingsError: no variant is named.
+        ArtifactError: the scene is not finished under a variant.
+    """
+    if not variants:
+        raise SettingsError("nothing is compared", expected="one variant or more", fix="name main_variants")
+    scene = Scene.load(Path(folder) / "scene")
+    with stage_log("comparison", scene.name) as counts:
+        methods: list[Answerer] = []
+        for variant in variants:
+            answers = LanguageScene.open(folder, variant, threads=threads)
+            for method in ("tree", "field") if variant == "default" else ("field",):
+                methods.append(Answerer(row_name(variant, method, names), method, answers))
+        truths = truths_of(scene, truth, labels, evaluate)
+        if truths:
+            rows = annotated_rows(truths, settings)
+        else:
+            rows = free_rows(methods[0].scene, queries, settings, evaluate)
+        save_png_and_pdf(draw_methods(methods, rows, evaluate), out)
+        several = over_views(scene, rows, truths)
+        save_png_and_pdf(draw_views(methods, several, evaluate), Path(out).with_name("views.png"))
+        view = several[0].view if several else (scene.views("test") or scene.views("train"))[0]
+        save_png_and_pdf(draw_features(methods, view), Path(out).with_name("features.png"))
+        counts |= {"methods": len(methods), "queries": len(rows), "views": len(several)}
+
+
+def over_views(
+    scene: Scene, rows: Sequence[Shown], truths: Mapping[str, object], count: int = VIEWS
+) -> list[Shown]:
+    """One query in several views: the first part or subpart that is shown, else the first query.
+
+    Views with a known truth come first, in their order; then others, spread over the scene.
+    """
+    if not rows:
+        return []
+    levelled = [row for row in rows if row.level in (Level.PART, Level.SUBPART)]
+    chosen = levelled[0] if levelled else rows[0]
+    found = [chosen]
+    for view, truth_of in truths.items():
+        if view != chosen.view and len(found) < count:
+            known = truth_of()
+            assert isinstance(known, ViewTruth)
+            for query in known.queries or known.categories:
+                if (query.text, query.level) == (chosen.text, chosen.level):
+                    found.append(Shown(chosen.text, chosen.path, chosen.level, view, query.truth))
+    others = scene.views()
+    for number in range(count):
+        view = others[number * len(others) // count]
+        if len(found) < count and view not in {row.view for row in found}:
+            found.append(Shown(chosen.text, chosen.path, chosen.level, view, None))
+    return found
+
+
+def draw_methods(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: EvaluateSettings) -> Figure:
+    """One row per query, one column per method; the truth is outlined, IoU in the title."""
+    scene = methods[0].scene.scene
+    figure, grid = _grid(scene, max(len(rows), 1), len(methods) + 1, f"{scene.name}: queries by method")
+    for axes, row in zip(grid, track(list(rows), "queries compared"), strict=False):
+        image = scene.image(row.view)
+        title = f"truth, {row.view}" if row.truth is not None else row.view
+        show(axes[0], paint_answer(image, None, row.truth), title)
+        label_left(axes[0], row.text, row.level)
+        for place, method in zip(axes[1:], methods, strict=True):
+            mask = method.mask(row, evaluate)
+            score = f"\nIoU {iou(mask, row.truth):.2f}" if row.truth is not None else ""
+            show(place, paint_answer(image, mask, row.truth), method.title + score)
+    return figure
+
+
+def draw_views(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: EvaluateSettings) -> Figure:
+    """One row per method, one column per view: does a method answer alike from everywhere?"""
+    scene = methods[0].scene.scene
+    asked = f"“{rows[0].text}” over {len(rows)} views" if rows else "no query"
+    figure, grid = _grid(scene, len(methods) + 1, max(len(rows), 1), f"{scene.name}: {asked}")
+    for column, row in enumerate(rows):
+        image = scene.image(row.view)
+        show(grid[0][column], paint_answer(image, None, row.truth), row.view)
+        for place, method in enumerate(methods, start=1):
+            mask = method.mask(row, evaluate)
+            score = f"IoU {iou(mask, row.truth):.2f}" if row.truth is not None else ""
+            show(grid[place][column], paint_answer(image, mask, row.truth), score)
+    label_left(grid[0][0], "photograph")
+    for place, method in enumerate(methods, start=1):
+        label_left(grid[place][0], method.title)
+    return figure
+
+
+def draw_features(methods: Sequence[Answerer], view: str) -> Figure:
+    """One row per field, one column per level; a tree shows the nodes as colours."""
+    scene = methods[0].scene.scene
+    figure, grid = _grid(scene, len(methods), len(LEVELS) + 1, f"{scene.name}: features at three levels")
+    for axes, method in zip(grid, methods, strict=True):
+        show(axes[0], scene.image(view), view)
+        label_left(axes[0], method.title)
+        for level in LEVELS:
+            picture = (
+                node_image(method.scene, view, level)
+                if method.method == "tree"
+                else method.scene.field_image(view, level)
+            )
+            show(axes[level.index + 1], picture, level.label)
+    return figure
+
+
+def node_image(scene: LanguageScene, view: str, level: Level) -> np.ndarray:
+    """The node of each pixel as a colour of its CLIP vector's three principal directions."""
+    vectors = scene.tree.clip.astype(np.float64)
+    nodes = scene.tree.nodes_of(level)
+    colours = np.zeros((len(vectors) + 1, 3))
+    if len(nodes):
+        centred = vectors[nodes] - vectors[nodes].mean(axis=0)
+        _, _, directions = np.linalg.svd(centred, full_matrices=False)
+        directions = directions[:3]
+        peak = np.abs(directions).argmax(axis=1)
+        directions = directions * np.sign(directions[np.arange(len(directions)), peak])[:, None]
+        values = centred @ directions.T
+        low, high = np.percentile(values, (2, 98), axis=0)
+        colours[nodes, : len(directions)] = np.clip((values - low) / np.maximum(high - low, 1e-9), 0, 1)
+    weights = scene.view_weights(view)
+    of_gaussian = colours[scene.tree.node_of_gaussian[:, level.index]].astype(np.float32)
+    height, width = scene.scene.cameras[view].size_hw
+    return (255 * np.clip(weights @ of_gaussian, 0, 1)).astype(np.uint8).reshape(height, width, 3)
+
+
+def _grid(scene: Scene, rows: int, columns: int, title: str) -> tuple[Figure, np.ndarray]:
+    """An empty grid of pictures of the scene's shape, axes off until something is shown."""
+    height, width = scene.cameras[scene.cameras.names[0]].size_hw
+    row_in = WIDTH_IN / columns * height / width + 0.18
+    figure = Figure(figsize=(WIDTH_IN, rows * row_in + 0.4), layout="constrained")
+    figure.suptitle(title, fontsize=12, fontweight="bold")
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for axes in grid.ravel():
+        axes.set_xticks([])
+        axes.set_yticks([])
+    return figure, grid

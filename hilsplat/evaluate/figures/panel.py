@@ -1,0 +1,268 @@
+"""The panel of a scene: photograph, masks, field, and what queries answer."""
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
+from matplotlib.figure import Figure, FigureBase
+
+from hilsplat.base.artifacts import read_index
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.progress import stage_log, track
+from hilsplat.datasets.labelled import LabelledScene
+from hilsplat.evaluate.metrics.masks import iou
+from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
+from hilsplat.evaluate.protocols.view_truth import ViewTruth
+from hilsplat.evaluate.protocols.views import rule_of
+from hilsplat.evaluate.truths import annotated_truths, labelled_truths
+from hilsplat.query.language_scene import PATH_SEPARATOR, LanguageScene
+from hilsplat.query.node_search import NodeHits
+from hilsplat.query.pictures import (
+    label_left,
+    paint_answer,
+    paint_relevancy,
+    save_png_and_pdf,
+    show,
+)
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.masks import HierarchicalMasks, made_from_truth, masks_label
+from hilsplat.segment.pictures import paint_level
+from hilsplat.settings import EvaluateSettings, FiguresSettings
+
+logger = logging.getLogger(__name__)
+
+WIDTH_IN = 13.0
+
+
+@dataclass(frozen=True)
+class Shown:
+    """One row of the panel: a query in a view.
+
+    Attributes:
+        text: what is asked; words separated by ">" are a path.
+        path: chain of texts from the whole down; the text alone where there are no annotations.
+        level: the annotation's level; None where there is none.
+        view: view name.
+        truth: true region; None where there is none.
+    """
+
+    text: str
+    path: tuple[str, ...]
+    level: Level | None
+    view: str
+    truth: Bool[np.ndarray, "H W"] | None
+
+
+def run_figures(
+    scene_folder: Path,
+    truth: Path | None,
+    masks_folder: Path,
+    gaussians: Path,
+    semantic_tree: Path,
+    field: Path,
+    autoencoder: Path,
+    clip_folder: Path,
+    out: Path,
+    settings: FiguresSettings,
+    evaluate: EvaluateSettings,
+    queries: Sequence[str] | None,
+    threads: int,
+    labels: LabelledScene | None = None,
+) -> None:
+    """Draw the panel.
+
+    Args:
+        scene_folder: scene artifact.
+        truth: annotations, where the scene has them; then they name the queries.
+        masks_folder: masks artifact (training views).
+        gaussians: 3DGS PLY.
+        semantic_tree: semantic tree artifact.
+        field: language field.
+        autoencoder: autoencoder artifact.
+        clip_folder: mask embeddings; their index names the CLIP model.
+        out: PNG to write.
+        settings: how much is shown.
+        evaluate: how answers are made.
+        queries: texts to show where there are no annotations.
+        threads: threads for rendering.
+        labels: labels of a published data set, in place of annotations.
+    """
+    scene = Scene.load(scene_folder)
+    with stage_log("figures", scene.name) as counts:
+        answers = LanguageScene.from_parts(
+            scene_folder,
+            gaussians,
+            semantic_tree,
+            field,
+            autoencoder,
+            Path(read_index(clip_folder)["model"]),
+            canonical=evaluate.canonical,
+            template=evaluate.template,
+            relevancy_scale=evaluate.relevancy_scale,
+            ancestors=evaluate.ancestors,
+            threads=threads,
+        )
+        truths = truths_of(scene, truth, labels, evaluate)
+        rows = (
+            annotated_rows(truths, settings)
+            if truths
+            else free_rows(answers, queries or (), settings, evaluate)
+        )
+        figure = draw_panel(answers, masks_folder, rows, evaluate)
+        save_png_and_pdf(figure, out)
+        counts["queries"] = len(rows)
+
+
+def truths_of(
+    scene: Scene, truth: Path | None, labels: LabelledScene | None, evaluate: EvaluateSettings
+) -> Mapping[str, Callable[[], ViewTruth]]:
+    """What is true in the views of a scene; nothing where it has neither annotations nor labels."""
+    if labels is not None:
+        return labelled_truths(labels, scene)
+    return annotated_truths(truth, scene, evaluate) if truth is not None else {}
+
+
+def annotated_rows(truths: Mapping[str, Callable[[], ViewTruth]], settings: FiguresSettings) -> list[Shown]:
+    """Texts of each level, from large to small regions, in the annotated views that show them best.
+
+    Labels without levels give texts of one kind.
+    """
+    found: dict[Level | None, dict[str, list[tuple[int, Shown]]]] = {}
+    for view, truth_of in truths.items():
+        truth = truth_of()
+        for query in truth.queries or truth.categories:
+            shown = Shown(query.text, query.paths[0], query.level, view, query.truth)
+            area = int(np.count_nonzero(query.truth))
+            found.setdefault(query.level, {}).setdefault(query.text, []).append((area, shown))
+    rows = []
+    for level in (*LEVELS, None):
+        texts = found.get(level, {})
+        for places in texts.values():
+            places.sort(key=lambda place: (-place[0], place[1].view))
+        ordered = sorted(texts, key=lambda text: (-texts[text][0][0], text))
+        wanted = settings.queries_per_level * (len(LEVELS) if level is None else 1)
+        count = min(wanted, len(ordered))
+        for number in range(count):  # the largest, then evenly down the list
+            places = texts[ordered[number * len(ordered) // count]]
+            rows += [shown for _, shown in places[: settings.views]]
+    return rows
+
+
+def free_rows(
+    answers: LanguageScene, queries: Sequence[str], settings: FiguresSettings, evaluate: EvaluateSettings
+) -> list[Shown]:
+    """Given texts, each in the views that show its best node largest."""
+    rows = []
+    for text in queries:
+        hits = answers.query(text, threshold=evaluate.node_select, limit=1)
+        fallback = [*answers.scene.views("test"), *answers.scene.views("train")]
+        views = (list(hits[0].best_views) if hits else []) or fallback
+        path = tuple(part.strip() for part in text.split(PATH_SEPARATOR))
+        rows += [Shown(text, path, None, view, None) for view in views[: settings.views]]
+    return rows
+
+
+def draw_panel(
+    answers: LanguageScene, masks_folder: Path, rows: Sequence[Shown], evaluate: EvaluateSettings
+) -> Figure:
+    """Masks of a training view, the field in a held-out view, then one row per query."""
+    scene = answers.scene
+    masked = next(iter(read_index(masks_folder)["views"]))
+    held_out = rows[0].view if rows else (scene.views("test") or scene.views("train"))[0]
+    height, width = scene.cameras[held_out].size_hw
+    aspect = height / width
+    columns = 7 if any(row.truth is not None for row in rows) else 6
+    overview_in = 2 * (WIDTH_IN / 4 * aspect + 0.15)
+    row_in = WIDTH_IN / columns * aspect + 0.1
+    queries_in = len(rows) * row_in + (0.2 if rows else 0)
+    figure = Figure(figsize=(WIDTH_IN, overview_in + queries_in + 0.45), layout="constrained")
+    label = masks_label(masks_folder)
+    warning = ": a diagnostic, masks made from the true labels" if made_from_truth(label) else ""
+    figure.suptitle(scene.name + warning, fontsize=12, fontweight="bold")
+    parts = figure.subfigures(2, 1, height_ratios=[overview_in, queries_in]) if rows else [figure]
+    grid = parts[0].subplots(2, 4, squeeze=False)
+    image = scene.image(masked)
+    masks = HierarchicalMasks.load(Path(masks_folder) / f"{masked}.npz")
+    show(grid[0, 0], image, f"photograph {masked} (training view)")
+    label_left(grid[0, 0], f"masks: {label}")
+    show(grid[1, 0], scene.image(held_out), f"photograph {held_out} ({scene.split[held_out]} view)")
+    label_left(grid[1, 0], "language field")
+    for level in LEVELS:
+        count = len(masks.rows_of(level))
+        show(
+            grid[0, level.index + 1],
+            paint_level(image, masks, level),
+            f"{level.label}: {count} masks",
+        )
+        show(
+            grid[1, level.index + 1], answers.field_image(held_out, level), f"{level.label}: field as colours"
+        )
+    if rows:
+        draw_queries(parts[1], answers, rows, evaluate, columns)
+    return figure
+
+
+def draw_queries(
+    figure: FigureBase,
+    answers: LanguageScene,
+    rows: Sequence[Shown],
+    evaluate: EvaluateSettings,
+    columns: int,
+) -> None:
+    """One row per query: truth, answers of tree and field, relevancy of the field at the three levels.
+
+    Titles give IoU with the truth and the highest relevancy; the level that answered is framed.
+    """
+    grid = figure.subplots(len(rows), columns, squeeze=False)
+    rule = rule_of(evaluate)
+    for axes, row in zip(grid, track(rows, "queries drawn"), strict=True):
+        image = answers.scene.image(row.view)
+        last = row.path[-1]
+        relevancy = np.asarray(answers.field_relevancy([last], row.view))[0]
+        hits = _hits(answers, row, evaluate)
+        level = row.level or hits.level
+        field_mask, _ = relevancy_mask(SmoothedRelevancy.of(relevancy, rule), level, rule)
+        pictures = [("tree", _node_mask(answers, row.view, hits))]
+        if columns == 7:
+            path = answers.select_path(
+                row.path, level=row.level, threshold=evaluate.node_select, view=row.view
+            )
+            pictures.append(("tree, path", _node_mask(answers, row.view, path)))
+        pictures.append(("field", field_mask))
+        title = f"truth, {row.view}" if row.truth is not None else row.view
+        show(axes[0], paint_answer(image, None, row.truth), title)
+        label_left(axes[0], _wrapped(row.text), level)
+        for place, (name, mask) in zip(axes[1:], pictures, strict=False):
+            score = f": IoU {iou(mask, row.truth):.2f}" if row.truth is not None else ""
+            show(place, paint_answer(image, mask, row.truth), name + score)
+        low, high = float(relevancy.min()), float(relevancy.max())
+        for each in LEVELS:
+            top = float(relevancy[each.index].max())
+            picture = paint_relevancy(image, relevancy[each.index], low, high)
+            show(
+                axes[columns - 3 + each.index],
+                picture,
+                f"relevancy, {each.label}: {top:.2f}",
+                bold=each is level,
+            )
+
+
+def _hits(answers: LanguageScene, row: Shown, evaluate: EvaluateSettings) -> NodeHits:
+    if row.level is None:
+        return answers.find(row.text, threshold=evaluate.node_select, view=row.view)
+    return answers.select_nodes(row.text, level=row.level, threshold=evaluate.node_select, view=row.view)
+
+
+def _node_mask(answers: LanguageScene, view: str, hits: NodeHits) -> Bool[np.ndarray, "H W"]:
+    if len(hits.ids) == 0:
+        return np.zeros(answers.scene.cameras[view].size_hw, dtype=bool)
+    return np.asarray(answers.node_masks(view, hits.ids))
+
+
+def _wrapped(text: str, width: int = 20) -> str:
+    import textwrap
+
+    return "\n".join(textwrap.wrap(text, width))

@@ -1,0 +1,160 @@
+"""What a scene and variant cost: seconds and memory of its jobs, seconds of a query.
+
+Times differ from run to run and stand apart from `scores.csv`, whose bytes must not change.
+"""
+
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hilsplat.base.artifacts import read_json
+from hilsplat.base.provenance import provenance_path
+from hilsplat.base.tables import read_csv, write_csv
+from hilsplat.evaluate.tables.efficiency import Job, read_benchmark
+
+if TYPE_CHECKING:
+    from hilsplat.query.language_scene import LanguageScene
+
+PREPARATION = ("masks", "coverage_tree", "clip")
+TRAINING = ("contributions", "semantic_tree", "autoencoder", "field")
+TIME_COLUMNS = ("dataset", "scene", "variant", "method", "seconds")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of one scene under one variant; shared stages count in full.
+
+    Attributes:
+        dataset: data set of the scene.
+        scene: scene name.
+        variant: named set of settings.
+        prepare_s: wall clock of masks, trees of the views and CLIP, s; nan where a job left no record.
+        train_s: of contributions, semantic tree, autoencoder and field, s; likewise.
+        peak_mib: largest resident memory of a training job, MiB; likewise.
+        query_s: per method, seconds from a text to a mask in a view.
+    """
+
+    dataset: str
+    scene: str
+    variant: str
+    prepare_s: float
+    train_s: float
+    peak_mib: float
+    query_s: Mapping[str, float]
+
+
+def times_path(scores: Path) -> Path:
+    """Where the seconds per query of a score file lie."""
+    return Path(scores).with_name("times.csv")
+
+
+def time_queries(
+    answers: "LanguageScene", asks: Mapping[str, Callable[[str], object]], view: str, texts: Sequence[str]
+) -> dict[str, float]:
+    """Seconds of one query per method: text, weights of the view, relevancy and mask.
+
+    The weights of the view and the text's vector are timed once and added, as both are kept in memory
+    for later queries.
+
+    Args:
+        answers: the scene.
+        asks: per method a function from a text to its mask in `view`, with weights and vectors ready.
+        view: a view.
+        texts: texts whose vectors are known; the median over them is taken.
+    """
+    start = time.perf_counter()
+    answers.encode_texts([texts[0]])
+    answers.pixel_weights(view)
+    shared_s = time.perf_counter() - start
+    seconds = {}
+    for method, ask in asks.items():
+        ask(texts[0])  # compiles and fills memory
+        taken = []
+        for text in texts:
+            start = time.perf_counter()
+            ask(text)
+            taken.append(time.perf_counter() - start)
+        seconds[method] = shared_s + sorted(taken)[len(taken) // 2]
+    return seconds
+
+
+def write_times(scores: Path, dataset: str, scene: str, variant: str, seconds: Mapping[str, float]) -> None:
+    """Write `times.csv` beside a score file."""
+    rows = [[dataset, scene, variant, method, f"{value:.4f}"] for method, value in sorted(seconds.items())]
+    write_csv(times_path(scores), TIME_COLUMNS, rows)
+
+
+def read_times(scores: Path) -> list[dict[str, str]]:
+    """Rows of `times.csv`.
+
+    Raises:
+        ArtifactError: the file is missing or has other columns.
+    """
+    return read_csv(times_path(scores), TIME_COLUMNS, "run the evaluate stage again")
+
+
+def read_costs(scores: Iterable[Path]) -> list[Cost]:
+    """Costs of the scenes and variants of some score files, from records beside their artifacts.
+
+    Raises:
+        ArtifactError: a score file has no times, or a record cannot be read.
+    """
+    found = []
+    for path in scores:
+        rows = read_times(path)
+        if not rows:  # a scene without labels
+            continue
+        jobs = jobs_of(Path(path))
+        first = rows[0]
+        found.append(
+            Cost(
+                first["dataset"],
+                first["scene"],
+                first["variant"],
+                _seconds(jobs, PREPARATION),
+                _seconds(jobs, TRAINING),
+                _peak(jobs),
+                {row["method"]: float(row["seconds"]) for row in rows},
+            )
+        )
+    return found
+
+
+def jobs_of(scores: Path) -> dict[str, Job | None]:
+    """The jobs behind a score file by stage, whichever variant ran them; None where one left no record.
+
+    Which artifacts were read stands in the provenance of the score file and, for those that `evaluate`
+    does not read, in that of the field. A stage that nothing read is not there: a baseline without trees.
+    """
+    places = _inputs(scores)
+    if "field" in places:
+        places = {**_inputs(places["field"]), **places}
+    jobs: dict[str, Job | None] = {}
+    for stage in (*PREPARATION, *TRAINING):
+        if stage in places:
+            record = places[stage].parent / "benchmarks" / f"{stage}.jsonl"
+            jobs[stage] = read_benchmark(record, record.parents[2])[-1] if record.is_file() else None
+    return jobs
+
+
+def _inputs(artifact: Path) -> dict[str, Path]:
+    record = provenance_path(artifact)
+    if not record.is_file():
+        return {}
+    return {name: Path(entry["path"]) for name, entry in read_json(record)["inputs"].items()}
+
+
+def _seconds(jobs: Mapping[str, Job | None], stages: tuple[str, ...]) -> float:
+    """Wall clock of the stages that were needed, s; nan where one left no record, or none is known."""
+    needed = [jobs[stage] for stage in stages if stage in jobs]
+    if not needed:
+        return math.nan
+    return sum(job.elapsed_s if job is not None else math.nan for job in needed)
+
+
+def _peak(jobs: Mapping[str, Job | None]) -> float:
+    peaks = [job.peak_mib for stage in TRAINING if (job := jobs.get(stage)) is not None]
+    return max(peaks) if peaks and max(peaks) > 0 else math.nan

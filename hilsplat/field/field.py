@@ -1,0 +1,162 @@
+"""The language field: one latent per Gaussian and level, and the stage that solves it.
+
+Geometry is frozen, so that everything the losses need is in the contributions: see `problem` for the
+quadratic part, `contrast` for the hierarchy losses and `solver` for how they are minimised.
+"""
+
+import json
+import logging
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import safetensors.numpy
+from jaxtyping import Float32
+from safetensors import SafetensorError, safe_open
+
+from hilsplat.base.artifacts import atomic_path, read_index, read_npz, sha256_of_file, write_json
+from hilsplat.base.device import compute_device
+from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.base.progress import stage_log
+from hilsplat.contributions.mask_operator import MaskOperator
+from hilsplat.contributions.rows import Contributions
+from hilsplat.field.autoencoder import autoencoder_file, load_latents, one_torch_thread
+from hilsplat.field.contrast import Contrast, view_relations
+from hilsplat.field.linear_code import METADATA_KEY
+from hilsplat.field.problem import QuadraticProblem
+from hilsplat.field.solver import keep_labelled, solve_field
+from hilsplat.settings import FieldSettings
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class LanguageField:
+    """One latent per Gaussian and level.
+
+    Attributes:
+        features: N Gaussians, L = 3 levels coarse to fine, D latent numbers; 0 where masks say nothing.
+        gaussians_sha256: digest of the PLY they belong to.
+        autoencoder_sha256: digest of the autoencoder that decodes them.
+    """
+
+    features: Float32[np.ndarray, "N 3 D"]
+    gaussians_sha256: str
+    autoencoder_sha256: str
+
+    def save(self, path: Path) -> None:
+        """Write `field.safetensors` atomically; the same field gives the same bytes."""
+        about = {"gaussians_sha256": self.gaussians_sha256, "autoencoder_sha256": self.autoencoder_sha256}
+        metadata = {METADATA_KEY: json.dumps(about, sort_keys=True)}
+        features = np.ascontiguousarray(self.features)
+        with atomic_path(path) as temporary:
+            safetensors.numpy.save_file({"features": features}, temporary, metadata=metadata)
+
+    @staticmethod
+    def load(path: Path) -> "LanguageField":
+        """Read `field.safetensors`.
+
+        Raises:
+            ArtifactError: the file is missing, damaged or no language field.
+        """
+        try:
+            with safe_open(path, framework="np") as file:
+                about = json.loads(file.metadata()[METADATA_KEY])
+                return LanguageField(file.get_tensor("features"), **about)
+        except (FileNotFoundError, SafetensorError, KeyError, TypeError) as error:
+            raise ArtifactError(
+                f"{path} cannot be read: {error}", fix="run the language stage again"
+            ) from error
+
+
+def run_field(
+    contributions_folder: Path,
+    tree_folder: Path,
+    autoencoder_folder: Path,
+    out: Path,
+    settings: FieldSettings,
+    threads: int,
+) -> None:
+    """Solve the language field of a scene: `field.safetensors` and `field.report.json` beside it.
+
+    Nothing is random (halves of masks are fixed by the view's name), and the result does not depend on
+    `threads` (sums are taken in one order).
+
+    Raises:
+        MisalignedArtifactError: coverage trees or latents belong to other masks.
+    """
+    contributions = Contributions.load(contributions_folder)
+    scene = read_index(contributions_folder)["scene"]
+    latents = load_latents(autoencoder_folder, contributions)
+    parents = read_parents(tree_folder, contributions)
+    with stage_log("field", scene) as counts, one_torch_thread():
+        device = compute_device(settings.device)
+        masks = MaskOperator.of(contributions.matrix("A"), contributions.level)
+        half_masks = MaskOperator.of(contributions.matrix("A_half"), contributions.level)
+        quadratic = contributions.quadratic(threads)
+        pixels = contributions.pixels.astype(np.float32)
+        problem = QuadraticProblem.of(
+            masks,
+            quadratic,
+            pixels,
+            latents,
+            (settings.weight_language, settings.weight_clustering, settings.ridge),
+            settings.start,
+        )
+        relations = view_relations(contributions, parents, settings, masks.means(problem.lifted))
+        if device != "cpu":
+            from hilsplat.contributions.cuda_algebra import DeviceMasks, DeviceQuadratic
+
+            masks, half_masks = DeviceMasks.of(masks, device), DeviceMasks.of(half_masks, device)
+            problem = replace(problem, masks=masks, quadratic=DeviceQuadratic.of(quadratic, device))
+        contrast = Contrast(
+            masks, half_masks, pixels, contributions.half_pixels.astype(np.float32), relations, settings
+        )
+        features, report = solve_field(problem, contrast, settings)
+        total_mass = contributions.mass().sum(axis=0, dtype=np.float64)
+        features = keep_labelled(features, problem.mass, total_mass, settings.min_labelled_share)
+        field = LanguageField(
+            features, contributions.gaussians_sha256, sha256_of_file(autoencoder_file(autoencoder_folder))
+        )
+        field.save(out)
+        unseen = int((problem.mass.max(axis=1) == 0).sum())
+        write_json(
+            report_path(out),
+            {
+                "scene": scene,
+                "gaussians": len(features),
+                "unseen_gaussians": unseen,
+                "masks": len(contributions),
+                "latent": features.shape[2],
+                "contrasted_masks": sum(len(view.rows) for view in relations),
+                **report,
+            },
+        )
+        counts |= {"masks": len(contributions), "Gaussians": len(features), "unseen": unseen}
+
+
+def report_path(field: Path) -> Path:
+    """Where the report of a field lies: `field.report.json` for `field.safetensors`."""
+    return Path(field).with_suffix(".report.json")
+
+
+def read_parents(tree_folder: Path, contributions: Contributions) -> dict[str, np.ndarray]:
+    """Parent of each mask in the coverage tree of each view.
+
+    Raises:
+        MisalignedArtifactError: a tree has another number of masks than the contributions.
+    """
+    read_index(tree_folder)
+    counts = np.bincount(contributions.view, minlength=len(contributions.views))
+    parents = {}
+    for view, count in zip(contributions.views, counts, strict=True):
+        parent = read_npz(Path(tree_folder) / f"{view}.npz")["parent"]
+        if len(parent) != count:
+            raise MisalignedArtifactError(
+                f"the coverage tree of view {view} belongs to other masks",
+                expected=f"{count} masks",
+                found=f"{len(parent)} in {tree_folder}",
+                fix="run the coverage_tree and contributions stages again on the same masks",
+            )
+        parents[view] = parent
+    return parents

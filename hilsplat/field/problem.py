@@ -1,0 +1,147 @@
+"""The quadratic part of the field's objective: language loss, clustering loss and ridge.
+
+With the rendered map M = W F, the mask means A F, the areas n and the mask latents h (see
+`contributions`), and all sums divided by the number of labelled pixels:
+
+- language loss (squared regression): tr F'GF - 2 sum n h.(AF) + sum n |h|^2
+- clustering loss L_h (Eq. 2):        tr F'GF - sum n |AF|^2
+- ridge: sum of visible mass x |F - F_lifted|^2
+
+One quadratic form, solved by a few conjugate-gradient steps from the lifted average.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from hilsplat.contributions.mask_operator import MaskOperator, MaskProducts, lifted_average, lifted_median
+from hilsplat.contributions.quadratic import Quadratic, QuadraticProduct, level_mass
+from hilsplat.field.minimise import CHUNK, dot
+
+
+@dataclass(frozen=True)
+class QuadraticProblem:
+    """Language loss, clustering loss and ridge: everything but the contrastive losses.
+
+    Attributes:
+        masks: A.
+        quadratic: G or W.
+        mass: G 1, the visible mass of each Gaussian at each level, px.
+        pixels: n.
+        latents: h.
+        lifted: the lifted average or median, towards which the ridge pulls.
+        weights: of the language loss, the clustering loss and the ridge.
+    """
+
+    masks: MaskProducts
+    quadratic: QuadraticProduct
+    mass: Float32[np.ndarray, "N 3"]
+    pixels: Float32[np.ndarray, " M"]
+    latents: Float32[np.ndarray, "M D"]
+    lifted: Float32[np.ndarray, "N 3 D"]
+    weights: tuple[float, float, float]
+
+    @staticmethod
+    def of(
+        masks: MaskOperator,
+        quadratic: Quadratic,
+        pixels: Float32[np.ndarray, " M"],
+        latents: Float32[np.ndarray, "M D"],
+        weights: tuple[float, float, float],
+        start: Literal["average", "median"] = "average",
+    ) -> "QuadraticProblem":
+        """Add mass and lift."""
+        mass = level_mass(quadratic)
+        lifted = lifted_average(masks, mass, pixels, latents)
+        if start == "median":
+            lifted = lifted_median(masks, pixels, latents, lifted)
+        return QuadraticProblem(masks, quadratic, mass, pixels, latents, lifted, weights)
+
+    @property
+    def total_pixels(self) -> float:
+        """Labelled pixels of all levels: the divisor that turns sums into means."""
+        return max(float(self.pixels.sum(dtype=np.float64)), 1.0)
+
+    def hessian_product(self, features: Float32[np.ndarray, "N 3 D"]) -> Float32[np.ndarray, "N 3 D"]:
+        """Half the Hessian of the sums, times the features."""
+        language, clustering, ridge = self.weights
+        out = np.float32(language + clustering) * self.quadratic.product(features)
+        if clustering:
+            means = self.masks.means(features)
+            out -= np.float32(clustering) * self.masks.spread(self.pixels[:, None] * means)
+        return out + np.float32(ridge) * self.mass[:, :, None] * features
+
+    def right_side(self) -> Float32[np.ndarray, "N 3 D"]:
+        """Where half the gradient of the sums vanishes: hessian_product(F) = right_side."""
+        language, _, ridge = self.weights
+        target = np.float32(language) * self.masks.spread(self.pixels[:, None] * self.latents)
+        return target + np.float32(ridge) * self.mass[:, :, None] * self.lifted
+
+    def terms(self, features: Float32[np.ndarray, "N 3 D"]) -> dict[str, float]:
+        """Unweighted means over labelled pixels of the language loss, L_h and the ridge.
+
+        Both losses are small differences of large sums, so everything is summed in float64.
+        """
+        features = features.astype(np.float64)
+        form = dot(features, self.quadratic.product(features))
+        means = self.masks.means(features)
+        pixels = self.pixels[:, None].astype(np.float64)
+        linear = float((pixels * means * self.latents).sum())
+        constant = float((pixels * np.square(self.latents, dtype=np.float64)).sum())
+        cohesion = float((pixels * means**2).sum())
+        pull = features - self.lifted
+        return {
+            "language": (form - 2 * linear + constant) / self.total_pixels,
+            "clustering": (form - cohesion) / self.total_pixels,
+            "ridge": dot(self.mass[:, :, None] * pull, pull) / self.total_pixels,
+        }
+
+
+def conjugate_gradient(
+    problem: QuadraticProblem, start: Float32[np.ndarray, "N 3 D"], steps: int
+) -> np.ndarray:
+    """Minimise the quadratic part by a few steps, preconditioned by the visible mass.
+
+    Levels and channels do not interact, so each has its own step sizes. Dot products are summed in
+    float64 in a fixed order.
+    """
+    scale = problem.mass[:, :, None] * np.float32(max(sum(problem.weights), 1e-12))
+    inverse = np.where(scale > 0, 1 / np.maximum(scale, 1e-20), 0).astype(np.float32)
+    features = start.copy()
+    residual = problem.right_side() - problem.hessian_product(features)
+    step = inverse * residual
+    direction = step.copy()
+    power = _channel_dot(residual, step)
+    for _ in range(steps):
+        curved = problem.hessian_product(direction)
+        curvature = _channel_dot(direction, curved)
+        length = _ratio(power, curvature)
+        features += length * direction
+        residual -= length * curved
+        step = inverse * residual
+        before, power = power, _channel_dot(residual, step)
+        direction = (
+            step
+            + np.where(before > 0, power / np.where(before > 0, before, 1), 0).astype(np.float32) * direction
+        )
+    return features
+
+
+def _channel_dot(
+    a: Float32[np.ndarray, "N 3 D"], b: Float32[np.ndarray, "N 3 D"]
+) -> Float64[np.ndarray, "3 D"]:
+    """Sum of products over Gaussians, per level and channel."""
+    out = np.zeros(a.shape[1:])
+    rows = max(1, CHUNK // max(out.size, 1))
+    for begin in range(0, len(a), rows):
+        out += np.multiply(a[begin : begin + rows], b[begin : begin + rows], dtype=np.float64).sum(axis=0)
+    return out
+
+
+def _ratio(
+    above: Float64[np.ndarray, "3 D"], below: Float64[np.ndarray, "3 D"]
+) -> Float32[np.ndarray, "3 D"]:
+    """Quotient, and 0 where a channel is already solved."""
+    return np.where(below > 0, above / np.where(below > 0, below, 1), 0).astype(np.float32)

@@ -1,0 +1,153 @@
+"""The reference trainer of the field: render one random view per step, after LangSplat and the paper.
+
+Slow on purpose. It is what the sparse solver is compared with: the same Gaussians, masks and latents,
+the loss taken on rendered pixels, Adam on the features.
+
+Departs from minghanqin/LangSplat `train.py`: views are drawn with replacement (there each once before any
+comes again), the three levels are trained in one run on the same draws, rendered features are divided by
+alpha and thinly covered pixels left out, and features of Gaussians are not scaled to unit length before they
+are blended. `hilsplat.methods.langsplat`, the baseline of the tables, departs in other ways; see there.
+"""
+
+import logging
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int32
+from torch import Tensor
+
+from hilsplat.base.artifacts import read_index, sha256_of_file, write_json
+from hilsplat.base.levels import LEVELS, NONE
+from hilsplat.base.progress import stage_log
+from hilsplat.contributions.compositing import MIN_ALPHA
+from hilsplat.contributions.rows import Contributions
+from hilsplat.contributions.stage import label_maps
+from hilsplat.field.autoencoder import autoencoder_file, load_latents, one_torch_thread
+from hilsplat.field.field import LanguageField, report_path
+from hilsplat.field.losses.latent_regression import latent_regression_loss
+from hilsplat.scene.finished import require_same
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.settings import ReferenceSettings
+from hilsplat.splat.ply import load_ply
+from hilsplat.splat.rasterise.api import render
+from hilsplat.splat.rasterise.device import choose_device
+
+logger = logging.getLogger(__name__)
+
+
+def rendered_loss(
+    rendered: Float[Tensor, "H W C"],
+    alpha: Float[Tensor, "H W"],
+    labels: Int32[np.ndarray, "P 3"],
+    latents: Float32[np.ndarray, "M D"],
+    kind: str,
+) -> Float[Tensor, ""]:
+    """Regression of one rendered view to the latents of its masks, all levels.
+
+    Args:
+        rendered: blended features, the levels' channels side by side, premultiplied by alpha.
+        alpha: coverage; thinly covered pixels do not count.
+        labels: row of the painted mask at each pixel and level, -1 for none.
+        latents: of the view's masks.
+        kind: "l1": LangSplat's, absolute differences averaged over all pixels and channels, the
+            unlabelled counting as 0; "squared": the language loss of the sparse solver, squared
+            distances averaged over labelled pixels of all levels (`latent_regression_loss`).
+
+    Returns:
+        l1: the sum of the levels' means; squared: one mean.
+
+    Departs: features are divided by alpha, so that both losses see what a query sees.
+    """
+    average = (rendered / alpha.clamp(min=1e-6)[..., None]).reshape(len(labels), len(LEVELS), -1)
+    covered = alpha.detach().reshape(-1, 1) >= MIN_ALPHA
+    rows = torch.from_numpy(labels).to(rendered.device).where(covered, NONE)
+    targets = torch.from_numpy(latents).to(rendered.device)
+    if kind == "squared":
+        return latent_regression_loss(average, rows, targets)
+    inside = rows != NONE
+    return (average[inside] - targets[rows[inside].long()]).abs().sum() / (len(labels) * targets.shape[1])
+
+
+def run_reference(
+    scene_folder: Path,
+    gaussians_ply: Path,
+    masks_folder: Path,
+    contributions_folder: Path,
+    autoencoder_folder: Path,
+    out: Path,
+    settings: ReferenceSettings,
+    device: str,
+    seed: int,
+    threads: int,
+) -> None:
+    """Train a field step by step; the same artifact as `field.run_field` writes.
+
+    Features start from zero. The report beside the field holds the loss over steps and seconds.
+
+    Args:
+        contributions_folder: for the order of masks alone; none of its matrices is read.
+        device: "auto", "cpu" or "cuda": what rasterises.
+
+    Raises:
+        MisalignedArtifactError: the contributions were made for other Gaussians.
+    """
+    scene = Scene.load(scene_folder)
+    gaussians = load_ply(gaussians_ply)
+    contributions = Contributions.load(contributions_folder)
+    require_same("contributions", scene.name, gaussians_ply, contributions.gaussians_sha256)
+    latents = load_latents(autoencoder_folder, contributions)
+    views = contributions.views
+    labels = [label_maps(HierarchicalMasks.load(Path(masks_folder) / f"{view}.npz")) for view in views]
+    own_latents = [latents[contributions.view == number] for number in range(len(views))]
+    chosen = choose_device(device)
+    if chosen == "cuda":
+        gaussians = type(gaussians)(**{name: value.cuda() for name, value in vars(gaussians).items()})
+    shape = (len(gaussians), len(LEVELS) * latents.shape[1])
+    features = torch.zeros(shape, device=gaussians.means.device, requires_grad=True)
+    optimiser = torch.optim.Adam([features], lr=settings.rate, eps=1e-15)
+    draws = np.random.default_rng(seed)
+    curve: list[dict[str, float]] = []
+    recent: list[float] = []
+    start = time.perf_counter()
+    with stage_log("reference field", scene.name) as counts, one_torch_thread():
+        for step in range(1, settings.steps + 1):
+            number = int(draws.integers(len(views)))
+            shown = render(
+                gaussians,
+                scene.cameras[views[number]],
+                features=features,
+                sh_degree=0,
+                threads=threads,
+                device=chosen,
+            )
+            loss = rendered_loss(
+                shown.features, shown.alpha, labels[number], own_latents[number], settings.loss
+            )
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            recent.append(float(loss.detach()))
+            if step % settings.log_every == 0 or step == settings.steps:
+                seconds = time.perf_counter() - start
+                curve.append({"step": step, "loss": float(np.mean(recent)), "seconds": round(seconds, 2)})
+                logger.info("reference field: step %d, loss %.5f", step, curve[-1]["loss"])
+                recent = []
+        found = features.detach().cpu().numpy().reshape(len(gaussians), len(LEVELS), latents.shape[1])
+        LanguageField(
+            np.ascontiguousarray(found, np.float32),
+            contributions.gaussians_sha256,
+            sha256_of_file(autoencoder_file(autoencoder_folder)),
+        ).save(out)
+        write_json(
+            report_path(out),
+            {
+                "scene": read_index(contributions_folder)["scene"],
+                "trainer": "reference",
+                "loss": settings.loss,
+                "curve": curve,
+            },
+        )
+        counts |= {"steps": settings.steps, "Gaussians": len(gaussians)}

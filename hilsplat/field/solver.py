@@ -1,0 +1,88 @@
+"""Solve the field: lifted average, conjugate gradient, then L-BFGS where contrastive losses are on.
+
+More steps fit the noise of mask borders, so both solvers stop early.
+"""
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from hilsplat.field.contrast import Contrast
+from hilsplat.field.minimise import dot, lbfgs
+from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
+from hilsplat.settings import FieldSettings
+
+
+def solve_field(
+    problem: QuadraticProblem, contrast: Contrast, settings: FieldSettings
+) -> tuple[Float32[np.ndarray, "N 3 D"], dict[str, object]]:
+    """Lifted average, conjugate gradient, then L-BFGS where a contrastive weight is on.
+
+    Returns:
+        the features, and a report: every term before and after, and gradient norms at the lift.
+    """
+    weights = (settings.weight_instance, settings.weight_part)
+    total = problem.total_pixels
+    # The variables of L-BFGS are scaled by the root of the mass: the quadratic part is then about round.
+    root = np.sqrt(problem.mass)[:, :, None]
+    inverse_root = np.where(root > 0, 1 / np.maximum(root, 1e-10), 0).astype(np.float32)
+    right = problem.right_side()
+
+    def objective(scaled: np.ndarray) -> tuple[float, np.ndarray]:
+        features = scaled * inverse_root
+        curved = problem.hessian_product(features)
+        value = (dot(features, curved) - 2 * dot(features, right)) / total
+        contrastive, gradient = contrast.weighted(features, weights)
+        gradient += np.float32(2 / total) * (curved - right)
+        return value + contrastive, gradient * inverse_root
+
+    lifted = problem.lifted
+    report: dict[str, object] = {
+        "lifted": problem.terms(lifted) | contrast.values(lifted),
+        "gradient_norms": gradient_norms(problem, contrast, inverse_root),
+    }
+    features = lifted
+    if settings.cg_steps and any(problem.weights):
+        features = conjugate_gradient(problem, lifted, settings.cg_steps)
+        report["after_cg"] = problem.terms(features) | contrast.values(features)
+    if any(weights) and settings.lbfgs_steps:
+        first_step = total / (2 * max(sum(problem.weights), 1e-3))
+        features = lbfgs(objective, features * root, settings.lbfgs_steps, first_step) * inverse_root
+        report["after_lbfgs"] = problem.terms(features) | contrast.values(features)
+    return features.astype(np.float32), report
+
+
+def gradient_norms(
+    problem: QuadraticProblem, contrast: Contrast, inverse_root: Float32[np.ndarray, "N 3 1"]
+) -> dict[str, float]:
+    """Norm of each unweighted term's gradient at the lifted average, in mass-scaled variables."""
+    lifted, factor = problem.lifted, np.float32(2 / problem.total_pixels)
+    curved = problem.quadratic.product(lifted)
+    means = problem.masks.means(lifted)
+    gradients = {
+        "language": factor * (curved - problem.masks.spread(problem.pixels[:, None] * problem.latents)),
+        "clustering": factor * (curved - problem.masks.spread(problem.pixels[:, None] * means)),
+        "instance": contrast.weighted(lifted, (1.0, 0.0))[1],
+        "part": contrast.weighted(lifted, (0.0, 1.0))[1],
+    }
+    return {name: float(np.sqrt(dot(g * inverse_root, g * inverse_root))) for name, g in gradients.items()}
+
+
+def keep_labelled(
+    features: Float32[np.ndarray, "N 3 D"],
+    mass: Float32[np.ndarray, "N 3"],
+    total_mass: Float[np.ndarray, " N"],
+    min_share: float,
+) -> Float32[np.ndarray, "N 3 D"]:
+    """Take the latent from Gaussians that hardly any mask of a level holds.
+
+    Table and walls have no parts. But where a mask's border runs over them by a pixel, their Gaussians
+    get its latent in full, and answer to it all over: the regression asks labelled pixels alone.
+
+    Args:
+        features: the solved field.
+        mass: visible weight in labelled pixels of each level.
+        total_mass: visible weight in all pixels.
+        min_share: of the weight that must lie in labelled pixels.
+    """
+    share = mass / np.maximum(total_mass, 1e-12)[:, None]
+    return np.where((share >= min_share)[:, :, None], features, np.float32(0)).astype(np.float32)

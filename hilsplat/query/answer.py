@@ -1,0 +1,178 @@
+"""Ask a finished scene for a text: a ranked list in words, and a picture."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from hilsplat.base.device import ComputeDevice
+from hilsplat.base.errors import SettingsError
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.query.hits import Hit
+from hilsplat.query.language_scene import PATH_SEPARATOR, LanguageScene
+from hilsplat.query.node_search import NodeHits
+from hilsplat.query.pictures import (
+    label_left,
+    paint_answer,
+    paint_relevancy,
+    save_figure,
+    show,
+    show_from_above,
+)
+from hilsplat.scene.finished import FinishedScene
+from hilsplat.segment.masks import made_from_truth, masks_label
+from hilsplat.semantic_tree.export import write_selection_ply
+
+LISTED = 10
+"""Answers told at most."""
+
+
+def answer(
+    folder: Path,
+    text: str,
+    *,
+    level: str = "auto",
+    variant: str = "default",
+    views: int = 3,
+    answerer: str = "tree",
+    view: str | None = None,
+    out: Path | None = None,
+    device: str = "cpu",
+    threads: int = 1,
+) -> str:
+    """Ask a scene; write `panel.png` and `selection.ply`, and tell what was found.
+
+    Args:
+        folder: `results/<dataset>/<scene>`.
+        text: words, or a path such as "bear > head > nose".
+        level: auto, whole, part or subpart.
+        variant: whose files answer.
+        views: views in the panel.
+        answerer: "tree" or "field", see `LanguageScene.query`.
+        view: asks only for what it shows, and stands first in the panel; None: the whole scene.
+        out: folder of both files; by default `queries/<text>` in the scene's folder.
+        device: "cpu" or "cuda": where the field is looked up.
+        threads: threads for rendering.
+
+    Raises:
+        ArtifactError: the scene is not finished.
+        SettingsError: level, answerer, view or device are unknown.
+        DeviceError: cuda was asked for and torch finds no device.
+    """
+    folder = Path(folder)
+    if device not in get_args(ComputeDevice):
+        raise SettingsError(
+            f"device {device!r} is unknown", expected=" or ".join(get_args(ComputeDevice)), found=device
+        )
+    parts = FinishedScene.locate(folder, variant)
+    scene = LanguageScene.open(folder, variant, threads=threads, device=device)
+    hits = scene.query(text, level, answerer=answerer, view=view, limit=LISTED)
+    panel = (Path(out) if out is not None else folder / "queries" / file_name(text)) / "panel.png"
+    shown = list(dict.fromkeys([*([view] if view else []), *views_of(scene, hits, views)]))[:views]
+    label = masks_label(parts.masks)
+    note = f"; a diagnostic, masks made from the true labels: {label}" if made_from_truth(label) else ""
+    asked = "" if view is None else f", of what {view} shows"
+    found = scene.find(text, level, answerer=answerer, view=view)
+    query_panel(scene, text, found, shown, panel, note=asked + note, answerer=answerer)
+    selection = panel.with_name("selection.ply")
+    write_selection_ply(parts.gaussians, scene.gaussians_of(found.ids), selection)
+    return "\n".join([told(text, hits, scene.scene.unit, view) + note, f"wrote {panel} and {selection.name}"])
+
+
+def query_panel(
+    scene: LanguageScene,
+    text: str,
+    hits: NodeHits,
+    views: Sequence[str],
+    out_png: Path,
+    *,
+    note: str = "",
+    answerer: str = "tree",
+) -> None:
+    """Draw a query: per view photograph, answer and relevancy at three levels; the scene from above.
+
+    `note` stands in the title, after what was found. With the answerer "field", relevancy is the field's.
+    """
+    last = text.split(PATH_SEPARATOR)[-1].strip()
+    size_hw = scene.scene.cameras[views[0]].size_hw
+    width_in, columns = 13.0, 5
+    row_in = width_in / columns * size_hw[0] / size_hw[1] + 0.1
+    map_in = 4.2
+    figure = Figure(figsize=(width_in, len(views) * row_in + map_in + 0.6), layout="constrained")
+    found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
+    figure.suptitle(f"“{text}” in {scene.scene.name}: {found}{note}", fontsize=12, fontweight="bold")
+    upper, lower = figure.subfigures(2, 1, height_ratios=[len(views) * row_in, map_in])
+    grid = upper.subplots(len(views), columns, squeeze=False)
+    for axes, view in zip(grid, views, strict=True):
+        image = scene.scene.image(view)
+        mask = (
+            np.asarray(scene.node_masks(view, hits.ids)) if len(hits.ids) else np.zeros(image.shape[:2], bool)
+        )
+        if answerer == "tree":
+            relevancy = scene.node_relevancy_map([last], view)[0]
+        else:
+            relevancy = scene.field_relevancy([last], view, exact=False)[0]
+        low, high = float(relevancy.min()), float(relevancy.max())
+        show(axes[0], image, view)
+        label_left(axes[0], f"{scene.scene.split[view]} view")
+        show(axes[1], paint_answer(image, mask), f"answer: {mask.mean():.1%} of the view")
+        for each in LEVELS:
+            top = float(relevancy[each.index].max())
+            picture = paint_relevancy(image, relevancy[each.index], low, high)
+            show(
+                axes[2 + each.index], picture, f"relevancy, {each.label}: {top:.2f}", bold=each is hits.level
+            )
+    selected = np.isin(scene.tree.node_of_gaussian, hits.ids).any(axis=1)
+    title = f"from above: {np.count_nonzero(selected)} of {len(selected)} Gaussians; triangles are cameras"
+    show_from_above(lower.subplots(), scene.gaussians, scene.scene.cameras, selected, title)
+    save_figure(figure, out_png)
+
+
+def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]:
+    """Views that show the best answers largest, each once; then others, spread over the scene."""
+    best = [view for hit in hits for view in hit.best_views[:1]] + [v for hit in hits for v in hit.best_views]
+    every = scene.scene.views()
+    spread = [every[number * len(every) // count] for number in range(count)]
+    return list(dict.fromkeys([*best, *spread, *every]))[:count]
+
+
+def told(text: str, hits: Sequence[Hit], unit: str, view: str | None = None) -> str:
+    """The answers in words; with a view, to what was asked of it alone."""
+    if not hits and view is not None:
+        return f"no node that {view} shows answers {text!r}; try --level part or subpart, or no --view"
+    if not hits:
+        return f"no node of the scene answers {text!r}; try --level part or subpart"
+    lengths = "metres" if unit == "metre" else "scene units"
+    lines = [
+        f"{counted(len(hits), 'answer')} to {text!r}; lengths in {lengths}; "
+        "a relevancy of 0.5 is no better than a generic phrase",
+        f"{'node':>5}  {'level':<8} {'score':>5}  {'position':<24} {'box size':<20} best views",
+    ]
+    for hit in hits:
+        position = ", ".join(f"{value:.2f}" for value in hit.centroid)
+        size = " x ".join(f"{side:.2f}" for side in hit.oriented_box.size)
+        views = ", ".join(hit.best_views)
+        lines.append(
+            f"{hit.node:>5}  {Level(hit.level).label:<8} {hit.score:>5.2f}  {position:<24} {size:<20} {views}"
+        )
+    if hits[0].route == "fallback":
+        lines.append(
+            "nothing of the kind lies in what answers the first text: everything else was searched instead"
+        )
+    if hits[0].score < 0.5:
+        lines.append("all scores are below 0.5: the scene may hold nothing of the kind")
+    return "\n".join(lines)
+
+
+def counted(count: int, noun: str) -> str:
+    """A count with its noun: 1 node, 2 nodes."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def file_name(text: str) -> str:
+    """A folder name that is safe on every system, such as `bear--nose`."""
+    words = [re.sub(r"[^\w.-]+", "-", part.strip()).strip("-.") for part in text.split(PATH_SEPARATOR)]
+    return "--".join(word for word in words if word) or "query"

@@ -1,0 +1,114 @@
+"""Relevancy of rendered latents without decoding every pixel.
+
+- a linear code (PCA): cosines are ratios of d numbers and need no decoding at all (`linear_look_up`).
+- a network: a view is decoded once and kept as coordinates in few directions (`projected_look_up`).
+"""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from hilsplat.base.device import ComputeDevice, compute_device
+from hilsplat.field.autoencoder import CHUNK_ROWS, Code, one_torch_thread
+from hilsplat.field.linear_code import LinearCode
+from hilsplat.query.device_look_up import PlacedOnDevice
+from hilsplat.query.linear_look_up import LinearLookUp, PlacedLinear
+from hilsplat.query.projected_look_up import PlacedProjected, ProjectedLookUp
+from hilsplat.query.relevancy import relevancy
+
+PIXELS_AT_A_TIME = 1 << 16
+
+Placed = PlacedLinear | PlacedProjected | PlacedOnDevice
+
+
+class LatentRelevancy:
+    """Relevancy of latents to texts, against fixed canonical phrases.
+
+    Args:
+        code: decodes latents.
+        canonical: unit vectors of the generic phrases.
+        scale: of the cosines.
+        threads: pixels are shared among them; results do not depend on it.
+        device: "cpu", or "cuda": where the fast way runs; the same to rounding.
+    """
+
+    def __init__(
+        self,
+        code: Code,
+        canonical: Float32[np.ndarray, "K C"],
+        scale: float,
+        threads: int = 1,
+        device: ComputeDevice = "cpu",
+    ) -> None:
+        self._device = compute_device(device)
+        self._code, self._canonical, self._scale, self._threads = code, canonical, scale, threads
+        self.is_linear = isinstance(code, LinearCode)
+        """Whether the fast way loses nothing but rounding."""
+        look_up = LinearLookUp if self.is_linear else ProjectedLookUp
+        self._look_up = look_up(code, canonical, scale)
+
+    def exact(
+        self, latents: Float32[np.ndarray, "P D"], texts: Float32[np.ndarray, "T C"]
+    ) -> Float32[np.ndarray, "T P"]:
+        """By decoding every latent."""
+        out = np.empty((len(texts), len(latents)), np.float32)
+
+        def decode(span: slice) -> None:
+            decoded = self._code.decode_array(np.ascontiguousarray(latents[span], np.float32))
+            out[:, span] = relevancy(decoded, texts, self._canonical, self._scale)
+
+        self._decode_in_parts(decode, len(latents))
+        return out
+
+    def prepare(self, latents: Float32[np.ndarray, "P D"]) -> Placed:
+        """What a look-up of these latents needs; once per view."""
+        if isinstance(self._look_up, LinearLookUp):
+            placed = self._look_up.place(latents)
+        else:
+            placed = self._look_up.place(latents, self._decode_in_parts)
+        return placed if self._device == "cpu" else PlacedOnDevice.of(placed, self._device)
+
+    def fast(
+        self,
+        placed: Placed,
+        texts: Float32[np.ndarray, "T C"],
+    ) -> Float32[np.ndarray, "T P"]:
+        """The fast way of this code; see the module for which that is.
+
+        Args:
+            placed: what `prepare` returned.
+            texts: unit vectors.
+        """
+        out = np.empty((len(texts), len(placed.generic)), np.float32)
+        for text, row in zip(texts, out, strict=True):
+            if isinstance(placed, PlacedOnDevice):
+                row[:] = placed.relevancy(*self._look_up.text_weights(placed, text), self._scale)
+                continue
+
+            def answer(span: slice, text: np.ndarray = text, row: np.ndarray = row) -> None:
+                self._look_up.look_up(placed, span, text, row[span])
+
+            self._in_parts(answer, len(placed.generic))
+        return out
+
+    def _decode_in_parts(self, work: Callable[[slice], None], count: int) -> None:
+        """`_in_parts` for work that decodes; torch takes one thread, as the parts share the cores."""
+
+        def alone(span: slice) -> None:
+            torch.set_num_threads(1)  # holds for one thread of the pool
+            work(span)
+
+        with one_torch_thread():
+            self._in_parts(alone, count, CHUNK_ROWS)
+
+    def _in_parts(self, work: Callable[[slice], None], count: int, at_a_time: int = PIXELS_AT_A_TIME) -> None:
+        spans = [slice(begin, begin + at_a_time) for begin in range(0, count, at_a_time)]
+        if self._threads == 1:
+            for span in spans:
+                work(span)
+            return
+        with ThreadPoolExecutor(self._threads) as pool:
+            list(pool.map(work, spans))

@@ -1,0 +1,134 @@
+"""The semantic tree of a scene as a picture: a crop per node, parents above their children."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from hilsplat.base.artifacts import write_json
+from hilsplat.base.images import write_png
+from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.query.language_scene import LanguageScene
+from hilsplat.scene.finished import FinishedScene
+from hilsplat.semantic_tree.export import readable_nodes, write_tree_ply
+
+CELL_PX = 84
+GAP_PX = 6
+LABEL_PX = 20
+BLOCK_GAP_PX = 18
+MARGIN_PX = 84
+"""On the left, for the names of the levels."""
+
+ROW_PX = CELL_PX + LABEL_PX + 2 * GAP_PX
+COLUMNS = 18
+"""Leaves in a row of the picture; wholes are laid beside each other until it is full."""
+
+BACKGROUND = 250
+LINE = (150, 150, 150)
+TEXT = (40, 40, 40)
+FONT = 0  # cv2.FONT_HERSHEY_SIMPLEX
+FONT_SCALE = 0.5
+
+
+def export_tree(folder: Path, variant: str, out: Path, threads: int) -> str:
+    """Write `tree.json`, `tree.ply` (a node per Gaussian and level) and `tree.png` of a finished scene.
+
+    Returns:
+        what was written, for people.
+    """
+    parts = FinishedScene.locate(folder, variant)
+    scene = LanguageScene.open(folder, variant, threads=threads)
+    write_json(out / "tree.json", {"scene": scene.scene.name, "nodes": readable_nodes(scene.tree)})
+    write_tree_ply(parts.gaussians, scene.tree, out / "tree.ply")
+    write_png(out / "tree.png", tree_picture(scene))
+    counts = ", ".join(f"{len(scene.tree.nodes_of(level))} {level.label}" for level in LEVELS)
+    return f"wrote tree.json, tree.ply and tree.png to {out} ({counts})"
+
+
+def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw the tree: one row of crops per level, blocks of a whole and all below it side by side.
+
+    Orphans of finer levels stand in blocks of their own at their level. A crop shows the node in the
+    view that shows it largest, the rest of that view dimmed; under it stands the node's number.
+    """
+    tree = scene.tree
+    roots = [node for level in LEVELS for node in tree.nodes_of(level) if tree.parent[node] == NONE]
+    width_of = {int(root): _leaves(tree, int(root)) for root in roots}
+    rows: list[list[int]] = [[]]
+    for root in map(int, roots):
+        if rows[-1] and sum(width_of[each] for each in rows[-1]) + width_of[root] > COLUMNS:
+            rows.append([])
+        rows[-1].append(root)
+    step = CELL_PX + GAP_PX
+    height = len(LEVELS) * ROW_PX + BLOCK_GAP_PX
+    width = max(sum(width_of[each] * step + BLOCK_GAP_PX for each in row) for row in rows)
+    canvas = np.full((len(rows) * height, MARGIN_PX + width, 3), BACKGROUND, np.uint8)
+    placed: list[tuple[int, int, int]] = []
+
+    def place(node: int, left: int, top: int) -> tuple[int, int]:
+        """Place a node and what is below it, and draw its lines; returns its middle and the width used."""
+        index = Level(int(tree.level[node])).index
+        y = top + index * ROW_PX
+        kids, used, middles = tree.children_of(np.array([node])), 0, []
+        for child in map(int, kids):
+            middle, width = place(child, left + used, top)
+            depth = Level(int(tree.level[child])).index - index
+            middles.append((middle, y + depth * ROW_PX))
+            used += width
+        used = max(used, step)
+        x = left + (used - step) // 2
+        bar = y + CELL_PX + LABEL_PX + GAP_PX  # below it every child has columns of its own
+        for middle, below in middles:
+            canvas[bar:below, middle] = LINE
+            canvas[bar, min(middle, x + CELL_PX // 2) : max(middle, x + CELL_PX // 2) + 1] = LINE
+        if middles:
+            canvas[bar - GAP_PX : bar, x + CELL_PX // 2] = LINE
+        placed.append((node, x, y))
+        return x + CELL_PX // 2, used
+
+    for number, row in enumerate(rows):
+        left, top = MARGIN_PX, number * height + GAP_PX
+        for root in row:
+            left += place(root, left, top)[1] + BLOCK_GAP_PX
+        for level in LEVELS:
+            _write(canvas, level.label, (MARGIN_PX // 2, top + level.index * ROW_PX + CELL_PX // 2 + 5))
+    for node, x, y in placed:
+        canvas[y : y + CELL_PX, x : x + CELL_PX] = _crop(scene, node)
+        _write(canvas, str(node), (x + CELL_PX // 2, y + CELL_PX + LABEL_PX - 5))
+    return canvas
+
+
+def _write(canvas: UInt8[np.ndarray, "H W 3"], text: str, middle_xy: tuple[int, int]) -> None:
+    """Write a word, its base line's middle at a point."""
+    import cv2
+
+    (width, _), _ = cv2.getTextSize(text, FONT, FONT_SCALE, 1)
+    place = (middle_xy[0] - width // 2, middle_xy[1])
+    cv2.putText(canvas, text, place, FONT, FONT_SCALE, TEXT, 1, cv2.LINE_AA)
+
+
+def _leaves(tree, node: int) -> int:
+    kids = tree.children_of(np.array([node]))
+    return sum(_leaves(tree, int(child)) for child in kids) if len(kids) else 1
+
+
+def _crop(scene: LanguageScene, node: int) -> UInt8[np.ndarray, "84 84 3"]:
+    """The node where it is seen largest, square, the rest dimmed."""
+    import cv2
+
+    view = scene.tree.view_names[int(scene.tree.view_area_px[node].argmax())]
+    image = scene.scene.image(view)
+    mask = scene.node_masks(view, [node])
+    if not mask.any():
+        return np.full((CELL_PX, CELL_PX, 3), 225, np.uint8)
+    ys, xs = np.nonzero(mask)
+    side = max(np.ptp(ys), np.ptp(xs)) * 1.15 + 4
+    centre_y, centre_x = (ys.min() + ys.max()) / 2, (xs.min() + xs.max()) / 2
+    shown = np.where(mask[..., None], image, (0.35 * image + 0.65 * BACKGROUND)).astype(np.uint8)
+    scale = CELL_PX / side
+    shift = np.array(
+        [[scale, 0, CELL_PX / 2 - scale * centre_x], [0, scale, CELL_PX / 2 - scale * centre_y]], np.float32
+    )
+    return cv2.warpAffine(
+        shown, shift, (CELL_PX, CELL_PX), flags=cv2.INTER_AREA, borderValue=(BACKGROUND,) * 3
+    )

@@ -1,0 +1,120 @@
+"""How much of each node a pixel shows: what masks and relevancy maps of a view are made of.
+
+A pixel blends some ten Gaussians, but hardly ever more than two nodes of a level. Summing its weights
+by node once per view makes every later answer in that view several times cheaper than a product with
+all weights, for a fraction of the memory.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Bool, Float32, Int32, Int64
+
+from hilsplat.base.compiled import compiled
+
+
+@dataclass(frozen=True)
+class ViewNodes:
+    """Nodes of one level in one view, pixel by pixel (CSR over P pixels).
+
+    Attributes:
+        indptr: where the entries of each pixel begin.
+        nodes: rows of the semantic tree.
+        shares: share of the pixel that they make up; what is left to 1 has no node.
+        covered: pixels that the Gaussians cover.
+    """
+
+    indptr: Int64[np.ndarray, " P1"]
+    nodes: Int32[np.ndarray, " E"]
+    shares: Float32[np.ndarray, " E"]
+    covered: Bool[np.ndarray, " P"]
+
+    @staticmethod
+    def of(weights: sp.csr_matrix, node_of_gaussian: Int32[np.ndarray, " N"]) -> "ViewNodes":
+        """Sum normalised weights (rows sum to 1 or are empty) by node."""
+        indptr, nodes, shares = _summed_by_node(
+            weights.indptr, weights.indices, weights.data, np.ascontiguousarray(node_of_gaussian)
+        )
+        return ViewNodes(indptr, nodes, shares, np.diff(weights.indptr) > 0)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held."""
+        return sum(each.nbytes for each in (self.indptr, self.nodes, self.shares, self.covered))
+
+    def area_px(self, num_nodes: int) -> Int64[np.ndarray, " n"]:
+        """Pixels of which each node makes up more than half."""
+        return np.bincount(self.nodes[self.shares > 0.5], minlength=num_nodes)
+
+    def blend(self, values: Float32[np.ndarray, " n"], without: float) -> Float32[np.ndarray, " P"]:
+        """Blend one value per node; Gaussians without a node have the value `without`.
+
+        Uncovered pixels get the least value of the covered ones.
+        """
+        out = np.empty(len(self.covered), np.float32)
+        least = _blend(self.indptr, self.nodes, self.shares, self.covered, values, np.float32(without), out)
+        out[~self.covered] = least
+        return out
+
+    def mask(self, chosen: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " P"]:
+        """Pixels of which the chosen nodes make up more than half."""
+        out = np.zeros(len(self.covered), np.bool_)
+        _mask(self.indptr, self.nodes, self.shares, chosen, out)
+        return out
+
+
+@compiled
+def _summed_by_node(indptr, indices, data, node_of_gaussian):
+    num_pixels = len(indptr) - 1
+    out_indptr = np.zeros(num_pixels + 1, np.int64)
+    room = max(1024, 2 * num_pixels)
+    nodes, shares = np.empty(room, np.int32), np.empty(room, np.float32)
+    done = 0
+    for p in range(num_pixels):
+        longest = indptr[p + 1] - indptr[p]
+        if done + longest > room:
+            room = 2 * (done + longest)
+            more_nodes, more_shares = np.empty(room, np.int32), np.empty(room, np.float32)
+            more_nodes[:done], more_shares[:done] = nodes[:done], shares[:done]
+            nodes, shares = more_nodes, more_shares
+        first = done
+        for k in range(indptr[p], indptr[p + 1]):
+            node = node_of_gaussian[indices[k]]
+            if node < 0:
+                continue
+            place = first
+            while place < done and nodes[place] != node:
+                place += 1
+            if place == done:
+                nodes[place], shares[place] = node, np.float32(0)
+                done += 1
+            shares[place] += data[k]
+        out_indptr[p + 1] = done
+    return out_indptr, nodes[:done].copy(), shares[:done].copy()
+
+
+@compiled
+def _blend(indptr, nodes, shares, covered, values, without, out):
+    least = np.float32(np.inf)
+    for p in range(len(covered)):
+        if not covered[p]:
+            continue
+        total, left = np.float32(0), np.float32(1)
+        for k in range(indptr[p], indptr[p + 1]):
+            total += shares[k] * values[nodes[k]]
+            left -= shares[k]
+        total += max(left, np.float32(0)) * without
+        out[p] = total
+        least = min(least, total)
+    return least if least < np.inf else np.float32(0)
+
+
+@compiled
+def _mask(indptr, nodes, shares, chosen, out):
+    for p in range(len(out)):
+        total = np.float32(0)
+        for k in range(indptr[p], indptr[p + 1]):
+            if chosen[nodes[k]]:
+                total += shares[k]
+        out[p] = total > 0.5

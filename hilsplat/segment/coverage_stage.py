@@ -1,0 +1,43 @@
+"""The stage `coverage_tree`: the coverage tree of every view that has masks."""
+
+from pathlib import Path
+from typing import Any
+
+from hilsplat.base.artifacts import atomic_folder, read_index, write_index, write_npz
+from hilsplat.base.levels import NONE, Level
+from hilsplat.base.progress import stage_log, track
+from hilsplat.segment.coverage import coverage_tree
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.settings import CoverageTreeSettings
+
+
+def run_coverage_tree(masks_folder: Path, out: Path, settings: CoverageTreeSettings) -> None:
+    """Build the coverage tree of every view.
+
+    Args:
+        masks_folder: what `run_masks` wrote.
+        out: folder to write: `<view>.npz` with `parent` i32 (M) and `depth` u8 (M), rows as the
+            masks, and `index.json`.
+        settings: threshold and where a parent may come from.
+    """
+    masks_index = read_index(masks_folder)
+    index: dict[str, Any] = {}
+    with stage_log("coverage_tree", masks_index["scene"]) as counts, atomic_folder(out) as folder:
+        for view in track(list(masks_index["views"]), "coverage trees"):
+            masks = HierarchicalMasks.load(Path(masks_folder) / f"{view}.npz")
+            parent, depth = coverage_tree(masks, settings)
+            write_npz(folder / f"{view}.npz", parent=parent, depth=depth)
+            has_parent = parent != NONE
+            index[view] = {
+                "masks": len(masks),
+                "roots": int((~has_parent).sum()),
+                "part_with_parent": int(has_parent[masks.rows_of(Level.PART)].sum()),
+                "subpart_with_parent": int(has_parent[masks.rows_of(Level.SUBPART)].sum()),
+                "deepest": int(depth.max(initial=0)),
+            }
+        write_index(folder, index, scene=masks_index["scene"], theta=settings.theta, parents=settings.parents)
+        counts.update(
+            views=len(index),
+            masks=sum(entry["masks"] for entry in index.values()),
+            roots=sum(entry["roots"] for entry in index.values()),
+        )

@@ -1,0 +1,228 @@
+"""How far masks of different views agree on the Gaussians that both views see.
+
+Everything is sparse: only masks that share Gaussians are compared.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Bool, Float, Float64, Int32
+
+from hilsplat.base.compiled import compiled
+
+ROWS_AT_A_TIME = 64
+"""Rows of masks that one thread takes at a time."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """How far every two of the M masks of a level agree on the Gaussians that both views see.
+
+    Attributes:
+        intersection: of pairs that share Gaussians; symmetric, no diagonal, no pair of one view.
+        union: of the same pairs, in the same order of stored values.
+        seen: size of each mask as each of the V views sees it; its whole size in its own view, 0
+            where the view sees too little of it. The union of a pair that is not stored is
+            `seen[a, view[b]] + seen[b, view[a]]`; its intersection is 0.
+        view: view of each mask.
+    """
+
+    intersection: sp.csr_matrix
+    union: sp.csr_matrix
+    seen: Float64[np.ndarray, "M V"]
+    view: Int32[np.ndarray, " M"]
+
+    def pair(self, a: int, b: int) -> tuple[float, float]:
+        """Intersection and union of two masks."""
+        row = slice(self.intersection.indptr[a], self.intersection.indptr[a + 1])
+        found = np.flatnonzero(self.intersection.indices[row] == b)
+        if len(found):
+            at = row.start + int(found[0])
+            return float(self.intersection.data[at]), float(self.union.data[at])
+        return 0.0, float(self.seen[a, self.view[b]] + self.seen[b, self.view[a]])
+
+
+def mask_evidence(
+    shares: sp.csr_matrix,
+    importance: Float[np.ndarray, " N"],
+    visible: Bool[np.ndarray, "V N"],
+    view: Int32[np.ndarray, " M"],
+    min_covisible: float,
+    overlap: str,
+    threads: int = 1,
+    device: str = "cpu",
+) -> Evidence:
+    """Soft intersection and union of every two masks of one level, on the Gaussians both views see.
+
+    With s the share of a Gaussian's visible weight that lies in a mask and w its importance, the
+    intersection of a and b is sum w s_a s_b, the size of a as seen from the view of b is the sum of
+    w s_a^2 (Tanimoto) or w s_a (soft) over Gaussians visible there. For shares of 0 and 1 the two
+    agree. A fitted Gaussian reaches across borders and has shares between: there soft sizes shrink
+    the IoU of one region with itself (shares of 0.3 give 0.18), Tanimoto keeps it at 1.
+
+    Two masks of one view are different things: they are evidence against a link (intersection 0,
+    union both full sizes). Masks that share Gaussians but see less than `min_covisible` of each
+    other, both ways, are no evidence; of masks that share none, each counts as far as the other's
+    view sees at least that share of it.
+
+    Args:
+        shares: s, one row per mask; zero where the Gaussian is not visible in the mask's view.
+        importance: w, such as the mean visible mass.
+        visible: which Gaussians each view sees.
+        view: view of each mask.
+        min_covisible: share below which a pair is dropped.
+        overlap: "tanimoto" or "soft".
+        threads: rows are shared among them; the bytes do not depend on it.
+        device: "cpu", or where torch forms the two products (see `cuda_algebra`).
+    """
+
+    def like(values: np.ndarray) -> sp.csr_matrix:
+        return sp.csr_matrix((values, shares.indices, shares.indptr), shape=shares.shape, copy=False)
+
+    share = shares.data.astype(np.float64)
+    weight = importance.astype(np.float64)[shares.indices]
+    size = weight * (np.square(share) if overlap == "tanimoto" else share)
+    products = (like(share), like(weight * share), like(size), visible, view, min_covisible)
+    if device == "cpu":
+        upper, seen = _evidence_by_loops(*products, threads)
+    else:
+        upper, seen = _evidence_by_torch(*products, device)
+    shape = (len(view), len(view))
+    # Adding the transposed keeps the two patterns alike: every stored value is positive.
+    matrices = (sp.csr_matrix((values, *upper[:2]), shape=shape) for values in upper[2:])
+    intersection, union = (sp.csr_matrix(each + each.T) for each in matrices)
+    intersection.sort_indices()
+    union.sort_indices()
+    return Evidence(intersection, union, seen, view)
+
+
+def _evidence_by_loops(
+    shares: sp.csr_matrix,
+    weighted: sp.csr_matrix,
+    sizes: sp.csr_matrix,
+    visible: Bool[np.ndarray, "V N"],
+    view: Int32[np.ndarray, " M"],
+    min_covisible: float,
+    threads: int,
+) -> tuple[tuple[np.ndarray, ...], Float64[np.ndarray, "M V"]]:
+    """Pairs a < b that share Gaussians, and `Evidence.seen`.
+
+    Args:
+        shares: s; `weighted` is w s and `sizes` what each Gaussian adds to a mask's size, stored alike.
+        visible, view, min_covisible, threads: as in `mask_evidence`.
+
+    Returns:
+        (b, row starts, intersection, union) of the pairs, and sizes.
+    """
+    num = shares.shape[0]
+    seen_everywhere = np.zeros((num, len(visible)))
+    flags = np.ascontiguousarray(visible.T).view(np.uint8)
+    columns = shares.tocsc()
+    rows = (shares.indptr, shares.indices)
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        ranges = list(pairwise([*range(0, num, ROWS_AT_A_TIME), num]))
+        list(pool.map(lambda span: _seen_sizes(*span, *rows, sizes.data, flags, seen_everywhere), ranges))
+        seen = _counted(seen_everywhere, view, min_covisible)
+        column_arrays = (columns.indptr, columns.indices, columns.data)
+        parts = list(
+            pool.map(
+                lambda span: _shared_pairs(
+                    *span, *rows, weighted.data, *column_arrays, view, seen, seen_everywhere
+                ),
+                ranges,
+            )
+        )
+    if not parts:
+        return (np.zeros(0, np.int32), np.zeros(num + 1, np.int64), np.zeros(0), np.zeros(0)), seen
+    indptr = np.concatenate(([0], np.cumsum(np.concatenate([np.diff(part[0]) for part in parts]))))
+    indices, intersection, union = (np.concatenate([part[k] for part in parts]) for k in (1, 2, 3))
+    return (indices, indptr, intersection, union), seen
+
+
+def _evidence_by_torch(
+    shares: sp.csr_matrix,
+    weighted: sp.csr_matrix,
+    sizes: sp.csr_matrix,
+    visible: Bool[np.ndarray, "V N"],
+    view: Int32[np.ndarray, " M"],
+    min_covisible: float,
+    device: str,
+) -> tuple[tuple[np.ndarray, ...], Float64[np.ndarray, "M V"]]:
+    """The same by torch."""
+    from hilsplat.contributions.cuda_algebra import shared_pairs_on
+
+    pairs, everywhere = shared_pairs_on(weighted, shares, sizes, visible, view, device)
+    seen = _counted(everywhere, view, min_covisible)
+    row = np.repeat(np.arange(len(view)), np.diff(pairs.indptr))
+    column = pairs.indices
+    keep = (seen[row, view[column]] > 0) | (seen[column, view[row]] > 0)
+    row, column, shared = row[keep], column[keep], pairs.data[keep]
+    union = everywhere[row, view[column]] + everywhere[column, view[row]] - shared
+    indptr = np.concatenate(([0], np.cumsum(np.bincount(row, minlength=len(view)))))
+    return (column, indptr, shared, union), seen
+
+
+def _counted(
+    seen_everywhere: Float64[np.ndarray, "M V"], view: Int32[np.ndarray, " M"], min_covisible: float
+) -> Float64[np.ndarray, "M V"]:
+    """Sizes as far as they are evidence: 0 where a view sees too little of a mask."""
+    size = seen_everywhere[np.arange(len(view)), view]
+    return np.where(seen_everywhere < min_covisible * size[:, None], 0.0, seen_everywhere)
+
+
+@compiled
+def _seen_sizes(begin, end, indptr, indices, sizes, visible, out):
+    """Size of each mask on the Gaussians that each view sees."""
+    for a in range(begin, end):
+        for k in range(indptr[a], indptr[a + 1]):
+            g = indices[k]
+            for v in range(visible.shape[1]):
+                out[a, v] += sizes[k] * visible[g, v]
+
+
+@compiled
+def _shared_pairs(
+    begin, end, indptr, indices, weighted, col_indptr, col_rows, col_shares, view, seen, seen_everywhere
+):
+    """Pairs a < b that share Gaussians: row starts, b, intersection and union."""
+    num = len(indptr) - 1
+    touched_by = np.full(num, -1, np.int64)
+    sums = np.zeros(num)
+    found = np.empty(num, np.int32)
+    out_indptr = np.zeros(end - begin + 1, np.int64)
+    out = np.empty(1024, np.int32)
+    out_intersection, out_union = np.empty(1024), np.empty(1024)
+    done = 0
+    for a in range(begin, end):
+        count = 0
+        for k in range(indptr[a], indptr[a + 1]):
+            g = indices[k]
+            for t in range(col_indptr[g], col_indptr[g + 1]):
+                b = col_rows[t]
+                if b > a and view[b] != view[a]:
+                    if touched_by[b] != a:
+                        touched_by[b] = a
+                        sums[b] = 0.0
+                        found[count] = b
+                        count += 1
+                    sums[b] += weighted[k] * col_shares[t]
+        found[:count] = np.sort(found[:count])
+        if done + count > len(out):
+            room = 2 * (done + count)
+            more, more_intersection, more_union = np.empty(room, np.int32), np.empty(room), np.empty(room)
+            more[:done], more_intersection[:done] = out[:done], out_intersection[:done]
+            more_union[:done] = out_union[:done]
+            out, out_intersection, out_union = more, more_intersection, more_union
+        for place in range(count):
+            b = found[place]
+            if seen[a, view[b]] == 0.0 and seen[b, view[a]] == 0.0:
+                continue
+            out[done] = b
+            out_intersection[done] = sums[b]
+            out_union[done] = seen_everywhere[a, view[b]] + seen_everywhere[b, view[a]] - sums[b]
+            done += 1
+        out_indptr[a - begin + 1] = done
+    return out_indptr, out[:done].copy(), out_intersection[:done].copy(), out_union[:done].copy()

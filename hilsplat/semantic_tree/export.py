@@ -1,0 +1,76 @@
+"""The semantic tree for people and other programs: JSON, and a PLY with a node per Gaussian and level."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Int64
+
+from hilsplat.base.artifacts import atomic_path
+from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.levels import LEVELS, Level
+
+if TYPE_CHECKING:
+    from hilsplat.semantic_tree.tree import SemanticTree
+
+
+def readable_nodes(tree: "SemanticTree") -> list[dict]:
+    """One entry per node, for people."""
+    members = [np.bincount(column[column >= 0], minlength=len(tree)) for column in tree.node_of_gaussian.T]
+    return [
+        {
+            "node": node,
+            "level": Level(int(tree.level[node])).label,
+            "parent": int(tree.parent[node]),
+            "children": tree.children_of(np.array([node])).tolist(),
+            "gaussians": int(members[Level(int(tree.level[node])).index][node]),
+            "views": int(tree.views[node]),
+            "best_view": tree.view_names[int(tree.view_area_px[node].argmax())],
+            "quality": round(float(tree.quality[node]), 4),
+            "centroid": [round(float(value), 4) for value in tree.centroid[node]],
+            "oriented_box": [[round(float(value), 4) for value in row] for row in tree.oriented_box[node]],
+            "box": [[round(float(value), 4) for value in corner] for corner in tree.box[node]],
+        }
+        for node in range(len(tree))
+    ]
+
+
+def write_tree_ply(gaussians_ply: Path, tree: "SemanticTree", out: Path) -> None:
+    """Copy a 3DGS PLY with three more properties per Gaussian: `node_whole`, `node_part`, `node_subpart`.
+
+    Viewers of Gaussians pass them over; tools that show scalar fields colour by them. -1 is no node.
+
+    Raises:
+        MisalignedArtifactError: the PLY holds another number of Gaussians.
+    """
+    from plyfile import PlyData
+
+    vertex = PlyData.read(str(gaussians_ply))["vertex"].data
+    if len(vertex) != len(tree.node_of_gaussian):
+        raise MisalignedArtifactError(
+            f"the tree was made for other Gaussians than {gaussians_ply}",
+            expected=f"{len(tree.node_of_gaussian)} Gaussians",
+            found=f"{len(vertex)}",
+            fix="run the contributions and semantic tree stages again",
+        )
+    more = [(f"node_{level.label}", "<i4") for level in LEVELS]
+    table = np.empty(len(vertex), [*vertex.dtype.descr, *more])
+    for name in vertex.dtype.names:
+        table[name] = vertex[name]
+    for level in LEVELS:
+        table[f"node_{level.label}"] = tree.node_of_gaussian[:, level.index]
+    _write(table, out)
+
+
+def write_selection_ply(gaussians_ply: Path, rows: Int64[np.ndarray, " g"], out: Path) -> None:
+    """Copy the given Gaussians of a 3DGS PLY, such as those that answer a query."""
+    from plyfile import PlyData
+
+    _write(PlyData.read(str(gaussians_ply))["vertex"].data[rows], out)
+
+
+def _write(table: np.ndarray, out: Path) -> None:
+    from plyfile import PlyData, PlyElement
+
+    with atomic_path(out) as temporary:
+        PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(str(temporary))

@@ -1,0 +1,110 @@
+"""The nodes of one level: masks linked across views, and the Gaussians they win."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
+
+from hilsplat.base.device import compute_device
+from hilsplat.base.levels import NONE
+from hilsplat.semantic_tree.evidence import mask_evidence
+from hilsplat.semantic_tree.linkage import pooled_linkage
+from hilsplat.semantic_tree.nodes import gaussian_nodes, level_fits
+from hilsplat.settings import SemanticTreeSettings
+
+
+@dataclass(frozen=True)
+class LevelNodes:
+    """Nodes of one level, counted from 0.
+
+    Attributes:
+        of_mask: node that each mask of the level makes up, -1 for none.
+        of_gaussian: node of each Gaussian, -1 for none.
+        membership: share of the Gaussian's visible weight that lies in its node's masks.
+        quality: of each node.
+    """
+
+    of_mask: Int64[np.ndarray, " m"]
+    of_gaussian: Int32[np.ndarray, " N"]
+    membership: Float32[np.ndarray, " N"]
+    quality: Float64[np.ndarray, " t"]
+
+
+def level_nodes(
+    weights: sp.csr_matrix,
+    view: Int32[np.ndarray, " m"],
+    mass: Float32[np.ndarray, "V N"],
+    visible: Bool[np.ndarray, "V N"],
+    importance: Float64[np.ndarray, " N"],
+    total_mass: Float64[np.ndarray, " N"],
+    settings: SemanticTreeSettings,
+    threads: int,
+) -> LevelNodes:
+    """Link the masks of one level into nodes and give them Gaussians.
+
+    A cluster whose Gaussians others win, as happens to doubles, shows nothing wherever it is asked for: it
+    is no node unless `min_views` masks fit it best.
+
+    Args:
+        weights: S of the masks.
+        view: of each mask.
+        mass: visible mass of each Gaussian in each view, px.
+        visible: which Gaussians each view sees.
+        importance: mean visible mass, px.
+        total_mass: sum of it, px.
+        settings: thresholds.
+        threads: for the evidence.
+    """
+    seen_in = view[_row_of(weights)]
+    shares = _divide(
+        weights, np.where(visible[seen_in, weights.indices], mass[seen_in, weights.indices], np.inf)
+    )
+    del seen_in
+    evidence = mask_evidence(
+        shares,
+        importance,
+        visible,
+        view,
+        settings.min_covisible,
+        settings.overlap,
+        threads,
+        compute_device(settings.device),
+    )
+    del shares
+    cluster, quality = pooled_linkage(evidence, settings.link_threshold)
+    del evidence
+    pairs = np.unique(np.stack([cluster, view.astype(np.int64)], axis=1), axis=0)
+    kept = np.flatnonzero(np.bincount(pairs[:, 0], minlength=len(quality)) >= settings.min_views)
+
+    def winners(kept: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        of_cluster = np.full(len(quality) + 1, NONE, np.int64)
+        of_cluster[kept] = np.arange(len(kept))
+        return of_cluster, *gaussian_nodes(
+            of_cluster[cluster], len(kept), weights, view, mass, total_mass, settings.min_member_share
+        )
+
+    fits = level_fits(winners(kept)[1], len(kept), weights, mass, view, settings.min_fit)
+    kept = kept[np.bincount(fits[fits >= 0], minlength=len(kept)) >= settings.min_views]
+    of_cluster, node, share = winners(kept)
+    # A node that wins no Gaussian selects nothing: it is dropped.
+    used = np.unique(node[node >= 0])
+    renumber = np.full(len(kept) + 1, NONE, np.int64)
+    renumber[used] = np.arange(len(used))
+    return LevelNodes(
+        renumber[of_cluster[cluster]], renumber[node].astype(np.int32), share, quality[kept[used]]
+    )
+
+
+def _row_of(matrix: sp.csr_matrix) -> np.ndarray:
+    """Row of every stored value."""
+    return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+
+
+def _divide(matrix: sp.csr_matrix, by: np.ndarray) -> sp.csr_matrix:
+    """Divide the stored values one by one (float64); those divided by infinity are dropped."""
+    divided = sp.csr_matrix(
+        (matrix.data.astype(np.float64) / by, matrix.indices.copy(), matrix.indptr.copy()), shape=matrix.shape
+    )
+    divided.eliminate_zeros()
+    return divided

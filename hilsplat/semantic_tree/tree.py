@@ -1,0 +1,267 @@
+"""The 3D semantic tree: masks of all views linked by the Gaussians they share.
+
+No mask has an identity across views. Two masks of different views and the same level are linked by
+how far they agree on the Gaussians that both views see; clusters of masks become nodes, nodes take
+their Gaussians, a coarser node that holds most of a finer one becomes its parent, and every node
+gets the average of its masks' full CLIP vectors. Queries are answered by ranking nodes.
+"""
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float, Float32, Int32, Int64, UInt8
+
+from hilsplat.base.artifacts import (
+    INDEX,
+    atomic_folder,
+    read_index,
+    read_into,
+    sha256_of_file,
+    write_index,
+    write_json,
+    write_npz,
+)
+from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.base.progress import stage_log
+from hilsplat.contributions.rows import Contributions, mask_embeddings, read_full_index
+from hilsplat.semantic_tree.boxes import node_boxes
+from hilsplat.semantic_tree.export import readable_nodes
+from hilsplat.semantic_tree.level_nodes import level_nodes
+from hilsplat.semantic_tree.nodes import (
+    mask_fits,
+    nest_nodes,
+    node_parents,
+    renumbered_without_empty,
+)
+from hilsplat.settings import SemanticTreeSettings
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class SemanticTree:
+    """T nodes at three levels, coarse to fine.
+
+    Attributes:
+        level: `Level` of each node.
+        parent: row of the coarser node that holds it, -1 for none.
+        clip: unit CLIP vector, the average of its masks' vectors weighted by the root of their area.
+        centroid: mean of its Gaussians' centres weighted by visible mass, scene units.
+        box: axis-aligned box, lower and upper corner, scene units.
+        oriented_box: centre, three axes and sizes (see `OrientedBox`), scene units.
+        quality: pooled IoU of its masks across views, in [0, 1].
+        views: number of views with a mask of it.
+        node_of_gaussian: node of each Gaussian at each level, -1 for none.
+        membership: share of the Gaussian's visible weight that lies in its node's masks, in [0, 1]; 0 for
+            those that only joined because a child of the node holds them, or have no node.
+        node_of_mask: node that each mask (row of the contributions) fits, -1 for none.
+        view_area_px: pixels of its masks in each view.
+        view_names: the columns of `view_area_px`.
+        gaussians_sha256: digest of the PLY the tree belongs to.
+        min_weight: weights that the contributions dropped; views are drawn with the same.
+    """
+
+    level: UInt8[np.ndarray, " T"]
+    parent: Int32[np.ndarray, " T"]
+    clip: Float32[np.ndarray, "T C"]
+    centroid: Float32[np.ndarray, "T 3"]
+    box: Float32[np.ndarray, "T 2 3"]
+    oriented_box: Float32[np.ndarray, "T 5 3"]
+    quality: Float32[np.ndarray, " T"]
+    views: Int32[np.ndarray, " T"]
+    node_of_gaussian: Int32[np.ndarray, "N 3"]
+    membership: Float32[np.ndarray, "N 3"]
+    node_of_mask: Int32[np.ndarray, " M"]
+    view_area_px: Float32[np.ndarray, "T V"]
+    view_names: tuple[str, ...]
+    gaussians_sha256: str
+    min_weight: float
+
+    def __len__(self) -> int:
+        return len(self.level)
+
+    def nodes_of(self, level: Level) -> Int64[np.ndarray, " t"]:
+        """Nodes of a level, in order."""
+        return np.flatnonzero(self.level == int(level))
+
+    def children_of(self, nodes: Int64[np.ndarray, " t"]) -> Int64[np.ndarray, " c"]:
+        """Direct children of any of the nodes."""
+        return np.flatnonzero(np.isin(self.parent, nodes))
+
+    def ancestors(self) -> Int32[np.ndarray, "T 3"]:
+        """The node that holds each node at each level: itself at its own, -1 below it or where none does."""
+        found = np.full((len(self), len(LEVELS)), NONE, np.int32)
+        rows, above = np.arange(len(self)), np.arange(len(self), dtype=np.int32)
+        while len(rows):
+            found[rows, self.level[above] - 1] = above
+            above = self.parent[above]
+            rows, above = rows[above != NONE], above[above != NONE]
+        return found
+
+    @staticmethod
+    def load(folder: Path) -> "SemanticTree":
+        """Read a finished semantic tree.
+
+        Raises:
+            ArtifactError: it is missing, damaged or of another version.
+        """
+        folder = Path(folder)
+        index = read_full_index(folder, "gaussians_sha256", "min_weight")
+        return read_into(
+            SemanticTree,
+            folder / "tree.npz",
+            view_names=tuple(index["views"]),
+            gaussians_sha256=index["gaussians_sha256"],
+            min_weight=index["min_weight"],
+        )
+
+
+def build_tree(
+    contributions: Contributions,
+    S: sp.csr_matrix,
+    mass: Float32[np.ndarray, "V N"],
+    clip: Float32[np.ndarray, "M C"],
+    means: Float[np.ndarray, "N 3"],
+    settings: SemanticTreeSettings,
+    threads: int = 1,
+) -> SemanticTree:
+    """Link masks, make nodes, and give them Gaussians, parents, vectors and boxes.
+
+    Args:
+        contributions: rows of the masks.
+        S: weight of each Gaussian in each raw mask.
+        mass: weight of each Gaussian in each view.
+        clip: CLIP vector of each mask.
+        means: centres of the Gaussians.
+        settings: thresholds.
+        threads: for the evidence; results do not depend on it.
+    """
+    visible = mass > settings.min_visible_px
+    num_visible = visible.sum(axis=0)
+    total_mass = mass.sum(axis=0, dtype=np.float64)
+    importance = np.einsum("vn,vn->n", mass, visible, dtype=np.float64) / np.maximum(num_visible, 1)
+
+    level: list[int] = []
+    quality: list[float] = []
+    cluster_of_mask = np.full(len(contributions), NONE, np.int64)
+    node_of_gaussian = np.full((S.shape[1], len(LEVELS)), NONE, np.int32)
+    membership = np.zeros((S.shape[1], len(LEVELS)), np.float32)
+    for each in LEVELS:
+        rows = contributions.rows_of(each)
+        found = level_nodes(
+            S[rows], contributions.view[rows], mass, visible, importance, total_mass, settings, threads
+        )
+        renumber = np.append(len(level) + np.arange(len(found.quality)), NONE)
+        node_of_gaussian[:, each.index] = renumber[found.of_gaussian]
+        membership[:, each.index] = found.membership
+        cluster_of_mask[rows] = renumber[found.of_mask]
+        level += [int(each)] * len(found.quality)
+        quality += found.quality.tolist()
+
+    levels = np.array(level, np.uint8)
+    num = len(levels)
+    parent = node_parents(node_of_gaussian, levels, total_mass, settings.parent_coverage)
+    if settings.nested:
+        nested = nest_nodes(node_of_gaussian, levels, parent)
+        membership[nested != node_of_gaussian] = 0
+        node_of_gaussian = nested
+        renumber = renumbered_without_empty(node_of_gaussian, num)
+        kept = np.flatnonzero(renumber[:num] != NONE)
+        node_of_gaussian, cluster_of_mask = renumber[node_of_gaussian], renumber[cluster_of_mask]
+        levels, parent, num = levels[kept], renumber[parent[kept]], len(kept)
+        quality = [quality[node] for node in kept]
+    view_area = np.zeros((num, len(contributions.views)), np.float64)
+    own = np.flatnonzero(cluster_of_mask >= 0)
+    np.add.at(view_area, (cluster_of_mask[own], contributions.view[own]), contributions.area_px[own])
+    vectors = np.zeros((num, clip.shape[1]), np.float64)
+    root_area = np.sqrt(contributions.area_px[own].astype(np.float64))
+    np.add.at(vectors, cluster_of_mask[own], root_area[:, None] * clip[own])
+    vectors /= np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+    centroid, box, oriented = node_boxes(node_of_gaussian, levels, means, total_mass)
+    return SemanticTree(
+        level=levels,
+        parent=parent,
+        clip=vectors.astype(np.float32),
+        centroid=centroid,
+        box=box,
+        oriented_box=oriented,
+        quality=np.array(quality, np.float32),
+        views=(view_area > 0).sum(axis=1).astype(np.int32),
+        node_of_gaussian=node_of_gaussian,
+        membership=membership,
+        node_of_mask=mask_fits(
+            node_of_gaussian, num, S, mass, contributions.view, contributions.level, settings.min_fit
+        ),
+        view_area_px=view_area.astype(np.float32),
+        view_names=contributions.views,
+        gaussians_sha256=contributions.gaussians_sha256,
+        min_weight=contributions.min_weight,
+    )
+
+
+def run_semantic_tree(
+    contributions_folder: Path,
+    masks_folder: Path,
+    clip_folder: Path,
+    out: Path,
+    settings: SemanticTreeSettings,
+    threads: int = 1,
+) -> None:
+    """Write the 3D semantic tree of a scene: `tree.npz`, the readable `tree.json`, `index.json`.
+
+    Raises:
+        MisalignedArtifactError: contributions or CLIP vectors were made from other masks.
+    """
+    contributions = Contributions.load(contributions_folder)
+    index = read_index(contributions_folder)
+    scene = index["scene"]
+    masks_sha256 = sha256_of_file(Path(masks_folder) / INDEX)
+    if masks_sha256 != index["masks_sha256"]:
+        raise MisalignedArtifactError(
+            f"contributions of {scene} belong to other masks",
+            expected=f"{masks_folder} with index sha256 {index['masks_sha256'][:12]}",
+            found=f"sha256 {masks_sha256[:12]}",
+            fix="run the contributions stage again",
+        )
+    with stage_log("semantic tree", scene) as counts:
+        tree = build_tree(
+            contributions,
+            contributions.matrix("S"),
+            contributions.mass(),
+            mask_embeddings(clip_folder, contributions),
+            contributions.means(),
+            settings,
+            threads,
+        )
+        per_level = {level.label: len(tree.nodes_of(level)) for level in LEVELS}
+        orphans = {
+            level.label: int((tree.parent[tree.nodes_of(level)] == NONE).sum()) for level in LEVELS[1:]
+        }
+        counts |= {**per_level, "orphans": sum(orphans.values())}
+        if not len(tree):
+            logger.warning(
+                "semantic tree %s has no node: no mask was found again in %d views; "
+                "lower semantic_tree.min_views or semantic_tree.link_threshold",
+                scene,
+                settings.min_views,
+            )
+        masks = np.bincount(contributions.view, minlength=len(contributions.views))
+        with atomic_folder(out) as folder:
+            fields = {name: value for name, value in vars(tree).items() if isinstance(value, np.ndarray)}
+            write_npz(folder / "tree.npz", **fields)
+            write_json(folder / "tree.json", {"scene": scene, "nodes": readable_nodes(tree)})
+            write_index(
+                folder,
+                {view: {"masks": int(count)} for view, count in zip(contributions.views, masks, strict=True)},
+                scene=scene,
+                nodes=per_level,
+                orphans=orphans,
+                masks_with_node=int((tree.node_of_mask >= 0).sum()),
+                masks=len(contributions),
+                gaussians_sha256=contributions.gaussians_sha256,
+                min_weight=contributions.min_weight,
+            )

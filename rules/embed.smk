@@ -1,0 +1,24 @@
+# One CLIP vector per mask.
+rule clip:
+    input:
+        scene="results/{dataset}/{scene}/scene",
+        masks=shared("masks", "masks"),
+    output:
+        clip=directory("results/{dataset}/{scene}/{variant}/clip"),
+    log:
+        "results/{dataset}/{scene}/{variant}/logs/clip.log",
+    benchmark:
+        "results/{dataset}/{scene}/{variant}/benchmarks/clip.jsonl"
+    conda:
+        ENVIRONMENT
+    threads: THREADS
+    resources:
+        mem_mb=3000,
+    params:
+        settings=settings_of("clip"),
+        model=digest_of_model("clip"),
+        cache="results/.cache",
+        code=code("clip"),
+    shell:
+        "hilsplat clip --scene {input.scene} --masks {input.masks} --settings {params.settings:q}"
+        " --threads {threads} --cache {params.cache} --out {output.clip} --log {log}"

@@ -1,0 +1,52 @@
+# The scene's code of CLIP vectors and the language field.
+rule autoencoder:
+    input:
+        clip=shared("clip", "clip"),
+        semantic_tree=shared("semantic_tree", "semantic_tree"),
+        contributions=shared("contributions", "contributions"),
+    output:
+        autoencoder=directory("results/{dataset}/{scene}/{variant}/autoencoder"),
+    log:
+        "results/{dataset}/{scene}/{variant}/logs/autoencoder.log",
+    benchmark:
+        "results/{dataset}/{scene}/{variant}/benchmarks/autoencoder.jsonl"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        mem_mb=2000,
+    params:
+        settings=settings_of("autoencoder"),
+        seed=lambda wildcards: RUN.seed_of(wildcards.variant),
+        code=code("autoencoder"),
+    shell:
+        "hilsplat autoencoder --clip {input.clip} --semantic-tree {input.semantic_tree}"
+        " --contributions {input.contributions} --settings {params.settings:q} --seed {params.seed}"
+        " --out {output.autoencoder} --log {log}"
+
+
+rule field:
+    input:
+        contributions=shared("contributions", "contributions"),
+        coverage_tree=shared("coverage_tree", "coverage_tree"),
+        autoencoder=shared("autoencoder", "autoencoder"),
+    output:
+        field="results/{dataset}/{scene}/{variant}/field.safetensors",
+    log:
+        "results/{dataset}/{scene}/{variant}/logs/field.log",
+    benchmark:
+        "results/{dataset}/{scene}/{variant}/benchmarks/field.jsonl"
+    wildcard_constraints:
+        variant=any_of(variants_by_method(baselines=False)),
+    conda:
+        ENVIRONMENT
+    threads: THREADS
+    resources:
+        mem_mb=4000,
+    params:
+        settings=settings_of("field"),
+        code=code("field"),
+    shell:
+        "hilsplat field --contributions {input.contributions} --coverage-tree {input.coverage_tree}"
+        " --autoencoder {input.autoencoder} --settings {params.settings:q}"
+        " --threads {threads} --out {output.field} --log {log}"

@@ -1,0 +1,284 @@
+"""A and G against their definitions, and what the stage writes."""
+
+import shutil
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+from hilsplat.base.artifacts import sha256_of_path
+from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.levels import Level
+from hilsplat.contributions import quadratic_builder, stage
+from hilsplat.contributions.compositing import normalised_weights
+from hilsplat.contributions.quadratic import level_mass, load_quadratic
+from hilsplat.contributions.quadratic_builder import GramBuilder, QuadraticBuilder, stack_weights
+from hilsplat.contributions.rows import Contributions, mask_embeddings
+from hilsplat.contributions.stage import (
+    label_maps,
+    labelled_rows,
+    random_half,
+    run_contributions,
+    view_contributions,
+)
+from hilsplat.contributions.streams import ArrayStream
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.settings import ContributionsSettings
+from tests.unit.two_boxes_world import HEIGHT, REGIONS, WIDTH, two_boxes_weights
+
+SIZE = (9, 7)
+PIXELS = 63
+
+
+def random_view(seed: int, num_gaussians: int = 40) -> tuple[sp.csr_matrix, HierarchicalMasks]:
+    """Some pixels are nearly transparent; masks overlap within and across levels."""
+    rng = np.random.default_rng(seed)
+    weights = sp.random(PIXELS, num_gaussians, 0.15, random_state=rng, dtype=np.float32, format="csr")
+    weights = weights.multiply(1 / np.maximum(weights.sum(axis=1), 1e-9)).tocsr()
+    weights = sp.diags(np.where(rng.random(PIXELS) < 0.2, 0.3, 0.98)) @ weights
+    dense = rng.random((8, *SIZE)) < rng.uniform(0.1, 0.6, (8, 1, 1))
+    level = np.array([1, 1, 1, 2, 2, 3, 3, 3], np.uint8)
+    ones = np.ones(8, np.float32)
+    return weights.astype(np.float32).tocsr(), HierarchicalMasks.from_dense(dense, level, ones, ones)
+
+
+def matrix(arrays: dict[str, np.ndarray], name: str, columns: int) -> np.ndarray:
+    parts = arrays[f"{name}_data"], arrays[f"{name}_indices"], arrays[f"{name}_indptr"]
+    return sp.csr_matrix(parts, shape=(len(parts[2]) - 1, columns)).toarray()
+
+
+def test_normalised_rows_sum_to_one_or_are_empty():
+    weights = sp.csr_matrix(np.array([[0.6, 0.3, 0], [0.1, 0.2, 0], [0, 0, 0]], np.float32))
+    normalised = normalised_weights(weights)
+    assert normalised.toarray() == pytest.approx(np.array([[2 / 3, 1 / 3, 0], [0, 0, 0], [0, 0, 0]]))
+    assert weights[0, 0] == pytest.approx(0.6)  # the argument is left alone
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_mask_means_equal_their_definition(seed):
+    raw, masks = random_view(seed)
+    weights = normalised_weights(raw)
+    arrays = view_contributions("v", weights, masks)
+    dense = weights.toarray().astype(np.float64)
+    covered = dense.sum(axis=1) > 0
+    half = random_half("v", PIXELS)
+    labels = label_maps(masks)
+    A, A_half, S = (matrix(arrays, name, 40) for name in ("A", "A_half", "S"))
+    for row in range(len(masks)):
+        painted = (labels == row).any(axis=1) & covered
+        assert arrays["pixels"][row] == painted.sum()
+        assert arrays["half_pixels"][row] == (painted & half).sum()
+        assert A[row] == pytest.approx(dense[painted].mean(axis=0), abs=1e-6)
+        if (painted & half).any():
+            assert A_half[row] == pytest.approx(dense[painted & half].mean(axis=0), abs=1e-6)
+        raw_mask = masks.dense(np.array([row]))[0].ravel()
+        assert S[row] == pytest.approx(dense[raw_mask].sum(axis=0), abs=1e-5)
+    assert arrays["mass"] == pytest.approx(dense.sum(axis=0), abs=1e-5)
+
+
+def test_gram_and_weights_give_the_quadratic_form_of_every_level():
+    stacked, dense = [], np.zeros((3, 40, 40))
+    for seed in range(3):
+        raw, masks = random_view(seed)
+        weights = normalised_weights(raw)
+        labels = label_maps(masks)
+        stacked.append(labelled_rows(weights, labels))
+        full = weights.toarray().astype(np.float64)
+        for index in range(3):
+            valid = labels[:, index] >= 0
+            dense[index] += full[valid].T @ full[valid]
+    everything = stack_weights(stacked)
+    gram = built_gram(stacked)
+    features = np.random.default_rng(5).normal(size=(40, 3, 4)).astype(np.float32)
+    expected = np.einsum("lij,jld->ild", dense, features)
+    assert gram.product(features) == pytest.approx(expected, abs=1e-5)
+    assert everything.product(features) == pytest.approx(expected, abs=1e-5)
+    # entry by entry: unit vectors pick columns
+    columns = np.repeat(np.eye(40, dtype=np.float32)[:, None], 3, axis=1)
+    assert gram.product(columns).transpose(1, 0, 2) == pytest.approx(dense, abs=1e-6)
+    # rows of W sum to 1, so G 1 is the mass in labelled pixels
+    assert level_mass(gram) == pytest.approx(dense.sum(axis=2).T, abs=1e-5)
+
+
+def built_gram(parts, threads=1):
+    builder = GramBuilder(parts[0].num_gaussians, threads)
+    for part in parts:
+        builder.add(part)
+    return builder.finish()
+
+
+def chosen_quadratic(part, keep):
+    builder = QuadraticBuilder(part.num_gaussians, keep, threads=1)
+    builder.add(part)
+    return builder.finish()
+
+
+def test_gram_does_not_depend_on_threads():
+    raw, masks = random_view(0)
+    weights = normalised_weights(raw)
+    part = labelled_rows(weights, label_maps(masks))
+    one, two = built_gram([part], threads=1), built_gram([part], threads=2)
+    assert one.values.tobytes() == two.values.tobytes()
+    assert one.indices.tobytes() == two.indices.tobytes()
+
+
+def test_gram_does_not_depend_on_how_the_pixels_are_parted(monkeypatch):
+    parts = []
+    for seed in range(4):
+        raw, masks = random_view(seed)
+        weights = normalised_weights(raw)
+        parts.append(labelled_rows(weights, label_maps(masks)))
+    one, four = built_gram([stack_weights(parts)]), built_gram(parts)
+    for name in ("indptr", "indices", "values"):
+        assert getattr(one, name).tobytes() == getattr(four, name).tobytes()
+    # too many weights to hold: G, whatever its size
+    monkeypatch.setattr(quadratic_builder, "MAX_WEIGHTS", parts[0].nonzeros)
+    builder = QuadraticBuilder(40, "auto", threads=1)
+    for part in parts:
+        builder.add(part)
+    assert builder.finish().values.tobytes() == one.values.tobytes()
+
+
+def test_the_smaller_quadratic_is_kept_and_read_back_equal(tmp_path):
+    raw, masks = random_view(0)
+    weights = normalised_weights(raw)
+    part = labelled_rows(weights, label_maps(masks))
+    features = np.random.default_rng(5).normal(size=(40, 3, 4)).astype(np.float32)
+    for keep in ("gram", "weights"):
+        kept = chosen_quadratic(part, keep)
+        folder = tmp_path / keep
+        kept.save(folder / ("G.npz" if keep == "gram" else "W.npz"))
+        again = load_quadratic(folder)
+        assert type(again) is type(kept)
+        assert np.array_equal(again.product(features), kept.product(features))
+    gram = built_gram([part])
+    chosen = chosen_quadratic(part, "auto")
+    assert chosen.nonzeros == min(gram.nonzeros, part.nonzeros)
+
+
+def test_stage_writes_rows_in_view_order_and_masses(two_boxes_contributions):
+    world, out = two_boxes_contributions
+    found = Contributions.load(out)
+    assert found.views == world.views  # the test view is held out
+    assert len(found) == 4 * (len(REGIONS) - 1)
+    assert found.view.tolist() == np.repeat(range(4), 6).tolist()
+    assert found.mask.tolist() == list(range(6)) * 4
+    # view 0 misses region 3, "A bottom": A, B, A top, B top, A top left, B corner
+    assert found.level[:6].tolist() == [1, 1, 2, 2, 3, 3]
+    assert found.pixels[:6].tolist() == [48, 48, 24, 24, 8, 6]
+    assert found.rows_of(Level.SUBPART)[:2].tolist() == [4, 5]
+    assert found.mass().sum(axis=1) == pytest.approx([HEIGHT * WIDTH] * 4, rel=1e-5)
+    A = found.matrix("A").toarray()
+    assert A.sum(axis=1) == pytest.approx(np.ones(len(found)), abs=1e-5)
+    weights = normalised_weights(two_boxes_weights(0))
+    corner = weights.toarray().reshape(HEIGHT, WIDTH, -1)[6:8, 6:9].reshape(6, -1).mean(axis=0)
+    assert A[5] == pytest.approx(corner, abs=1e-6)
+    assert mask_embeddings(world.clip, found).shape == (24, 16)
+
+
+def test_a_resumed_run_writes_the_same_bytes(two_boxes_contributions):
+    world, out = two_boxes_contributions
+    before = sha256_of_path(out)
+    arguments = (world.scene, world.ply, world.masks, out, world.folder / "cache", ContributionsSettings())
+    cached = sorted((world.folder / "cache").rglob("*.npz"))
+    assert len(cached) == 4
+    cached[0].unlink()  # as if the run had been killed before one view
+    shutil.rmtree(out)
+    run_contributions(*arguments, 2)
+    assert sha256_of_path(out) == before
+
+
+def test_a_killed_run_goes_on_from_its_checkpoint(two_boxes, monkeypatch):
+    settings = ContributionsSettings(keep="gram")
+    folder = two_boxes.folder
+    arguments = (two_boxes.scene, two_boxes.ply, two_boxes.masks)
+    run_contributions(*arguments, folder / "whole", folder / "other cache", settings, 1)
+    drawn = []
+    weights = stage.pixel_weights
+
+    def counted(gaussians, camera, **more):
+        drawn.append(camera.name)
+        if len(drawn) == 3:
+            raise KeyboardInterrupt
+        return weights(gaussians, camera, **more)
+
+    monkeypatch.setattr(quadratic_builder, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(stage, "pixel_weights", counted)
+    with pytest.raises(KeyboardInterrupt):
+        run_contributions(*arguments, folder / "out", folder / "cache", settings, 1)
+    run_contributions(*arguments, folder / "out", folder / "cache", settings, 1)
+    # the first two views are neither drawn nor summed again
+    assert drawn[3:] == list(two_boxes.views[2:])
+    assert sha256_of_path(folder / "out") == sha256_of_path(folder / "whole")
+    assert not list((folder / "cache").rglob("*.npy"))  # the checkpoint is gone
+
+
+def test_a_checkpoint_that_lost_a_file_costs_time_and_no_result(two_boxes, monkeypatch):
+    settings, folder = ContributionsSettings(keep="gram"), two_boxes.folder
+    arguments = (two_boxes.scene, two_boxes.ply, two_boxes.masks)
+    run_contributions(*arguments, folder / "whole", folder / "other cache", settings, 1)
+    monkeypatch.setattr(quadratic_builder, "CHECKPOINT_SECONDS", 0.0)
+    with monkeypatch.context() as killed:
+        killed.setattr(stage, "write_npz", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            run_contributions(*arguments, folder / "out", folder / "cache", settings, 1)
+    lost, *_ = sorted((folder / "cache").rglob("*.npy"))
+    lost.unlink()
+    run_contributions(*arguments, folder / "out", folder / "cache", settings, 1)
+    assert sha256_of_path(folder / "out") == sha256_of_path(folder / "whole")
+
+
+@pytest.mark.parametrize("keep", ["auto", "weights", "gram"])
+def test_a_builder_goes_on_from_its_state(keep, monkeypatch):
+    parts = []
+    for seed in range(3):
+        raw, masks = random_view(seed)
+        parts.append(labelled_rows(normalised_weights(raw), label_maps(masks)))
+    monkeypatch.setattr(quadratic_builder, "CHUNK_WEIGHTS", parts[0].nonzeros + 1)
+    whole, first, second = (QuadraticBuilder(40, keep, threads=1) for _ in range(3))
+    for part in parts:
+        whole.add(part)
+    first.add(parts[0])
+    first.add(parts[1])
+    second.restore(first.state())
+    second.add(parts[2])
+    features = np.random.default_rng(5).normal(size=(40, 3, 4)).astype(np.float32)
+    one, two = whole.finish(), second.finish()
+    assert type(one) is type(two)
+    assert one.product(features).tobytes() == two.product(features).tobytes()
+
+
+def test_streams_are_files_of_numpy(tmp_path):
+    rows = np.arange(12, dtype=np.float32).reshape(4, 3)
+    with ArrayStream(tmp_path / "rows.npy", np.float32, 3) as stream:
+        stream.append(rows[:1])
+        stream.append(rows[1:])
+    assert np.array_equal(np.load(tmp_path / "rows.npy"), rows)
+    assert np.array_equal(np.load(tmp_path / "rows.npy", mmap_mode="r"), rows)
+    with ArrayStream(tmp_path / "none.npy", np.int64) as stream:
+        pass
+    assert np.load(tmp_path / "none.npy").shape == (0,)
+
+
+def test_masks_of_another_size_are_refused(two_boxes):
+    view = two_boxes.views[1]
+    ones = np.ones(1, np.float32)
+    wrong = HierarchicalMasks.from_dense(np.ones((1, 4, 4), bool), np.ones(1, np.uint8), ones, ones)
+    wrong.save(two_boxes.masks / f"{view}.npz")
+    with pytest.raises(MisalignedArtifactError, match=r"masks of view 001.png do not fit its camera"):
+        run_contributions(
+            two_boxes.scene,
+            two_boxes.ply,
+            two_boxes.masks,
+            two_boxes.folder / "out",
+            two_boxes.folder / "cache",
+            ContributionsSettings(),
+            1,
+        )
+
+
+def test_missing_clip_vectors_are_named(two_boxes_contributions):
+    world, out = two_boxes_contributions
+    np.save(world.clip / f"{world.views[2]}.npy", np.zeros((2, 16), np.float16))
+    with pytest.raises(MisalignedArtifactError, match=r"view 002.png"):
+        mask_embeddings(world.clip, Contributions.load(out))

@@ -1,0 +1,116 @@
+"""A as an operator against dense algebra, on the CPU and by torch; the two lifts by hand."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+from hilsplat.base.device import compute_device, cuda_missing
+from hilsplat.contributions.cuda_algebra import DeviceMasks, DeviceQuadratic
+from hilsplat.contributions.mask_operator import MaskOperator, lifted_average, lifted_median
+from hilsplat.contributions.quadratic import StackedWeights
+from hilsplat.contributions.quadratic_builder import GramBuilder
+from hilsplat.semantic_tree.evidence import mask_evidence
+
+DEVICES = [
+    "cpu",
+    pytest.param("cuda", marks=pytest.mark.skipif(cuda_missing() is not None, reason=str(cuda_missing()))),
+]
+
+
+def random_operator(masks: int = 14, gaussians: int = 30) -> tuple[MaskOperator, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    A = sp.random(masks, gaussians, 0.3, random_state=rng, dtype=np.float32, format="csr")
+    level = rng.integers(1, 4, masks).astype(np.uint8)
+    return MaskOperator.of(A, level), A.toarray().astype(np.float64), level
+
+
+def test_means_and_spread_equal_the_dense_products():
+    operator, A, level = random_operator()
+    rng = np.random.default_rng(1)
+    features = rng.normal(size=(30, 3, 4))
+    values = rng.normal(size=(14, 4))
+    means = np.stack([A[m] @ features[:, level[m] - 1] for m in range(14)])
+    assert operator.means(features) == pytest.approx(means, abs=1e-12)
+    assert operator.means(features.astype(np.float32)) == pytest.approx(means, abs=1e-5)
+    spread = operator.spread(values)
+    for index in range(3):
+        rows = level == index + 1
+        assert spread[:, index] == pytest.approx(A[rows].T @ values[rows], abs=1e-12)
+    # adjoint: <A F, x> = <F, A' x>
+    assert (means * values).sum() == pytest.approx((features * spread).sum(), rel=1e-12)
+
+
+def one_gaussian(latents: list[list[float]], weights: list[float]):
+    """Masks of level whole that all show one Gaussian."""
+    count = len(latents)
+    A = sp.csr_matrix(np.array(weights, np.float32)[:, None])
+    masks = MaskOperator.of(A, np.ones(count, np.uint8))
+    pixels = np.ones(count, np.float32)
+    mass = np.array([[sum(weights), 0, 0]], np.float32)
+    return masks, mass, pixels, np.array(latents, np.float32)
+
+
+def test_the_median_passes_over_a_mask_that_is_wrong():
+    masks, mass, pixels, latents = one_gaussian([[0, 1], [0, 1], [1, 0]], [1, 1, 1])
+    average = lifted_average(masks, mass, pixels, latents)
+    assert average[0, 0] == pytest.approx([1 / 3, 2 / 3])
+    median = lifted_median(masks, pixels, latents, average)
+    assert median[0, 0] == pytest.approx([0, 1], abs=1e-3)
+    assert np.array_equal(median[0, 1:], average[0, 1:])  # levels that no mask shows keep the start
+
+
+def test_the_median_of_a_triangle_sees_its_sides_under_equal_angles():
+    # an isosceles triangle: from (0, y) the two lower corners stand 120 degrees apart, y = 1 / sqrt(3)
+    masks, mass, pixels, latents = one_gaussian([[-1, 0], [1, 0], [0, 3]], [1, 1, 1])
+    median = lifted_median(masks, pixels, latents, lifted_average(masks, mass, pixels, latents), steps=200)
+    assert median[0, 0] == pytest.approx([0, 1 / np.sqrt(3)], abs=1e-4)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_torch_products_equal_the_loops(device):
+    operator, _, _ = random_operator()
+    moved = DeviceMasks.of(operator, device)
+    rng = np.random.default_rng(1)
+    features = rng.normal(size=(30, 3, 4)).astype(np.float32)
+    values = rng.normal(size=(14, 4)).astype(np.float32)
+    assert moved.means(features) == pytest.approx(operator.means(features), abs=1e-5)
+    assert moved.spread(values) == pytest.approx(operator.spread(values), abs=1e-5)
+
+    dense = rng.random((50, 30)) * (rng.random((50, 30)) < 0.3)
+    W = StackedWeights(sp.csr_matrix(dense.astype(np.float32)), rng.random((50, 3)) < 0.7)
+    builder = GramBuilder(30, 1)
+    builder.add(W)
+    for quadratic in (W, builder.finish()):
+        product = DeviceQuadratic.of(quadratic, device).product(features)
+        assert product == pytest.approx(quadratic.product(features), abs=1e-4)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_torch_finds_the_same_evidence(device, monkeypatch):
+    from hilsplat.semantic_tree import evidence as module
+
+    rng = np.random.default_rng(2)
+    view = np.repeat(np.arange(4, dtype=np.int32), 5)
+    shares = sp.random(20, 40, 0.3, random_state=rng, format="csr")
+    visible = rng.random((4, 40)) < 0.8
+    shares = sp.csr_matrix(shares.multiply(visible[view]))
+    arguments = (shares, rng.random(40), visible, view, 0.2, "tanimoto")
+    loops = mask_evidence(*arguments)
+    if device == "cpu":  # torch's CPU stands in for the device
+        by_torch = module._evidence_by_torch
+        monkeypatch.setattr(module, "_evidence_by_loops", lambda *a: by_torch(*a[:-1], "cpu"))
+    found = mask_evidence(*arguments, 1, device)
+    assert found.intersection.toarray() == pytest.approx(loops.intersection.toarray(), abs=1e-12)
+    assert found.union.toarray() == pytest.approx(loops.union.toarray(), abs=1e-12)
+    assert found.seen == pytest.approx(loops.seen, abs=1e-12)
+
+
+def test_cuda_is_refused_where_there_is_none():
+    from hilsplat.base.errors import DeviceError
+
+    if cuda_missing() is None:
+        assert compute_device("cuda") == "cuda"
+    else:
+        with pytest.raises(DeviceError, match="finds no CUDA device"):
+            compute_device("cuda")
+    assert compute_device("cpu") == "cpu"

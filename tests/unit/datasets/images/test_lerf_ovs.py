@@ -1,0 +1,223 @@
+"""LERF-OVS: polygons as regions, and what label files bring."""
+
+import json
+
+import numpy as np
+import pytest
+
+from hilsplat.base.errors import SceneError
+from hilsplat.base.images import write_png
+from hilsplat.datasets.images.isat import read_isat
+from hilsplat.datasets.images.lerf_ovs import DATASET, check_scene, open_scene
+from hilsplat.datasets.images.polygons import fill_polygon, polygons_of
+from hilsplat.datasets.labelled import posed_images
+from hilsplat.datasets.published import PAIRS, PROMPTS
+from hilsplat.datasets.synthetic.write_labelled import write_lerf_ovs
+
+SQUARE = [[2.0, 3.0], [5.0, 3.0], [5.0, 6.0], [2.0, 6.0]]
+
+
+def thing(category="knife", segmentation=SQUARE, **keys):
+    return {"category": category, "segmentation": segmentation, "group": 1, "iscrowd": 0, **keys}
+
+
+def label_file(folder, objects, size_wh=(20, 10), name="frame_00001"):
+    path = folder / f"{name}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    info = {"folder": "x", "name": f"{name}.jpg", "width": size_wh[0], "height": size_wh[1], "note": ""}
+    path.write_text(json.dumps({"info": info, "objects": objects}))
+    return path
+
+
+@pytest.fixture
+def root(tmp_path, true_world):
+    """The small world as scene `figurines`, its second and fourth view labelled."""
+    write_lerf_ovs(true_world, tmp_path / "lerf_ovs", "figurines", ["001.png", "003.png"])
+    return tmp_path / "lerf_ovs"
+
+
+def test_a_polygon_covers_its_border_pixels():
+    mask = fill_polygon(np.array([[0, 0], [2, 0], [0, 2]], float), (4, 4))
+    assert mask.tolist() == [
+        [True, True, True, False],
+        [True, True, False, False],
+        [True, False, False, False],
+        [False] * 4,
+    ]
+
+
+def test_vertices_are_cut_to_whole_numbers_not_rounded():
+    assert fill_polygon(np.array([[0.9, 0.9], [1.9, 0.9], [1.9, 0.2]]), (3, 3)).sum() == 2
+
+
+def test_even_odd_fill_leaves_the_middle_of_a_pentagram_empty():
+    angle = 2 * np.pi * np.arange(5) * 2 / 5
+    star = 50 + 45 * np.stack([np.sin(angle), -np.cos(angle)], axis=1)
+    mask = fill_polygon(star, (100, 100))
+    assert not mask[50, 50] and mask[20, 50]
+
+
+def test_polygons_of_any_region_give_it_back_exactly():
+    generator = np.random.default_rng(1)
+    for share in (0.2, 0.5, 0.8):  # rings, pinches, single pixels and lines among them
+        mask = generator.random((13, 17)) < share
+        back = np.any([fill_polygon(p.astype(float), mask.shape) for p in polygons_of(mask)], axis=0)
+        assert np.array_equal(back, mask)
+
+
+def test_a_written_world_is_read_back_equal(true_world, root):
+    scene = open_scene(root, "figurines")
+    assert list(scene.images) == [f"frame_0000{n}" for n in (1, 2, 3, 4)]  # numbered from 1
+    assert list(scene.views) == ["frame_00002", "frame_00004"]
+    for name, view in (("001.png", "frame_00002"), ("003.png", "frame_00004")):
+        nodes = true_world.nodes(name)
+        assert {region.text for region in scene.views[view]} == set(nodes)
+        for region in scene.views[view]:
+            assert region.size_hw == (24, 40)
+            assert np.array_equal(region.mask(), true_world.mask(name, nodes[region.text]))
+    assert scene.prompts == ("Ring", "bear", "head", "nose", "paw")
+    assert scene.num_pairs == 9  # the fourth view does not show the ring
+
+
+def test_written_poses_are_read_back_equal(true_world, root):
+    posed = posed_images(root / "figurines", "LERF-OVS")
+    for name, view in zip(true_world.cameras.names, posed.values(), strict=True):
+        camera = true_world.cameras[name]
+        assert np.allclose(view.cam_from_source, camera.cam_from_world, atol=1e-12)
+        assert np.array_equal(view.camera.calibration_matrix(), camera.K)
+
+
+def test_objects_of_one_category_are_one_region_with_all_boxes(root):
+    (paw,) = [region for region in open_scene(root, "figurines").views["frame_00002"] if region.text == "paw"]
+    # View 1: paws of rows 14 to 17, columns 3 to 6 and 13 to 18.
+    assert paw.boxes().tolist() == [[3, 14, 6, 17], [13, 14, 18, 17]]
+    assert paw.mask().sum() == 4 * 4 + 4 * 6
+
+
+def test_boxes_are_corners_not_sizes(tmp_path):
+    path = label_file(tmp_path, [thing(bbox=[2.0, 3.0, 5.0, 6.0])])
+    assert read_isat(path).objects[0].box_xyxy.tolist() == [2, 3, 5, 6]
+    path = label_file(tmp_path, [thing(segmentation=[[4, 3], [8, 3], [8, 6]], bbox=[4, 3, 4, 3])])
+    with pytest.raises(SceneError, match=r"object 0 \(knife\): bbox is not \[x1, y1, x2, y2\]"):
+        read_isat(path)
+
+
+def test_a_box_with_decimals_keeps_the_whole_pixels_inside(tmp_path):
+    polygon = [[2.5, 3.5], [5.5, 3.5], [5.5, 6.5]]
+    path = label_file(tmp_path, [thing(segmentation=polygon, bbox=[2.5, 3.5, 5.5, 6.5])])
+    assert read_isat(path).objects[0].box_xyxy.tolist() == [3, 4, 5, 6]
+
+
+@pytest.mark.parametrize("iscrowd", [0, 1, False, True])
+def test_iscrowd_may_be_number_or_boolean(tmp_path, iscrowd):
+    assert len(read_isat(label_file(tmp_path, [thing(iscrowd=iscrowd)])).objects) == 1
+
+
+def test_categories_differ_by_case(tmp_path, root):
+    label_file(root / "label" / "figurines", [thing("Pot"), thing("pot")], (40, 24), "frame_00001")
+    assert [r.text for r in open_scene(root, "figurines").views["frame_00001"]] == ["Pot", "pot"]
+
+
+def test_a_frame_is_found_by_name_when_an_image_before_it_is_missing(root):
+    before = open_scene(root, "figurines").views["frame_00004"][0].mask()
+    (root / "figurines" / "images" / "frame_00003.jpg").unlink()
+    scene = open_scene(root, "figurines")
+    assert scene.images["frame_00004"].name == "frame_00004.jpg"
+    assert np.array_equal(scene.views["frame_00004"][0].mask(), before)
+    assert scene.posed_views(["frame_00002.png", "frame_00004.png"])["frame_00004"] == "frame_00004.png"
+
+
+def test_labelled_frames_without_image_or_pose_are_named(root):
+    with pytest.raises(SceneError, match="have no pose: frame_00004"):
+        open_scene(root, "figurines").posed_views(["frame_00002.png", "frame_00003.png"])
+    (root / "figurines" / "images" / "frame_00004.jpg").unlink()
+    with pytest.raises(SceneError, match="labelled frames of figurines have no image: frame_00004"):
+        open_scene(root, "figurines")
+
+
+def test_a_polygon_outside_the_image_is_clipped_and_told_or_refused(tmp_path):
+    path = label_file(tmp_path, [thing(segmentation=[[15, 2], [25, 2], [25, 4], [15, 4]])])
+    labels = read_isat(path)
+    assert labels.objects[0].mask((10, 20)).sum() == 3 * 5  # columns 15 to 19
+    assert len(labels.warnings) == 1 and "reaches 5 px outside the image; clipped" in labels.warnings[0]
+    path = label_file(tmp_path, [thing(segmentation=[[30, 2], [35, 2], [35, 4]])])
+    with pytest.raises(SceneError, match=r"object 0 \(knife\): a polygon lies outside the image"):
+        read_isat(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"info": ', "cannot be read"),
+        ("[]", "has no list `objects`"),
+        ('{"shapes": []}', "has no list `objects`"),
+        ('{"info": {}, "objects": []}', "does not say how large"),
+    ],
+)
+def test_malformed_label_files_are_refused_by_name(tmp_path, text, message):
+    path = tmp_path / "frame_00001.json"
+    path.write_text(text)
+    with pytest.raises(SceneError, match=rf"frame_00001.json .*{message}"):
+        read_isat(path)
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        (thing(category=None), "object 0 has no category"),
+        (thing(segmentation=[[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]]), "segmentation is no polygon"),
+        (thing(segmentation=[]), "segmentation is no polygon"),
+        (thing(segmentation="x"), "segmentation is no polygon"),
+        (thing(bbox=[1, 2, 3]), "bbox cannot be used"),
+    ],
+)
+def test_malformed_objects_are_refused_by_number(tmp_path, entry, message):
+    with pytest.raises(SceneError, match=message):
+        read_isat(label_file(tmp_path, [entry]))
+
+
+def test_a_label_of_a_scaled_copy_is_resized_and_told(root):
+    for name in ("frame_00002", "frame_00004"):
+        (root / "figurines" / "images" / f"{name}.jpg").unlink()
+        write_png(root / "figurines" / "images" / f"{name}.png", np.zeros((12, 20, 3), np.uint8))
+    scene = open_scene(root, "figurines")
+    assert sum("resized by nearest neighbour" in sentence for sentence in scene.warnings) == 2
+    (bear,) = [region for region in scene.views["frame_00002"] if region.text == "bear"]
+    assert bear.mask((12, 20)).sum() * 4 == pytest.approx(bear.mask().sum(), rel=0.2)
+    # Columns 3 to 18 and rows 6 to 17 of 40 x 24, at half the size.
+    assert bear.boxes((12, 20)).tolist() == [[1, 3, 9, 8]]
+
+
+def test_a_label_of_another_release_is_refused(root):
+    (root / "figurines" / "images" / "frame_00002.jpg").unlink()
+    write_png(root / "figurines" / "images" / "frame_00002.png", np.zeros((26, 40, 3), np.uint8))
+    with pytest.raises(SceneError, match=r"frame_00002.json does not fit its image\n.*40 x 26 px"):
+        open_scene(root, "figurines")
+
+
+def test_unlisted_texts_and_missing_frames_are_told(root):
+    told = "; ".join(check_scene(root, "figurines").warnings)
+    assert "published frames without label: frame_00041, frame_00105, frame_00152, frame_00195" in told
+    assert "texts that the published list lacks: Ring, bear, head, nose, paw" in told
+
+
+def test_a_wrong_count_of_pairs_is_told_for_whole_published_scenes(tmp_path, true_world):
+    root = tmp_path / "lerf_ovs"
+    write_lerf_ovs(true_world, root, "figurines", [])
+    for frame in (41, 105, 152, 195):
+        name = f"frame_{frame:05d}"
+        write_png(root / "figurines" / "images" / f"{name}.png", np.zeros((10, 20, 3), np.uint8))
+        objects = [thing(text) for text in PROMPTS["lerf_ovs"]["figurines"][:14]]
+        label_file(root / "label" / "figurines", objects, name=name)
+    assert open_scene(root, "figurines").num_pairs == PAIRS["figurines"] == 56
+    assert not open_scene(root, "figurines").warnings
+    label_file(root / "label" / "figurines", [thing("bag")], name="frame_00041")
+    (warning,) = open_scene(root, "figurines").warnings
+    assert warning.startswith("43 pairs of frame and category")
+
+
+def test_a_half_extracted_archive_is_refused_with_what_is_missing(root):
+    (root / "label" / "figurines").rename(root / "label" / "elsewhere")
+    with pytest.raises(SceneError, match=r"incomplete.*\n.*also label/figurines"):
+        open_scene(root, "figurines")
+    assert DATASET.missing(root, "figurines") == ("label/figurines",)

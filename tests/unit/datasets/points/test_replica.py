@@ -1,0 +1,210 @@
+"""Replica by hand: three quads of three objects, sequences in both layouts."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hilsplat.base.errors import SceneError
+from hilsplat.datasets.classes.replica import REPLICA_48, REPLICA_51
+from hilsplat.datasets.points.point_files import write_ply
+from hilsplat.datasets.points.posed_images import PosedImage
+from hilsplat.datasets.points.replica import check_scene, open_scene, read_depth, read_images
+from hilsplat.datasets.points.replica_mesh import (
+    class_of_objects,
+    object_of_vertices,
+    read_labelled_mesh,
+    read_semantic_mesh,
+    triangles_of,
+)
+from hilsplat.datasets.points.replica_write import write_semantic_mesh, write_sequence
+from hilsplat.datasets.registry import DATASETS
+
+# Three quads in a row, of objects 2, 1 and 3:   0--1--2--3
+#                                                4--5--6--7
+XYZ = np.array([[x, y, 0] for y in (1, 0) for x in range(4)], np.float32)
+QUADS = np.array([[4, 5, 1, 0], [5, 6, 2, 1], [6, 7, 3, 2]], np.int32)
+OBJECT = np.array([2, 1, 3], np.int32)
+NAMED = [{"id": 20, "name": "chair"}, {"id": 93, "name": "wall"}]
+
+
+def make_habitat(folder: Path, labels=(-2, 20, 93, -1)) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    places = {axis: XYZ[:, column] for column, axis in enumerate("xyz")}
+    write_ply(folder / "mesh_semantic.ply", places, QUADS, {"object_id": OBJECT})
+    info = {"classes": NAMED, "id_to_label": list(labels), "objects": [], "gravity_dir": [0, 0, -1]}
+    (folder / "info_semantic.json").write_text(json.dumps(info))
+    return folder
+
+
+def make_images(folder: Path, frames: int) -> list[PosedImage]:
+    folder.mkdir(parents=True, exist_ok=True)
+    images = []
+    for number in range(frames):
+        path = folder / f"{number}.jpg"
+        Image.fromarray(np.full((6, 10, 3), number, np.uint8)).save(path)
+        pose = np.eye(4)
+        pose[0, 3] = number
+        K = np.array([[7.0, 0, 5], [0, 7.0, 3], [0, 0, 1]])
+        images.append(PosedImage(path.name, path, np.linalg.inv(pose), K, (6, 10)))
+    return images
+
+
+def make_semantic_nerf(folder: Path, frames: int, lines: int | None = None) -> Path:
+    """A sequence whose frame n stands at x = n."""
+    for name in ("rgb", "depth"):
+        (folder / name).mkdir(parents=True)
+    for number in range(frames):
+        Image.fromarray(np.full((6, 10, 3), number, np.uint8)).save(folder / "rgb" / f"rgb_{number}.png")
+        depth = np.full((6, 10), 2500, np.uint16)
+        Image.fromarray(depth).save(folder / "depth" / f"depth_{number}.png")
+    Image.fromarray(np.zeros((6, 10, 3), np.uint8)).save(folder / "rgb" / "vis_rgb_0.png")
+    rows = np.tile(np.eye(4).ravel(), (frames if lines is None else lines, 1))
+    rows[:, 3] = np.arange(len(rows))
+    np.savetxt(folder / "traj_w_c.txt", rows)
+    return folder
+
+
+def test_vertices_take_the_object_of_most_faces_and_of_equally_many_the_smallest(tmp_path):
+    points = read_semantic_mesh(make_habitat(tmp_path))
+    # vertices 1 and 5 lie on objects 2 and 1, vertices 2 and 6 on 1 and 3: object 1 both times
+    assert points.instance_id.tolist() == [3, 2, 2, 0, 3, 2, 2, 0]
+    assert points.class_id.tolist() == [93, 20, 20, 0, 93, 20, 20, 0]
+    np.testing.assert_array_equal(points.xyz, XYZ)
+    # object 3 twice at vertex 0: most faces win over the smaller id
+    faces = np.array([[0, 1], [0, 2], [0, 3]])
+    assert object_of_vertices(faces, np.array([3, 3, 1]), 5).tolist() == [3, 3, 3, 1, -1]
+
+
+def test_negative_classes_are_none(tmp_path):
+    path = make_habitat(tmp_path) / "info_semantic.json"
+    assert class_of_objects(path).tolist() == [0, 20, 93, 0]
+
+
+def test_sets_with_and_without_walls(tmp_path):
+    points = read_semantic_mesh(make_habitat(tmp_path))
+    assert points.labels(REPLICA_51)[0] == 1 and points.labels(REPLICA_48)[0] == 0  # 93 is the wall
+    assert REPLICA_48.texts[points.labels(REPLICA_48)[1] - 1] == "chair"
+
+
+def test_quads_become_two_triangles_unless_a_corner_repeats():
+    assert triangles_of(np.array([[0, 1, 2, 3]], np.int32)).tolist() == [[0, 1, 2], [0, 2, 3]]
+    assert triangles_of(np.array([[0, 1, 2, 2]], np.int32)).tolist() == [[0, 1, 2]]
+
+
+def test_unpadded_frames_are_sorted_by_number_and_pictures_beside_them_are_left(tmp_path):
+    images, warnings = read_images(make_semantic_nerf(tmp_path / "seq", 12, lines=15))
+    assert [image.name for image in images] == [f"rgb_{number}.png" for number in range(12)]
+    assert [image.world_from_cam[0, 3] for image in images] == list(range(12))
+    assert warnings == ("3 poses have no image and are passed over",)
+
+
+def test_lens_is_half_the_width_unless_the_sequence_says(tmp_path):
+    images, _ = read_images(make_semantic_nerf(tmp_path / "seq", 1))
+    assert images[0].K.tolist() == [[5, 0, 5], [0, 5, 3], [0, 0, 1]]  # of 10 x 6 px
+    write_sequence(tmp_path / "slam" / "room0", make_images(tmp_path / "own", 2))
+    images, _ = read_images(tmp_path / "slam" / "room0")
+    assert images[0].K.tolist() == [[7, 0, 5], [0, 7, 3], [0, 0, 1]]
+    lens = json.loads((tmp_path / "slam" / "cam_params.json").read_text())["camera"]
+    assert (lens["cx"], lens["cy"], lens["scale"]) == (4.5, 2.5, 6553.5)  # pixel centres from 0, as 599.5
+
+
+def test_published_lens_of_nice_slam(tmp_path):
+    Image.fromarray(np.zeros((68, 120, 3), np.uint8)).save(tmp_path / "small.png")
+    path = tmp_path / "room0" / "results"
+    path.mkdir(parents=True)
+    Image.fromarray(np.zeros((680, 1200, 3), np.uint8)).save(path / "frame000000.jpg")
+    (tmp_path / "room0" / "traj.txt").write_text(" ".join(map(str, np.eye(4).ravel())) + "\n")
+    images, _ = read_images(tmp_path / "room0")
+    assert images[0].K[0, 0] == 600 and images[0].K[:2, 2].tolist() == [600, 340]  # 599.5, 339.5 from 0
+
+
+def test_depth_scales_differ_by_layout(tmp_path):
+    images = make_images(tmp_path / "own", 1)
+    depth = np.full((6, 10), 2.5, np.float32)
+    depth[0, 0] = np.inf
+    write_sequence(tmp_path / "slam" / "room0", images, [depth])
+    stored = np.asarray(Image.open(tmp_path / "slam" / "room0" / "results" / "depth000000.png"))
+    assert stored[1, 1] == round(2.5 * 6553.5) and stored[0, 0] == 0
+    slam = read_depth(tmp_path / "slam" / "room0", 0)
+    assert slam[1, 1] == pytest.approx(2.5, abs=1e-4) and slam[0, 0] == 0
+    assert read_depth(make_semantic_nerf(tmp_path / "nerf", 1), 0)[1, 1] == 2.5  # 2500 millimetres
+    with pytest.raises(SceneError, match=r"frame 7 of .* has no depth image"):
+        read_depth(tmp_path / "nerf", 7)
+
+
+def test_labels_per_vertex_as_text(tmp_path):
+    places = {axis: XYZ[:, column] for column, axis in enumerate("xyz")}
+    for mesh, faces in (("quads", QUADS), ("triangles", QUADS[:, :3])):
+        write_ply(tmp_path / f"{mesh}.ply", places, faces, {})
+    labels, instances = tmp_path / "labels.txt", tmp_path / "instances.txt"
+    labels.write_text("20\n93\n-1\n-2\n20\n20\n20\n20\n")
+    instances.write_text("20001\n93002\n-1\n7\n20001\n20001\n20003\n20003\n")
+    for mesh in ("quads", "triangles"):
+        points = read_labelled_mesh(tmp_path / f"{mesh}.ply", labels, instances)
+        assert points.class_id.tolist() == [20, 93, 0, 0, 20, 20, 20, 20]
+        assert points.instance_id.tolist() == [20001, 93002, 0, 0, 20001, 20001, 20003, 20003]
+        assert points.faces.shape[1] == 3
+    with pytest.raises(SceneError, match=r"classes that Replica does not(.|\n)*found     20001 \(3 lines\)"):
+        read_labelled_mesh(tmp_path / "quads.ply", instances)
+    labels.write_text("20\n93\n")
+    with pytest.raises(SceneError, match=r"expected  8 lines\n  found     2"):
+        read_labelled_mesh(tmp_path / "quads.ply", labels)
+
+
+def test_a_scene_is_read_from_either_sequence(tmp_path):
+    make_habitat(tmp_path / "room_0" / "habitat")
+    with pytest.raises(SceneError, match=r"no rendered sequence(.|\n)*expected  room0/ or room_0/imap/00/"):
+        open_scene(tmp_path, "room_0")
+    make_semantic_nerf(tmp_path / "room_0" / "imap" / "00", 3)
+    assert len(open_scene(tmp_path, "room_0").images) == 3
+    write_sequence(tmp_path / "room0", make_images(tmp_path / "own", 2))
+    scene = open_scene(tmp_path, "room_0")
+    assert [image.name for image in scene.images] == ["frame000000.jpg", "frame000001.jpg"]
+    assert check_scene(tmp_path, "room_0").facts["replica classes"] == 2
+    assert DATASETS["replica"].found(tmp_path) == ("room_0",)
+
+
+def test_written_objects_count_from_one_and_undefined_ones_are_negative(tmp_path):
+    faces = np.array([[0, 1, 4], [1, 5, 4], [2, 3, 6]], np.int32)
+    write_semantic_mesh(tmp_path / "habitat", XYZ, faces, np.array([0, 1, -1], np.int32), [20, 0])
+    info = json.loads((tmp_path / "habitat" / "info_semantic.json").read_text())
+    assert info["id_to_label"] == [-2, 20, -1] and len(info["classes"]) == 101
+    points = read_semantic_mesh(tmp_path / "habitat")
+    assert points.class_id.tolist() == [20, 20, 0, 0, 20, 0, 0, 0]
+    np.testing.assert_array_equal(points.faces, faces)
+
+
+def refuse(message):
+    return pytest.raises(SceneError, match=message)
+
+
+def test_damage_is_answered_by_a_sentence_that_says_what_to_do(tmp_path):
+    habitat = make_habitat(tmp_path / "a", labels=(-2, 20))
+    with refuse(r"do not belong together\n  expected  object ids 0 to 1\n  found     1 to 3"):
+        read_semantic_mesh(habitat)
+    habitat = make_habitat(tmp_path / "b", labels=(-2, 20, 205, 93))
+    with refuse(r"classes that Replica does not(.|\n)*found     class id 205"):
+        read_semantic_mesh(habitat)
+    info = {"classes": [{"id": 20, "name": "sofa"}], "id_to_label": [0, 1, 2, 3]}
+    (habitat / "info_semantic.json").write_text(json.dumps(info))
+    with refuse(r"found     20 sofa"):
+        read_semantic_mesh(habitat)
+    (habitat / "info_semantic.json").write_text("{}")
+    with refuse(r"expected  an object with classes, id_to_label"):
+        read_semantic_mesh(habitat)
+    (habitat / "info_semantic.json").unlink()
+    with refuse(r"info_semantic\.json is missing\n  found     mesh_semantic\.ply"):
+        read_semantic_mesh(habitat)
+    with refuse(r"1 lines, 3 images, the first without a line is frame 1"):
+        read_images(make_semantic_nerf(tmp_path / "short", 3, lines=1))
+    make_semantic_nerf(tmp_path / "deep" / "room0" / "room0", 1)
+    with refuse(r"no rendered sequence(.|\n)*fix       name the folder .*room0/room0"):
+        read_images(tmp_path / "deep" / "room0")
+    (tmp_path / "short" / "traj_w_c.txt").write_text("1 0 0 0\n")
+    with refuse(r"line 1: cannot be read\n  expected  16 numbers"):
+        read_images(tmp_path / "short")
+    with refuse(r"room_1 of Replica has no labels(.|\n)*mesh_semantic\.ply, or semantic_labels_room1\.txt"):
+        open_scene(tmp_path, "room_1")

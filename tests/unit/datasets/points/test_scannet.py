@@ -1,0 +1,307 @@
+"""ScanNet by hand: a mesh of five vertices, two objects, frames that are numbered without zeros."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hilsplat.base.errors import MisalignedArtifactError, SceneError
+from hilsplat.datasets.classes.replica import REPLICA_48
+from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_19
+from hilsplat.datasets.classes.scannet200 import SCANNET200, SCANNET200_INSTANCES
+from hilsplat.datasets.classes.scannet_splits import VALIDATION_SCANS
+from hilsplat.datasets.points.posed_images import PosedImage, write_posed_images
+from hilsplat.datasets.points.scannet import LABEL_TABLE, check_scan, open_scan, read_label_table
+from hilsplat.datasets.points.scannet_write import write_label_table, write_scan
+from hilsplat.datasets.registry import DATASETS
+from hilsplat.datasets.sources import export_images
+from hilsplat.scene.known_poses import find_known_poses
+from hilsplat.scene.known_views import read_transforms
+from tests.conftest import PROJECT
+
+SCAN = "scene0000_00"
+CATEGORIES = {
+    "chair": (2, 5),
+    "stack of chairs": (2, 5),
+    "mattress": (1191, 4),
+    "wall": (1, 1),
+    "gizmo": (9999, 40),
+}
+XYZ = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [5, 5, 5]], np.float32)
+FACES = np.array([[0, 1, 2], [1, 3, 2]], np.int32)
+OBJECTS = ("wall", "mattress", "chair")
+OWNER = np.array([0, 0, 1, 2, -1], np.int32)
+"""Object of each vertex; the last has none."""
+
+
+def turned(degrees: float) -> np.ndarray:
+    pose = np.eye(4)
+    angle = np.radians(degrees)
+    pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    pose[:3, 3] = [degrees, 2.0, 3.0]
+    return pose
+
+
+def make_scan(root: Path, frames: int = 12, lost: tuple[int, ...] = ()) -> Path:
+    """Write the scan; frame n is turned by n degrees. Returns its folder."""
+    pictures = root.parent / "pictures"
+    pictures.mkdir(parents=True, exist_ok=True)
+    K = np.array([[10.0, 0, 8.25], [0, 10.0, 6.5], [0, 0, 1]])
+    images = []
+    for number in range(frames):
+        path = pictures / f"{number}.jpg"
+        Image.fromarray(np.full((12, 16, 3), number, np.uint8)).save(path)
+        images.append(PosedImage(path.name, path, np.linalg.inv(turned(number)), K, (12, 16)))
+    write_label_table(root, CATEGORIES)
+    write_scan(root, SCAN, images, XYZ, FACES, OWNER, OBJECTS, CATEGORIES, lost)
+    return root / "scans" / SCAN
+
+
+@pytest.fixture
+def root(tmp_path):
+    make_scan(tmp_path / "scannet")
+    return tmp_path / "scannet"
+
+
+def test_labels_and_instances_are_those_of_the_files(root):
+    scene = open_scan(root, SCAN)
+    points = scene.truth["nyu40"]
+    np.testing.assert_array_equal(points.xyz, XYZ)
+    np.testing.assert_array_equal(points.faces, FACES)
+    assert points.class_id.tolist() == [1, 1, 4, 5, 0]
+    assert points.instance_id.tolist() == [1, 1, 2, 3, 0]  # objectId + 1: the first object is not "none"
+    assert scene.truth["scannet200"].class_id.tolist() == [1, 1, 1191, 2, 0]
+    assert scene.warnings == ()
+
+
+def test_evaluated_sets_leave_out_what_they_lack(root):
+    truth = open_scan(root, SCAN).truth
+    # wall, bed and chair are rows 1, 4 and 5 of the 19, and rows 1, 3 and 4 of the 10
+    assert truth["nyu40"].labels(SCANNET_19).tolist() == [1, 1, 4, 5, 0]
+    assert truth["nyu40"].labels(SCANNET_10).tolist() == [1, 1, 3, 4, 0]
+    of_200 = truth["scannet200"].labels(SCANNET200)
+    assert of_200[2] == 200  # mattress, 1191, is the last
+    assert truth["scannet200"].labels(SCANNET200_INSTANCES).tolist() == [0, 0, 198, 1, 0]  # walls are none
+    with pytest.raises(MisalignedArtifactError, match=r"replica-48 are not defined on nyu40 labels"):
+        truth["nyu40"].labels(REPLICA_48)
+
+
+def test_frames_are_sorted_by_number_and_every_nth_counts_that_way(root):
+    names = [image.name for image in open_scan(root, SCAN).images]
+    assert names == [f"{number}.jpg" for number in range(12)]  # as text, 10 would come before 2
+    assert [image.name for image in open_scan(root, SCAN, every=5).images] == ["0.jpg", "5.jpg", "10.jpg"]
+
+
+def test_poses_are_inverted_and_centres_moved_by_half_a_pixel(root):
+    image = open_scan(root, SCAN).images[3]
+    np.testing.assert_allclose(image.world_from_cam, turned(3), atol=1e-12)
+    # the file counts pixel centres from 0
+    stored = np.loadtxt(root / "scans" / SCAN / "intrinsic" / "intrinsic_color.txt")
+    assert stored[:2, 2].tolist() == [7.75, 6.0]
+    assert image.K[:2, 2].tolist() == [8.25, 6.5]
+    assert image.size_hw == (12, 16)
+
+
+def test_frames_without_a_pose_are_passed_over_and_told(tmp_path):
+    folder = make_scan(tmp_path / "scannet", frames=5, lost=(1, 3))
+    (folder / "pose" / "4.txt").unlink()
+    scene = open_scan(tmp_path / "scannet", SCAN)
+    assert [image.name for image in scene.images] == ["0.jpg", "2.jpg"]
+    assert scene.warnings[0].startswith("2 frames were lost by tracking")
+    assert scene.warnings[1] == "1 images have no file in pose/ and are passed over, first 4"
+
+
+def test_a_scan_without_any_pose_is_refused(tmp_path):
+    make_scan(tmp_path / "scannet", frames=2, lost=(0, 1))
+    with pytest.raises(
+        SceneError, match=r"no frame of scene0000_00 can be used\n.*\n  found     2 images; 0 .* 2 lost"
+    ):
+        open_scan(tmp_path / "scannet", SCAN)
+
+
+def test_alignment_is_off_by_default_and_turns_mesh_and_cameras_together(root):
+    folder = root / "scans" / SCAN
+    turn = turned(90)
+    info = folder / f"{SCAN}.txt"
+    info.write_text(f"axisAlignment = {' '.join(map(str, turn.ravel()))}\nsceneType = Office\n")
+    plain, aligned = open_scan(root, SCAN), open_scan(root, SCAN, aligned=True)
+    np.testing.assert_array_equal(plain.truth["nyu40"].xyz, XYZ)
+    # 90 degrees: x becomes y, then the translation (90, 2, 3)
+    np.testing.assert_allclose(aligned.truth["nyu40"].xyz[1], [90, 3, 3], atol=1e-5)
+    for before, after in zip(plain.images, aligned.images, strict=True):
+        seen = before.cam_from_world @ [1, 0, 0, 1]
+        np.testing.assert_allclose(after.cam_from_world @ [90, 3, 3, 1], seen, atol=1e-9)
+
+
+def test_a_category_that_the_table_lacks_has_no_class_and_is_told(root):
+    folder = root / "scans" / SCAN
+    path = folder / f"{SCAN}.aggregation.json"
+    path.write_text(path.read_text().replace('"chair"', '"trashcan"'))
+    scene = open_scan(root, SCAN)
+    assert scene.truth["scannet200"].class_id.tolist() == [1, 1, 1191, 0, 0]
+    assert scene.truth["scannet200"].instance_id.tolist() == [1, 1, 2, 3, 0]
+    assert scene.warnings[0].endswith("trashcan (1)")
+
+
+def test_of_two_groups_that_claim_a_vertex_the_later_one_wins(root):
+    path = root / "scans" / SCAN / f"{SCAN}.aggregation.json"
+    record = json.loads(path.read_text())
+    record["segGroups"][2]["segments"] += record["segGroups"][1]["segments"]  # the chair claims the mattress
+    path.write_text(json.dumps(record))
+    assert open_scan(root, SCAN).truth["scannet200"].class_id.tolist() == [1, 1, 2, 2, 0]
+
+
+def test_nyu40_follows_from_the_category_and_ids_outside_the_200_are_none(root):
+    path = root / LABEL_TABLE
+    # real rows: id 107 occurs with two NYU40 ids; cells may be empty
+    path.write_text("id\traw_category\tcount\tnyu40id\n107\tone\t\t38\n107\tother\t\t40\n5\tdoor\t\t\n")
+    table = read_label_table(path)
+    assert table.nyu40 == {"one": 38, "other": 40, "door": 0}
+    assert table.scannet200["door"] == 5
+    write_label_table(root, CATEGORIES)
+    assert read_label_table(path).scannet200["gizmo"] == 0
+
+
+def break_json(folder: Path) -> None:
+    (folder / f"{SCAN}.aggregation.json").write_text('{"segGroups": [')
+
+
+def break_labels(folder: Path) -> None:
+    # the plain mesh gets a vertex more than its labels
+    from hilsplat.datasets.points.point_files import write_ply
+
+    more = np.concatenate([XYZ, XYZ[:1]])
+    write_ply(folder / f"{SCAN}_vh_clean_2.ply", {a: more[:, i] for i, a in enumerate("xyz")}, FACES, {})
+
+
+def break_places(folder: Path) -> None:
+    path = folder / f"{SCAN}_vh_clean_2.ply"
+    data = bytearray(path.read_bytes())
+    start = data.index(b"end_header\n") + len(b"end_header\n")
+    data[start : start + 4] = np.float32(0.5).tobytes()
+    path.write_bytes(bytes(data))
+
+
+def break_mesh(folder: Path) -> None:
+    path = folder / f"{SCAN}_vh_clean_2.labels.ply"
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def break_segments(folder: Path) -> None:
+    (folder / f"{SCAN}_vh_clean_2.0.010000.segs.json").write_text('{"segIndices": [1, 2]}')
+
+
+def break_groups(folder: Path) -> None:
+    path = folder / f"{SCAN}.aggregation.json"
+    path.write_text(json.dumps({"segGroups": [{"objectId": 0, "label": "wall", "segments": [123456]}]}))
+
+
+def break_group(folder: Path) -> None:
+    path = folder / f"{SCAN}.aggregation.json"
+    path.write_text(json.dumps({"segGroups": [{"label": "wall", "segments": [7]}]}))
+
+
+def break_archive(folder: Path) -> None:
+    (folder / f"{SCAN}_vh_clean_2.labels.ply").unlink()
+
+
+def break_name(folder: Path) -> None:
+    (folder / "color" / "0.jpg").rename(folder / "color" / "first.jpg")
+
+
+def break_pose(folder: Path) -> None:
+    (folder / "pose" / "0.txt").write_text("2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+
+
+def break_pose_shape(folder: Path) -> None:
+    (folder / "pose" / "0.txt").write_text("1 0 0\n")
+
+
+def break_table(folder: Path) -> None:
+    (folder.parents[1] / LABEL_TABLE).write_text("id,raw_category,nyu40id\n")
+
+
+def break_depth_of_folder(folder: Path) -> None:
+    inner = folder / SCAN
+    folder.rename(folder.with_name("aside"))
+    folder.mkdir()
+    folder.with_name("aside").rename(inner)
+
+
+def break_scans_folder(folder: Path) -> None:
+    folder.rename(folder.parents[1] / SCAN)
+
+
+def break_sens(folder: Path) -> None:
+    (folder / f"{SCAN}.sens").write_bytes(b"")
+    (folder / "color").rename(folder / "colour")
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (break_json, r"aggregation\.json is not valid JSON(.|\n)*fix "),
+        (break_labels, r"does not belong to(.|\n)*expected  the same 6 vertices(.|\n)*found     5 vertices"),
+        (break_places, r"does not belong to(.|\n)*found     vertices elsewhere"),
+        (break_mesh, r"labels\.ply cannot be read(.|\n)*found     a file of \d+ bytes(.|\n)*fix "),
+        (break_segments, r"segs\.json does not belong(.|\n)*each of 5 vertices(.|\n)*found     2 values"),
+        (break_groups, r"group 0 \(wall\): none of its segments(.|\n)*fix "),
+        (break_group, r"group 0: cannot be read: KeyError\('objectId'\)"),
+        (break_archive, r"scene0000_00 of ScanNet v2 is incomplete(.|\n)*labels\.ply(.|\n)*unpack"),
+        (break_name, r"first\.jpg is not named as a frame\n  expected  <number>\.jpg"),
+        (break_pose, r"0\.txt: the pose is no rotation"),
+        (break_pose_shape, r"0\.txt, line 1: cannot be read\n  expected  4 numbers\n  found     1 0 0"),
+        (break_table, r"is no table of ScanNet's labels(.|\n)*found     id,raw_category,nyu40id"),
+        (break_depth_of_folder, r"wrong place(.|\n)*fix       move .*scene0000_00/scene0000_00 to"),
+        (break_scans_folder, r"wrong place(.|\n)*fix       move .*scannet/scene0000_00 to .*scans"),
+        (break_sens, r"still inside scene0000_00\.sens(.|\n)*SensReader"),
+    ],
+)
+def test_damage_is_answered_by_a_sentence_that_says_what_to_do(root, damage, message):
+    damage(root / "scans" / SCAN)
+    with pytest.raises(SceneError, match=message):
+        open_scan(root, SCAN)
+
+
+def test_the_importer_reads_the_same_cameras(root, tmp_path):
+    images = open_scan(root, SCAN).images[:3]
+    folder = tmp_path / "posed"
+    write_posed_images(folder, images)
+    views, points = read_transforms(find_known_poses(folder))
+    assert points is None and len(views) == 3
+    for view, image in zip(views, images, strict=True):
+        assert view.image == folder / "images" / image.name
+        assert view.image.read_bytes() == image.image.read_bytes()
+        np.testing.assert_allclose(view.cam_from_source, image.cam_from_world, atol=1e-9)
+        np.testing.assert_allclose(view.camera.calibration_matrix(), image.K)
+        assert (view.camera.height, view.camera.width) == image.size_hw
+    with pytest.raises(SceneError, match=r"twice: 0\.jpg"):
+        write_posed_images(folder, [images[0], images[0]])
+
+
+def test_the_mesh_becomes_the_sparse_points_in_its_order(root, tmp_path):
+    export_images(f"scannet/{SCAN}", root.parent, tmp_path / "source")
+    views, (xyz, _) = read_transforms(find_known_poses(tmp_path / "source"))
+    truth = open_scan(root, SCAN)
+    assert len(views) == len(truth.images)
+    np.testing.assert_array_equal(xyz, truth.truth["nyu40"].xyz.astype(np.float32))
+
+
+def test_validation_scans_are_the_benchmarks():
+    assert len(VALIDATION_SCANS) == len(set(VALIDATION_SCANS)) == 312
+    assert "scene0645_00" in VALIDATION_SCANS and "scene0000_00" not in VALIDATION_SCANS
+    path = PROJECT.parent / "shared/reference/samples/scannet/scannetv2_val.txt"
+    if not path.is_file():
+        pytest.skip("ScanNet's list of scans is not beside the checkout (shared/reference/samples/scannet)")
+    assert set(path.read_text().split()) == set(VALIDATION_SCANS)
+
+
+def test_registry_checks_a_scan(root):
+    report = check_scan(root, SCAN)
+    assert report.facts["posed images"] == 12
+    assert report.facts["nyu40 points with a class"] == 4
+    assert report.facts["scannet200 classes"] == 3
+    for name in ("scannet", "scannet200"):
+        assert DATASETS[name].found(root) == (SCAN,)

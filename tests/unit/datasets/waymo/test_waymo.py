@@ -1,0 +1,421 @@
+"""Waymo by hand: a range image of one row, a camera with round numbers, records made by protobuf itself."""
+
+import struct
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+from hilsplat.base.errors import SceneError
+from hilsplat.datasets.registry import DATASETS
+from hilsplat.datasets.waymo import records as tfrecords
+from hilsplat.datasets.waymo.frames import CameraShot, LidarFrame, LidarReturn, frame_points
+from hilsplat.datasets.waymo.geometry import (
+    WaymoCamera,
+    beam_inclinations,
+    column_azimuths,
+    range_image_points,
+    rotation_of,
+)
+from hilsplat.datasets.waymo.reader import RECORD, check_segment, open_segment
+from hilsplat.datasets.waymo.records import fields_of, masked_crc32c, matrix, packed_varints
+from hilsplat.datasets.waymo.write import write_segment
+from tests.conftest import PROJECT
+
+SEGMENT = "1_2_000_3_000"
+SQRT2 = np.sqrt(2.0)
+LENS = np.array([2000.0, 2000, 960, 640, 0, 0, 0, 0, 0])
+POINT = np.array([[10.0, 1.0, -0.5]])
+
+
+def turned(degrees: float, x: float = 0.0) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_of(np.array([0.0, 0.0, np.radians(degrees)]))
+    pose[0, 3] = x
+    return pose
+
+
+def camera(**changes) -> WaymoCamera:
+    lens = LENS.copy()
+    for name, value in changes.items():
+        lens[["f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3"].index(name)] = value
+    return WaymoCamera("FRONT", lens, np.eye(4), (1280, 1920))
+
+
+def one_return(ranges, classes, instances=None, cameras=None) -> LidarReturn:
+    """A return of one row."""
+    width = len(ranges)
+    image = np.zeros((1, width, 4), np.float32)
+    image[0, :, 0] = ranges
+    labels = np.zeros((1, width, 2), np.int32)
+    labels[0, :, 1] = classes
+    labels[0, :, 0] = instances if instances is not None else 0
+    cells = np.zeros((1, width, 6), np.int32)
+    cells[0, :, 0] = cameras if cameras is not None else 0
+    return LidarReturn(image, labels, cells)
+
+
+def make_frame(
+    time: int = 1000, vehicle: np.ndarray | None = None, lidar: np.ndarray | None = None
+) -> LidarFrame:
+    """Four columns, range 2 all around; the second return has two hits, one of them unlabelled."""
+    vehicle = np.eye(4) if vehicle is None else vehicle
+    yaw = np.arctan2(vehicle[1, 0], vehicle[0, 0])
+    pose = np.tile(np.float32([0, 0, yaw, *vehicle[:3, 3]]), (1, 4, 1))
+    first = one_return([2, 2, 2, 2], [1, 14, 15, 18], [7, 0, 0, 0], [1, 0, 3, 0])
+    second = one_return([-1, 4, 0, 6], [22, 10, 22, 0], [0, 9, 0, 0], [0, 0, 0, 5])
+    lidar = np.eye(4) if lidar is None else lidar
+    return LidarFrame(time, vehicle, lidar, np.zeros(1), pose, (first, second))
+
+
+def make_shots(vehicle: np.ndarray) -> list[CameraShot]:
+    side = replace(camera(), name="SIDE_LEFT", vehicle_from_cam=turned(90), size_hw=(886, 1920))
+    return [
+        CameraShot(time, lens, b"jpeg %d" % time, vehicle)
+        for time in (1000, 2000, 3000)
+        for lens in (camera(), side)
+    ]
+
+
+# --- geometry -------------------------------------------------------------------------------------
+
+
+def test_columns_look_from_the_left_back_round_to_the_right_back():
+    np.testing.assert_allclose(np.degrees(column_azimuths(4, np.eye(4))), [135, 45, -45, -135])
+    # a lidar turned by 30 degrees: its own azimuths are 30 less, those in the vehicle stay
+    np.testing.assert_allclose(np.degrees(column_azimuths(4, turned(30))), [105, 15, -75, -165])
+
+
+@pytest.mark.parametrize("turn", [0, 30, 148])
+def test_four_columns_at_range_two(turn):
+    points = range_image_points(np.full((1, 4), 2.0), np.zeros(1), turned(turn))[0]
+    expected = [[-SQRT2, SQRT2, 0], [SQRT2, SQRT2, 0], [SQRT2, -SQRT2, 0], [-SQRT2, -SQRT2, 0]]
+    np.testing.assert_allclose(points, expected, atol=1e-12)
+
+
+def test_the_first_row_is_the_highest_beam():
+    # two beams share -20 to 0 degrees: -15 and -5
+    even = beam_inclinations(None, np.radians(-20), 0.0, 2)
+    np.testing.assert_allclose(np.degrees(even), [-5, -15])
+    np.testing.assert_allclose(beam_inclinations(np.array([-0.3, -0.1, 0.2]), 0.0, 0.0, 3), [0.2, -0.1, -0.3])
+    points = range_image_points(np.ones((2, 4)), even, np.eye(4))
+    np.testing.assert_allclose(points[:, 0, 2], np.sin(np.radians([-5, -15])))
+
+
+def test_rotation_is_yaw_after_pitch_after_roll():
+    roll, pitch, yaw = np.pi / 2 * np.eye(3)
+    np.testing.assert_allclose(rotation_of(yaw) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(rotation_of(pitch) @ [1, 0, 0], [0, 0, -1], atol=1e-12)
+    np.testing.assert_allclose(rotation_of(roll) @ [0, 1, 0], [0, 0, 1], atol=1e-12)
+    # roll takes y to z, pitch takes z to x, yaw takes x to y
+    np.testing.assert_allclose(rotation_of(roll + pitch + yaw) @ [0, 1, 0], [0, 1, 0], atol=1e-12)
+
+
+def test_camera_model_by_hand():
+    np.testing.assert_allclose(camera().project(POINT)[0], [[760, 740]])
+    # r^2 = 0.01 + 0.0025, so k1 = 0.1 stretches by 1.00125
+    np.testing.assert_allclose(camera(k1=0.1).project(POINT)[0], [[759.75, 740.125]])
+    # u = -0.1, v = 0.05: p1 adds 2000 * 0.1 * 2uv = -2 and 2000 * 0.1 * (r^2 + 2v^2) = 3.5
+    np.testing.assert_allclose(camera(p1=0.1).project(POINT)[0], [[758, 743.5]])
+
+
+def test_projections_behind_or_far_out_of_the_lens_are_invalid():
+    points = np.array([[10.0, 0, 0], [-10.0, 0, 0], [1.0, 2.0, 0]])
+    assert camera(k1=0.1).project(points)[1].tolist() == [True, False, False]  # 1 + 0.1 * 4 = 1.4
+
+
+def test_opencv_axes_give_the_same_pixel():
+    """Half a pixel: Waymo's 0 is the left edge of the first pixel, as here, so K is taken as it is."""
+    vehicle = turned(40, x=7.0)
+    lens = replace(camera(), vehicle_from_cam=turned(90))
+    in_world = vehicle @ turned(90) @ [*POINT[0], 1]
+    x, y, z, _ = lens.cam_from_world(vehicle) @ in_world
+    np.testing.assert_allclose([x, y, z], [-1, 0.5, 10], atol=1e-12)
+    np.testing.assert_allclose((lens.K @ [x, y, z])[:2] / z, [760, 740])
+    assert camera(k1=1, k2=2, p1=3, p2=4, k3=5).distortion == (1, 2, 3, 4, 5)
+
+
+def test_each_return_has_its_own_mask_and_channel_one_is_the_class():
+    points = frame_points(make_frame(), np.eye(4))
+    assert points.class_id.tolist() == [1, 14, 15, 18, 10, 0]
+    assert points.instance_id.tolist() == [7, 0, 0, 0, 9, 0]
+    assert points.visible.tolist() == [True, False, True, False, False, True]
+    np.testing.assert_allclose(points.xyz[4], [2 * SQRT2, 2 * SQRT2, 0])  # range 4 in column 1
+    np.testing.assert_allclose(points.xyz[5], [-3 * SQRT2, -3 * SQRT2, 0])  # range 6 in column 3
+
+
+def test_pixel_poses_move_points_into_the_world():
+    frame = make_frame()
+    pose = np.zeros((1, 4, 6), np.float32)
+    pose[0, 1] = [0, 0, np.pi / 2, 10, 0, 1]  # column 1 was measured a quarter turn and 10 m later
+    points = frame_points(replace(frame, pixel_pose=pose), np.eye(4))
+    np.testing.assert_allclose(points.xyz[0], [-SQRT2, SQRT2, 0], atol=1e-6)
+    np.testing.assert_allclose(points.xyz[1], [10 - SQRT2, SQRT2, 1], atol=1e-6)
+    # the second return has no poses of its own and uses the first's
+    np.testing.assert_allclose(points.xyz[4], [10 - 2 * SQRT2, 2 * SQRT2, 1], atol=1e-6)
+
+
+# --- release 2 ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def root(tmp_path):
+    vehicle = turned(90, x=20000.0)
+    frames = [make_frame(1000, vehicle, turned(30)), make_frame(3000, vehicle, turned(30))]
+    write_segment(tmp_path / "waymo" / "validation", SEGMENT, frames, make_shots(vehicle))
+    return tmp_path / "waymo"
+
+
+def test_a_written_segment_reads_back_in_the_frame_of_its_first_vehicle(root):
+    scene = open_segment(root, SEGMENT)
+    truth = scene.truth["waymo"]
+    one = frame_points(make_frame(), np.eye(4))
+    np.testing.assert_allclose(truth.xyz, np.tile(one.xyz, (2, 1)), atol=2e-3)  # pixel poses are float32
+    assert truth.class_id.tolist() == one.class_id.tolist() * 2
+    assert truth.instance_id.tolist() == one.instance_id.tolist() * 2
+    assert truth.visible.tolist() == one.visible.tolist() * 2
+    assert [image.name for image in scene.images[:3]] == [
+        "1000_FRONT.jpg",
+        "1000_SIDE_LEFT.jpg",
+        "2000_FRONT.jpg",
+    ]
+    assert scene.images[2].image == b"jpeg 2000" and scene.images[1].size_hw == (886, 1920)
+    np.testing.assert_allclose(scene.images[0].cam_from_world @ [10, 1, -0.5, 1], [-1, 0.5, 10, 1], atol=1e-9)
+    assert [image.name for image in open_segment(root, SEGMENT, every=2).images[::2]] == [
+        "1000_FRONT.jpg",
+        "3000_FRONT.jpg",
+    ]
+
+
+def test_registry_finds_and_checks_the_segments_that_are_there(root):
+    dataset = DATASETS["waymo"]
+    assert dataset.locate(root.parent) == root and dataset.found(root) == (SEGMENT,)
+    assert dataset.missing(root, SEGMENT) == ()
+    report = check_segment(root, SEGMENT)
+    assert report.facts["waymo points that a camera sees"] == 6
+    (root / "validation" / "vehicle_pose" / f"{SEGMENT}.parquet").unlink()
+    assert dataset.missing(root, SEGMENT) == (f"validation/vehicle_pose/{SEGMENT}.parquet",)
+
+
+def test_projections_are_optional_and_told(root):
+    (root / "validation" / "lidar_camera_projection" / f"{SEGMENT}.parquet").unlink()
+    scene = open_segment(root, SEGMENT)
+    assert scene.truth["waymo"].visible is None
+    assert scene.warnings[0].startswith("lidar_camera_projection is missing")
+
+
+def test_damaged_components_are_answered_by_a_sentence(root):
+    def path(tag: str) -> Path:
+        return root / "validation" / tag / f"{SEGMENT}.parquet"
+
+    whole = path("lidar_pose").read_bytes()
+    path("lidar_pose").write_bytes(whole[:200])
+    with pytest.raises(SceneError, match=r"cannot be read(.|\n)*found     a file of 200 bytes(.|\n)*fix "):
+        open_segment(root, SEGMENT)
+    path("lidar_pose").write_bytes(path("lidar").read_bytes())
+    with pytest.raises(SceneError, match=r"is not the component lidar_pose of release 2"):
+        open_segment(root, SEGMENT)
+    path("lidar_pose").unlink()
+    with pytest.raises(
+        SceneError, match=r"component lidar_pose of segment .* is missing(.|\n)*fix       download"
+    ):
+        open_segment(root, SEGMENT)
+    (root / "validation").rename(root / "waymo")
+    (root / "all").mkdir()
+    (root / "waymo").rename(root / "all" / "validation")
+    with pytest.raises(SceneError, match=r"one level too deep\n  fix       move .*all/validation to"):
+        open_segment(root, SEGMENT)
+
+
+def test_images_and_classes_that_do_not_fit_are_refused():
+    frame = make_frame()
+    with pytest.raises(SceneError, match=r"return 1 of the top lidar at 1000(.|\n)*an inclination per row"):
+        frame_points(replace(frame, inclinations=np.zeros(2)), np.eye(4))
+    strange = replace(frame, returns=(one_return([1, 1], [3, 23]),), pixel_pose=frame.pixel_pose[:, :2])
+    with pytest.raises(SceneError, match=r"unknown class\n  expected  0 to 22\n  found     3 to 23"):
+        frame_points(strange, np.eye(4))
+
+
+# --- release 1 ------------------------------------------------------------------------------------
+
+DOUBLE, FLOAT, INT64, INT32, STRING, MESSAGE, BYTES = 1, 2, 3, 5, 9, 11, 12
+FIELDS = {  # message -> name, number, type, repeated; a type that is a word is a message
+    "Shape": [("dims", 1, INT32, True)],
+    "MatrixFloat": [("data", 1, FLOAT, True), ("shape", 2, "Shape", False)],
+    "MatrixInt32": [("data", 1, INT32, True), ("shape", 2, "Shape", False)],
+    "Transform": [("transform", 1, DOUBLE, True)],
+    "CameraCalibration": [
+        ("name", 1, INT32, False), ("intrinsic", 2, DOUBLE, True), ("extrinsic", 3, "Transform", False),
+        ("width", 4, INT32, False), ("height", 5, INT32, False),
+    ],
+    "LaserCalibration": [
+        ("name", 1, INT32, False), ("beam_inclinations", 2, DOUBLE, True), ("low", 3, DOUBLE, False),
+        ("high", 4, DOUBLE, False), ("extrinsic", 5, "Transform", False),
+    ],
+    "Context": [
+        ("name", 1, STRING, False), ("cameras", 2, "CameraCalibration", True),
+        ("lasers", 3, "LaserCalibration", True),
+    ],
+    "RangeImage": [("range", 2, BYTES, False), ("cells", 3, BYTES, False), ("pose", 4, BYTES, False),
+                   ("labels", 6, BYTES, False)],
+    "Laser": [("name", 1, INT32, False), ("first", 2, "RangeImage", False),
+              ("second", 3, "RangeImage", False)],
+    "Image": [("name", 1, INT32, False), ("image", 2, BYTES, False), ("pose", 3, "Transform", False)],
+    "Frame": [
+        ("context", 1, "Context", False), ("timestamp_micros", 2, INT64, False),
+        ("pose", 3, "Transform", False),
+        ("images", 4, "Image", True), ("lasers", 5, "Laser", True),
+    ],
+}  # fmt: skip
+
+
+def protobuf_messages():
+    """Waymo's messages, as far as they are read, built by protobuf: the reference for our own reader."""
+    file = descriptor_pb2.FileDescriptorProto(name="w.proto", package="w", syntax="proto2")
+    for message, fields in FIELDS.items():
+        described = file.message_type.add(name=message)
+        for name, number, kind, repeated in fields:
+            field = described.field.add(name=name, number=number, label=3 if repeated else 1)
+            if isinstance(kind, str):
+                field.type, field.type_name = MESSAGE, f".w.{kind}"
+            else:
+                field.type = kind
+                field.options.packed = repeated and kind in (FLOAT, INT32) and name == "data"
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    find = pool.FindMessageTypeByName
+    return {name: message_factory.GetMessageClass(find(f"w.{name}")) for name in FIELDS}
+
+
+PROTO = protobuf_messages()
+
+
+def compressed(image: np.ndarray) -> bytes:
+    kind = "MatrixInt32" if image.dtype.kind == "i" else "MatrixFloat"
+    message = PROTO[kind](data=image.ravel().tolist(), shape={"dims": image.shape})
+    return zlib.compress(message.SerializeToString())
+
+
+def encoded(frame: LidarFrame, shots: list[CameraShot], labelled: bool = True) -> bytes:
+    message = PROTO["Frame"](timestamp_micros=frame.timestamp_micros)
+    message.pose.transform.extend(frame.world_from_vehicle.ravel())
+    message.context.name = SEGMENT
+    for number, name in ((4, "SIDE_LEFT"), (1, "FRONT")):
+        lens = next(shot.camera for shot in shots if shot.camera.name == name)
+        added = message.context.cameras.add(
+            name=number, intrinsic=lens.intrinsic, width=lens.size_hw[1], height=lens.size_hw[0]
+        )
+        added.extrinsic.transform.extend(lens.vehicle_from_cam.ravel())
+    message.context.lasers.add(name=2)
+    laser = message.context.lasers.add(name=1, low=-0.1, high=0.1)  # one beam in the middle: 0
+    laser.extrinsic.transform.extend(frame.vehicle_from_lidar.ravel())
+    for shot in shots:
+        if shot.timestamp_micros == frame.timestamp_micros:
+            image = message.images.add(name=1 if shot.camera.name == "FRONT" else 4, image=shot.encoded)
+            image.pose.transform.extend(shot.world_from_vehicle.ravel())
+    message.lasers.add(name=2)
+    top = message.lasers.add(name=1)
+    for name, part in zip(("first", "second"), frame.returns, strict=True):
+        target = getattr(top, name)
+        target.range, target.cells = compressed(part.image), compressed(part.projection)
+        if labelled:
+            target.labels = compressed(part.labels)
+    top.first.pose = compressed(frame.pixel_pose)
+    return message.SerializeToString()
+
+
+def write_records(path: Path, records: list[bytes]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as stream:
+        for record in records:
+            length = struct.pack("<Q", len(record))
+            stream.write(length + struct.pack("<I", masked_crc32c(length)) + record + b"\0\0\0\0")
+    return path
+
+
+def test_checksum_is_the_one_of_tfrecords():
+    # CRC-32C of "123456789" is e3069283 (RFC 3720); turned by 15 bits, plus a282ead8
+    crc = 0xE3069283
+    assert masked_crc32c(b"123456789") == ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
+
+
+def test_packed_numbers_and_fields_by_hand():
+    assert packed_varints(b"\x01\xac\x02\x00").tolist() == [1, 300, 0]  # 300 is ac 02
+    assert packed_varints(b"\xff" * 9 + b"\x01").tolist() == [-1]
+    assert packed_varints(b"").tolist() == []
+    fields = fields_of(b"\x08\x96\x01\x12\x02hi\x08\x01")  # 1: 150, 2: "hi", 1: 1
+    assert fields[1] == [150, 1] and bytes(fields[2][0]) == b"hi"
+    for damaged in (b"\x08\x96", b"\x12\x05hi", b"\x0b"):
+        with pytest.raises(ValueError, match=r"ends inside|wire type 3"):
+            fields_of(damaged)
+
+
+def test_matrices_agree_with_protobuf():
+    rng = np.random.default_rng(1)
+    whole = rng.integers(-(2**31), 2**31, (3, 4, 2)).astype(np.int32)
+    np.testing.assert_array_equal(matrix(compressed(whole), whole_numbers=True), whole)
+    real = rng.normal(size=(2, 3, 4)).astype(np.float32)
+    np.testing.assert_array_equal(matrix(compressed(real), whole_numbers=False), real)
+
+
+def test_both_releases_give_the_same_scene(root, tmp_path):
+    vehicle = turned(90, x=20000.0)
+    shots = make_shots(vehicle)
+    frames = [make_frame(time, vehicle, turned(30)) for time in (1000, 2000, 3000)]
+    records = [encoded(frame, shots, labelled=frame.timestamp_micros != 2000) for frame in frames]
+    name = RECORD.format(split="validation", segment=SEGMENT)
+    write_records(tmp_path / "old" / name, records)
+    old, new = open_segment(tmp_path / "old", SEGMENT), open_segment(root, SEGMENT)
+    for field in ("xyz", "class_id", "instance_id", "visible"):
+        np.testing.assert_array_equal(getattr(old.truth["waymo"], field), getattr(new.truth["waymo"], field))
+    assert [image.name for image in old.images] == [image.name for image in new.images]
+    for first, second in zip(old.images, new.images, strict=True):
+        assert first.image == second.image and first.size_hw == second.size_hw
+        np.testing.assert_array_equal(first.cam_from_world, second.cam_from_world)
+    assert DATASETS["waymo"].found(tmp_path / "old") == (SEGMENT,)
+    # without its prefix and in a folder of its split
+    write_records(
+        tmp_path / "other" / "validation" / name.removeprefix("individual_files_validation_"), records
+    )
+    assert len(open_segment(tmp_path / "other", SEGMENT).images) == 6
+
+
+def test_a_record_that_is_cut_off_or_unlabelled_is_refused(tmp_path):
+    shots = make_shots(np.eye(4))
+    record = encoded(make_frame(), shots, labelled=False)
+    path = write_records(tmp_path / RECORD.format(split="validation", segment=SEGMENT), [record])
+    with pytest.raises(SceneError, match=r"no frame with labels of the top lidar"):
+        open_segment(tmp_path, SEGMENT)
+    path.write_bytes(path.read_bytes()[:-30])
+    with pytest.raises(SceneError, match=r"record 0 is damaged or cut off(.|\n)*expected  a TFRecord file"):
+        open_segment(tmp_path, SEGMENT)
+    path.write_bytes(b"no record at all")
+    with pytest.raises(SceneError, match=r"record 0 is damaged"):
+        open_segment(tmp_path, SEGMENT)
+    write_records(path, [b"\x0b"])
+    with pytest.raises(SceneError, match=r"frame 0 cannot be read: wire type 3"):
+        open_segment(tmp_path, SEGMENT)
+
+
+def test_published_label_file_holds_all_classes():
+    """The file of Waymo's metrics tool: frames and lasers are fields 1, labels field 6 of a return."""
+    path = PROJECT.parent / "shared/reference/samples/waymo/fake_segmentation_groundtruths.bin"
+    if not path.is_file():
+        pytest.skip("Waymo's test files are not beside the checkout (shared/reference/samples/waymo)")
+    frames = [fields_of(frame) for frame in fields_of(path.read_bytes())[1]]
+    assert [frame[3] for frame in frames] == [[0], [1000000], [2000000]] * 2
+    labels = [
+        matrix(fields_of(fields_of(frame[1][0])[number][0])[6][0], whole_numbers=True)
+        for frame in frames
+        for number in (2, 3)
+    ]
+    assert len(labels) == 12 and all(image.size == 50 * 1000 for image in labels)
+    assert set(np.unique(np.concatenate([image.ravel() for image in labels]))) >= set(range(1, 23))
+
+
+def test_first_pose_of_an_empty_file_is_refused(tmp_path):
+    with pytest.raises(SceneError, match=r"holds no frame"):
+        tfrecords.first_pose(write_records(tmp_path / "empty.tfrecord", []))

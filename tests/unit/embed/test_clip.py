@@ -1,0 +1,251 @@
+"""CLIP folders, crops and texts, with hand-made networks whose vectors can be computed by hand."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+from tokenizers import Tokenizer, models, pre_tokenizers
+
+from hilsplat.base.artifacts import read_index, read_npy, sha256_of_path
+from hilsplat.base.errors import MisalignedArtifactError, ModelError, SettingsError
+from hilsplat.base.images import write_png
+from hilsplat.base.onnx_models import Network
+from hilsplat.configuration import parse_section
+from hilsplat.embed.clip import ClipModel, unit
+from hilsplat.embed.model_check import check_model
+from hilsplat.embed.stage import run_clip
+from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.settings import ClipSettings
+
+WORDS = ["red", "green", "blue"]
+
+
+def save(path: Path, nodes: list, inputs: list, outputs: list, constants: dict[str, np.ndarray]) -> None:
+    initialisers = [numpy_helper.from_array(value, name) for name, value in constants.items()]
+    graph = helper.make_graph(nodes, "hand-made", inputs, outputs, initialisers)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    onnx.checker.check_model(model)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(model.SerializeToString())
+
+
+@pytest.fixture
+def colour_clip(tmp_path) -> Path:
+    """A CLIP of 4-px crops: an image is its mean colour, a text the sum of its words' colours."""
+    folder = tmp_path / "clip"
+    value = helper.make_tensor_value_info
+    save(
+        folder / "vision_model.onnx",
+        [helper.make_node("ReduceMean", ["pixel_values"], ["image_embeds"], axes=[2, 3], keepdims=0)],
+        [value("pixel_values", TensorProto.FLOAT, ["batch", 3, 4, 4])],
+        [value("image_embeds", TensorProto.FLOAT, ["batch", 3])],
+        {},
+    )
+    save(
+        folder / "text_model.onnx",
+        [
+            helper.make_node("Gather", ["table", "input_ids"], ["words"]),
+            helper.make_node("ReduceSum", ["words", "one"], ["text_embeds"], keepdims=0),
+        ],
+        [value("input_ids", TensorProto.INT64, ["batch", "words_of_text"])],
+        [value("text_embeds", TensorProto.FLOAT, ["batch", 3])],
+        {"table": np.concatenate([np.zeros((1, 3)), np.eye(3)]).astype(np.float32), "one": np.array([1])},
+    )
+    (folder / "config.json").write_text(
+        json.dumps({"model_type": "clip", "text_config": {"max_position_embeddings": 4}})
+    )
+    (folder / "preprocessor_config.json").write_text(
+        json.dumps(
+            {
+                "size": {"shortest_edge": 4},
+                "crop_size": {"height": 4, "width": 4},
+                "image_mean": [0, 0, 0],
+                "image_std": [1, 1, 1],
+            }
+        )
+    )
+    tokenizer = Tokenizer(
+        models.WordLevel({"[UNK]": 0} | {word: 1 + n for n, word in enumerate(WORDS)}, "[UNK]")
+    )
+    tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
+    tokenizer.save(str(folder / "tokenizer.json"))
+    return folder
+
+
+def pack(*masks: np.ndarray) -> HierarchicalMasks:
+    number = len(masks)
+    ones = np.ones(number, np.float32)
+    return HierarchicalMasks.from_dense(np.stack(masks).astype(bool), np.ones(number, np.uint8), ones, ones)
+
+
+def two_colours() -> tuple[np.ndarray, np.ndarray]:
+    """An image with a red left and a green right half, and the mask of the left half."""
+    image = np.zeros((8, 8, 3), dtype=np.uint8)
+    image[:, :4, 0] = image[:, 4:, 1] = 255
+    mask = np.zeros((8, 8), dtype=bool)
+    mask[:, :4] = True
+    return image, mask
+
+
+def test_pixels_outside_the_mask_do_not_reach_the_vector(colour_clip):
+    image, mask = two_colours()
+    vectors = ClipModel.load(colour_clip).embed_masks(image, pack(mask, ~mask))
+    assert vectors.dtype == np.float16
+    np.testing.assert_array_equal(vectors, np.array([[1, 0, 0], [0, 1, 0]], np.float16))
+
+
+def test_kept_background_mixes_in_by_hand(colour_clip):
+    image, mask = two_colours()
+    # margin of 0.5 x 8 = 4 px: the box grows to the whole image, half red and half green
+    settings = ClipSettings(background="keep", context=0.5)
+    vectors = ClipModel.load(colour_clip).embed_masks(image, pack(mask), settings)
+    np.testing.assert_allclose(vectors, [[0.5**0.5, 0.5**0.5, 0]], atol=1e-3)
+
+
+def test_a_thin_box_is_padded_to_a_centred_square(colour_clip, monkeypatch):
+    image = np.full((8, 8, 3), 255, dtype=np.uint8)
+    mask = np.zeros((8, 8), dtype=bool)
+    mask[3, 2:6] = True  # 4 px wide, 1 high: row 1 of a 4 x 4 square
+    seen = []
+    model = ClipModel.load(colour_clip)
+    monkeypatch.setattr(model, "embed_crops", lambda crops: (seen.append(crops), np.ones((len(crops), 3)))[1])
+    model.embed_masks(image, pack(mask))
+    expected = np.zeros((4, 4), dtype=np.uint8)
+    expected[1] = 255
+    np.testing.assert_array_equal(seen[0][0, ..., 0], expected)
+
+
+@pytest.mark.parametrize(("batch", "threads"), [(1, 1), (2, 3), (64, 1)])
+def test_vectors_do_not_depend_on_batch_or_threads(colour_clip, batch, threads):
+    generator = np.random.default_rng(0)
+    image = generator.integers(0, 255, (12, 10, 3), dtype=np.uint8)
+    masks = pack(*(generator.random((5, 12, 10)) > 0.7))
+    expected = ClipModel.load(colour_clip).embed_masks(image, masks)
+    found = ClipModel.load(colour_clip, threads).embed_masks(image, masks, ClipSettings(batch=batch))
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_allclose(np.linalg.norm(expected.astype(float), axis=1), 1, atol=2e-3)
+
+
+def test_no_masks_give_no_rows_of_the_right_width(colour_clip):
+    none = HierarchicalMasks.concatenate([], (8, 8))
+    assert ClipModel.load(colour_clip).embed_masks(np.zeros((8, 8, 3), np.uint8), none).shape == (0, 3)
+
+
+def test_texts_are_unit_vectors_in_order(colour_clip):
+    vectors = ClipModel.load(colour_clip).embed_texts(["blue", "red green", "red red green"])
+    expected = [[0, 0, 1], [0.5**0.5, 0.5**0.5, 0], [2 / 5**0.5, 1 / 5**0.5, 0]]
+    np.testing.assert_allclose(vectors, expected, atol=1e-6)
+
+
+def test_every_text_is_put_into_the_template(colour_clip):
+    plain = ClipModel.load(colour_clip)
+    asked = ClipModel.load(colour_clip, template="blue {} thing").embed_texts(["red"])
+    np.testing.assert_array_equal(asked, plain.embed_texts(["blue red thing"]))
+    np.testing.assert_allclose(asked, [[0.5**0.5, 0, 0.5**0.5]], atol=1e-6)
+
+
+def test_a_text_that_was_asked_before_runs_no_network(colour_clip, monkeypatch):
+    model = ClipModel.load(colour_clip)
+    first = model.embed_texts(["blue", "red"])
+    monkeypatch.setattr(model, "text", None)
+    np.testing.assert_array_equal(model.embed_texts(["red", "blue", "red"]), first[[1, 0, 1]])
+
+
+@pytest.mark.parametrize("template", ["a photo", "a {} of a {}", "{0}", "{"])
+def test_a_template_names_the_text_once(template):
+    with pytest.raises(SettingsError, match=r"evaluate\.template"):
+        parse_section("evaluate", json.dumps({"template": template}))
+
+
+def test_vectors_of_another_width_are_refused(colour_clip):
+    model = ClipModel.load(colour_clip)
+    model.require_width(3, "autoencoder a")
+    with pytest.raises(
+        MisalignedArtifactError, match=r"autoencoder a does not belong(.|\n)*3 numbers(.|\n)*512"
+    ):
+        model.require_width(512, "autoencoder a")
+
+
+def test_long_texts_are_cut_and_say_so(colour_clip, caplog):
+    vectors = ClipModel.load(colour_clip).embed_texts(["red red red red green"])
+    np.testing.assert_allclose(vectors, [[1, 0, 0]])
+    assert "cut at 4 tokens" in caplog.text
+
+
+def test_text_without_a_word_is_refused(colour_clip):
+    with pytest.raises(ModelError, match="text '' has no token"):
+        ClipModel.load(colour_clip).embed_texts([""])
+
+
+def test_zero_vectors_stay_zero():
+    assert unit(np.array([[0.0, 0.0], [3.0, 4.0]], np.float32)).tolist() == [
+        [0, 0],
+        [pytest.approx(0.6), pytest.approx(0.8)],
+    ]
+
+
+def test_missing_tokenizer_is_named(colour_clip):
+    (colour_clip / "tokenizer.json").unlink()
+    with pytest.raises(ModelError, match=r"lacks tokenizer.json"):
+        ClipModel.load(colour_clip)
+
+
+def test_check_describes_the_model(colour_clip):
+    text = check_model(colour_clip)
+    assert "kind       clip" in text
+    assert "vectors    3 numbers" in text
+    assert ClipModel.load(colour_clip).digest in text
+
+
+@pytest.fixture
+def red_scene(tmp_path) -> tuple[Path, Path]:
+    """A scene of two training views and its masks."""
+    image, mask = two_colours()
+    names = ("0.png", "1.png")
+    for name in names:
+        write_png(tmp_path / "scene" / "images" / name, image)
+    eye = np.tile(np.eye(4), (2, 1, 1))
+    cameras = Cameras(names, eye, eye[:, :3, :3], np.full((2, 2), 8, np.int32))
+    empty = np.zeros((0, 3))
+    Scene(
+        tmp_path / "scene",
+        "set/scene",
+        "metre",
+        cameras,
+        dict.fromkeys(names, "train"),
+        empty.astype(np.float32),
+        empty.astype(np.uint8),
+        np.eye(4),
+    ).save()
+    for name in names:
+        pack(mask, ~mask).save(tmp_path / "masks" / f"{name}.npz")
+    views = {name: {"whole": 2} for name in names}
+    (tmp_path / "masks" / "index.json").write_text(json.dumps({"scene": "set/scene", "views": views}))
+    return tmp_path / "scene", tmp_path / "masks"
+
+
+def test_stage_writes_a_row_per_mask_and_reuses_finished_views(red_scene, colour_clip, tmp_path, monkeypatch):
+    scene, masks = red_scene
+    settings = ClipSettings(model=str(colour_clip))
+    run_clip(scene, masks, tmp_path / "first", tmp_path / "cache", settings, threads=2)
+    np.testing.assert_array_equal(read_npy(tmp_path / "first" / "0.png.npy"), [[1, 0, 0], [0, 1, 0]])
+    assert read_index(tmp_path / "first")["dim"] == 3
+
+    def refuse(self: Network, **feeds: np.ndarray):
+        raise AssertionError("the network ran again")
+
+    monkeypatch.setattr(Network, "__call__", refuse)
+    run_clip(scene, masks, tmp_path / "second", tmp_path / "cache", settings, threads=1)
+    assert sha256_of_path(tmp_path / "first") == sha256_of_path(tmp_path / "second")
+
+
+def test_masks_of_other_views_are_refused(red_scene, colour_clip, tmp_path):
+    scene, masks = red_scene
+    (masks / "index.json").write_text(json.dumps({"scene": "set/scene", "views": {"7.png": {}}}))
+    with pytest.raises(MisalignedArtifactError, match=r"7\.png"):
+        run_clip(scene, masks, tmp_path / "out", tmp_path / "cache", ClipSettings(model=str(colour_clip)), 1)

@@ -1,0 +1,203 @@
+"""LangSplat's files: what is written is read back, and what others wrote is checked."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilsplat.base.artifacts import read_index, read_npy
+from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.base.images import write_png
+from hilsplat.embed.langsplat_files import maps_of, read_clip, read_masks, read_view, write_langsplat
+from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.settings import ClipSettings
+
+SIZE = (6, 8)
+
+
+def pack(dense: np.ndarray, level: list[int]) -> HierarchicalMasks:
+    ones = np.ones(len(dense), np.float32)
+    masks = HierarchicalMasks.from_dense(dense, np.array(level, np.uint8), ones, ones)
+    return masks.take(masks.content_order())
+
+
+def nested() -> HierarchicalMasks:
+    """A whole, in it a part, in that two subparts."""
+    dense = np.zeros((4, *SIZE), bool)
+    dense[0, 1:, 1:7] = True
+    dense[1, 2:5, 2:6] = True
+    dense[2, 2, 2] = dense[3, 4, 3:5] = True
+    return pack(dense, [1, 2, 3, 3])
+
+
+def unit_rows(number: int) -> np.ndarray:
+    vectors = np.random.default_rng(number).normal(size=(number, 512))
+    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float16)
+
+
+@pytest.fixture
+def ours(tmp_path) -> tuple[Path, Path]:
+    """Folders of masks and vectors of two views."""
+    masks = nested()
+    names = ("a.png", "b.png")
+    (tmp_path / "clip").mkdir()
+    for name in names:
+        masks.save(tmp_path / "masks" / f"{name}.npz")
+        np.save(tmp_path / "clip" / f"{name}.npy", unit_rows(4))
+    index = {"scene": "set/scene", "views": {name: {} for name in names}}
+    (tmp_path / "masks" / "index.json").write_text(json.dumps(index))
+    return tmp_path / "masks", tmp_path / "clip"
+
+
+@pytest.fixture
+def scene(tmp_path) -> Path:
+    names = ("a.png", "b.png")
+    for name in names:
+        write_png(tmp_path / "scene" / "images" / name, np.zeros((*SIZE, 3), np.uint8))
+    eye = np.tile(np.eye(4), (2, 1, 1))
+    cameras = Cameras(names, eye, eye[:, :3, :3], np.tile(np.array(SIZE, np.int32), (2, 1)))
+    empty = np.zeros((0, 3))
+    Scene(
+        tmp_path / "scene",
+        "set/scene",
+        "metre",
+        cameras,
+        dict.fromkeys(names, "train"),
+        empty.astype(np.float32),
+        empty.astype(np.uint8),
+        np.eye(4),
+    ).save()
+    return tmp_path / "scene"
+
+
+def test_maps_by_hand():
+    maps, rows = maps_of(nested())
+    assert maps.dtype == np.float32
+    # default: all four masks, the small ones on top; then s, m, l, rows counted through
+    assert rows.tolist() == [0, 1, 2, 3, 2, 3, 1, 0]
+    assert maps[0, 1, 1] == 0
+    assert maps[0, 3, 3] == 1
+    # the larger subpart comes first
+    assert (maps[0, 4, 3], maps[1, 4, 3], maps[1, 2, 2]) == (2, 4, 5)
+    assert set(np.unique(maps[2])) == {-1, 6}
+    assert set(np.unique(maps[3])) == {-1, 7}
+    assert maps[3, 0, 0] == -1
+
+
+def test_what_is_written_is_read_back(ours, scene, tmp_path):
+    masks_folder, clip_folder = ours
+    write_langsplat(masks_folder, clip_folder, tmp_path / "files")
+    assert sorted(path.name for path in (tmp_path / "files").glob("*.npy")) == [
+        "a_f.npy",
+        "a_s.npy",
+        "b_f.npy",
+        "b_s.npy",
+    ]
+    maps, vectors = (np.load(tmp_path / "files" / f"a_{kind}.npy", allow_pickle=False) for kind in "sf")
+    assert (maps.shape, maps.dtype, vectors.shape, vectors.dtype) == ((4, *SIZE), "f4", (8, 512), "f4")
+    read_masks(scene, tmp_path / "files", tmp_path / "again", resize=False)
+    found = HierarchicalMasks.load(tmp_path / "again" / "a.png.npz")
+    # masks of a level do not overlap here, so nothing was painted over
+    for name in ("runs", "offsets", "level", "area_px", "box_xyxy"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(nested(), name), err_msg=name)
+    assert read_index(tmp_path / "again")["views"]["a.png"] == {"whole": 1, "part": 1, "subpart": 2}
+    _, clip = read_view(tmp_path / "files", "a.png", SIZE, resize=False)
+    np.testing.assert_allclose(clip.astype(float), unit_rows(4).astype(float), atol=1e-3)
+
+
+def test_levels_run_the_other_way_in_the_files(tmp_path):
+    maps = np.full((4, 2, 4), -1, np.float32)
+    maps[0] = 0  # mixed: left out
+    maps[1, 0, 0], maps[2, 0, 1], maps[3, 0, 2] = 1, 2, 3
+    np.save(tmp_path / "x_s.npy", maps)
+    np.save(tmp_path / "x_f.npy", np.eye(4, 5, dtype=np.float32) * 3)
+    masks, vectors = read_view(tmp_path, "x.y.jpg", (2, 4), resize=False)
+    assert masks.level.tolist() == [1, 2, 3]
+    assert masks.box_xyxy[:, 0].tolist() == [2, 1, 0]
+    np.testing.assert_array_equal(vectors, np.eye(5, dtype=np.float16)[[3, 2, 1]])
+
+
+def test_a_scene_without_any_mask_at_a_level_is_read(tmp_path):
+    np.save(tmp_path / "x_s.npy", np.full((4, 2, 4), -1, np.float32))
+    np.save(tmp_path / "x_f.npy", np.zeros((0, 5), np.float32))
+    masks, vectors = read_view(tmp_path, "x.jpg", (2, 4), resize=False)
+    assert (len(masks), vectors.shape) == (0, (0, 5))
+
+
+def test_maps_of_another_size_are_refused_or_resized(ours, tmp_path):
+    write_langsplat(*ours, tmp_path / "files")
+    with pytest.raises(MisalignedArtifactError, match=r"\(12, 16\)(.|\n)*\(6, 8\)(.|\n)*--resize"):
+        read_view(tmp_path / "files", "a.png", (12, 16), resize=False)
+    masks, _ = read_view(tmp_path / "files", "a.png", (12, 16), resize=True)
+    np.testing.assert_array_equal(masks.area_px, 4 * nested().area_px)
+
+
+@pytest.mark.parametrize(
+    ("maps", "vectors", "words"),
+    [
+        (np.zeros((3, 6, 8)), np.zeros((1, 5)), "is no LangSplat map"),
+        (np.full((4, 6, 8), 7.0), np.zeros((7, 5)), "does not belong to a_f.npy"),
+        (np.full((4, 6, 8), 0.5), np.zeros((7, 5)), "does not belong to a_f.npy"),
+        (np.full((4, 6, 8), np.nan), np.zeros((7, 5)), "does not belong to a_f.npy"),
+        (np.zeros((4, 6, 8)), np.full((1, 5), np.inf), "holds no vectors"),
+        (np.zeros((4, 6, 8)), np.zeros(5), "holds no vectors"),
+        (np.array([{"a": 1}], dtype=object), np.zeros((1, 5)), "cannot be read"),
+    ],
+)
+def test_strange_files_are_refused_and_nothing_is_unpickled(tmp_path, maps, vectors, words):
+    np.save(tmp_path / "a_s.npy", maps, allow_pickle=True)
+    np.save(tmp_path / "a_f.npy", vectors)
+    with pytest.raises(ArtifactError, match=words):
+        read_view(tmp_path, "a.png", SIZE, resize=False)
+
+
+def test_missing_views_are_listed(ours, scene, tmp_path):
+    write_langsplat(*ours, tmp_path / "files")
+    (tmp_path / "files" / "b_s.npy").unlink()
+    with pytest.raises(ArtifactError, match=r"lacks the maps of 1 of 2 training views(.|\n)*b_s.npy"):
+        read_masks(scene, tmp_path / "files", tmp_path / "out", resize=False)
+    assert not (tmp_path / "out").exists()
+
+
+def test_views_that_differ_after_a_dot_only_are_refused(ours, tmp_path):
+    masks_folder, clip_folder = ours
+    index = {"scene": "set/scene", "views": {"a.1.png": {}, "a.2.png": {}}}
+    (masks_folder / "index.json").write_text(json.dumps(index))
+    with pytest.raises(ArtifactError, match=r"a.1.png, a.2.png"):
+        write_langsplat(masks_folder, clip_folder, tmp_path / "files")
+
+
+def test_vectors_of_other_masks_are_refused(ours, tmp_path):
+    masks_folder, clip_folder = ours
+    np.save(clip_folder / "b.png.npy", unit_rows(3))
+    with pytest.raises(MisalignedArtifactError, match=r"4 vectors(.|\n)*found +3"):
+        write_langsplat(masks_folder, clip_folder, tmp_path / "files")
+
+
+def test_vectors_of_another_clip_are_refused(ours, scene, tmp_path, project):
+    write_langsplat(*ours, tmp_path / "files")
+    settings = ClipSettings(model=str(project / "models/clip-tiny"))
+    with pytest.raises(MisalignedArtifactError, match=r"a_f.npy does not belong to the CLIP in"):
+        for stem in "ab":
+            vectors = np.load(tmp_path / "files" / f"{stem}_f.npy")[:, :100]
+            np.save(tmp_path / "files" / f"{stem}_f.npy", vectors)
+        read_clip(scene, tmp_path / "files", tmp_path / "out", False, settings)
+
+
+def test_vectors_of_the_same_clip_are_taken(ours, scene, tmp_path, project):
+    from hilsplat.embed.clip import ClipModel
+
+    write_langsplat(*ours, tmp_path / "files")
+    model = project / "models/clip-tiny"
+    width = ClipModel.load(model).width
+    for stem in "ab":
+        vectors = np.random.default_rng(0).normal(size=(8, width)).astype(np.float32)
+        np.save(tmp_path / "files" / f"{stem}_f.npy", vectors)
+    read_clip(scene, tmp_path / "files", tmp_path / "out", False, ClipSettings(model=str(model)))
+    index = read_index(tmp_path / "out")
+    assert (index["dim"], index["model"], index["views"]["a.png"]) == (width, str(model), {"masks": 4})
+    lengths = np.linalg.norm(read_npy(tmp_path / "out" / "a.png.npy").astype(float), axis=1)
+    np.testing.assert_allclose(lengths, 1, atol=2e-3)

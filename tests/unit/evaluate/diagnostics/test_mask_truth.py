@@ -1,0 +1,94 @@
+"""Masks against true regions, by hand, and the picture of where they fail."""
+
+import numpy as np
+import pytest
+
+from hilsplat.base.artifacts import write_index
+from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.images import read_image
+from hilsplat.base.levels import Level
+from hilsplat.evaluate.diagnostics.mask_truth import fit_of_view, middling_and_worst, run_mask_truth
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.overlaps import region_ious
+
+VIEW = "001.png"
+
+
+def masks_of(regions_by_level) -> HierarchicalMasks:
+    dense = [mask for masks in regions_by_level.values() for mask in masks]
+    level = [int(level) for level, masks in regions_by_level.items() for _ in masks]
+    ones = np.ones(len(level), np.float32)
+    return HierarchicalMasks.from_dense(np.stack(dense), np.array(level, np.uint8), ones, ones)
+
+
+def box(rows, columns) -> np.ndarray:
+    mask = np.zeros((64, 64), dtype=bool)
+    mask[slice(*rows), slice(*columns)] = True
+    return mask
+
+
+def found_masks() -> HierarchicalMasks:
+    """The bear whole, the lower half of the chest and nothing of it elsewhere; three quarters of the head."""
+    return masks_of(
+        {
+            Level.WHOLE: [box((8, 56), (8, 40)), box((44, 56), (44, 60)), box((0, 4), (0, 4))],
+            Level.PART: [box((8, 24), (12, 30))],
+        }
+    )
+
+
+def test_ious_by_hand():
+    labels = np.array([[0, 0, 4, 4], [0, 0, 4, -1]])
+    masks = np.array([[[1, 1, 0, 0], [1, 1, 0, 0]], [[0, 1, 1, 1], [0, 1, 0, 1]]], dtype=bool)
+    ids, areas, ious = region_ious(labels, masks)
+    assert (ids.tolist(), areas.tolist()) == ([0, 4], [4, 3])
+    assert ious == pytest.approx(np.array([[1, 2 / 7], [0, 2 / 6]]), abs=1e-6)
+
+
+def test_no_mask_and_no_region():
+    assert region_ious(np.zeros((2, 2), int), np.zeros((0, 2, 2), bool))[2].shape == (1, 0)
+    assert region_ious(np.full((2, 2), -1), np.ones((3, 2, 2), bool))[2].shape == (0, 3)
+
+
+def test_levels_are_compared_apart(block_world):
+    fit = fit_of_view(found_masks(), block_world.annotations, VIEW)
+    whole, part, subpart = (fit[level] for level in (Level.WHOLE, Level.PART, Level.SUBPART))
+    assert whole.ids.tolist() == [0, 1]
+    assert whole.best == pytest.approx([1, 0.5])
+    assert (whole.masks, whole.fitting) == (3, 2)
+    assert part.best == pytest.approx([0.75, 0])  # the head, the lid
+    assert (part.masks, part.fitting) == (1, 1)
+    assert subpart.ids.tolist() == []  # the nose has 64 px
+    assert subpart.masks == 0
+
+
+def test_table_and_picture(block_world, tmp_path):
+    found_masks().save(tmp_path / "masks" / f"{VIEW}.npz")
+    write_index(tmp_path / "masks", {VIEW: {}}, segmenter="graph", model=None)
+    out = tmp_path / "masks.png"
+    text = run_mask_truth(block_world.folder / "scene", block_world.folder / "truth", tmp_path / "masks", out)
+    rows = out.with_suffix(".csv").read_text().splitlines()
+    assert rows[1:] == [
+        "synthetic/blocks,graph,whole,1,2,0.7500,1.0000,3.0,0.6667",
+        "synthetic/blocks,graph,part,1,2,0.3750,0.5000,1.0,1.0000",
+        "synthetic/blocks,graph,subpart,1,0,nan,nan,0.0,nan",
+    ]
+    assert "| graph | whole | 1 | 2 | 0.7500 |" in text
+    picture = read_image(out)
+    green, red = (0, 104, 55), (165, 0, 38)  # ends of the scale of colours
+    for colour in (green, red):
+        assert (np.abs(picture.astype(int) - colour).sum(axis=2) < 90).sum() > 100
+
+
+def test_views_that_are_shown(block_world):
+    perfect = block_world.annotations
+    good = fit_of_view(found_masks(), perfect, VIEW)
+    bad = fit_of_view(masks_of({Level.WHOLE: [box((0, 4), (0, 4))]}), perfect, VIEW)
+    assert middling_and_worst({"a": good, "b": bad, "c": good}) == ["a", "b"]
+    assert middling_and_worst({"a": good}) == ["a"]
+
+
+def test_masks_of_another_size_are_refused(block_world):
+    small = HierarchicalMasks.concatenate([], (32, 32))
+    with pytest.raises(MisalignedArtifactError, match=r"64 x 64(.|\n)*32 x 32"):
+        fit_of_view(small, block_world.annotations, VIEW)

@@ -1,0 +1,129 @@
+"""Figures of the paper: which methods and queries are shown, and that answers are drawn where they are."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.base.levels import Level
+from hilsplat.evaluate.figures import comparison
+from hilsplat.evaluate.figures.comparison import (
+    Answerer,
+    draw_methods,
+    node_image,
+    over_views,
+    run_comparison,
+)
+from hilsplat.evaluate.figures.panel import annotated_rows, truths_of
+from hilsplat.evaluate.figures.sweep_plot import read_lines, run_sweep_plot
+from hilsplat.settings import EvaluateSettings, FiguresSettings
+
+EVALUATE = EvaluateSettings()
+
+
+@pytest.fixture
+def rows(block_world):
+    truths = truths_of(block_world.scene, block_world.folder / "truth", None, EVALUATE)
+    return truths, annotated_rows(truths, FiguresSettings(queries_per_level=1))
+
+
+def test_tree_and_field_of_an_exact_world_answer_with_the_truth(block_world, rows):
+    for method in ("tree", "field"):
+        answerer = Answerer(method, method, block_world.answers)
+        for row in rows[1]:
+            mask = answerer.mask(row, EVALUATE)
+            assert np.count_nonzero(mask != row.truth) <= 0.05 * row.truth.size, (method, row.text)
+
+
+def test_titles_name_the_method_and_its_iou(block_world, rows):
+    methods = [Answerer("hilsplat (tree)", "tree", block_world.answers)]
+    figure = draw_methods(methods, rows[1], EVALUATE)
+    titles = [axes.get_title() for axes in figure.get_axes()]
+    assert titles[:2] == ["truth, 001.png", "hilsplat (tree)\nIoU 1.00"]
+    assert len(titles) == 2 * len(rows[1])
+
+
+def test_one_part_is_shown_over_views_and_views_without_truth_fill_up(block_world, rows):
+    shown = over_views(block_world.scene, rows[1], rows[0])
+    assert {(row.text, row.level) for row in shown} == {("head", Level.PART)}
+    assert [row.view for row in shown] == ["001.png", "000.png"]  # there are two views
+    assert shown[1].truth is None
+
+
+def test_equal_nodes_have_equal_colours_and_what_has_none_is_black(block_world):
+    picture = node_image(block_world.answers, "001.png", Level.WHOLE)
+    bear, chest, nothing = picture[20, 20], picture[50, 50], picture[2, 2]
+    assert (picture[40, 10] == bear).all()
+    assert not (bear == chest).all()
+    assert nothing.tolist() == [0, 0, 0]
+
+
+def test_all_figures_are_written_as_png_and_pdf_twice_the_same(block_world, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        comparison, "LanguageScene", SimpleNamespace(open=lambda *_, **__: block_world.answers)
+    )
+    for name in ("one", "two"):
+        run_comparison(
+            block_world.folder,
+            ["default", "paper"],
+            {"paper": "hilsplat (paper)"},
+            tmp_path / name / "comparison.png",
+            FiguresSettings(queries_per_level=1),
+            EVALUATE,
+            truth=block_world.folder / "truth",
+        )
+    for figure in ("comparison", "views", "features"):
+        for suffix in (".png", ".pdf"):
+            first, second = (tmp_path / name / f"{figure}{suffix}" for name in ("one", "two"))
+            assert first.read_bytes() == second.read_bytes()
+            assert len(first.read_bytes()) > 1000
+        with Image.open(tmp_path / "one" / f"{figure}.png") as picture:
+            assert picture.width == 1430
+
+
+def test_scenes_without_labels_show_the_queries_of_the_configuration(block_world, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(
+        comparison, "LanguageScene", SimpleNamespace(open=lambda *_, **__: block_world.answers)
+    )
+    monkeypatch.setattr(comparison, "draw_methods", lambda methods, rows, _: drawn.append(rows) or None)
+    monkeypatch.setattr(comparison, "save_png_and_pdf", lambda figure, out: None)
+    run_comparison(
+        block_world.folder, ["default"], {}, tmp_path / "c.png", FiguresSettings(), EVALUATE, queries=["bear"]
+    )
+    assert [row.text for row in drawn[0]] == ["bear"]
+    assert drawn[0][0].truth is None
+
+
+def test_nothing_to_compare_is_told(block_world, tmp_path):
+    with pytest.raises(SettingsError, match="nothing is compared"):
+        run_comparison(block_world.folder, [], {}, tmp_path / "c.png", FiguresSettings(), EVALUATE)
+
+
+SWEEP = """kind,data,method,Hi-LERF mIoU,Hi-LERF HC,notes
+reported,LERF,theta = 0.6,38.4,56.3,
+reported,LERF,theta = 0.9,39.1,56.9,
+synthetic stand-in,synthetic,hilsplat (field),42.10,50.00,
+synthetic stand-in,synthetic,theta = 0.6,41.00 ± 0.50,,
+"""
+
+
+def test_curves_take_the_value_from_the_rows_name_and_kinds_stay_apart(tmp_path):
+    (tmp_path / "theta.csv").write_text(SWEEP)
+    lines = {(line.kind, line.column): line.points for line in read_lines(tmp_path / "theta.csv", 0.9)}
+    assert lines == {
+        ("reported", "Hi-LERF mIoU"): ((0.6, 38.4), (0.9, 39.1)),
+        ("reported", "Hi-LERF HC"): ((0.6, 56.3), (0.9, 56.9)),
+        ("synthetic stand-in", "Hi-LERF mIoU"): ((0.6, 41.0), (0.9, 42.1)),
+    }
+    run_sweep_plot("theta", tmp_path / "theta.csv", tmp_path / "theta.png")
+    assert (tmp_path / "theta.pdf").is_file()
+
+
+def test_a_sweep_that_does_not_exist_names_those_that_do(tmp_path):
+    with pytest.raises(ArtifactError, match="one of theta, omega"):
+        run_sweep_plot("lambda", tmp_path / "theta.csv", tmp_path / "x.png")
+    with pytest.raises(ArtifactError, match="build the table first"):
+        run_sweep_plot("theta", tmp_path / "theta.csv", tmp_path / "x.png")

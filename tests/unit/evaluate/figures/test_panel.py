@@ -1,0 +1,135 @@
+"""Pictures are drawn for scenes with and without annotations, and show what they say."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hilsplat.base.artifacts import write_json
+from hilsplat.base.errors import ArtifactError
+from hilsplat.base.levels import Level
+from hilsplat.base.provenance import provenance_path
+from hilsplat.evaluate.figures.panel import annotated_rows, draw_panel, free_rows, truths_of
+from hilsplat.query.answer import file_name, query_panel, told, views_of
+from hilsplat.query.pictures import ANSWER_RGB, TRUTH_RGB, outline, paint_answer, save_figure
+from hilsplat.scene.finished import FinishedScene
+from hilsplat.settings import EvaluateSettings, FiguresSettings
+
+EVALUATE = EvaluateSettings()
+
+
+def test_answer_is_filled_and_truth_outlined():
+    image = np.full((20, 20, 3), 100, np.uint8)
+    answer, truth = np.zeros((2, 20, 20), dtype=bool)
+    answer[:, :8], truth[:, 12:18] = True, True
+    painted = paint_answer(image, answer, truth)
+    inside = (0.4 * 100 + 0.6 * np.array(ANSWER_RGB)).astype(np.uint8)
+    assert painted[10, 4].tolist() == inside.tolist()
+    assert painted[10, 12].tolist() == list(TRUTH_RGB)
+    assert painted[10, 15].tolist() == [65, 65, 65]  # outside: 0.25 of the photograph and 0.4 of its grey
+
+
+def test_outline_runs_inside_the_mask_but_not_along_the_image_border():
+    mask = np.zeros((6, 6), dtype=bool)
+    mask[:, 2:] = True
+    assert np.argwhere(outline(mask, 1)).tolist() == [[row, 2] for row in range(6)]
+
+
+def truths_of_blocks(block_world):
+    return truths_of(block_world.scene, block_world.folder / "truth", None, EVALUATE)
+
+
+def test_largest_text_of_each_level_is_shown_first(block_world):
+    rows = annotated_rows(truths_of_blocks(block_world), FiguresSettings(queries_per_level=1))
+    assert [(row.text, row.level) for row in rows] == [
+        ("bear", Level.WHOLE),
+        ("head", Level.PART),
+        ("nose", Level.SUBPART),
+    ]
+    assert rows[2].path == ("bear", "head", "nose")
+
+
+def test_panel_with_annotations_is_drawn(block_world, tmp_path):
+    rows = annotated_rows(truths_of_blocks(block_world), FiguresSettings())
+    assert len(rows) == 5  # two of whole and part, the only one of subpart
+    figure = draw_panel(block_world.answers, block_world.folder / "masks", rows, EVALUATE)
+    save_figure(figure, tmp_path / "panel.png", dpi=60)
+    with Image.open(tmp_path / "panel.png") as picture:
+        assert picture.width == 780
+        assert "Software" not in picture.info
+
+
+def test_panel_without_annotations_takes_given_texts(block_world, tmp_path):
+    rows = free_rows(block_world.answers, ["bear", "bear > head"], FiguresSettings(), EVALUATE)
+    assert [(row.path, row.view) for row in rows] == [(("bear",), "000.png"), (("bear", "head"), "000.png")]
+    figure = draw_panel(block_world.answers, block_world.folder / "masks", rows, EVALUATE)
+    save_figure(figure, tmp_path / "panel.png", dpi=60)
+    assert (tmp_path / "panel.png").stat().st_size > 10_000
+
+
+def test_panel_without_queries_shows_the_overview(block_world, tmp_path):
+    figure = draw_panel(block_world.answers, block_world.folder / "masks", [], EVALUATE)
+    save_figure(figure, tmp_path / "panel.png", dpi=60)
+
+
+def test_query_is_told_and_drawn(block_world, tmp_path):
+    hits = block_world.answers.query("bear > head")
+    assert views_of(block_world.answers, hits, 2) == ["000.png", "001.png"]
+    lines = told("bear > head", hits, "metre").splitlines()
+    assert lines[0].startswith("1 answer to 'bear > head'")
+    assert lines[2].split()[:3] == ["2", "part", "1.00"]
+    answers, text = block_world.answers, "bear > head"
+    query_panel(answers, text, answers.find(text), ["000.png", "001.png"], tmp_path / "panel.png")
+    assert (tmp_path / "panel.png").stat().st_size > 10_000
+
+
+def test_no_answer_is_said():
+    assert told("unicorn", [], "metre").startswith("no node of the scene answers 'unicorn'")
+    assert told("unicorn", [], "metre", "000.png").startswith("no node that 000.png shows answers 'unicorn'")
+
+
+def test_a_path_that_ended_outside_its_first_thing_says_so(block_world):
+    (hit,) = block_world.answers.query("bear > head")
+    assert "everything else was searched" not in told("bear > head", [hit], "metre")
+    assert "everything else was searched" in told("bear > head", [replace(hit, route="fallback")], "metre")
+
+
+def test_file_names_hold_no_separators():
+    assert file_name("plush doll > ../bonnet") == "plush-doll--bonnet"
+    assert file_name(" > ") == "query"
+
+
+def finished_scene(folder, variant="default"):
+    (folder / "scene").mkdir(parents=True, exist_ok=True)
+    (folder / "gaussians.ply").touch()
+    for part in ("semantic_tree", "autoencoder", "clip", "masks"):
+        (folder / variant / part).mkdir(parents=True, exist_ok=True)
+    (folder / variant / "field.safetensors").touch()
+    return folder
+
+
+def test_parts_of_a_variant_are_found_through_provenance(tmp_path):
+    folder = finished_scene(tmp_path / "results" / "photos" / "bear")
+    field = folder / "omega-2" / "field.safetensors"
+    field.parent.mkdir()
+    field.touch()
+    path = "results/photos/bear/default/autoencoder"
+    write_json(provenance_path(field), {"inputs": {"autoencoder": {"path": path, "sha256": ""}}})
+    parts = FinishedScene.locate(folder, "omega-2")
+    assert parts.field == field
+    assert parts.autoencoder == folder / "default" / "autoencoder"
+    assert parts.semantic_tree == folder / "default" / "semantic_tree"
+
+
+def test_unfinished_scene_names_the_missing_part(tmp_path):
+    folder = finished_scene(tmp_path)
+    (folder / "gaussians.ply").unlink()
+    with pytest.raises(ArtifactError, match=r"snakemake --cores 2 .*gaussians\.ply"):
+        FinishedScene.locate(folder, "default")
+
+
+def test_unknown_variant_names_those_there_are(tmp_path):
+    folder = finished_scene(tmp_path)
+    with pytest.raises(ArtifactError, match="one of default"):
+        FinishedScene.locate(folder, "leftover")

@@ -1,0 +1,390 @@
+"""Every example here is small enough to check with pencil and paper."""
+
+import hypothesis.extra.numpy as hnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hilsplat.base.levels import Level
+from hilsplat.evaluate.metrics.averages import (
+    accuracy_at,
+    mean_over_classes,
+    mean_over_levels,
+    mean_over_pairs,
+    mean_over_scenes,
+)
+from hilsplat.evaluate.metrics.hierarchy import Family, hierarchical_consistency
+from hilsplat.evaluate.metrics.localization import box_of, hits_a_box, hits_the_mask, peak_points
+from hilsplat.evaluate.metrics.masks import (
+    best_threshold_iou,
+    boundary,
+    boundary_iou,
+    boundary_width_px,
+    exceeds,
+    foreground,
+    iou,
+)
+from hilsplat.evaluate.metrics.pixel_classes import argmax_masks, pixel_accuracy
+from hilsplat.evaluate.metrics.relevancy_rule import (
+    RelevancyRule,
+    SmoothedRelevancy,
+    filter_side_px,
+    level_by_mean_in_mask,
+    majority_smooth,
+    mean_filter,
+    relevancy_mask,
+    threshold_mask,
+)
+
+
+def rectangle(rows, columns, size_hw=(10, 10)):
+    """A mask of half-open row and column ranges."""
+    mask = np.zeros(size_hw, dtype=bool)
+    mask[slice(*rows), slice(*columns)] = True
+    return mask
+
+
+# --- relevancy ------------------------------------------------------------------------------------
+
+
+def test_relevancy_is_decided_by_the_nearest_canonical_phrase():
+    from hilsplat.query.relevancy import relevancy
+
+    def at_cosine(value):
+        return [value, (1 - value**2) ** 0.5]
+
+    embedding, text = np.array([[1.0, 0.0]]), np.array([at_cosine(0.30)])
+    canonical = np.array([at_cosine(value) for value in (0.25, 0.28, 0.20, 0.22)])
+    # 1 / (1 + exp(-10 (0.30 - 0.28)))
+    assert relevancy(embedding, text, canonical)[0, 0] == pytest.approx(0.549834, abs=1e-6)
+    assert relevancy(embedding, canonical[1:2], canonical)[0, 0] == 0.5
+
+
+# --- threshold and filter of LangSplat's LERF rule ------------------------------------------------
+
+RELEVANCY = np.array([[0.30, 0.50, 0.60], [0.44, 0.65, 0.70], [0.52, 0.57, 0.61]])
+
+
+def test_threshold_means_min_max_above_0_7():
+    # min-max: [[0, .5, .75], [.35, .875, 1], [.55, .675, .775]]
+    expected = np.array([[0, 0, 1], [0, 1, 1], [0, 0, 1]], dtype=bool)
+    np.testing.assert_array_equal(threshold_mask(RELEVANCY), expected)
+    truth = np.array([[0, 0, 0], [0, 1, 1], [0, 1, 1]], dtype=bool)
+    assert iou(expected, truth) == pytest.approx(3 / 5)
+
+
+def test_threshold_on_min_max_and_on_raw_relevancy():
+    # min-max above 0.4 leaves out .0 and .35; all raw values but 0.30 are above 0.4
+    np.testing.assert_array_equal(
+        threshold_mask(RELEVANCY, 0.4, "normalised_01"),
+        np.array([[0, 1, 1], [0, 1, 1], [1, 1, 1]], dtype=bool),
+    )
+    np.testing.assert_array_equal(
+        threshold_mask(RELEVANCY, 0.4, "raw"), np.array([[0, 1, 1], [1, 1, 1], [1, 1, 1]], dtype=bool)
+    )
+
+
+def test_constant_map_has_an_empty_mask():
+    assert not threshold_mask(np.full((4, 4), 0.6)).any()
+
+
+def test_even_filter_is_anchored_right_of_its_middle():
+    impulse = np.zeros((6, 6))
+    impulse[2, 3] = 1
+    expected = np.zeros((6, 6))
+    expected[2:4, 3:5] = 0.25
+    np.testing.assert_allclose(mean_filter(impulse, 2), expected)
+
+
+def test_filter_of_30_averages_15_rows_above_and_14_below():
+    impulse = np.zeros((80, 80))
+    impulse[40, 40] = 900
+    rows, columns = np.nonzero(mean_filter(impulse, 30) > 0.5)
+    # output y averages rows y - 15 .. y + 14, so row 40 is seen by y = 26 .. 55
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (26, 55, 26, 55)
+
+
+def test_filter_reflects_at_the_border_without_repeating_the_edge():
+    row = np.array([[1.0, 2.0, 4.0]])
+    # side 3 at column 0: values 2, 1, 2; the single row is its own reflection
+    np.testing.assert_allclose(mean_filter(row, 3), [[5 / 3, 7 / 3, 8 / 3]], rtol=1e-6)
+
+
+def test_filter_scales_with_the_height_unless_it_is_set():
+    assert filter_side_px(0, 730) == 30
+    assert filter_side_px(0, 256) == 11  # 10.52
+    assert filter_side_px(0, 10) == 1
+    assert filter_side_px(20, 256) == 20
+
+
+def test_majority_filter_ignores_the_last_row_and_column():
+    smoothed = majority_smooth(rectangle((0, 4), (0, 4), (8, 8)))
+    expected = np.zeros((8, 8), dtype=bool)
+    expected[0, :4] = expected[1, :3] = expected[2, :2] = expected[3, 0] = True
+    np.testing.assert_array_equal(smoothed, expected)
+
+
+def test_majority_filter_equals_the_plain_loop_over_windows():
+    mask = np.random.default_rng(0).random((13, 17)) > 0.5
+    height, width = mask.shape
+    expected = np.zeros_like(mask)
+    for i in range(height):
+        for j in range(width):
+            window = mask[max(0, i - 3) : min(i + 4, height - 1), max(0, j - 3) : min(j + 4, width - 1)]
+            expected[i, j] = window.sum() * 2 > window.size
+    np.testing.assert_array_equal(majority_smooth(mask), expected)
+
+
+def test_level_of_an_automatic_mask_has_the_highest_mixed_value():
+    relevancy = np.zeros((3, 8, 8), dtype=np.float32)
+    relevancy[0, 2, 2], relevancy[1, 5, 5], relevancy[2, 1, 1] = 0.6, 0.9, 0.7
+    rule = RelevancyRule(filter_px=1, majority=False)
+    mask, level = relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)
+    assert level is Level.PART
+    assert np.argwhere(mask).tolist() == [[5, 5]]
+
+
+def test_mixing_halves_the_filtered_and_the_raw_map():
+    relevancy = np.zeros((3, 6, 6), dtype=np.float32)
+    relevancy[:, 2, 3] = 1
+    smoothed = SmoothedRelevancy.of(relevancy, RelevancyRule(filter_px=2))
+    assert smoothed.mixed[0, 2, 3] == pytest.approx(0.5 * (0.25 + 1))
+    assert smoothed.mixed[0, 3, 4] == pytest.approx(0.125)
+    assert smoothed.filtered[0, 3, 4] == pytest.approx(0.25)
+
+
+def test_level_by_mean_in_mask_prefers_the_higher_mean_not_the_higher_value():
+    relevancy = np.zeros((3, 1, 6), dtype=np.float32)
+    relevancy[0, 0, :2] = 0.9, 0.5  # mean 0.7
+    relevancy[1, 0, :4] = 0.6, 0.6, 0.6, 0.9  # mean 0.675
+    assert level_by_mean_in_mask(relevancy, relevancy > 0) is Level.WHOLE
+
+
+def test_rule_names_what_departs_from_langsplat():
+    assert RelevancyRule().departures(RelevancyRule()) == ()
+    rule = RelevancyRule(filter_px=20, mix=False, threshold=0.5, threshold_on="raw", majority=False)
+    expected = ("filter 20", "no mix", "threshold 0.5", "raw", "no majority")
+    assert rule.departures(RelevancyRule()) == expected
+    assert RelevancyRule().departures(RelevancyRule(filter_px=20)) == ("filter scaled",)
+
+
+def test_windows_inside_the_image_average_what_is_there():
+    row = np.array([[1.0, 2.0, 4.0]])
+    # side 3 at column 0: values 1, 2; LangSplat's reflection would see 2, 1, 2
+    np.testing.assert_allclose(mean_filter(row, 3, "inside"), [[1.5, 7 / 3, 3.0]], rtol=1e-6)
+
+
+def test_majority_inside_the_image_sees_the_last_row_and_column():
+    mask = rectangle((4, 8), (4, 8), (8, 8))
+    # turned by 180 degrees this is the same square at the other corner, and so is the smoothed mask
+    turned = majority_smooth(mask[::-1, ::-1], "inside")[::-1, ::-1]
+    np.testing.assert_array_equal(majority_smooth(mask, "inside"), turned)
+    # at (7, 7) the window holds rows and columns 4 .. 7: all ones. LangSplat's window drops row and column 7.
+    assert majority_smooth(mask, "inside")[7, 7]
+    corner = rectangle((7, 8), (0, 8), (8, 8))
+    assert not majority_smooth(corner).any()
+
+
+def test_level_is_chosen_among_the_levels_of_the_rule():
+    relevancy = np.zeros((3, 8, 8), dtype=np.float32)
+    relevancy[0, 2, 2], relevancy[1, 5, 5], relevancy[2, 1, 1] = 0.6, 0.7, 0.9
+    two = (Level.WHOLE, Level.PART)
+    for level_rule in ("max", "mean_in_mask"):
+        rule = RelevancyRule(filter_px=1, majority=False, level_rule=level_rule, levels=two)
+        mask, level = relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)
+        assert level is Level.PART
+        assert np.argwhere(mask).tolist() == [[5, 5]]
+
+
+# --- masks ----------------------------------------------------------------------------------------
+
+
+def test_boundary_iou_of_a_shifted_square():
+    truth, prediction = rectangle((1, 7), (1, 7)), rectangle((1, 7), (2, 8))
+    assert boundary_width_px((10, 10)) == 1
+    assert iou(prediction, truth) == pytest.approx(30 / 42)
+    assert boundary(truth, 1).sum() == 20
+    assert boundary_iou(prediction, truth) == pytest.approx(10 / 30)
+
+
+def test_boundary_counts_pixels_at_the_image_border():
+    assert boundary(np.ones((10, 10), dtype=bool), 1).sum() == 36
+
+
+@pytest.mark.parametrize(
+    ("size_hw", "width_px"), [((728, 986), 25), ((731, 988), 25), ((730, 988), 25), ((725, 985), 24)]
+)
+def test_boundary_width_of_the_lerf_images(size_hw, width_px):
+    assert boundary_width_px(size_hw) == width_px
+
+
+def test_one_wide_erosion_equals_many_small_ones():
+    import cv2
+
+    mask = np.random.default_rng(1).random((40, 50)) > 0.02
+    padded = np.pad(mask.astype(np.uint8), 1)
+    repeated = cv2.erode(padded, np.ones((3, 3), np.uint8), iterations=4)[1:-1, 1:-1]
+    np.testing.assert_array_equal(boundary(mask, 4), mask & (repeated == 0))
+
+
+def test_iou_of_nothing_with_nothing_is_zero():
+    empty = np.zeros((3, 3), dtype=bool)
+    assert iou(empty, empty) == 0
+    assert boundary_iou(empty, empty) == 0
+
+
+def test_best_threshold_finds_the_best_cut_and_keeps_ties_together():
+    score = np.array([[0.9, 0.8, 0.8], [0.1, 0.5, 0.0]])
+    truth = np.array([[1, 1, 0], [0, 1, 0]], dtype=bool)
+    # cuts: {.9} 1/3; {.9 .8 .8} 2/4; and .5: 3/4; and .1: 3/5; all: 3/6
+    assert best_threshold_iou(score, truth) == pytest.approx(3 / 4)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    hnp.arrays(np.float32, (4, 5), elements=st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0])),
+    hnp.arrays(bool, (4, 5)),
+)
+def test_best_threshold_equals_trying_every_cut(score, truth):
+    expected = max(iou(score >= cut, truth) for cut in np.unique(score))
+    assert best_threshold_iou(score, truth) == pytest.approx(expected)
+
+
+def test_accuracy_of_a_pair_needs_more_than_the_threshold():
+    truth, quarter = rectangle((0, 1), (0, 4)), rectangle((0, 1), (0, 1))  # IoU 1/4
+    assert exceeds(quarter, truth, 0.25) == 0
+    assert exceeds(rectangle((0, 1), (0, 2)), truth, 0.25) == 1
+
+
+def test_foreground_is_above_the_value_and_resized_by_the_nearest_pixel():
+    grey = np.array([[128, 129], [255, 0]], dtype=np.uint8)
+    np.testing.assert_array_equal(foreground(grey, 128, (2, 2)), [[False, True], [True, False]])
+    np.testing.assert_array_equal(foreground(grey, 254, (2, 2)), [[False, False], [True, False]])
+    np.testing.assert_array_equal(
+        foreground(grey, 128, (4, 4)), np.kron([[0, 1], [1, 0]], np.ones((2, 2))).astype(bool)
+    )
+
+
+# --- every pixel a class --------------------------------------------------------------------------
+
+
+def test_argmax_protocol_of_3d_ovs_on_four_pixels():
+    truth = np.array([[[1, 1, 0, 0]], [[0, 0, 1, 0]], [[0, 0, 0, 1]]], dtype=bool)  # classes 0, 0, 1, 2
+    similarity = np.array([[[0.9, 0.1, 0.2, 0.2]], [[0.3, 0.5, 0.4, 0.2]], [[0.1, 0.4, 0.3, 0.3]]])
+    prediction = argmax_masks(similarity)  # 0, 1, 1, 2
+    ious = [iou(prediction[row], truth[row]) for row in range(3)]
+    assert ious == [1 / 2, 1 / 2, 1]
+    assert np.mean(ious) == pytest.approx(0.666667, abs=1e-6)
+    assert pixel_accuracy(prediction, truth) == 0.75
+
+
+def test_equal_similarities_go_to_the_first_class_and_an_absent_class_has_no_iou():
+    prediction = argmax_masks(np.zeros((2, 1, 3)))
+    assert prediction[0].all()
+    assert not prediction[1].any()
+    assert iou(prediction[1], np.zeros((1, 3), dtype=bool)) == 0
+
+
+def test_pixel_with_two_true_classes_is_never_right():
+    truth = np.array([[[1, 1]], [[1, 0]]], dtype=bool)
+    assert pixel_accuracy(argmax_masks(np.array([[[1.0, 1.0]], [[0.0, 0.0]]])), truth) == 0.5
+
+
+# --- localization ---------------------------------------------------------------------------------
+
+
+def test_any_of_several_maxima_may_hit_and_borders_count():
+    filtered = np.zeros((3, 24, 24), dtype=np.float32)
+    filtered[1, 5, 10] = filtered[1, 5, 12] = 0.8
+    points, level = peak_points(filtered, None)
+    assert level is Level.PART
+    assert points.tolist() == [[10, 5], [12, 5]]
+    assert hits_a_box(points, np.array([[0, 0, 9, 9], [12, 5, 20, 20]]))
+    assert not hits_a_box(points, np.array([[0, 0, 9, 9], [13, 5, 20, 20]]))
+
+
+def test_mask_hit_is_stricter_than_box_hit():
+    truth = rectangle((0, 1), (0, 5)) | rectangle((0, 5), (0, 1))  # an L; its box holds (3, 3)
+    point = np.array([[3, 3]])
+    assert box_of(truth).tolist() == [0, 0, 4, 4]
+    assert hits_a_box(point, box_of(truth)[None])
+    assert not hits_the_mask(point, truth)
+
+
+def test_localization_accuracy_is_the_share_of_pairs():
+    hits = {("f1", "apple"): 1.0, ("f1", "egg"): 1.0, ("f2", "apple"): 0.0}
+    assert mean_over_pairs(hits) == pytest.approx(0.666667, abs=1e-6)
+
+
+# --- averages -------------------------------------------------------------------------------------
+
+
+def test_pooled_and_class_averages_differ():
+    values = {("f1", "apple"): 0.8, ("f1", "egg"): 0.3, ("f2", "apple"): 0.6}
+    assert mean_over_pairs(values) == pytest.approx(1.7 / 3)
+    assert mean_over_classes(values) == pytest.approx((0.7 + 0.3) / 2)
+
+
+def test_scenes_weigh_equally_whatever_their_pairs():
+    assert mean_over_scenes([0.5, 0.7, float("nan")]) == pytest.approx(0.6)
+    assert np.isnan(mean_over_scenes([]))
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.permutations([("f1", "a"), ("f1", "b"), ("f2", "a"), ("f3", "b"), ("f3", "c")]))
+def test_averages_do_not_depend_on_the_order_of_views_and_queries(pairs):
+    value = {("f1", "a"): 0.1, ("f1", "b"): 0.7, ("f2", "a"): 0.2, ("f3", "b"): 0.3, ("f3", "c"): 0.9}
+    shuffled = {pair: value[pair] for pair in pairs}
+    assert mean_over_pairs(shuffled) == mean_over_pairs(value)
+    assert mean_over_classes(shuffled) == mean_over_classes(value)
+
+
+def test_level_averages_weigh_levels_equally():
+    levels, average = mean_over_levels([[0.8, 0.6], [0.5], [0.2, 0.0, 0.1]])
+    assert levels == pytest.approx([0.7, 0.5, 0.1])
+    assert average == pytest.approx(0.433333, abs=1e-6)
+
+
+def test_accuracy_counts_only_ious_above_the_threshold():
+    assert accuracy_at([0.25, 0.26, 0.9, 0.0], 0.25) == pytest.approx(0.5)
+
+
+# --- hierarchical consistency ---------------------------------------------------------------------
+
+A, B = rectangle((0, 10), (0, 5)), rectangle((0, 5), (5, 10))
+A1, A2, B1 = rectangle((0, 4), (0, 5)), rectangle((4, 8), (3, 7)), rectangle((0, 2), (5, 10))
+X = rectangle((0, 2), (0, 2))
+
+
+def families(a=A, b=B, a1=A1, a2=A2, b1=B1, x=X):
+    return [[Family(a, (a1, a2), A), Family(b, (b1,), B)], [Family(a1, (x,), A1)]]
+
+
+def test_consistency_of_the_worked_example():
+    # wholes: literal (0.28 + 0.4) / 2, containment (0.75 + 1) / 2; parts: 4/20 and 1
+    assert hierarchical_consistency(families(), "literal") == pytest.approx(0.27)
+    assert hierarchical_consistency(families(), "containment") == pytest.approx(0.9375)
+
+
+def test_pooled_consistency_weighs_parents_equally():
+    assert hierarchical_consistency(families(), "literal", pooled=True) == pytest.approx(0.293333, abs=1e-6)
+    assert hierarchical_consistency(families(), pooled=True) == pytest.approx(0.916667, abs=1e-6)
+
+
+def test_empty_child_scores_nothing():
+    empty = np.zeros((10, 10), dtype=bool)
+    assert hierarchical_consistency(families(x=empty)) == pytest.approx(0.4375)
+
+
+def test_whole_image_fools_all_readings_but_the_anchored_one():
+    full = np.ones((10, 10), dtype=bool)
+    fooled = families(full, full, full, full, full, full)
+    assert hierarchical_consistency(fooled, "containment") == 1
+    assert hierarchical_consistency(fooled, "literal") == 1
+    # area of the true parents: A 50, B 25, a1 20 of 100 px
+    assert hierarchical_consistency(fooled, "anchored") == pytest.approx((0.375 + 0.2) / 2)
+
+
+def test_transition_without_parents_contributes_nothing():
+    assert hierarchical_consistency([families()[0], []]) == pytest.approx(0.4375)

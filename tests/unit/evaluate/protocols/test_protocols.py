@@ -1,0 +1,323 @@
+"""What is asked, what counts, and what a missing answer is worth."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations, write_hierarchy
+from hilsplat.evaluate.protocols.answers import QueryableScene, Selections
+from hilsplat.evaluate.protocols.cards import PROTOCOLS, card_of
+from hilsplat.evaluate.protocols.flat_views import FlatProtocols
+from hilsplat.evaluate.protocols.view_truth import ViewTruth
+from hilsplat.evaluate.protocols.views import measure_view
+from hilsplat.evaluate.scores import COLUMNS, Score, read_scores, write_scores
+from hilsplat.segment.masks import masks_label
+from hilsplat.settings import EvaluateSettings
+
+SIZE = (10, 10)
+
+
+def annotations_of(folder, nodes, regions, view="v.png", listed=None):
+    """Annotations from (text, level, parent) and half-open (rows, columns)."""
+    labels = {level: np.full(SIZE, -1, np.int32) for level in LEVELS}
+    for node, ((_, level, _), (rows, columns)) in enumerate(zip(nodes, regions, strict=True)):
+        labels[Level(level)][slice(*rows), slice(*columns)] = node
+    records = [AnnotatedNode(node, level, parent, text) for node, (text, level, parent) in enumerate(nodes)]
+    write_hierarchy(folder, records, {view: labels}, {view: listed or range(len(nodes))})
+    return HierarchyAnnotations.load(folder)
+
+
+def mask_of(rows, columns):
+    mask = np.zeros(SIZE, dtype=bool)
+    mask[slice(*rows), slice(*columns)] = True
+    return mask
+
+
+class HandMade:
+    """Answers that are written down: node i of `masks` answers the texts that name it.
+
+    `scene_wide` has those that differ where not this view is given.
+    """
+
+    def __init__(self, masks, answers, relevancy=None, scene_wide=None):
+        self.masks, self.answers, self.relevancy = masks, answers, relevancy or {}
+        self.scene_wide = scene_wide or {}
+
+    def field_relevancy(self, texts, view):
+        return np.stack([self.relevancy.get(text, np.zeros((3, *SIZE), np.float32)) for text in texts])
+
+    node_relevancy_map = field_relevancy
+
+    def select_nodes(self, text, *, level=None, threshold=0.85, view=None):
+        answers = self.answers if view == "v.png" else self.answers | self.scene_wide
+        return SimpleNamespace(ids=np.array(answers.get((text, level), []), dtype=np.int64), level=level)
+
+    def select_path(self, path, *, level=None, threshold=0.85, view=None):
+        answers = self.answers if view == "v.png" else self.answers | self.scene_wide
+        return SimpleNamespace(ids=np.array(answers.get(path, []), dtype=np.int64))
+
+    def node_masks(self, view, ids):
+        return np.any([self.masks[node] for node in ids], axis=0)
+
+
+def measured(scene, truth, **settings):
+    """{(method, protocol, query, level, metric): value} of one view."""
+    section = EvaluateSettings(min_region_px=1, **settings)
+    rows = measure_view(scene, Selections(scene, 0.85), truth, "v.png", SIZE, section)
+    return {(row.method, row.protocol, row.query, row.level, row.metric): row.value for row in rows}
+
+
+# the worked example of hierarchical consistency: A holds a1 and half of a2, B holds b1, a1 holds x
+NODES = [("A", 1, -1), ("B", 1, -1), ("a1", 2, 0), ("a2", 2, 0), ("b1", 2, 1), ("x", 3, 2)]
+REGIONS = [
+    ((0, 10), (0, 5)),
+    ((0, 5), (5, 10)),
+    ((0, 4), (0, 5)),
+    ((4, 8), (3, 5)),
+    ((0, 2), (5, 10)),
+    ((0, 2), (0, 2)),
+]
+ANSWERED = [*REGIONS[:3], ((4, 8), (3, 7)), *REGIONS[4:]]
+
+
+def worked_example(tmp_path, without=()):
+    annotations = annotations_of(tmp_path, NODES, REGIONS)
+    answers = {}
+    for node, (text, level, _) in enumerate(NODES):
+        if text not in without:
+            answers[text, Level(level)] = answers[text, None] = [node]
+            answers[annotations.path_of(node)] = [node]
+    scene = HandMade([mask_of(*each) for each in ANSWERED], answers)
+    return scene, ViewTruth.of(annotations, "v.png", SIZE, 1)
+
+
+def test_fake_and_real_scene_fit_the_protocol(block_world):
+    assert isinstance(HandMade([], {}), QueryableScene)
+    assert isinstance(block_world.answers, QueryableScene)
+
+
+def test_consistency_rows_match_the_worked_example(tmp_path):
+    scene, truth = worked_example(tmp_path)
+    values = measured(scene, truth, methods=("tree", "tree-path"))
+    for method, protocol in (
+        ("tree", "level-given@4"),
+        ("tree", "level-auto@4"),
+        ("tree", "scene-wide@1"),
+        ("tree-path", "path@3"),
+    ):
+        key = (method, f"hierarchy/{protocol}", "", "")
+        assert values[*key, "hc_containment"] == pytest.approx(0.9375)
+        assert values[*key, "hc_literal"] == pytest.approx(0.27)
+        assert values[*key, "hc_containment_pooled"] == pytest.approx(0.916667, abs=1e-6)
+        assert values[*key, "hc_literal_pooled"] == pytest.approx(0.293333, abs=1e-6)
+    # the annotations nest perfectly: a2 is 8 px of A, so literal is ((20 + 8)/50/2 + 10/25)/2 = 0.34
+    reference = ("truth", "hierarchy/annotations@1", "", "")
+    assert values[*reference, "hc_containment"] == 1
+    assert values[*reference, "hc_literal"] == pytest.approx((0.34 + 0.2) / 2)
+
+
+def test_missing_answer_counts_zero_and_breaks_consistency(tmp_path):
+    scene, truth = worked_example(tmp_path, without=("x",))
+    values = measured(scene, truth, methods=("tree",))
+    assert values["tree", "hierarchy/level-given@4", "x", "subpart", "iou"] == 0
+    assert values["tree", "hierarchy/level-given@4", "A", "whole", "iou"] == 1
+    assert values["tree", "hierarchy/level-given@4", "", "", "hc_containment"] == pytest.approx(0.4375)
+
+
+def test_scene_wide_answers_know_of_no_view(tmp_path):
+    scene, truth = worked_example(tmp_path)
+    scene.scene_wide = {
+        ("x", Level.SUBPART): [4],
+        ("A", "a1", "x"): [4],
+    }  # b1 is more like it, in another view
+    values = measured(scene, truth, methods=("tree", "tree-path"))
+    assert values["tree-path", "hierarchy/path@3", "x", "subpart", "iou"] == 1
+    assert values["tree", "hierarchy/level-given@4", "x", "subpart", "iou"] == 1
+    assert values["tree", "hierarchy/scene-wide@1", "x", "subpart", "iou"] == 0
+    assert values["tree", "hierarchy/scene-wide@1", "A", "whole", "iou"] == 1
+    # as if x had no answer: of its mask none lies inside a1
+    assert values["tree", "hierarchy/scene-wide@1", "", "", "hc_containment"] == pytest.approx(0.4375)
+
+
+def test_regions_with_the_same_text_are_united(tmp_path):
+    nodes = [("cup", 1, -1), ("cup", 1, -1)]
+    annotations = annotations_of(tmp_path, nodes, [((0, 4), (0, 4)), ((6, 10), (6, 10))])
+    truth = ViewTruth.of(annotations, "v.png", SIZE, 1)
+    assert len(truth.queries) == 1
+    assert truth.queries[0].truth.sum() == 32
+    assert truth.queries[0].boxes_xyxy.tolist() == [[0, 0, 3, 3], [6, 6, 9, 9]]
+    scene = HandMade([mask_of((0, 4), (0, 4))], {("cup", Level.WHOLE): [0], ("cup", None): [0]})
+    values = measured(scene, truth, methods=("tree",))
+    assert values["tree", "hierarchy/level-given@4", "cup", "whole", "iou"] == pytest.approx(0.5)
+
+
+def test_text_at_two_levels_is_one_category_and_two_queries(tmp_path):
+    nodes = [("wheel", 1, -1), ("cart", 1, -1), ("wheel", 2, 1)]
+    annotations = annotations_of(tmp_path, nodes, [((0, 2), (0, 10)), ((4, 10), (0, 10)), ((8, 10), (0, 5))])
+    truth = ViewTruth.of(annotations, "v.png", SIZE, 1)
+    assert [(query.text, query.level) for query in truth.queries] == [
+        ("wheel", Level.WHOLE),
+        ("cart", Level.WHOLE),
+        ("wheel", Level.PART),
+    ]
+    category = next(query for query in truth.categories if query.text == "wheel")
+    assert category.truth.sum() == 20 + 10
+
+
+def test_small_regions_are_not_scored(tmp_path):
+    annotations = annotations_of(tmp_path, NODES, REGIONS)
+    truth = ViewTruth.of(annotations, "v.png", SIZE, min_px=9)
+    assert [query.text for query in truth.queries] == ["A", "B", "a1", "b1"]  # x has 4 px, a2 has 8
+    assert truth.families() == [
+        [(("A",), [("A", "a1")]), (("B",), [("B", "b1")])],
+        [],
+    ]
+
+
+def test_view_without_parents_gives_no_consistency_row(tmp_path):
+    annotations = annotations_of(tmp_path, NODES[:2], REGIONS[:2])
+    truth = ViewTruth.of(annotations, "v.png", SIZE, 1)
+    values = measured(HandMade([], {}), truth, methods=("tree",))
+    assert not [key for key in values if key[4].startswith("hc_")]
+
+
+def test_labels_of_another_size_are_refused(tmp_path):
+    annotations = annotations_of(tmp_path, NODES, REGIONS)
+    with pytest.raises(MisalignedArtifactError, match=r"10 x 10"):
+        ViewTruth.of(annotations, "v.png", (20, 20), 1)
+
+
+def test_automatic_level_of_the_field_follows_the_highest_value(tmp_path):
+    annotations = annotations_of(tmp_path, [("cup", 1, -1)], [((2, 6), (2, 6))])
+    truth = ViewTruth.of(annotations, "v.png", SIZE, 1)
+    relevancy = np.full((3, *SIZE), 0.4, np.float32)
+    relevancy[0, 2:6, 2:6] = 0.8  # right place, at the level of the annotation
+    relevancy[2, 8, 8] = 0.9  # wrong place, finest level, higher
+    scene = HandMade([], {}, {"cup": relevancy})
+    values = measured(scene, truth, methods=("field",), filter_px=1, majority=False)
+    given, auto, lerf = (
+        f"{name} (filter 1, no majority)"
+        for name in ("hierarchy/level-given@4", "hierarchy/level-auto@4", "lerf/langsplat@1")
+    )
+    key = ("cup", "whole", "iou")
+    assert values["field", given, *key] == 1
+    assert values["field", auto, *key] == 0
+    assert values["field", lerf, "cup", "", "iou"] == 0
+    assert values["field", lerf, "cup", "", "localization_box"] == 0
+    assert values["field", given, "cup", "whole", "localization_box"] == 1
+    assert values["field", given, "cup", "whole", "best_threshold_iou"] == 1
+
+
+def test_other_protocols_are_measured_with_their_own_rules():
+    # The right place has the higher mean, another level the higher value.
+    relevancy = np.full((3, *SIZE), 0.1, np.float32)
+    relevancy[0, 2:6, 2:6] = 0.8
+    relevancy[2, 8, 8], relevancy[2, 8, 9] = 0.9, 0.66  # min-max 0.7: just in the mask
+    truth = ViewTruth.flat({"cup": mask_of((2, 6), (2, 6))})
+    scene = HandMade([], {}, {"cup": relevancy})
+    cards = [PROTOCOLS["3d-ovs/langsplat@1"], PROTOCOLS["3d-ovs/langsplat-raw@1"]]
+    rows = list(
+        measure_view(
+            scene,
+            Selections(scene, 0.85),
+            truth,
+            "v.png",
+            SIZE,
+            EvaluateSettings(methods=("field",), filter_px=1, mix=False, majority=False, relevancy_scale=5),
+            FlatProtocols(cards, None, ["relevancy scale 5"]),
+        )
+    )
+    ious = {row.protocol: row.value for row in rows if row.metric == "iou"}
+    assert ious == {
+        "lerf/langsplat@1 (filter 1, no mix, no majority, relevancy scale 5)": 0,
+        "3d-ovs/langsplat@1 (relevancy scale 5)": 1,
+        "3d-ovs/langsplat-raw@1 (relevancy scale 5)": 1,
+    }
+    own = {row.metric for row in rows if row.protocol.startswith("3d-ovs/")}
+    assert own == {"iou", "boundary_iou"}
+
+
+def test_path_localization_looks_inside_the_parent(tmp_path):
+    nodes = [("bear", 1, -1), ("nose", 2, 0)]
+    regions = [((0, 10), (0, 5)), ((2, 4), (2, 4))]
+    annotations = annotations_of(tmp_path, nodes, regions)
+    truth = ViewTruth.of(annotations, "v.png", SIZE, 1)
+    relevancy = np.full((3, *SIZE), 0.4, np.float32)
+    relevancy[1, 2:4, 2:4], relevancy[1, 7, 8] = 0.7, 0.9  # the nose, and something beside the bear
+    answers = {("bear",): [0], ("bear", "nose"): [1], ("nose", Level.PART): [1]}
+    scene = HandMade([mask_of(*each) for each in regions], answers, {"nose": relevancy})
+    values = measured(scene, truth, methods=("tree", "tree-path"), filter_px=1)
+    assert values["tree", "hierarchy/level-given@4 (filter 1)", "nose", "part", "localization_box"] == 0
+    assert values["tree-path", "hierarchy/path@3 (filter 1)", "nose", "part", "localization_box"] == 1
+
+
+def test_perfect_tree_of_the_block_world_scores_one(block_world):
+    view, size_hw = "001.png", (64, 64)
+    settings = EvaluateSettings()
+    truth = ViewTruth.of(block_world.annotations, view, size_hw, settings.min_region_px)
+    selections = Selections(block_world.answers, settings.node_select)
+    rows = list(measure_view(block_world.answers, selections, truth, view, size_hw, settings))
+    given = [row for row in rows if row.method == "tree" and row.protocol == "hierarchy/level-given@4"]
+    ious = {row.query: row.value for row in given if row.metric == "iou"}
+    assert ious == dict.fromkeys(("bear", "chest", "head", "lid", "nose"), 1.0)
+    assert {row.value for row in given if row.metric in ("localization_box", "hc_containment")} == {1.0}
+    for name in {row.protocol for row in rows}:
+        assert {row.metric for row in rows if row.protocol == name} == set(card_of(name).metrics)
+    field = {
+        row.query: row.value
+        for row in rows
+        if (row.method, row.protocol, row.metric) == ("field", "hierarchy/level-given@4", "iou")
+    }
+    assert field["bear"] > 0.9  # exact features; the filter rounds the corners
+
+
+def score(**changes):
+    fields = {
+        "dataset": "synthetic",
+        "scene": "s",
+        "variant": "default",
+        "masks": "sam-tiny",
+        "method": "tree",
+        "view": "v.png",
+        "query": "cup",
+        "level": "whole",
+        "metric": "iou",
+        "protocol": "hierarchy/level-given@4",
+        "value": 0.5,
+        "n": 1,
+    }
+    return Score(**{**fields, **changes})
+
+
+def test_score_files_are_sorted_and_stable(tmp_path):
+    rows = [score(query="b", value=1 / 3), score(query="a, or b"), score(query="a", metric="boundary_iou")]
+    write_scores(tmp_path / "one.csv", rows)
+    write_scores(tmp_path / "two.csv", rows[::-1])
+    text = (tmp_path / "one.csv").read_bytes()
+    assert text == (tmp_path / "two.csv").read_bytes()
+    assert text.decode().splitlines()[0] == ",".join(COLUMNS)
+    frame = read_scores([tmp_path / "one.csv"])
+    assert list(frame["query"]) == ["a", "a, or b", "b"]
+    assert frame["value"].tolist() == [0.5, 0.5, 0.333333]
+
+
+def test_header_only_score_file_reads_as_no_rows(tmp_path):
+    write_scores(tmp_path / "scores.csv", [])
+    assert len(read_scores([tmp_path / "scores.csv"])) == 0
+
+
+def test_other_columns_are_refused_by_name(tmp_path):
+    (tmp_path / "scores.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(ArtifactError, match=r"found     a, b"):
+        read_scores([tmp_path / "scores.csv"])
+
+
+def test_masks_are_named_after_the_model_or_the_segmenter(block_world, tmp_path):
+    from hilsplat.base.artifacts import write_index
+
+    assert masks_label(block_world.folder / "masks") == "sam-tiny"
+    write_index(tmp_path, {}, segmenter="graph", model=None)
+    assert masks_label(tmp_path) == "graph"

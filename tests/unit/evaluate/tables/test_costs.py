@@ -1,0 +1,126 @@
+"""Time and memory of a row, from the records that the workflow leaves beside its artifacts."""
+
+import csv
+import json
+import math
+
+import pytest
+
+from hilsplat.base.artifacts import write_json
+from hilsplat.base.errors import ArtifactError
+from hilsplat.base.provenance import provenance_path
+from hilsplat.evaluate.scores import Score, write_scores
+from hilsplat.evaluate.tables.build import run_table
+from hilsplat.evaluate.tables.costs import read_costs, time_queries, write_times
+from tests.unit.evaluate.tables.test_tables import PUBLISHED
+
+
+def record(folder, stage, seconds, mib):
+    """A benchmark file as Snakemake writes it."""
+    path = folder / "benchmarks" / f"{stage}.jsonl"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"s": seconds, "cpu_time": seconds, "max_rss": mib}) + "\n")
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """Scores of two variants; the second has a field of its own and shares the rest."""
+    folder = tmp_path / "results" / "synthetic" / "table-1"
+    default, other = folder / "default", folder / "omega-2"
+    stages = {
+        "masks": 60,
+        "coverage_tree": 6,
+        "clip": 54,
+        "contributions": 30,
+        "semantic_tree": 6,
+        "autoencoder": 12,
+    }
+    for stage, seconds in stages.items():
+        record(default, stage, seconds, 512)
+    for variant, seconds in ((default, 12), (other, 72)):
+        record(variant, "field", seconds, 1024 if variant is default else 2048)
+        inputs = {
+            name: {"path": str(default / name)}
+            for name in stages
+            if name not in ("coverage_tree", "contributions")
+        }
+        inputs["language"] = {"path": str(variant / "field.safetensors")}
+        scores = variant / "scores.csv"
+        row = Score(
+            "synthetic", "table-1", variant.name, "sam-tiny", "field", "v", "cup", "whole", "iou",
+            "hierarchy/level-given@4", 0.5, 1,
+        )  # fmt: skip
+        write_scores(scores, [row])
+        write_json(provenance_path(scores), {"inputs": inputs})
+        own = {
+            name: {"path": str(default / name)} for name in ("coverage_tree", "contributions", "autoencoder")
+        }
+        write_json(provenance_path(variant / "field.safetensors"), {"inputs": own})
+        write_times(scores, "synthetic", "table-1", variant.name, {"field": 0.25})
+    return [default / "scores.csv", other / "scores.csv"]
+
+
+def test_shared_stages_count_in_full_and_own_ones_alone(scene):
+    first, second = read_costs(scene)
+    assert (first.prepare_s, first.train_s, first.peak_mib) == (120, 60, 1024)
+    assert (second.prepare_s, second.train_s, second.peak_mib) == (120, 120, 2048)
+    assert first.query_s == {"field": 0.25}
+
+
+def test_a_job_that_left_no_record_leaves_its_sum_unknown(scene):
+    (scene[0].parent / "benchmarks" / "masks.jsonl").unlink()
+    first, _ = read_costs(scene)
+    assert math.isnan(first.prepare_s)
+    assert first.train_s == 60
+
+
+def test_a_stage_that_nothing_read_costs_nothing(scene):
+    record = provenance_path(scene[0].with_name("field.safetensors"))
+    inputs = json.loads(record.read_text())["inputs"]
+    del inputs["coverage_tree"]
+    write_json(record, {"inputs": inputs})
+    assert read_costs(scene)[0].prepare_s == 114
+
+
+def test_score_files_without_times_are_named(scene):
+    scene[0].with_name("times.csv").unlink()
+    with pytest.raises(ArtifactError, match=r"times\.csv is missing"):
+        read_costs(scene)
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "expected"),
+    [
+        ("cost", "Training (min)", ["1.00", "2.00"]),
+        ("cost", "table-1 query (s)", ["0.25", "0.25"]),
+        ("efficiency", "Memory (GB)", ["1.00", "2.00"]),
+        ("efficiency", "Hi-LERF mIoU", ["50.00", "50.00"]),
+        ("pruning", "Query (s)", ["0.25", "0.25"]),
+    ],
+)
+def test_tables_of_costs_show_measured_rows_beside_the_papers(scene, tmp_path, table, column, expected):
+    out = tmp_path / f"{table}.csv"
+    labels = {"default": "hilsplat", "omega-2": "Omega = 2"}
+    run_table(table, scene, PUBLISHED / f"{table}.csv", labels, out)
+    with out.open(newline="") as stream:
+        rows = [row for row in csv.DictReader(stream) if row["kind"] != "reported"]
+    assert [row["method"] for row in rows] == ["hilsplat (field)", "Omega = 2"]
+    assert [row[column] for row in rows] == expected
+    assert "main memory" in out.with_suffix(".md").read_text()
+
+
+def test_a_query_is_text_weights_and_answer():
+    class Scene:
+        def __init__(self):
+            self.asked = []
+
+        def encode_texts(self, texts):
+            self.asked.append(("text", *texts))
+
+        def pixel_weights(self, view):
+            self.asked.append(("weights", view))
+
+    scene = Scene()
+    seconds = time_queries(scene, {"tree": lambda text: scene.asked.append(text)}, "v.png", ["cup", "mug"])
+    assert seconds["tree"] > 0
+    assert scene.asked == [("text", "cup"), ("weights", "v.png"), "cup", "cup", "mug"]

@@ -1,0 +1,139 @@
+"""Tables of points, seeds, consistency and frames, from rows small enough to add up by hand."""
+
+import numpy as np
+import pytest
+
+from hilsplat.configuration import RunSettings
+from hilsplat.evaluate.instance_files import write_instances
+from hilsplat.evaluate.metrics.instances import InstanceScan, match_instances
+from hilsplat.evaluate.tables.build import TABLES, run_table
+from tests.unit.evaluate.tables.test_tables import PUBLISHED, built, measured, score
+
+MODE = "(points: nearest)"
+
+
+def point_score(protocol, metric, value, **more):
+    names = {"dataset": "synthetic-rooms", "query": "", "level": "", "view": ""}
+    return score(metric, value, protocol=f"{protocol}@1 {MODE}", **{**names, **more})
+
+
+def test_scannet_shows_all_sets_of_classes_in_one_row_and_instances_of_all_scans_together(tmp_path):
+    scores = [
+        point_score("scannet/opengaussian-19", "miou_present", 0.2, scene="room-1"),
+        point_score("scannet/opengaussian-19", "miou_present", 0.4, scene="room-2"),
+        point_score("scannet200/opengaussian", "macc_present", 0.1, scene="room-1"),
+    ]
+    # one scan finds its only instance, the other misses it: precision 1 up to recall 1/2
+    truth = np.full(100, 2001)
+    hit = match_instances(InstanceScan(truth, np.ones((1, 100), bool), np.array([2]), np.array([0.5])), (2,))
+    missed = match_instances(
+        InstanceScan(truth, np.zeros((0, 100), bool), np.zeros(0, int), np.zeros(0)), (2,)
+    )
+    key = ("default", "sam-tiny", "tree")
+    matches = {
+        ("synthetic-rooms", "room-1", *key): hit,
+        ("synthetic-rooms", "room-2", *key): missed,
+    }
+    write_instances(tmp_path / "scores.csv", matches)
+    rows, _ = built(tmp_path, "scannet", scores)
+    row = measured(rows, method="hilsplat (tree)")
+    assert (row["19 classes mIoU"], row["ScanNet200 mAcc"]) == ("30.00", "10.00")
+    assert (row["ScanNet200 AP"], row["ScanNet200 AP@25"]) == ("50.00", "50.00")
+    assert row["protocol"] == "points: nearest"
+
+
+def test_replica_shows_scenes_and_their_mean(tmp_path):
+    scores = [
+        point_score("replica/per-scene", "miou_present", 0.2, scene="room-1"),
+        point_score("replica/per-scene", "miou_present", 0.4, scene="room-2"),
+    ]
+    rows, _ = built(tmp_path, "replica", scores)
+    row = measured(rows, method="hilsplat (tree)")
+    assert (row["room-1 mIoU"], row["room-2 mIoU"], row["Mean mIoU"]) == ("20.00", "40.00", "30.00")
+
+
+def test_waymo_pools_the_counts_of_all_scenes(tmp_path):
+    scores = []
+    for scene, hits, union in (("street-1", 1, 2), ("street-2", 8, 8)):
+        for metric, of in (("class_iou", union), ("class_accuracy", union)):
+            row = point_score("waymo/segmentation", metric, hits / of, scene=scene, query="car")
+            scores.append(type(row)(**{**vars(row), "n": of, "dataset": "synthetic-streets"}))
+    rows, _ = built(tmp_path, "waymo", scores)
+    row = measured(rows, method="hilsplat (tree)")
+    # (1 + 8) / (2 + 8) for cars, and 21 absent classes that count 1
+    assert row["mIoU, present classes"] == "90.00"
+    assert row["mIoU"] == f"{100 * (21 + 0.9) / 22:.2f}"
+
+
+def test_seeds_of_a_variant_are_one_row_with_mean_and_spread(tmp_path):
+    scores = [
+        score("iou", value, variant=variant, method="field")
+        for variant, value in (("default", 0.4), ("default.seed1", 0.5), ("default.seed2", 0.6))
+    ]
+    rows, forms = built(tmp_path, "hierarchy", scores)
+    row = measured(rows, method="hilsplat (field)")
+    assert (row["L1"], row["seeds"], row["Pairs"]) == ("50.00 ± 10.00", "3", "1")
+    assert "50.0 ± 10.0" in forms[".md"]
+    assert r"50.0 $\pm$ 10.0" in forms[".tex"]
+    assert "standard deviation over seeds" in forms[".md"]
+
+
+def test_annotations_are_one_row_whatever_the_seeds(tmp_path):
+    scores = [
+        score("hc_containment", 1.0, variant=variant, method="truth", protocol="hierarchy/annotations@1")
+        for variant in ("default", "paper", "paper.seed1", "paper.seed2")
+    ]
+    rows, _ = built(tmp_path, "hierarchy", scores)
+    assert len([row for row in rows if row["method"] == "annotations"]) == 1
+
+
+def test_view_consistency_stands_beside_the_level_given_rows(tmp_path):
+    scores = [
+        score("iou", 0.5),
+        score("iou", 0.5, protocol="hierarchy/level-auto@4"),
+        score("view_consistency", 0.8, protocol="world/view-consistency@2"),
+        score("view_consistency", 0.6, protocol="world/view-consistency@2", query="mug"),
+        score("view_consistency", 0.1, protocol="world/view-consistency@2", level="part"),
+    ]
+    rows, _ = built(tmp_path, "hierarchy", scores)
+    assert measured(rows, protocol="level given")["View consistency"] == "40.00"  # (0.7 + 0.1) / 2
+    assert measured(rows, protocol="level chosen")["View consistency"] == ""
+
+
+def test_frames_are_the_views_that_were_asked_at_levels(tmp_path):
+    scores = [
+        score("iou", 0.5, view="007.png"),
+        score("iou", 0.5, view="007.png", query="mug"),
+        score("iou", 0.5, view="015.png"),
+        score("iou", 0.5, view="015.png", method="field"),
+    ]
+    rows, _ = built(tmp_path, "frames-hi-lerf", scores)
+    assert [row["one"] for row in rows if row["kind"] != "reported"] == ["007 (2 texts)", "015 (1 texts)"]
+    assert [row["Figurines"] for row in rows if row["kind"] == "reported"][:2] == [
+        "frame_00016",
+        "frame_00041",
+    ]
+
+
+@pytest.mark.parametrize("name", sorted(TABLES))
+def test_what_was_not_measured_stands_below_every_table(tmp_path, name):
+    out = tmp_path / f"{name}.csv"
+    run_table(name, [], PUBLISHED / f"{name}.csv", {}, out, ["replica (room_0): data_root is not set."])
+    for suffix in (".md", ".tex", ".html"):
+        assert "Not measured: replica (room" in out.with_suffix(suffix).read_text().replace(r"\_", "_")
+
+
+@pytest.mark.parametrize("name", sorted(TABLES))
+def test_variants_of_every_table_are_a_list_of_the_configuration(name):
+    assert TABLES[name].variants in RunSettings.model_fields
+
+
+def test_lerf_mask_means_go_over_texts_and_not_over_pairs(tmp_path):
+    protocol = "lerf-mask/gaussian-grouping@1 (wholes)"
+    scores = [
+        score("iou", 0.8, query="apple", view="a", protocol=protocol, level=""),
+        score("iou", 0.6, query="apple", view="b", protocol=protocol, level=""),
+        score("iou", 0.3, query="egg", view="a", protocol=protocol, level=""),
+    ]
+    rows, _ = built(tmp_path, "lerf", scores)
+    assert measured(rows, protocol=protocol)["Average mIoU"] == "50.00"  # pairs would give 56.67

@@ -1,0 +1,346 @@
+"""The sparse solver against dense algebra and autograd, and the stage."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import torch
+
+from hilsplat.base.artifacts import read_json
+from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.contributions.cuda_algebra import DeviceMasks, DeviceQuadratic
+from hilsplat.contributions.mask_operator import MaskOperator
+from hilsplat.contributions.quadratic import StackedWeights
+from hilsplat.contributions.stage import painted_indicator
+from hilsplat.field.autoencoder import run_autoencoder
+from hilsplat.field.contrast import Contrast, ViewRelations, distinct, instance_term, part_term
+from hilsplat.field.field import LanguageField, run_field
+from hilsplat.field.losses.clustering import clustering_loss
+from hilsplat.field.losses.latent_regression import latent_regression_loss
+from hilsplat.field.minimise import lbfgs
+from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
+from hilsplat.field.reference_trainer import rendered_loss, run_reference
+from hilsplat.field.solver import keep_labelled, solve_field
+from hilsplat.methods.method import MethodInputs
+from hilsplat.semantic_tree.tree import run_semantic_tree
+from hilsplat.settings import AutoencoderSettings, FieldSettings, ReferenceSettings, SemanticTreeSettings
+from hilsplat.splat.gaussians import Gaussians
+
+PIXELS, GAUSSIANS, CHANNELS = 60, 12, 2
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+
+
+class Toy:
+    """One view with three masks a level on 60 pixels and 12 Gaussians, and its dense matrices."""
+
+    def __init__(self, weights: tuple[float, float, float]) -> None:
+        rng = np.random.default_rng(0)
+        dense = rng.random((PIXELS, GAUSSIANS)) * (rng.random((PIXELS, GAUSSIANS)) < 0.4)
+        dense[:, 0] += 0.01  # no empty row
+        self.W = (dense / dense.sum(axis=1, keepdims=True)).astype(np.float32)
+        self.labels = rng.integers(-1, 3, (PIXELS, 3)) + np.array([0, 3, 6])
+        self.labels[rng.random((PIXELS, 3)) < 0.2] = -1
+        self.labels[self.labels == np.array([-1, 2, 5])] = -1
+        self.level = np.repeat(np.array([1, 2, 3], np.uint8), 3)
+        indicator = painted_indicator(self.labels.astype(np.int32), 9, np.ones(PIXELS, bool))
+        half = painted_indicator(self.labels.astype(np.int32), 9, rng.random(PIXELS) < 0.5)
+        self.pixels = np.asarray(indicator.sum(axis=1)).ravel().astype(np.float32)
+        self.half_pixels = np.asarray(half.sum(axis=1)).ravel().astype(np.float32)
+        self.A = (sp.diags(1 / self.pixels) @ indicator @ self.W).astype(np.float32)
+        self.A_half = (sp.diags(1 / self.half_pixels) @ half @ self.W).astype(np.float32)
+        self.latents = rng.normal(size=(9, CHANNELS)).astype(np.float32)
+        self.problem = QuadraticProblem.of(
+            MaskOperator.of(sp.csr_matrix(self.A), self.level),
+            StackedWeights(sp.csr_matrix(self.W), self.labels >= 0),
+            self.pixels,
+            self.latents,
+            weights,
+        )
+        self.features = rng.normal(size=(GAUSSIANS, 3, CHANNELS)).astype(np.float32)
+
+    def contrast(self, settings: FieldSettings) -> Contrast:
+        parent = torch.tensor([-1] * 3 + [0, 0, 1] + [3, 4, 4])
+        depth = torch.zeros(9, 9, dtype=torch.long)
+        relations = ViewRelations(
+            torch.arange(9),
+            depth,
+            torch.from_numpy(self.level.astype(np.int64)),
+            (torch.tensor([3, 4, 5]), torch.tensor([6, 7, 8])),
+            (parent[3:6], parent[6:9]),
+        )
+        half = MaskOperator.of(sp.csr_matrix(self.A_half), self.level)
+        return Contrast(self.problem.masks, half, self.pixels, self.half_pixels, [relations], settings)
+
+    def dense_losses(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Language loss and L_h by rendering every pixel, as means over labelled pixels."""
+        language, clustering = 0, 0
+        for index in range(3):
+            labels = torch.from_numpy(self.labels[:, index])[None]
+            rendered = (torch.from_numpy(self.W).double() @ features[:, index])[None]
+            count = (labels >= 0).sum() / self.pixels.sum()
+            latents = torch.from_numpy(self.latents).double()
+            language = language + count * latent_regression_loss(rendered, labels, latents)
+            clustering = clustering + count * clustering_loss(rendered, labels)
+        return language, clustering
+
+
+def test_terms_equal_the_losses_of_rendered_pixels():
+    toy = Toy((1.0, 0.3, 0.1))
+    terms = toy.problem.terms(toy.features)
+    language, clustering = toy.dense_losses(torch.from_numpy(toy.features).double())
+    assert terms["language"] == pytest.approx(language.item(), rel=1e-5)
+    assert terms["clustering"] == pytest.approx(clustering.item(), rel=1e-5)
+
+
+def test_gradient_equals_autograd_through_rendering():
+    toy = Toy((0.7, 0.4, 0.0))
+    features = torch.from_numpy(toy.features).double().requires_grad_()
+    language, clustering = toy.dense_losses(features)
+    (expected,) = torch.autograd.grad(0.7 * language + 0.4 * clustering, features)
+    half = toy.problem.hessian_product(toy.features) - toy.problem.right_side()
+    assert 2 / toy.problem.total_pixels * half == pytest.approx(expected.numpy(), abs=1e-6)
+
+
+def test_lifted_average_is_a_weighted_mean_of_latents():
+    toy = Toy((1.0, 0.0, 0.1))
+    for index in range(3):
+        valid = toy.labels[:, index] >= 0
+        target = toy.latents[toy.labels[valid, index]]
+        weight = toy.W[valid]
+        expected = weight.T @ target / weight.sum(axis=0)[:, None]
+        assert toy.problem.lifted[:, index] == pytest.approx(expected, abs=1e-5)
+
+
+def test_unseen_gaussians_stay_zero():
+    toy = Toy((1.0, 0.3, 0.1))
+    toy.W[:, 5] = 0
+    toy.A[:, 5] = 0
+    problem = QuadraticProblem.of(
+        MaskOperator.of(sp.csr_matrix(toy.A), toy.level),
+        StackedWeights(sp.csr_matrix(toy.W), toy.labels >= 0),
+        toy.pixels,
+        toy.latents,
+        (1.0, 0.3, 0.1),
+    )
+    solved = conjugate_gradient(problem, problem.lifted, 5)
+    assert np.isfinite(solved).all()
+    assert (solved[5] == 0).all()
+
+
+def test_conjugate_gradient_reaches_the_dense_solution():
+    language, clustering, ridge = weights = (1.0, 0.3, 0.1)
+    toy = Toy(weights)
+    solved = conjugate_gradient(toy.problem, toy.problem.lifted, 30)
+    for index in range(3):
+        valid = toy.labels[:, index] >= 0
+        rows = toy.level == index + 1
+        W = toy.W[valid].astype(np.float64)
+        G, mass = W.T @ W, np.diag(W.sum(axis=0))
+        A, n = toy.A[rows].astype(np.float64), np.diag(toy.pixels[rows].astype(np.float64))
+        hessian = (language + clustering) * G - clustering * A.T @ n @ A + ridge * mass
+        right = language * A.T @ n @ toy.latents[rows] + ridge * mass @ toy.problem.lifted[:, index]
+        assert solved[:, index] == pytest.approx(np.linalg.solve(hessian, right), abs=2e-5)
+
+
+def test_a_solved_problem_stays_solved():
+    toy = Toy((0.0, 0.0, 1.0))  # only the ridge: the lift is the answer
+    assert np.array_equal(conjugate_gradient(toy.problem, toy.problem.lifted, 3), toy.problem.lifted)
+
+
+def test_lbfgs_finds_the_minimum_of_a_bowl():
+    curvature = np.array([1.0, 4.0, 9.0], np.float32)
+
+    def bowl(x: np.ndarray) -> tuple[float, np.ndarray]:
+        return float((curvature * (x - 1) ** 2).sum()), 2 * curvature * (x - 1)
+
+    assert lbfgs(bowl, np.zeros(3, np.float32), 20, 0.1) == pytest.approx(np.ones(3), abs=1e-3)
+
+
+@pytest.mark.parametrize("instance", ["literal", "coverage_tree", "logratio"])
+@pytest.mark.parametrize("part", ["literal", "disentangle"])
+def test_contrastive_gradients_equal_autograd_through_the_means(instance, part):
+    toy = Toy((1.0, 0.3, 0.1))
+    contrast = toy.contrast(FieldSettings(instance_mode=instance, part_mode=part, tau=0.5))
+    terms = contrast.values(toy.features)
+    value, gradient = contrast.weighted(toy.features, (0.5, 0.25))
+
+    features = torch.from_numpy(toy.features).double().requires_grad_()
+    own = [features[:, level - 1] for level in toy.level]
+    means, halves = (
+        torch.stack([torch.from_numpy(row).double() @ values for row, values in zip(A, own, strict=True)])
+        for A in (toy.A.astype(np.float64), toy.A_half.astype(np.float64))
+    )
+    n, half = (torch.from_numpy(count).double()[:, None] for count in (toy.pixels, toy.half_pixels))
+    others = (n * means - half * halves) / (n - half)
+    instance_loss = instance_term(means, contrast.relations, contrast.settings)
+    part_loss = part_term(means, halves, others, contrast.relations, contrast.settings)
+    assert terms == pytest.approx({"instance": instance_loss.item(), "part": part_loss.item()}, rel=1e-5)
+    total = 0.5 * instance_loss + 0.25 * part_loss
+    assert value == pytest.approx(total.item(), rel=1e-5)
+    (expected,) = torch.autograd.grad(total, features, retain_graph=True)
+    assert gradient == pytest.approx(expected.numpy(), abs=1e-5)
+    (of_part,) = torch.autograd.grad(part_loss, features)
+    value, gradient = contrast.weighted(toy.features, (0.0, 1.0))  # the other is not computed
+    assert value == pytest.approx(part_loss.item(), rel=1e-5)
+    assert gradient == pytest.approx(of_part.numpy(), abs=1e-5)
+
+
+def test_contrastive_weights_lower_their_terms():
+    toy = Toy((1.0, 0.0, 0.1))
+    settings = FieldSettings(
+        weight_clustering=0.0, weight_instance=1.0, weight_part=0.1, omega=3.0, lbfgs_steps=15
+    )
+    features, report = solve_field(toy.problem, toy.contrast(settings), settings)
+    assert np.isfinite(features).all()
+    assert report["after_lbfgs"]["instance"] < report["after_cg"]["instance"]
+    without = settings.model_copy(update={"weight_instance": 0.0, "weight_part": 0.0})
+    _, plain = solve_field(toy.problem, toy.contrast(without), without)
+    assert "after_lbfgs" not in plain
+    assert plain["after_cg"]["language"] < plain["lifted"]["language"]
+    assert set(plain["gradient_norms"]) == {"language", "clustering", "instance", "part"}
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_device_solves_the_same_field(device):
+    toy = Toy((1.0, 0.3, 0.1))
+    settings = FieldSettings(weight_instance=0.3, weight_part=0.1, lbfgs_steps=5)
+    contrast = toy.contrast(settings)
+    features, report = solve_field(toy.problem, contrast, settings)
+    moved = replace(
+        toy.problem,
+        masks=DeviceMasks.of(toy.problem.masks, device),
+        quadratic=DeviceQuadratic.of(toy.problem.quadratic, device),
+    )
+    halves = DeviceMasks.of(contrast.half_masks, device)
+    there = Contrast(moved.masks, halves, toy.pixels, toy.half_pixels, contrast.relations, contrast.settings)
+    on_device, told = solve_field(moved, there, settings)
+    assert on_device == pytest.approx(features, abs=1e-4)
+    for step in ("lifted", "after_cg", "after_lbfgs"):
+        assert told[step] == pytest.approx(report[step], rel=1e-3)
+    # losses are small differences of large sums: a device takes them in float64 too
+    assert told["lifted"]["language"] == pytest.approx(report["lifted"]["language"], rel=1e-9)
+
+
+def test_gaussians_that_masks_hardly_hold_keep_no_latent():
+    features = np.ones((3, 3, 2), np.float32)
+    mass = np.array([[4, 0.1, 4], [4, 2, 0], [0, 0, 0]], np.float32)
+    kept = keep_labelled(features, mass, np.array([4.0, 4.0, 0.0]), 0.5)
+    assert kept[..., 0].tolist() == [[1, 0, 1], [1, 1, 0], [0, 0, 0]]
+    assert np.array_equal(keep_labelled(features, mass, np.array([4.0, 4.0, 0.0]), 0.0), features)
+
+
+def test_pruning_drops_look_alikes_that_are_unrelated():
+    means = np.array([[1, 0], [1, 0.01], [1, 0.02], [0, 1]], np.float32)
+    depth = np.zeros((4, 4), np.int64)
+    assert distinct(means, depth, 0.95).tolist() == [0, 3]
+    depth[0, 1] = depth[1, 0] = 1  # siblings are kept apart; the third is like both
+    assert distinct(means, depth, 0.95).tolist() == [0, 1, 3]
+    assert distinct(means, depth, 1.0).tolist() == [0, 1, 2, 3]
+
+
+def test_the_reference_loss_is_the_solver_s_language_loss():
+    toy = Toy((1.0, 0.0, 0.0))
+    features = torch.from_numpy(toy.features)
+    rendered = torch.from_numpy(toy.W) @ features.reshape(GAUSSIANS, -1)
+    alpha = torch.full((6, 10), 0.8)
+    shown = 0.8 * rendered.reshape(6, 10, -1)  # premultiplied, as the rasteriser gives it
+    labels = toy.labels.astype(np.int32)
+    squared = rendered_loss(shown, alpha, labels, toy.latents, "squared")
+    assert squared.item() == pytest.approx(toy.problem.terms(toy.features)["language"], rel=1e-5)
+    apart = [
+        np.abs(rendered.numpy().reshape(60, 3, 2)[p, i] - toy.latents[labels[p, i]]).sum()
+        for p in range(60)
+        for i in range(3)
+        if labels[p, i] >= 0
+    ]
+    l1 = rendered_loss(shown, alpha, labels, toy.latents, "l1")
+    assert l1.item() == pytest.approx(sum(apart) / (60 * 2), rel=1e-5)
+    thin = rendered_loss(shown, torch.full((6, 10), 0.4), labels, toy.latents, "l1")
+    assert thin.item() == 0  # thinly covered pixels do not count
+
+
+@pytest.fixture
+def boxes_with_latents(two_boxes_contributions):
+    world, contributions = two_boxes_contributions
+    tree, autoencoder = world.folder / "semantic_tree", world.folder / "autoencoder"
+    run_semantic_tree(contributions, world.masks, world.clip, tree, SemanticTreeSettings())
+    quick = AutoencoderSettings(code="network", latent=3, epochs=1, min_steps=100)
+    run_autoencoder(world.clip, tree, contributions, autoencoder, quick, 0)
+    return world, contributions, autoencoder
+
+
+SMALL_MASKS = FieldSettings(min_mask_px=4, weight_part=0.003)
+
+
+def test_stage_is_the_same_on_any_number_of_threads(boxes_with_latents):
+    world, contributions, autoencoder = boxes_with_latents
+    out = world.folder / "field.safetensors"
+    run_field(contributions, world.coverage_tree, autoencoder, out, SMALL_MASKS, 1)
+    before = out.read_bytes()
+    run_field(contributions, world.coverage_tree, autoencoder, out, SMALL_MASKS, 2)
+    assert out.read_bytes() == before
+    field = LanguageField.load(out)
+    assert field.features.shape == (96, 3, 3)
+    report = read_json(world.folder / "field.report.json")
+    assert report["after_lbfgs"]["language"] >= 0
+    assert report["gaussians"] == 96
+    assert report["gradient_norms"]["part"] > 0
+
+
+def test_the_median_start_and_pruning_are_options_of_the_stage(boxes_with_latents):
+    world, contributions, autoencoder = boxes_with_latents
+    reports = {}
+    for name, more in (("plain", {}), ("median", {"start": "median"}), ("pruned", {"prune_cosine": 0.0})):
+        out = world.folder / name / "field.safetensors"
+        settings = SMALL_MASKS.model_copy(update=more)
+        run_field(contributions, world.coverage_tree, autoencoder, out, settings, 1)
+        reports[name] = read_json(out.with_suffix(".report.json"))
+    assert reports["median"]["lifted"] != reports["plain"]["lifted"]
+    assert reports["pruned"]["contrasted_masks"] < reports["plain"]["contrasted_masks"]
+
+
+def test_the_reference_trainer_and_baselines_refuse_other_gaussians(boxes_with_latents, monkeypatch):
+    world, contributions, autoencoder = boxes_with_latents
+    other = world.folder / "other.ply"
+    other.write_bytes(b"other")
+    monkeypatch.setattr("hilsplat.field.reference_trainer.load_ply", lambda path: None)
+    parts = (world.scene, other, world.masks, contributions, autoencoder)
+    with pytest.raises(MisalignedArtifactError, match=r"made for another other\.ply"):
+        run_reference(*parts, world.folder / "l.safetensors", ReferenceSettings(), "cpu", 0, 1)
+    with pytest.raises(MisalignedArtifactError, match=r"made for another other\.ply"):
+        MethodInputs(*parts).view_weights(world.views[0])
+
+
+def test_the_reference_trainer_lowers_its_loss(boxes_with_latents, monkeypatch):
+    world, contributions, autoencoder = boxes_with_latents
+    row, column = np.divmod(np.arange(96), 12)
+    means = torch.from_numpy(np.stack([column - 5.5, row - 3.5, np.full(96, 10.0)], axis=1)).float()
+    flat = Gaussians(
+        means,
+        torch.full((96, 3), -1.5),
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(96, 1),
+        torch.full((96,), 5.0),
+        torch.zeros(96, 1, 3),
+    )
+    monkeypatch.setattr("hilsplat.field.reference_trainer.load_ply", lambda path: flat)
+    out = world.folder / "reference" / "field.safetensors"
+    arguments = (world.scene, world.ply, world.masks, contributions, autoencoder, out)
+    settings = ReferenceSettings(steps=60, rate=0.05, log_every=20)
+    run_reference(*arguments, settings, "cpu", 0, 1)
+    curve = read_json(world.folder / "reference" / "field.report.json")["curve"]
+    assert [point["step"] for point in curve] == [20, 40, 60]
+    assert curve[-1]["loss"] < 0.7 * curve[0]["loss"]
+    before = out.read_bytes()
+    run_reference(*arguments, settings, "cpu", 0, 2)
+    assert out.read_bytes() == before
+    assert LanguageField.load(out).features.shape == (96, 3, 3)
+
+
+def test_tree_of_other_masks_is_refused(boxes_with_latents):
+    world, contributions, autoencoder = boxes_with_latents
+    np.savez(world.coverage_tree / "001.png.npz", parent=np.zeros(2, np.int32))
+    with pytest.raises(MisalignedArtifactError, match=r"view 001.png belongs to other masks"):
+        run_field(
+            contributions, world.coverage_tree, autoencoder, world.folder / "l.safetensors", SMALL_MASKS, 1
+        )

@@ -1,0 +1,188 @@
+"""Look-ups of relevancy against decoding every latent, and the linear code by its algebra."""
+
+import numpy as np
+import pytest
+import torch
+
+from hilsplat.base.device import compute_device
+from hilsplat.base.errors import DeviceError
+from hilsplat.field.autoencoder import Autoencoder, train_autoencoder
+from hilsplat.field.linear_code import LinearCode
+from hilsplat.query import projected_look_up
+from hilsplat.query.device_look_up import PlacedOnDevice
+from hilsplat.query.latent_relevancy import LatentRelevancy
+from hilsplat.query.projected_look_up import lost_for_error
+from hilsplat.settings import AutoencoderSettings
+
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+
+
+def unit(vectors):
+    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def vectors():
+    """Sixty vectors about six directions, as a scene's masks have them."""
+    rng = np.random.default_rng(0)
+    centres = rng.normal(size=(6, 32))
+    return unit(np.repeat(centres, 10, axis=0) + 0.3 * rng.normal(size=(60, 32)))
+
+
+@pytest.fixture(scope="module")
+def texts():
+    return unit(np.random.default_rng(1).normal(size=(7, 32)))
+
+
+def blends(features, count):
+    """What pixels show: averages of a few Gaussians."""
+    rng = np.random.default_rng(2)
+    weights = rng.dirichlet(np.full(4, 0.5), count)
+    return np.einsum("pk,pkd->pd", weights, features[rng.integers(0, len(features), (count, 4))]).astype(
+        np.float32
+    )
+
+
+@torch.no_grad()
+def pass_through(latent, channels):
+    """A network that decodes to the positive part of a latent, then zeros, at unit length."""
+    code = Autoencoder(channels, latent)
+    for layer in code.decoder:
+        if isinstance(layer, torch.nn.Linear):
+            layer.weight.copy_(torch.eye(*layer.weight.shape))
+            layer.bias.zero_()
+    return code
+
+
+def distance_from_kept(code, latents, placed):
+    """Of decoded vectors from what is kept of them: no unit text's cosine errs by more."""
+    kept = (placed.coordinates.T / projected_look_up.STEPS) @ placed.directions
+    return np.linalg.norm(code.decode_array(latents) - kept, axis=1)
+
+
+@pytest.mark.parametrize("latent", [3, 5])
+def test_look_up_of_a_network_is_within_two_thousandths_of_decoding(vectors, texts, latent):
+    settings = AutoencoderSettings(code="network", latent=latent, epochs=1, min_steps=600)
+    code = train_autoencoder(vectors, settings, 0)
+    fast = LatentRelevancy(code, texts[:4], 10.0)
+    latents = blends(code.encode_array(vectors), 20_000)  # more than one thread decodes at a time
+    placed = fast.prepare(latents)
+    found, exact = fast.fast(placed, texts[4:]), fast.exact(latents, texts[4:])
+    assert np.ptp(exact) > 0.2  # there is something to get wrong
+    assert np.abs(found - exact).max() < 2e-3
+    assert len(placed.directions) < 32
+    assert distance_from_kept(code, latents, placed).max() < 8e-4  # 4 x 2e-3 / 10: so for any text
+    two = LatentRelevancy(code, texts[:4], 10.0, threads=2)
+    assert np.array_equal(two.fast(two.prepare(latents), texts[4:]), found)
+
+
+def view_with_an_object(height):
+    """50,000 px between two directions; 10 px, not of the sample of every 7th, rise into a third."""
+    share = np.linspace(0, 1, 50_000, dtype=np.float32)
+    latents = np.stack([share, 1 - share, np.zeros_like(share)], axis=1)
+    pixels = np.array([p for p in range(100, 115) if p % 7][:10])
+    latents[pixels] = [1, 0, height]
+    return latents, pixels
+
+
+def test_a_small_object_that_the_sample_missed_is_found():
+    latents, pixels = view_with_an_object(height=1)
+    code, axes = pass_through(3, 128), np.eye(128, dtype=np.float32)
+    fast = LatentRelevancy(code, axes[3:4], 10.0)
+    placed = fast.prepare(latents)
+    found = fast.fast(placed, axes[2:3])
+    # The object's cosine with the third axis is 1 / sqrt(2), all else's 0, and the phrase's 0 everywhere.
+    expected = np.full(50_000, 0.5)
+    expected[pixels] = 1 / (1 + np.exp(-10 / np.sqrt(2)))
+    assert np.abs(found - expected).max() < 2e-3
+    assert len(placed.directions) == 3
+    two = LatentRelevancy(code, axes[3:4], 10.0, threads=2)
+    assert np.array_equal(two.fast(two.prepare(latents), axes[2:3]), found)
+
+
+@pytest.mark.parametrize(("height", "directions"), [(6e-4, 2), (7e-4, 3)])
+def test_what_may_be_lost_gets_no_direction(height, directions):
+    # By hand: 4 x 2e-3 / 10 - sqrt(128) / (2 x 32767) = 6.27e-4
+    assert lost_for_error(10.0, 128) == pytest.approx(6.27e-4, abs=1e-6)
+    latents, _ = view_with_an_object(height)
+    code, axes = pass_through(3, 128), np.eye(128, dtype=np.float32)
+    fast = LatentRelevancy(code, axes[3:4], 10.0)
+    placed = fast.prepare(latents)
+    assert len(placed.directions) == directions
+    # At a tie with the phrase relevancy is steepest: nothing is worse than asking for what is lost.
+    assert np.abs(fast.fast(placed, axes[2:3]) - fast.exact(latents, axes[2:3])).max() < 2e-3
+
+
+def test_objects_missed_again_are_found_and_directions_end_with_the_channels(monkeypatch):
+    monkeypatch.setattr(projected_look_up, "SAMPLE", 4)
+    latents = np.zeros((4000, 8), np.float32)  # the sample takes every 1000th
+    latents[:, 0] = 1
+    latents[101:201, 1] = 1  # the sample of these 100 takes every 25th
+    latents[[103, 108, 111, 115, 119, 123], 2:] = np.eye(6)
+    code, axes = pass_through(8, 8), np.eye(8, dtype=np.float32)
+    fast = LatentRelevancy(code, axes[:1], 10.0)
+    placed = fast.prepare(latents)
+    assert distance_from_kept(code, latents, placed).max() < 8e-4
+    assert placed.directions @ placed.directions.T == pytest.approx(axes, abs=1e-6)
+    assert placed.nbytes == 8 * 4000 * 2 + 8 * 8 * 4 + 4000 * 4
+    assert placed.coordinates.base is None  # keeps nothing larger alive
+
+
+def test_a_level_without_a_pixel_has_no_answer(vectors, texts):
+    code = train_autoencoder(vectors, AutoencoderSettings(code="network", latent=3, epochs=1, min_steps=1), 0)
+    fast = LatentRelevancy(code, texts[:4], 10.0)
+    assert fast.fast(fast.prepare(np.zeros((0, 3), np.float32)), texts[4:]).shape == (3, 0)
+
+
+@pytest.mark.parametrize("latent", [3, 8, 11])  # loops take eight channels at a time
+def test_linear_codes_need_no_decoding(vectors, texts, latent):
+    code = LinearCode.fit(vectors, latent)
+    fast = LatentRelevancy(code, texts[:4], 10.0)
+    latents = blends(code.encode_array(vectors), 70_000)  # more than one thread takes at a time
+    found = fast.fast(fast.prepare(latents), texts[4:])
+    assert found == pytest.approx(fast.exact(latents, texts[4:]), abs=1e-5)
+    two = LatentRelevancy(code, texts[:4], 10.0, threads=2)
+    assert np.array_equal(two.fast(two.prepare(latents), texts[4:]), found)
+
+
+def test_a_linear_code_of_full_rank_loses_nothing(vectors):
+    code = LinearCode.fit(vectors, 32)
+    assert code.decode_array(code.encode_array(vectors)) == pytest.approx(vectors, abs=1e-5)
+    assert code.basis @ code.basis.T == pytest.approx(np.eye(32), abs=1e-5)
+
+
+def test_an_average_of_linear_codes_is_the_code_of_the_average(vectors):
+    code = LinearCode.fit(vectors, 4)
+    mean = vectors[:10].mean(axis=0, keepdims=True)
+    assert code.encode_array(vectors[:10]).mean(axis=0) == pytest.approx(code.encode_array(mean)[0], abs=1e-5)
+
+
+def test_principal_directions_are_those_of_the_largest_spread():
+    rng = np.random.default_rng(3)
+    data = (rng.normal(size=(500, 3)) * [0.1, 3.0, 1.0]).astype(np.float32)
+    basis = LinearCode.fit(data, 2).basis
+    assert np.abs(basis) == pytest.approx(np.array([[0, 1, 0], [0, 0, 1]]), abs=0.05)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("code", ["pca", "network"])
+def test_torch_looks_up_the_same(vectors, texts, code, device):
+    if code == "pca":
+        model = LinearCode.fit(vectors, 8)
+    else:
+        model = train_autoencoder(
+            vectors, AutoencoderSettings(code="network", latent=3, epochs=1, min_steps=200), 0
+        )
+    answer = LatentRelevancy(model, texts[:3], 10.0)
+    placed = answer.prepare(blends(model.encode_array(vectors), 3000))
+    moved = PlacedOnDevice.of(placed, device)
+    assert answer.fast(moved, texts) == pytest.approx(answer.fast(placed, texts), abs=1e-5)
+    assert moved.nbytes == placed.nbytes
+
+
+def test_a_device_that_is_missing_is_told(vectors, texts, monkeypatch):
+    monkeypatch.setattr("hilsplat.base.device.cuda_missing", lambda: "no device here")
+    compute_device.cache_clear()
+    with pytest.raises(DeviceError, match="no device here"):
+        LatentRelevancy(LinearCode.fit(vectors, 4), texts[:3], 10.0, device="cuda")
+    compute_device.cache_clear()

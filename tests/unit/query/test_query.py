@@ -1,0 +1,462 @@
+"""Queries on the world with two boxes: flat, along a path, of a view."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from hilsplat.base.artifacts import write_json
+from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError
+from hilsplat.base.levels import Level
+from hilsplat.base.provenance import provenance_path
+from hilsplat.field.autoencoder import load_code, run_autoencoder
+from hilsplat.field.field import LanguageField, run_field
+from hilsplat.query.language_scene import LanguageScene
+from hilsplat.query.node_search import ancestor_margins, automatic_level, best_nodes, search_path
+from hilsplat.query.view_nodes import ViewNodes
+from hilsplat.query.view_store import ViewStore
+from hilsplat.scene.finished import FinishedScene, require_same
+from hilsplat.scene.scene import Scene
+from hilsplat.semantic_tree.tree import SemanticTree, run_semantic_tree
+from hilsplat.settings import AutoencoderSettings, EvaluateSettings, FieldSettings, SemanticTreeSettings
+from hilsplat.splat.gaussians import Gaussians
+from tests.unit.two_boxes_world import (
+    HEIGHT,
+    NUM_GAUSSIANS,
+    REGIONS,
+    WIDTH,
+    build_contributions,
+    build_two_boxes,
+    region_mask,
+    two_boxes_weights,
+)
+
+NAMES = ("A", "B", "A top", "B top", "A bottom", "A top left", "B corner")
+NODE = {name: node for node, name in enumerate(NAMES)}
+
+
+def logistic(margin: np.ndarray) -> np.ndarray:
+    """Relevancies behind which the margins lie."""
+    return (1 / (1 + np.exp(-margin))).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> LanguageScene:
+    folder = tmp_path_factory.mktemp("boxes")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        world = build_two_boxes(folder, monkeypatch)
+        contributions = build_contributions(world)
+    run_semantic_tree(contributions, world.masks, world.clip, folder / "st", SemanticTreeSettings())
+    settings = AutoencoderSettings(code="network", latent=4, epochs=1, min_steps=400, learning_rate=2e-3)
+    run_autoencoder(world.clip, folder / "st", contributions, folder / "ae", settings, 0)
+    run_field(contributions, world.tree, folder / "ae", folder / "field.safetensors", FieldSettings(), 1)
+    rng = np.random.default_rng(9)
+    vectors = {name: world.region_vectors[row] for row, (name, *_) in enumerate(REGIONS)}
+
+    def encode(texts: list[str]) -> np.ndarray:
+        new = {text: rng.normal(size=16) for text in texts if text not in vectors}
+        vectors.update({text: vector / np.linalg.norm(vector) for text, vector in new.items()})
+        return np.stack([vectors[text] for text in texts]).astype(np.float32)
+
+    zeros = torch.zeros(NUM_GAUSSIANS, 3)
+    return LanguageScene(
+        Scene.load(world.scene),
+        Gaussians(zeros, zeros, torch.zeros(NUM_GAUSSIANS, 4), torch.zeros(NUM_GAUSSIANS), zeros[:, None]),
+        SemanticTree.load(folder / "st"),
+        LanguageField.load(folder / "field.safetensors"),
+        load_code(folder / "ae"),
+        encode,
+        lambda view: two_boxes_weights(int(view[:3])),
+    )
+
+
+@pytest.mark.parametrize("name", NODE)
+def test_every_region_is_found_at_its_level(scene, name):
+    level = Level(int(scene.tree.level[NODE[name]]))
+    hits = scene.select_nodes(name, level=level, threshold=0.85)
+    assert hits.ids.tolist() == [NODE[name]]
+    assert hits.scores[0] > 0.9
+    assert scene.query(name, level.label)[0].node == NODE[name]
+
+
+@pytest.mark.parametrize("name", NODE)
+def test_automatic_level_is_the_region_s_own(scene, name):
+    assert scene.select_nodes(name, level=None, threshold=0.85).ids.tolist() == [NODE[name]]
+
+
+def test_automatic_level_is_that_of_the_best_node_and_of_equals_the_coarsest(scene):
+    scores = np.full(7, 0.2, np.float32)
+    scores[[NODE["A top left"], NODE["A top"], NODE["A"]]] = 0.9, 0.8, 0.7
+    assert automatic_level(scene.tree, scores) == Level.SUBPART
+    shown = np.arange(7) != NODE["A top left"]
+    assert automatic_level(scene.tree, scores, shown) == Level.PART
+    scores[NODE["A top"]] = 0.9
+    assert automatic_level(scene.tree, scores) == Level.PART
+    assert automatic_level(scene.tree, scores, np.zeros(7, bool)) == Level.WHOLE
+
+
+def test_selection_is_by_margins_which_do_not_saturate():
+    every, apart = np.arange(4), np.eye(4, dtype=np.float32)
+    scores = np.array([0.1, 0.95, 0.98, 0.999])
+    # the relevancies 0.95 to 0.999 all lie above 0.94 of their range; of the margins (-2.2, 2.9, 3.9,
+    # 6.9) only the last lies above 0.85 of theirs
+    assert best_nodes(scores, apart, every, Level.PART, 0.85).ids.tolist() == [3]
+    assert best_nodes(scores, apart, every, Level.PART, 0.5).ids.tolist() == [3, 2, 1]
+    equal = best_nodes(np.array([0.4, 0.9, 0.9]), apart[:3], np.arange(3), Level.PART, 0.95)
+    assert equal.ids.tolist() == [1, 2]
+
+
+@pytest.mark.parametrize(("cosine", "found"), [(0.91, [3, 2]), (0.89, [3])])
+def test_what_looks_like_the_best_answer_may_lie_three_times_as_far_below(cosine, found):
+    margin = np.array([0.0, 7.0, 8.6, 10.0])  # of a range of 10: 0.05 is 0.5, three times that 1.5
+    vectors = np.eye(5, dtype=np.float32)[:4]
+    for node in (1, 2):
+        vectors[node] = cosine * vectors[3] + np.sqrt(1 - cosine**2) * np.eye(5)[4]
+    assert best_nodes(logistic(margin), vectors, np.arange(4), Level.PART, 0.95).ids.tolist() == found
+
+
+def test_only_what_is_shown_answers_in_the_range_of_all():
+    scores, apart = logistic(np.array([0.0, 9.4, 9.7, 10.0])), np.eye(4, dtype=np.float32)
+    shown = np.array([True, True, True, False])
+    hits = best_nodes(scores, apart, np.arange(4), Level.PART, 0.95, shown)
+    assert hits.ids.tolist() == [2, 1]  # within 0.05 of the range of all four, 10
+    assert not len(best_nodes(scores, apart, np.arange(4), Level.PART, 0.95, np.zeros(4, bool)).ids)
+
+
+def test_what_lies_in_a_likely_thing_is_ahead(scene):
+    margin = np.full(7, -1.0)
+    margin[[NODE["A"], NODE["A top"], NODE["A top left"]]] = 3.0, 1.0, 1.0
+    margin[[NODE["B"], NODE["B corner"]]] = 0.0, 1.1
+    scores = logistic(margin)
+    added = ancestor_margins(scene.tree, scores)
+    # A top left lies in A top and A, B corner in B alone; wholes lie in nothing and add nothing
+    assert added[NODE["A top left"]] == pytest.approx(2.0, abs=1e-5)
+    assert added[NODE["B corner"]] == pytest.approx(0.0, abs=1e-5)
+    assert added[[NODE["A"], NODE["B"]]].tolist() == [0, 0]
+    subparts = scene.tree.nodes_of(Level.SUBPART)
+    vectors = scene.tree.clip
+    assert best_nodes(scores, vectors, subparts, Level.SUBPART, 0.9).ids[0] == NODE["B corner"]
+    hits = best_nodes(scores, vectors, subparts, Level.SUBPART, 0.9, added=0.2 * added)
+    assert hits.ids.tolist() == [NODE["A top left"]]
+    assert hits.scores == pytest.approx(scores[[NODE["A top left"]]])  # told as it is
+    orphans = replace(scene.tree, parent=np.full(7, -1, np.int32))
+    least = ancestor_margins(orphans, scores)
+    assert least[scene.tree.level > 1] == pytest.approx(-1.0, abs=1e-5)
+
+
+def of_path(scene, *margins):
+    """Relevancies of a path's texts: -1 but for the nodes that are named."""
+    every = np.full((len(margins), len(NAMES)), -1.0)
+    for row, named in zip(every, margins, strict=True):
+        for name, value in named.items():
+            row[NODE[name]] = value
+    return logistic(every)
+
+
+def test_a_path_stays_inside_its_first_thing(scene):
+    scores = of_path(scene, {"A": 3.0}, {"A bottom": 2.0}, {"A top left": 0.4, "B corner": 2.2})
+    hits = search_path(scene.tree, scores, scene.tree.clip, ("A", "A bottom", "x"), 0.95)
+    # the one subpart of A hangs under its top; that of B answers better, but is no part of A
+    assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "child")
+
+
+@pytest.fixture
+def three_wholes(scene) -> SemanticTree:
+    """B top is a whole of its own, with the least margin: wholes range from -1 to 4 in the tests below."""
+    level, parent = scene.tree.level.copy(), scene.tree.parent.copy()
+    level[NODE["B top"]], parent[NODE["B top"]] = 1, -1
+    return replace(scene.tree, level=level, parent=parent)
+
+
+@pytest.mark.parametrize(("b_corner", "found"), [(2.4, "A top left"), (2.6, "B corner")])
+def test_a_node_competes_together_with_what_holds_it(scene, three_wholes, b_corner, found):
+    # A is best, B 1 below it, which counts half: 2.0 against b_corner - 0.5
+    scores = of_path(scene, {"A": 4.0, "B": 3.0}, {"A top left": 2.0, "B corner": b_corner})
+    hits = search_path(three_wholes, scores, scene.tree.clip, ("x", "y"), 0.99, Level.SUBPART)
+    assert hits.ids.tolist() == [NODE[found]]
+
+
+@pytest.mark.parametrize(("b", "found"), [(2.7, "A top left"), (2.8, "B corner")])
+def test_what_holds_no_likely_first_thing_does_not_compete(scene, three_wholes, b, found):
+    # a quarter of the range of 5 is 1.25
+    scores = of_path(scene, {"A": 4.0, "B": b}, {"A top left": 0.0, "B corner": 9.0})
+    hits = search_path(three_wholes, scores, scene.tree.clip, ("x", "y"), 0.99, Level.SUBPART)
+    assert hits.ids.tolist() == [NODE[found]]
+
+
+def test_where_nothing_likely_holds_an_answer_everything_is_searched_and_told(scene, three_wholes):
+    # B top, the best whole, holds nothing, and all else is further below it than a quarter of the range
+    scores = of_path(scene, {"A": 1.0, "B": 0.0, "B top": 4.0}, {"A top left": 1.0, "B corner": 1.2})
+    hits = search_path(three_wholes, scores, scene.tree.clip, ("x", "y"), 0.99, Level.SUBPART)
+    assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "fallback")
+
+
+def test_what_a_view_does_not_show_is_no_rival_of_what_it_shows(scene, three_wholes):
+    parent = three_wholes.parent.copy()
+    parent[NODE["B corner"]] = -1
+    tree = replace(three_wholes, parent=parent)
+    # B top would leave A unlikely, and B corner, which nothing holds, the answer
+    scores = of_path(scene, {"A": 1.0, "B top": 4.0}, {}, {"A top left": 2.0, "B corner": 0.0})
+    for hidden, found in (("B", "B corner"), ("B top", "A top left")):
+        shown = np.arange(7) != NODE[hidden]
+        hits = search_path(tree, scores, tree.clip, ("x", "y", "z"), 0.99, shown=shown)
+        assert hits.ids.tolist() == [NODE[found]]
+
+
+def test_a_missing_ancestor_counts_a_tenth_of_the_range(scene, three_wholes):
+    parent = three_wholes.parent.copy()
+    parent[NODE["B corner"]] = -1
+    tree = replace(three_wholes, parent=parent)
+    # of the range of 5 half a tenth, 0.25
+    for margin, found in ((2.2, "A top left"), (2.3, "B corner")):
+        scores = of_path(scene, {"A": 4.0}, {"A top left": 2.0, "B corner": margin})
+        hits = search_path(tree, scores, tree.clip, ("x", "y"), 0.99, Level.SUBPART)
+        assert hits.ids.tolist() == [NODE[found]]
+    assert hits.route == "fallback"
+
+
+def test_a_scene_opens_with_the_settings_it_was_evaluated_with(tmp_path):
+    folder = tmp_path / "results" / "photos" / "bear"
+    variant = folder / "default"
+    for part in ("semantic_tree", "autoencoder", "clip", "masks"):
+        (variant / part).mkdir(parents=True)
+    (folder / "scene").mkdir()
+    for name in ("gaussians.ply", "default/field.safetensors", "default/scores.csv"):
+        (folder / name).touch()
+    assert FinishedScene.locate(folder).evaluate_settings() == EvaluateSettings()
+    settings = {"canonical": ["thing", "surface"], "node_select": 0.9, "a knob of old": 1}
+    write_json(provenance_path(variant / "scores.csv"), {"settings": settings, "inputs": {}})
+    found = FinishedScene.locate(folder).evaluate_settings()
+    assert found.canonical == ("thing", "surface")
+    assert found.node_select == 0.9
+
+
+def test_a_variant_answers_with_the_field_it_was_scored_with_and_never_with_another(tmp_path):
+    folder = tmp_path / "results" / "synthetic" / "bear"
+    for part in ("semantic_tree", "autoencoder", "clip", "masks"):
+        (folder / "default" / part).mkdir(parents=True)
+    (folder / "scene").mkdir()
+    for name in ("gaussians.ply", "default/field.safetensors"):
+        (folder / name).touch()
+    (folder / "lifted").mkdir()  # begun, and killed
+    with pytest.raises(ArtifactError, match=r"lifted/language\.safetensors is missing"):
+        FinishedScene.locate(folder, "lifted")
+    inputs = {"language": {"path": "results/synthetic/bear/default/field.safetensors"}}
+    (folder / "theta").mkdir()
+    (folder / "theta/scores.csv").touch()
+    write_json(provenance_path(folder / "theta/scores.csv"), {"settings": {}, "inputs": inputs})
+    found = FinishedScene.locate(folder, "theta")
+    assert found.language == folder / "default/field.safetensors"
+    assert found.semantic_tree == folder / "default/semantic_tree"
+    with pytest.raises(ArtifactError, match="no variant 'x'"):
+        FinishedScene.locate(folder, "x")
+
+
+def test_a_scene_without_labels_opens_with_the_settings_of_its_panel(tmp_path):
+    folder = tmp_path / "results" / "photos" / "bear"
+    panel = tmp_path / "results" / "figures" / "photos" / "bear" / "panel.png"
+    for part in ("default/semantic_tree", "default/autoencoder", "default/clip", "default/masks", "scene"):
+        (folder / part).mkdir(parents=True)
+    for name in ("gaussians.ply", "default/field.safetensors"):
+        (folder / name).touch()
+    panel.parent.mkdir(parents=True)
+    settings = {"figures": {}, "evaluate": {"template": "a photo of a {}"}}
+    write_json(provenance_path(panel), {"settings": settings, "inputs": {}})
+    assert FinishedScene.locate(folder).evaluate_settings().template == "a photo of a {}"
+
+
+def test_the_field_answers_through_the_same_interface(scene):
+    hits = scene.query("B", "whole", answerer="field")
+    assert hits[0].node == NODE["B"]
+    (hit,) = scene.query("A > A top", answerer="field")
+    assert (hit.node, hit.route) == (NODE["A top"], "child")
+
+
+def test_the_look_up_of_the_field_is_what_decoding_gives(scene):
+    exact = scene.field_relevancy(["B", "A top"], "004.png")
+    fast = scene.field_relevancy(["B", "A top"], "004.png", exact=False)
+    assert fast == pytest.approx(exact, abs=2e-3)  # a network with d = 4: decoded as well
+
+
+def test_hits_tell_gaussians_and_an_oriented_box(scene):
+    (hit,) = scene.query("A top left", "subpart")
+    rows = scene.gaussians_of([hit.node])
+    assert rows.tolist() == np.flatnonzero(region_mask(5)).tolist()
+    # 2 columns and 4 rows of Gaussians one unit apart, in a plane
+    assert hit.oriented_box.size == pytest.approx((2.88, 1, 0), abs=0.15)
+
+
+def test_path_goes_from_child_to_child(scene):
+    hits = scene.select_path(("A", "A top", "A top left"), level=None, threshold=0.85)
+    assert hits.ids.tolist() == [NODE["A top left"]]
+    assert hits.route == "child"
+    assert hits.level == Level.SUBPART
+
+
+def test_path_restricts_a_part_to_its_object(scene):
+    # "A top" asked inside B can only be a part of B
+    assert scene.select_path(("B", "A top"), level=None, threshold=0.85).ids.tolist() == [NODE["B top"]]
+
+
+@pytest.mark.parametrize(
+    ("path", "level", "found"),
+    [
+        (("A", "A top left"), None, "A top left"),  # a subpart, with the part in between left out
+        (("A", "A top left"), Level.SUBPART, "A top left"),
+        (("A", "A top left"), Level.PART, "A top"),  # the part most like it
+        (("A", "A bottom"), None, "A bottom"),
+        (("A top", "A top left"), None, "A top left"),  # the first text need be no whole
+        (("B", "B corner"), None, "B corner"),
+    ],
+)
+def test_a_short_path_finds_its_levels_unless_one_is_given(scene, path, level, found):
+    hits = scene.select_path(path, level=level, threshold=0.85)
+    assert hits.ids.tolist() == [NODE[found]]
+    assert hits.level == Level(int(scene.tree.level[NODE[found]]))
+
+
+def test_a_way_through_the_levels_with_every_ancestor_goes_before_one_without(scene):
+    scores = np.full((2, 7), 0.1, np.float32)
+    scores[0, NODE["A"]], scores[0, NODE["B top"]] = 0.8, 0.9  # B top holds no subpart
+    scores[1, NODE["A top left"]], scores[1, NODE["B corner"]] = 0.6, 0.9
+    hits = search_path(scene.tree, scores, scene.tree.clip, ("x", "y"), 0.95)
+    assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "descendant")
+
+
+@pytest.mark.parametrize("text", ["A top left", "A > A top left"])
+def test_a_view_answers_with_what_it_shows(scene, text):
+    assert scene.nodes_shown("000.png").all()
+    hidden = np.arange(7) != NODE["A top left"]
+    scene._views.get(("shown", "half"), lambda: hidden, lambda kept: 0)
+    named = replace(scene, scene=replace(scene.scene, cameras=replace(scene.scene.cameras, names=("half",))))
+    assert [hit.node for hit in named.query(text, "subpart", view="half")] == [NODE["B corner"]]
+    named._views.get(("shown", "none"), lambda: np.zeros(7, bool), lambda kept: 0)
+    dark = replace(named, scene=replace(scene.scene, cameras=replace(scene.scene.cameras, names=("none",))))
+    assert dark.query(text, view="none") == []
+    with pytest.raises(SettingsError, match="has no view 'x'"):
+        scene.query(text, view="x")
+
+
+def test_a_view_shows_what_has_a_mask_there(scene, monkeypatch):
+    of_level = ViewNodes(
+        indptr=np.array([0, 2, 3, 3, 3]),
+        nodes=np.array([2, 3, 2], np.int32),
+        shares=np.array([0.4, 0.6, 0.9], np.float32),
+        covered=np.array([True, True, True, False]),
+    )
+    assert of_level.area_px(7).tolist() == [0, 0, 1, 1, 0, 0, 0]
+    empty = ViewNodes(
+        np.zeros(5, np.int64), np.zeros(0, np.int32), np.zeros(0, np.float32), np.zeros(4, bool)
+    )
+    assert empty.area_px(7).tolist() == [0] * 7
+    monkeypatch.setattr("hilsplat.query.language_scene.MIN_SHOWN_SHARE", 8 / (HEIGHT * WIDTH))
+    shown = replace(scene, _views=ViewStore()).nodes_shown("000.png")
+    # B corner has 2 x 3 px, A top left 4 x 2
+    assert np.flatnonzero(~shown).tolist() == [NODE["B corner"]]
+
+
+def test_path_falls_back_to_any_descendant_of_the_object(scene):
+    # "B top" has no subpart; "B corner" hangs directly under B
+    hits = scene.select_path(("B", "B top", "B corner"), level=None, threshold=0.85)
+    assert hits.ids.tolist() == [NODE["B corner"]]
+    assert hits.route == "descendant"
+
+
+def test_path_falls_back_to_the_whole_level(scene):
+    parent = np.where(scene.tree.level == Level.SUBPART, -1, scene.tree.parent).astype(np.int32)
+    orphaned = replace(scene, tree=replace(scene.tree, parent=parent))
+    hits = orphaned.select_path(("A", "A top", "B corner"), level=None, threshold=0.85)
+    assert hits.ids.tolist() == [NODE["B corner"]]
+    assert hits.route == "fallback"
+
+
+def test_query_parses_paths_and_describes_hits(scene):
+    (hit,) = scene.query("A > A top")
+    assert (hit.node, hit.level, hit.route) == (NODE["A top"], Level.PART, "child")
+    assert hit.score > 0.9
+    assert hit.best_views == ("000.png", "001.png", "002.png")
+    assert hit.box[0][0] <= hit.centroid[0] <= hit.box[1][0]
+
+
+@pytest.mark.parametrize(
+    ("text", "level", "words"),
+    [
+        ("a > b > c > d", "auto", "1 to 3 texts"),
+        ("a > b > c", "part", "cannot be searched at level part"),
+        (" ", "auto", "holds no text"),
+        ("A", "hole", "unknown"),
+        ("A > A top", "hole", "unknown"),
+    ],
+)
+def test_impossible_queries_say_why(scene, text, level, words):
+    with pytest.raises(SettingsError, match=words):
+        scene.query(text, level)
+
+
+def test_an_unknown_answerer_is_named(scene):
+    with pytest.raises(SettingsError, match="nothing answers as 'tre'"):
+        scene.query("A", answerer="tre")
+
+
+def test_node_masks_cover_their_region_in_an_unseen_view(scene):
+    mask = scene.node_masks("004.png", np.array([NODE["A bottom"]]))
+    assert np.array_equal(mask, np.roll(region_mask(3), 4, axis=1))
+    both = scene.node_masks("000.png", np.array([NODE["A bottom"], NODE["A top left"]]))
+    assert np.array_equal(both, region_mask(3) | region_mask(5))
+
+
+def test_node_map_is_high_where_the_node_is(scene):
+    maps = scene.node_relevancy_map(["B", "A top"], "004.png")
+    assert maps.shape == (2, 3, HEIGHT, WIDTH)
+    inside = np.roll(region_mask(1), 4, axis=1)
+    assert maps[0, 0][inside].min() > maps[0, 0][~inside].max()
+    top = np.roll(region_mask(2), 4, axis=1)
+    assert maps[1, 1][top].min() > maps[1, 1][~top].max()
+
+
+def test_field_answers_where_the_region_is(scene):
+    maps = scene.field_relevancy(["B", "A top"], "004.png")
+    assert maps.shape == (2, 3, HEIGHT, WIDTH)
+    inside = np.roll(region_mask(1), 4, axis=1)
+    assert maps[0, 0][inside].mean() > maps[0, 0][~inside].mean() + 0.05
+    top = np.roll(region_mask(2), 4, axis=1)
+    assert maps[1, 1][top].mean() > maps[1, 1][~top].mean() + 0.05
+
+
+def test_uncovered_pixels_get_the_least_relevancy(scene):
+    weights = two_boxes_weights(0).tolil()
+    weights[0] = 0
+    thin = replace(scene, pixel_weights=lambda view: weights.tocsr(), _views=ViewStore())
+    for maps in (thin.field_relevancy(["A"], "000.png"), thin.node_relevancy_map(["A"], "000.png")):
+        assert maps[0, 0, 0, 0] == maps[0, 0].min()
+    assert not thin.node_masks("000.png", np.array([NODE["A"]]))[0, 0]
+
+
+def test_gaussians_without_a_latent_do_not_dilute_a_pixel(scene):
+    features = scene.language.features.copy()
+    features[::7] = 0
+    thin = replace(scene, language=replace(scene.language, features=features), _views=ViewStore())
+    weights = scene.view_weights("000.png").toarray()
+    has = (features[:, 0] != 0).any(axis=1)
+    share = weights[:, has].sum(axis=1)
+    pixels, latents = thin._view_latents("000.png")[0]
+    assert pixels.tolist() == np.flatnonzero(share > 0.5).tolist()
+    assert (share[pixels] < 0.99).any()
+    expected = weights[pixels] @ features[:, 0] / share[pixels, None]
+    assert latents == pytest.approx(expected, abs=1e-5)
+
+
+def test_field_image_has_one_colour_per_region(scene):
+    image = scene.field_image("000.png", Level.WHOLE)
+    assert image.shape == (HEIGHT, WIDTH, 3)
+    a, b = image[region_mask(0)].mean(axis=0), image[region_mask(1)].mean(axis=0)
+    assert np.abs(a - b).max() > 50
+    assert np.array_equal(image, scene.field_image("000.png", Level.WHOLE))
+
+
+def test_artifacts_of_other_gaussians_are_refused(tmp_path):
+    path = tmp_path / "gaussians.ply"
+    path.write_bytes(b"new")
+    with pytest.raises(MisalignedArtifactError, match="language field of toy was made"):
+        require_same("language field", "toy", path, "0" * 64)

@@ -1,0 +1,156 @@
+"""Linking masks of different views."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+from hilsplat.semantic_tree.evidence import Evidence, mask_evidence
+from hilsplat.semantic_tree.linkage import pooled_linkage
+
+
+def dense_evidence(intersection, union):
+    """Any intersections and unions of pairs: one view per mask, half a union seen from either side."""
+    shared = np.nonzero(intersection)
+    shape = intersection.shape
+    return Evidence(
+        sp.csr_matrix((intersection[shared], shared), shape=shape),
+        sp.csr_matrix((union[shared], shared), shape=shape),
+        union / 2,
+        np.arange(len(union), dtype=np.int32),
+    )
+
+
+def test_evidence_counts_only_gaussians_both_views_see():
+    # three Gaussians; view 0 sees 0 and 1, view 1 sees 1 and 2
+    visible = np.array([[True, True, False], [False, True, True]])
+    shares = sp.csr_matrix(np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 0.5]]))
+    evidence = mask_evidence(shares, np.ones(3), visible, np.array([0, 1], np.int32), 0.2, "tanimoto")
+    # on Gaussian 1 both agree fully: intersection 1, union 1 + 1 - 1
+    assert evidence.pair(0, 1) == pytest.approx((1, 1))
+    assert evidence.pair(1, 0) == pytest.approx((1, 1))
+
+
+@pytest.mark.parametrize(("overlap", "iou"), [("tanimoto", 1.0), ("soft", 0.09 / 0.51)])
+def test_a_blurred_region_agrees_with_itself_only_by_tanimoto(overlap, iou):
+    visible, shares = np.ones((2, 1), bool), sp.csr_matrix(np.array([[0.3], [0.3]]))
+    view = np.array([0, 1], np.int32)
+    intersection, union = mask_evidence(shares, np.ones(1), visible, view, 0.2, overlap).pair(0, 1)
+    assert intersection / union == pytest.approx(iou)
+
+
+def test_masks_of_one_view_are_evidence_against_a_link():
+    visible = np.ones((1, 2), bool)
+    shares = sp.csr_matrix(np.array([[1.0, 0.0], [1.0, 1.0]]))
+    evidence = mask_evidence(shares, np.ones(2), visible, np.zeros(2, np.int32), 0.2, "tanimoto")
+    assert evidence.pair(0, 1) == pytest.approx((0, 3))  # sizes 1 and 2
+
+
+def test_masks_that_hardly_see_each_other_are_no_evidence():
+    visible = np.ones((2, 11), bool)
+    visible[0, 5:], visible[1, :4] = False, False  # common: Gaussian 4 alone
+    shares = sp.csr_matrix(np.where(visible, 1.0, 0.0))
+    view = np.array([0, 1], np.int32)
+    assert mask_evidence(shares, np.ones(11), visible, view, 0.1, "soft").pair(0, 1) == pytest.approx((1, 1))
+    assert mask_evidence(shares, np.ones(11), visible, view, 0.25, "soft").pair(0, 1) == (0, 0)
+
+
+def test_linkage_pools_intersections_over_unions():
+    # 0 and 1 agree by 0.8; together they agree with 2 by (3 + 0) / (10 + 5) = 0.2
+    intersection = np.array([[0, 8, 3], [8, 0, 0], [3, 0, 0]], float)
+    union = np.array([[0, 10, 10], [10, 0, 5], [10, 5, 0]], float)
+    cluster, quality = pooled_linkage(dense_evidence(intersection, union), 0.21)
+    assert cluster.tolist() == [0, 0, 1]
+    assert quality.tolist() == pytest.approx([0.8, 0.0])
+    cluster, quality = pooled_linkage(dense_evidence(intersection, union), 0.19)
+    assert cluster.tolist() == [0, 0, 0]
+    assert quality.tolist() == pytest.approx([11 / 25])
+
+
+def test_linkage_of_equal_pairs_takes_the_lowest_rows():
+    # 0-1 and 1-2 are equally good; joining 0-1 leaves 2 at 1 / 4 with the pair
+    intersection = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], float)
+    union = np.array([[0, 2, 2], [2, 0, 2], [2, 2, 0]], float)
+    assert pooled_linkage(dense_evidence(intersection, union), 0.3)[0].tolist() == [0, 0, 1]
+
+
+def brute_linkage(intersection, union, threshold):
+    clusters = [[row] for row in range(len(intersection))]
+    while True:
+        best, pair = -1.0, None
+        for a in range(len(clusters)):
+            for b in range(a + 1, len(clusters)):
+                grid = np.ix_(clusters[a], clusters[b])
+                if union[grid].sum() > 0:
+                    value = intersection[grid].sum() / union[grid].sum()
+                    if value > best + 1e-12:
+                        best, pair = value, (a, b)
+        if pair is None or best < threshold:
+            return sorted(sorted(cluster) for cluster in clusters)
+        clusters[pair[0]] += clusters.pop(pair[1])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_linkage_equals_a_search_over_all_pairs(seed):
+    rng = np.random.default_rng(seed)
+    union = rng.uniform(1, 2, (14, 14)) * (rng.random((14, 14)) < 0.7)
+    union = np.triu(union, 1) + np.triu(union, 1).T
+    intersection = np.triu(union * rng.random((14, 14)) ** 2, 1)
+    intersection = intersection + intersection.T
+    cluster, _ = pooled_linkage(dense_evidence(intersection, union), 0.3)
+    found = sorted(sorted(np.flatnonzero(cluster == c).tolist()) for c in range(cluster.max() + 1))
+    assert found == brute_linkage(intersection, union, 0.3)
+
+
+def dense_rule(shares, importance, visible, view, min_covisible):
+    """The rule of `mask_evidence` (Tanimoto) for every pair, written out."""
+    num = len(shares)
+    intersection, union = np.zeros((num, num)), np.zeros((num, num))
+    for a in range(num):
+        for b in range(num):
+            if a == b:
+                continue
+            sizes = [
+                [(importance * shares[m] ** 2)[visible[v]].sum() for v in (view[a], view[b])] for m in (a, b)
+            ]
+            seen_of_a, seen_of_b = sizes[0][1], sizes[1][0]
+            enough_of_a = seen_of_a >= min_covisible * sizes[0][0]
+            enough_of_b = seen_of_b >= min_covisible * sizes[1][1]
+            both = (importance * shares[a] * shares[b]).sum() if view[a] != view[b] else 0.0
+            if both > 0 and (enough_of_a or enough_of_b):
+                intersection[a, b] = both
+                union[a, b] = seen_of_a + seen_of_b - both
+            elif both == 0:
+                union[a, b] = seen_of_a * enough_of_a + seen_of_b * enough_of_b
+    return intersection, union
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_evidence_equals_the_rule_pair_by_pair(threads):
+    rng = np.random.default_rng(3)
+    view = np.repeat(np.arange(4), 3).astype(np.int32)
+    visible = rng.random((4, 30)) < 0.6
+    shares = rng.random((12, 30)) * (rng.random((12, 30)) < 0.25) * visible[view]
+    importance = rng.uniform(0.5, 2.0, 30)
+    found = mask_evidence(sp.csr_matrix(shares), importance, visible, view, 0.4, "tanimoto", threads)
+    intersection, union = dense_rule(shares, importance, visible, view, 0.4)
+    assert (intersection > 0).sum() > 20
+    for a in range(12):
+        for b in range(12):
+            if a != b:
+                assert found.pair(a, b) == pytest.approx((intersection[a, b], union[a, b]))
+
+
+def test_linkage_of_many_masks_equals_that_of_dense_sums():
+    # enough merges for the pool of neighbours to be compacted
+    rng = np.random.default_rng(0)
+    thing = rng.integers(0, 12, 160)
+    same = thing[:, None] == thing[None]
+    union = np.triu(rng.uniform(1, 2, (160, 160)), 1)
+    intersection = union * np.where(same, rng.uniform(0.5, 0.9, (160, 160)), 0.05)
+    union, intersection = union + union.T, np.triu(intersection, 1) + np.triu(intersection, 1).T
+    cluster, quality = pooled_linkage(dense_evidence(intersection, union), 0.4)
+    assert len(quality) == 12
+    assert all(len(np.unique(cluster[thing == each])) == 1 for each in range(12))
+    members = np.flatnonzero(cluster == 0)
+    grid = np.ix_(members, members)
+    assert quality[0] == pytest.approx(intersection[grid].sum() / union[grid].sum())

@@ -1,0 +1,157 @@
+"""Nodes of linked masks, and the tree of a world whose nodes are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+from hilsplat.base.artifacts import read_index, read_json, sha256_of_path, write_index
+from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.levels import Level
+from hilsplat.semantic_tree.level_nodes import level_nodes
+from hilsplat.semantic_tree.nodes import gaussian_nodes, node_parents
+from hilsplat.semantic_tree.tree import SemanticTree, run_semantic_tree
+from hilsplat.settings import SemanticTreeSettings
+from tests.unit.two_boxes_world import HEIGHT, NUM_GAUSSIANS, REGIONS, WIDTH, region_mask
+
+
+def test_gaussians_join_the_node_with_the_largest_share():
+    weights = sp.csr_matrix(np.array([[5, 1, 3], [4, 1, 0], [2, 0, 3]], np.float32))
+    mass = np.array([[5, 5, 5], [5, 5, 5]], np.float32)
+    # nodes: masks 0 and 1 are node 0, mask 2 is node 1
+    node, membership = gaussian_nodes(
+        np.array([0, 0, 1]), 2, weights, np.array([0, 1, 1], np.int32), mass, np.full(3, 10.0), 0.25
+    )
+    # 0.9 against 0.2; 0.2 is too little; a tie goes to the lower node
+    assert node.tolist() == [0, -1, 0]
+    assert membership == pytest.approx([0.9, 0, 0.3])
+
+
+def test_overlapping_masks_of_one_view_count_a_gaussian_once():
+    weights = sp.csr_matrix(np.array([[4, 2], [4, 0], [0, 2], [5, 3]], np.float32))
+    view = np.array([0, 0, 0, 1], np.int32)
+    mass = np.array([[4, 4], [6, 6]], np.float32)
+    # masks 0 and 1 are node 0, twice the same 4 of 4 px of Gaussian 0; mask 3 is node 1, with 5 of 6 px
+    node, membership = gaussian_nodes(np.array([0, 0, -1, 1]), 2, weights, view, mass, np.full(2, 10.0), 0.1)
+    assert node.tolist() == [1, 1]
+    assert membership == pytest.approx([0.5, 0.3])
+
+
+def test_a_double_that_shows_nothing_is_no_node():
+    # Four views of ten Gaussians: one mask of all (two views miss Gaussian 3), and in three of the views
+    # one of the first four. Those are a cluster of their own and win Gaussian 3 alone, which none shows.
+    whole = np.ones((4, 10))
+    whole[:2, 3] = 0
+    double = np.repeat((np.arange(10) < 4)[None], 3, axis=0)
+    weights = sp.csr_matrix(np.concatenate([whole, double]).astype(np.float32))
+    view = np.array([0, 1, 2, 3, 0, 1, 2], np.int32)
+    mass, once = np.ones((4, 10), np.float32), np.ones(10)
+    seen = mass > 0
+
+    found = level_nodes(weights, view, mass, seen, once, 4 * once, SemanticTreeSettings(), 1)
+    assert found.of_mask.tolist() == [0, 0, 0, 0, -1, -1, -1]
+    assert found.of_gaussian.tolist() == [0] * 10
+    assert found.membership == pytest.approx(np.where(np.arange(10) == 3, 0.5, 1.0))
+    assert len(found.quality) == 1
+
+    whole[:2, :4] = 0  # now it wins all four, and is a node
+    weights = sp.csr_matrix(np.concatenate([whole, double]).astype(np.float32))
+    found = level_nodes(weights, view, mass, seen, once, 4 * once, SemanticTreeSettings(), 1)
+    assert found.of_gaussian.tolist() == [1] * 4 + [0] * 6
+
+
+def test_subpart_may_hang_directly_under_a_whole():
+    node_of_gaussian = np.array([[0, 1, 2], [0, 1, 2], [0, -1, 3], [0, -1, 3], [-1, -1, 4]], np.int32)
+    level = np.array([1, 2, 3, 3, 3], np.uint8)
+    assert node_parents(node_of_gaussian, level, np.ones(5), 0.5).tolist() == [-1, 0, 1, 0, -1]
+    # a cover of exactly the threshold is not enough
+    heavy = np.array([1.0, 1, 1, 1, 1])
+    half = np.array([[0, 1, -1], [-1, 1, -1]], np.int32)
+    assert node_parents(half, np.array([1, 2], np.uint8), heavy[:2], 0.5).tolist() == [-1, -1]
+
+
+@pytest.fixture
+def tree_of_boxes(two_boxes_contributions):
+    world, contributions = two_boxes_contributions
+    out = world.folder / "semantic_tree"
+    run_semantic_tree(contributions, world.masks, world.clip, out, SemanticTreeSettings())
+    return world, out
+
+
+def test_two_boxes_give_exactly_their_regions(tree_of_boxes):
+    world, out = tree_of_boxes
+    tree = SemanticTree.load(out)
+    # Nodes follow the first mask of each: view 0 misses "A bottom", so it comes after "B top".
+    order = [0, 1, 2, 4, 3, 5, 6]
+    assert tree.level.tolist() == [REGIONS[row][1] for row in order]
+    names = [REGIONS[row][0] for row in order]
+    parents = [names[parent] if parent >= 0 else None for parent in tree.parent]
+    assert parents == [None, None, "A", "B", "A", "A top", "B"]
+    for node, row in enumerate(order):
+        member = (tree.node_of_gaussian[:, REGIONS[row][1] - 1] == node).reshape(HEIGHT, WIDTH)
+        assert np.array_equal(member, region_mask(row)), REGIONS[row][0]
+        assert tree.clip[node] @ world.region_vectors[row] > 0.99
+    assert np.linalg.norm(tree.clip, axis=1) == pytest.approx(np.ones(7), abs=1e-5)
+    assert tree.views.tolist() == [4, 4, 4, 3, 3, 3, 3]
+    assert (tree.node_of_mask >= 0).all()
+    assert tree.centroid[0] == pytest.approx([2.5, 3.5, 0], abs=0.2)
+    assert tree.box[0][0] == pytest.approx([0, 0, 0], abs=0.01)
+    assert tree.box[0][1] == pytest.approx([5, 7, 0], abs=0.01)
+    assert (tree.quality > 0.7).all()
+
+
+def test_children_and_ancestors_reach_past_missing_parts(tree_of_boxes):
+    tree = SemanticTree.load(tree_of_boxes[1])
+    assert tree.children_of(np.array([1])).tolist() == [3, 6]
+    ancestors = tree.ancestors()
+    assert ancestors[0].tolist() == [0, -1, -1]
+    assert ancestors[3].tolist() == [1, 3, -1]
+    assert ancestors[5].tolist() == [0, 2, 5]
+    assert ancestors[6].tolist() == [1, -1, 6]  # straight under the whole
+    orphan = replace(tree, parent=np.where(np.arange(7) == 2, -1, tree.parent).astype(np.int32))
+    assert orphan.ancestors()[5].tolist() == [-1, 2, 5]
+
+
+def test_readable_tree_and_counts(tree_of_boxes):
+    _, out = tree_of_boxes
+    assert read_index(out)["nodes"] == {"whole": 2, "part": 3, "subpart": 2}
+    nodes = read_json(out / "tree.json")["nodes"]
+    assert nodes[0]["level"] == Level.WHOLE.label
+    assert nodes[0]["children"] == [2, 4]
+    assert sum(node["gaussians"] for node in nodes if node["level"] == "whole") == NUM_GAUSSIANS
+
+
+def test_second_run_writes_the_same_bytes(tree_of_boxes):
+    world, out = tree_of_boxes
+    before = sha256_of_path(out)
+    run_semantic_tree(world.folder / "contributions", world.masks, world.clip, out, SemanticTreeSettings())
+    assert sha256_of_path(out) == before
+
+
+def test_soft_overlap_sees_less_agreement_where_gaussians_cross_borders(two_boxes_contributions):
+    world, contributions = two_boxes_contributions
+    quality = {}
+    for overlap in ("tanimoto", "soft"):
+        out = world.folder / overlap
+        settings = SemanticTreeSettings(overlap=overlap, link_threshold=0.12)
+        run_semantic_tree(contributions, world.masks, world.clip, out, settings)
+        quality[overlap] = SemanticTree.load(out).quality
+    assert (quality["soft"] < quality["tanimoto"]).all()
+
+
+def test_more_views_asked_for_than_there_are_leave_an_empty_tree(two_boxes_contributions, caplog):
+    world, contributions = two_boxes_contributions
+    out = world.folder / "empty"
+    run_semantic_tree(contributions, world.masks, world.clip, out, SemanticTreeSettings(min_views=5))
+    assert len(SemanticTree.load(out)) == 0
+    assert "has no node" in caplog.text
+
+
+def test_other_masks_are_refused(two_boxes_contributions):
+    world, contributions = two_boxes_contributions
+    write_index(world.masks, {}, changed=True)
+    with pytest.raises(MisalignedArtifactError, match="belong to other masks"):
+        run_semantic_tree(
+            contributions, world.masks, world.clip, world.folder / "out", SemanticTreeSettings()
+        )

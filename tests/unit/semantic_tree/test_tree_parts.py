@@ -1,0 +1,117 @@
+"""Boxes, nesting, pixels of nodes and exports of the semantic tree, by hand."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import torch
+from plyfile import PlyData
+
+from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.query.view_nodes import ViewNodes
+from hilsplat.semantic_tree.boxes import OrientedBox, oriented_box
+from hilsplat.semantic_tree.export import write_selection_ply, write_tree_ply
+from hilsplat.semantic_tree.nodes import nest_nodes, renumbered_without_empty
+from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.ply import load_ply, save_ply
+
+
+def test_the_box_of_a_turned_brick_lies_along_the_brick():
+    rng = np.random.default_rng(0)
+    angle = np.deg2rad(30)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    brick = rng.uniform(-0.5, 0.5, (20_000, 3)) * [4.0, 2.0, 1.0]
+    box = OrientedBox.from_array(oriented_box(brick @ turn.T + [1, 2, 3], np.ones(20_000)))
+    # 2nd to 98th percentile of an even spread: 96 % of each side
+    assert box.size == pytest.approx((3.84, 1.92, 0.96), abs=0.05)
+    assert box.centre == pytest.approx((1, 2, 3), abs=0.05)
+    axes = np.array(box.axes)
+    assert np.abs(axes[0] @ turn[:, 0]) > 0.999
+    assert np.linalg.det(axes) == pytest.approx(1, abs=1e-5)
+    corners = box.corners()
+    assert np.linalg.norm(np.ptp((corners - box.centre) @ axes.T, axis=0) - box.size) < 1e-6
+
+
+def test_children_become_subsets_of_their_parents():
+    level = np.array([1, 1, 2, 3], np.uint8)
+    parent = np.array([-1, -1, 0, 2], np.int32)  # 0 > 2 > 3, and another whole 1
+    before = np.array(
+        [
+            [0, 2, 3],  # already nested
+            [-1, 2, -1],  # only the part holds it: joins the whole
+            [1, 2, -1],  # another whole holds it: leaves the part
+            [-1, -1, 3],  # only the subpart holds it: joins part and whole
+            [1, -1, 3],  # another whole holds it: leaves the subpart
+            [1, -1, -1],
+        ],
+        np.int32,
+    )
+    after = nest_nodes(before, level, parent)
+    expected = [[0, 2, 3], [0, 2, -1], [1, -1, -1], [0, 2, 3], [1, -1, -1], [1, -1, -1]]
+    assert after.tolist() == expected
+    assert np.array_equal(nest_nodes(after, level, parent), after)
+
+
+def test_pixels_of_nodes_equal_the_product_with_all_weights():
+    rng = np.random.default_rng(1)
+    weights = sp.random(50, 20, 0.3, random_state=rng, dtype=np.float32, format="csr")
+    weights = sp.csr_matrix(weights.multiply(1 / np.maximum(weights.sum(axis=1), 1e-9)), dtype=np.float32)
+    node = rng.integers(-1, 4, 20).astype(np.int32)
+    shown = ViewNodes.of(weights, node)
+    values = rng.random(4).astype(np.float32)
+    expected = weights @ np.where(node >= 0, values[node], np.float32(0.1))
+    covered = np.diff(weights.indptr) > 0
+    blended = shown.blend(values, 0.1)
+    assert blended[covered] == pytest.approx(expected[covered], abs=1e-6)
+    assert (blended[~covered] == blended[covered].min()).all()
+    chosen = np.array([True, False, True, False])
+    member = np.where(node >= 0, chosen[node], False).astype(np.float32)
+    total = weights @ member
+    clear = np.abs(total - 0.5) > 1e-5
+    assert np.array_equal(shown.mask(chosen)[clear], (total > 0.5)[clear])
+
+
+@pytest.fixture
+def ply(tmp_path):
+    means = torch.arange(12.0).reshape(4, 3)
+    zeros = torch.zeros(4, 3)
+    path = tmp_path / "gaussians.ply"
+    save_ply(path, Gaussians(means, zeros, torch.ones(4, 4), torch.zeros(4), zeros[:, None]))
+    return path
+
+
+class SomeTree:
+    node_of_gaussian = np.array([[0, -1, 5], [0, 3, -1], [1, -1, -1], [-1, -1, -1]], np.int32)
+
+
+def test_the_exported_ply_is_still_one_of_gaussians(ply, tmp_path):
+    out = tmp_path / "tree.ply"
+    write_tree_ply(ply, SomeTree(), out)
+    vertex = PlyData.read(out)["vertex"]
+    assert vertex["node_whole"].tolist() == [0, 0, 1, -1]
+    assert vertex["node_part"].tolist() == [-1, 3, -1, -1]
+    assert vertex["node_subpart"].tolist() == [5, -1, -1, -1]
+    assert torch.equal(load_ply(out).means, load_ply(ply).means)
+
+
+def test_a_tree_of_other_gaussians_is_not_exported(ply, tmp_path):
+    class Other:
+        node_of_gaussian = SomeTree.node_of_gaussian[:2]
+
+    with pytest.raises(MisalignedArtifactError, match="2 Gaussians"):
+        write_tree_ply(ply, Other(), tmp_path / "tree.ply")
+
+
+def test_a_selection_holds_the_chosen_gaussians(ply, tmp_path):
+    write_selection_ply(ply, np.array([1, 3]), tmp_path / "selection.ply")
+    assert load_ply(tmp_path / "selection.ply").means[:, 0].tolist() == [3, 9]
+
+
+def test_a_node_that_nesting_emptied_is_dropped_and_the_others_keep_their_order():
+    # wholes 0 and 1, parts 2 and 3; part 2 belongs to whole 0 and lies wholly inside whole 1
+    before = np.array([[0, -1, -1], [1, 2, -1], [1, 3, -1]], np.int32)
+    level, parent = np.array([1, 1, 2, 2], np.uint8), np.array([-1, -1, 0, 1], np.int32)
+    after = nest_nodes(before, level, parent)
+    renumber = renumbered_without_empty(after, len(level))
+    assert renumber.tolist() == [0, 1, -1, 2, -1]
+    assert renumber[after].tolist() == [[0, -1, -1], [1, -1, -1], [1, 2, -1]]
+    assert renumber[parent[[0, 1, 3]]].tolist() == [-1, -1, 1]

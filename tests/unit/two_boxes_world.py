@@ -1,0 +1,159 @@
+"""A tiny world with two boxes, small enough to work out by hand."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import torch
+
+from hilsplat.base.artifacts import write_index, write_npy, write_npz
+from hilsplat.base.images import write_png
+from hilsplat.contributions import stage
+from hilsplat.contributions.stage import run_contributions
+from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.settings import ContributionsSettings
+from hilsplat.splat.gaussians import Gaussians
+
+HEIGHT, WIDTH = 8, 12
+NUM_GAUSSIANS = HEIGHT * WIDTH
+CHANNELS = 16
+
+REGIONS = (
+    # name, level, rows, columns, parent; box A is columns 0-6, box B columns 6-12
+    ("A", 1, (0, 8), (0, 6), -1),
+    ("B", 1, (0, 8), (6, 12), -1),
+    ("A top", 2, (0, 4), (0, 6), 0),
+    ("A bottom", 2, (4, 8), (0, 6), 0),
+    ("B top", 2, (0, 4), (6, 12), 1),
+    ("A top left", 3, (0, 4), (0, 2), 2),
+    ("B corner", 3, (6, 8), (6, 9), 1),
+)
+
+
+@dataclass(frozen=True)
+class TwoBoxes:
+    """Folders of the world, and what only a test may know.
+
+    Gaussian g is seen at pixel (row, column) = divmod(g, WIDTH), moved right by one column (and
+    around) per view. Weights are 0.9 there and 0.09 at the left neighbour's Gaussian.
+    """
+
+    folder: Path
+    views: tuple[str, ...]
+    region_vectors: np.ndarray
+
+    @property
+    def scene(self) -> Path:
+        return self.folder / "scene"
+
+    @property
+    def masks(self) -> Path:
+        return self.folder / "masks"
+
+    @property
+    def coverage_tree(self) -> Path:
+        return self.folder / "coverage_tree"
+
+    @property
+    def clip(self) -> Path:
+        return self.folder / "clip"
+
+    @property
+    def ply(self) -> Path:
+        return self.folder / "gaussians.ply"
+
+
+def region_mask(row: int) -> np.ndarray:
+    _, _, (top, bottom), (left, right), _ = REGIONS[row]
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[top:bottom, left:right] = True
+    return mask
+
+
+def two_boxes_weights(shift: int) -> sp.csr_matrix:
+    """Each pixel shows its own Gaussian and a little of the left neighbour of the same row."""
+    gaussian = np.arange(NUM_GAUSSIANS).reshape(HEIGHT, WIDTH)
+    left = np.roll(gaussian, 1, axis=1)
+    pixel = np.arange(NUM_GAUSSIANS)
+    seen = np.roll(gaussian, shift, axis=1).ravel()
+    beside = np.roll(left, shift, axis=1).ravel()
+    data = np.tile(np.array([0.9, 0.09], np.float32), NUM_GAUSSIANS)
+    columns = np.stack([seen, beside], axis=1).ravel()
+    return sp.csr_matrix((data, (np.repeat(pixel, 2), columns)), shape=(NUM_GAUSSIANS, NUM_GAUSSIANS))
+
+
+@pytest.fixture
+def two_boxes(tmp_path, monkeypatch) -> TwoBoxes:
+    """The world, for one test."""
+    return build_two_boxes(tmp_path, monkeypatch)
+
+
+@pytest.fixture
+def two_boxes_contributions(two_boxes) -> tuple[TwoBoxes, Path]:
+    """The world and its contributions, for one test."""
+    return two_boxes, build_contributions(two_boxes)
+
+
+def build_two_boxes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TwoBoxes:
+    """Four train views and a test view, masks of every region but one dropped per view."""
+    rng = np.random.default_rng(0)
+    names = tuple(f"{view:03d}.png" for view in range(5))
+    scene = tmp_path / "scene"
+    (scene / "images").mkdir(parents=True)
+    for name in names:
+        write_png(scene / "images" / name, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    cameras = Cameras(
+        names,
+        np.tile(np.eye(4), (5, 1, 1)),
+        np.tile(np.array([[10.0, 0, 6], [0, 10, 4], [0, 0, 1]]), (5, 1, 1)),
+        np.full((5, 2), (HEIGHT, WIDTH), np.int32),
+    )
+    split = {name: "test" if name == names[4] else "train" for name in names}
+    points = np.zeros((0, 3), np.float32)
+    Scene(scene, "toy/boxes", "metre", cameras, split, points, points.astype(np.uint8), np.eye(4)).save()
+    world = TwoBoxes(tmp_path, names[:4], rng.normal(size=(len(REGIONS), CHANNELS)))
+    world.region_vectors[:] /= np.linalg.norm(world.region_vectors, axis=1, keepdims=True)
+    for shift, view in enumerate(world.views):
+        dropped = shift + 3  # one region is missed in each view
+        rows = [row for row in range(len(REGIONS)) if row != dropped]
+        dense = np.stack([np.roll(region_mask(row), shift, axis=1) for row in rows])
+        level = np.array([REGIONS[row][1] for row in rows], np.uint8)
+        ones = np.ones(len(rows), np.float32)
+        HierarchicalMasks.from_dense(dense, level, ones, ones).save(world.masks / f"{view}.npz")
+        parent = [rows.index(REGIONS[row][4]) if REGIONS[row][4] in rows else -1 for row in rows]
+        write_npz(world.tree / f"{view}.npz", parent=np.array(parent, np.int32))
+        noisy = world.region_vectors[rows] + 0.02 * rng.normal(size=(len(rows), CHANNELS))
+        noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
+        write_npy(world.clip / f"{view}.npy", noisy.astype(np.float16))
+    for folder in (world.masks, world.tree, world.clip):
+        write_index(folder, {view: {} for view in world.views})
+    world.ply.write_bytes(b"two boxes")
+
+    gaussian = np.arange(NUM_GAUSSIANS)
+    means = np.stack([gaussian % WIDTH, gaussian // WIDTH, np.zeros(NUM_GAUSSIANS)], axis=1)
+    gaussians = Gaussians(
+        torch.from_numpy(means.astype(np.float32)),
+        torch.zeros(NUM_GAUSSIANS, 3),
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(NUM_GAUSSIANS, 1),
+        torch.zeros(NUM_GAUSSIANS),
+        torch.zeros(NUM_GAUSSIANS, 1, 3),
+    )
+    monkeypatch.setattr(stage, "load_ply", lambda path: gaussians)
+    monkeypatch.setattr(
+        stage,
+        "pixel_weights",
+        lambda gaussians, camera, *, min_weight, threads, device: two_boxes_weights(names.index(camera.name)),
+    )
+    return world
+
+
+def build_contributions(world: TwoBoxes) -> Path:
+    """Run the contributions stage."""
+    out = world.folder / "contributions"
+    cache = world.folder / "cache"
+    run_contributions(world.scene, world.ply, world.masks, out, cache, ContributionsSettings(), 1)
+    return out
