@@ -125,11 +125,11 @@ def build_two_boxes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TwoBoxes
         ones = np.ones(len(rows), np.float32)
         HierarchicalMasks.from_dense(dense, level, ones, ones).save(world.masks / f"{view}.npz")
         parent = [rows.index(REGIONS[row][4]) if REGIONS[row][4] in rows else -1 for row in rows]
-        write_npz(world.tree / f"{view}.npz", parent=np.array(parent, np.int32))
+        write_npz(world.coverage_tree / f"{view}.npz", parent=np.array(parent, np.int32))
         noisy = world.region_vectors[rows] + 0.02 * rng.normal(size=(len(rows), CHANNELS))
         noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
         write_npy(world.clip / f"{view}.npy", noisy.astype(np.float16))
-    for folder in (world.masks, world.tree, world.clip):
+    for folder in (world.masks, world.coverage_tree, world.clip):
         write_index(folder, {view: {} for view in world.views})
     world.ply.write_bytes(b"two boxes")
 
