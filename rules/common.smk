@@ -10,9 +10,9 @@ from snakemake.exceptions import WorkflowError
 from snakemake.logging import logger
 
 from hilsplat.base.artifacts import sha256_of_path
-from hilsplat.base.code_hash import code_hash as code_of
 from hilsplat.base.errors import HilsplatError
-from hilsplat.cli.stage_modules import STAGE_MODULES
+from hilsplat.cli.stages import stage_code
+from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.sources import (
     absence,
     image_files,
@@ -108,16 +108,33 @@ def settings_of(section):
     return lambda wildcards: getattr(stages_of(wildcards), section).model_dump_json()
 
 
-def code(stage):
-    """Parameter: digest of the code that a stage runs; a function tells the stage from the wildcards."""
-    if callable(stage):
-        return lambda wildcards: code(stage(wildcards))
-    return or_stop(code_of, STAGE_MODULES[stage])
+def code(stage, plugins=lambda wildcards: ()):
+    """Parameter: digest of the code that a stage runs, with the readers or baselines that a job uses.
+
+    `stage` names it, or is a function of the wildcards, as `plugins` is.
+    """
+
+    def digest(wildcards):
+        name = stage(wildcards) if callable(stage) else stage
+        return or_stop(stage_code, name, plugins(wildcards))
+
+    return digest
 
 
-def code_of_method(wildcards):
-    """Parameter: digest of the code of the baseline that writes a variant's field."""
-    return code("method") + or_stop(code_of, METHODS[stages_of(wildcards).method.name])
+def plugin_of_method(wildcards):
+    """The baseline that writes a variant's field."""
+    return (METHODS.places[stages_of(wildcards).method.name],)
+
+
+def readers_of(wildcards):
+    """The readers of the labels that a scene is scored against or shown with."""
+    datasets = {labels.partition("/")[0] for labels in labels_of(row_of(wildcards))}
+    return tuple(DATASETS.places[name] for name in sorted(datasets))
+
+
+def reader_of_source(wildcards):
+    """The reader of the published data set that a scene's images are exported from."""
+    return (DATASETS.places[published(row_of(wildcards).source)[0]],)
 
 
 def stage_of_masks(wildcards):

@@ -23,7 +23,7 @@ rule evaluate:
         mem_mb=4000,
     params:
         settings=settings_of("evaluate"),
-        code=code("evaluate"),
+        code=code("evaluate", readers_of),
         truth=truth_option_of,
     shell:
         "hilsplat evaluate --scene {input.scene} {params.truth} --gaussians {input.gaussians}"
@@ -60,7 +60,7 @@ rule table:
     params:
         labels=json.dumps(dict(RUN.labels)),
         absent=lambda wildcards: absent_of(wildcards.table),
-        code=code("tables"),
+        code=code("table"),
     shell:
         "hilsplat table {wildcards.table} --published {input.published} --labels {params.labels:q}"
         " {params.absent} --out {output.csv} --log {log} {input.scores}"

@@ -22,8 +22,7 @@ rule method:
     params:
         settings=settings_of("method"),
         seed=lambda wildcards: RUN.seed_of(wildcards.variant),
-        code=code("method"),
-        baseline=code_of_method,
+        code=code("method", plugin_of_method),
     shell:
         "hilsplat method --scene {input.scene} --gaussians {input.gaussians} --masks {input.masks}"
         " --contributions {input.contributions} --autoencoder {input.autoencoder}"

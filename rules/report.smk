@@ -46,7 +46,7 @@ rule figures:
         evaluate=settings_of("evaluate"),
         queries=queries_of,
         truth=figure_truth_of,
-        code=code("figures"),
+        code=code("figures", readers_of),
     shell:
         "hilsplat figures --scene {input.scene} {params.truth} --gaussians {input.gaussians}"
         " --fit {input.fit} --masks {input.masks} --clip {input.clip}"
@@ -131,7 +131,7 @@ rule comparison:
         evaluate=settings_of("evaluate"),
         queries=queries_of,
         truth=figure_truth_of,
-        code=code("comparison"),
+        code=code("comparison", readers_of),
     shell:
         "hilsplat comparison --folder {params.folder} --variants {params.variants:q}"
         " --names {params.names:q} {params.truth} --queries {params.queries:q}"

@@ -16,7 +16,7 @@ rule source:
     params:
         name=lambda wildcards: "/".join(published(row_of(wildcards).source)),
         root=str(Path(RUN.data_root)),
-        code=code("source"),
+        code=code("source", reader_of_source),
     shell:
         "hilsplat datasets export {params.name:q} --data-root {params.root:q} --out {output} --log {log}"
 

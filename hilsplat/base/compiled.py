@@ -8,16 +8,41 @@ from typing import Any
 import numba
 from numba.core import event
 
-logger = logging.getLogger(__name__)
+from hilsplat.base.identity import PACKAGE, code_digest
 
-PACKAGE = __name__.split(".")[0]
+logger = logging.getLogger(__name__)
 
 
 def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """`numba.njit` without the interpreter lock, cached on disk (unwrapped: tests wrap every function)."""
+    """`numba.njit` without the interpreter lock, cached on disk until code that the loop reaches changes.
+
+    numba takes a cached loop to be stale when its own file changes, and only then: an edited function of
+    another file that the loop calls would go unnoticed, a comment would compile it anew.
+    """
     if function is None:
         return lambda later: compiled(later, **options)
-    return numba.njit(nogil=True, cache=True, **options)(inspect.unwrap(function))
+    function = inspect.unwrap(function)  # the tests' type checker wraps every function
+    dispatcher = numba.njit(nogil=True, cache=True, **options)(function)
+    if function.__module__.split(".")[0] == PACKAGE and "<locals>" not in function.__qualname__:
+        # numba has no public way to say what else a cached function was made from
+        dispatcher._cache._cache_file._source_stamp = _Stamp(function, options)
+    return dispatcher
+
+
+class _Stamp:
+    """What a loop was compiled from, digested when numba first looks into its cache."""
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        self.function, self.options = function, options
+
+    def __str__(self) -> str:
+        return f"{code_digest(self.function)} {sorted(self.options.items())}"
+
+    def __eq__(self, other: object) -> bool:
+        return str(self) == str(other)
+
+    def __reduce__(self) -> tuple[type[str], tuple[str]]:
+        return str, (str(self),)  # the cache's index file keeps plain text
 
 
 class _Notice(event.Listener):

@@ -96,7 +96,7 @@ def table(
 
     scores = scores or []
     inputs = {"published": published, **{f"scores {number}": path for number, path in enumerate(scores)}}
-    with stage("tables", out, log, inputs=inputs):
+    with stage("table", out, log, inputs=inputs):
         from hilsplat.evaluate.tables.build import run_table
 
         run_table(name, scores, published, json.loads(labels), out, absent or [])

@@ -119,7 +119,7 @@ def field_reference(
         "contributions": contributions,
         "autoencoder": autoencoder,
     }
-    with stage("reference", out, log, settings=section, seed=seed, threads=threads, inputs=inputs):
+    with stage("field_reference", out, log, settings=section, seed=seed, threads=threads, inputs=inputs):
         from hilsplat.field.reference_trainer import run_reference
 
         run_reference(
@@ -146,8 +146,9 @@ def method(
     inputs |= {"contributions": contributions, "autoencoder": autoencoder}
     from hilsplat.methods.registry import METHODS
 
-    also = (METHODS[section.name],) if section.name in METHODS else ()
-    with stage("method", out, log, settings=section, seed=seed, threads=threads, inputs=inputs, also=also):
+    plugins = (METHODS.places[section.name],) if section.name in METHODS else ()
+    more = {"settings": section, "seed": seed, "threads": threads, "inputs": inputs, "plugins": plugins}
+    with stage("method", out, log, **more):
         from hilsplat.methods.method import MethodInputs
         from hilsplat.methods.stage import run_method
 

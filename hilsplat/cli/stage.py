@@ -12,7 +12,7 @@ import typer
 
 from hilsplat.base.artifacts import output_lock, require_free_space
 from hilsplat.base.errors import HilsplatError
-from hilsplat.cli.stage_modules import STAGE_MODULES
+from hilsplat.cli.stages import stage_code
 
 PathIn = Annotated[Path, typer.Option(help="input", show_default=False)]
 PathOut = Annotated[Path, typer.Option(help="output; written atomically", show_default=False)]
@@ -54,14 +54,13 @@ def stage(
     seed: int | None = None,
     threads: int = 1,
     inputs: dict[str, Path] | None = None,
-    also: tuple[str, ...] = (),
+    plugins: tuple[str, ...] = (),
 ) -> Iterator[None]:
     """Everything around a stage's one function call: log, lock, disk space, provenance.
 
-    `settings` is the section that the stage takes, or several by name; `also` names modules that the stage
-    runs and does not import.
+    `settings` is the section that the stage takes, or several by name; `plugins` are the places of the
+    readers or baselines that it uses (`base.plugins`).
     """
-    from hilsplat.base.code_hash import code_hash
     from hilsplat.base.provenance import write_provenance
 
     start_logging(log)
@@ -78,7 +77,7 @@ def stage(
             write_provenance(
                 out,
                 stage=name,
-                code="-".join(code_hash(module) for module in (STAGE_MODULES[name], *also)),
+                code=stage_code(name, plugins),
                 command=["hilsplat", *sys.argv[1:]],
                 settings=_recorded(settings),
                 seed=seed,

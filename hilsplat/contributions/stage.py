@@ -33,8 +33,8 @@ from hilsplat.base.artifacts import (
     write_index,
     write_npz,
 )
-from hilsplat.base.code_hash import code_hash
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.base.identity import code_digest
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import stage_log, track
 from hilsplat.contributions.compositing import normalised_weights, visible_mass
@@ -179,7 +179,7 @@ def run_contributions(
     device = choose_device(settings.device)
     read_index(masks_folder)
     about = {
-        "code": code_hash("hilsplat.contributions.stage"),
+        "code": code_digest(run_contributions),
         "device": device,
         "gaussians": gaussians_sha256,
         "min_weight": settings.min_weight,

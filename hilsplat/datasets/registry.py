@@ -6,33 +6,25 @@ A reader's module describes its data set in a constant (see `dataset.Dataset`); 
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
+from hilsplat.base.plugins import Plugins
 from hilsplat.datasets.dataset import Dataset
-from hilsplat.datasets.images.hi import HI_3DOVS, HI_LERF
-from hilsplat.datasets.images.lerf_mask import DATASET as LERF_MASK
-from hilsplat.datasets.images.lerf_ovs import DATASET as LERF_OVS
-from hilsplat.datasets.images.ovs3d import DATASET as OVS_3D
 from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.datasets.points.labelled_points import PointScene
-from hilsplat.datasets.points.replica import DATASET as REPLICA
-from hilsplat.datasets.points.scannet import DATASET as SCANNET
-from hilsplat.datasets.points.scannet import SCANNET200_DATASET as SCANNET200
-from hilsplat.datasets.waymo.reader import DATASET as WAYMO
 
-DATASETS: dict[str, Dataset] = {
-    dataset.name: dataset
-    for dataset in (
-        LERF_OVS,
-        LERF_MASK,
-        OVS_3D,
-        HI_LERF,
-        HI_3DOVS,
-        SCANNET,
-        SCANNET200,
-        REPLICA,
-        WAYMO,
-    )
-}
-"""By name, in the order of the paper's tables."""
+DATASETS: Plugins[Dataset] = Plugins(
+    {
+        "lerf_ovs": "hilsplat.datasets.images.lerf_ovs:DATASET",
+        "lerf_mask": "hilsplat.datasets.images.lerf_mask:DATASET",
+        "3d_ovs": "hilsplat.datasets.images.ovs3d:DATASET",
+        "hi_lerf": "hilsplat.datasets.images.hi:HI_LERF",
+        "hi_3dovs": "hilsplat.datasets.images.hi:HI_3DOVS",
+        "scannet": "hilsplat.datasets.points.scannet:DATASET",
+        "scannet200": "hilsplat.datasets.points.scannet:SCANNET200_DATASET",
+        "replica": "hilsplat.datasets.points.replica:DATASET",
+        "waymo": "hilsplat.datasets.waymo.reader:DATASET",
+    }
+)
+"""In the order of the paper's tables."""
 
 
 def open_labelled(name: str, data_root: Path) -> LabelledScene:

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 
-from hilsplat.base import crops, onnx_models
 from hilsplat.base.artifacts import (
     ViewCache,
     atomic_folder,
@@ -15,9 +14,9 @@ from hilsplat.base.artifacts import (
     write_npy,
 )
 from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.identity import code_digest
 from hilsplat.base.parallel import in_order
 from hilsplat.base.progress import stage_log, track
-from hilsplat.embed import clip
 from hilsplat.embed.clip import ClipModel
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
@@ -45,7 +44,6 @@ def run_clip(
     views = list(read_index(masks_folder)["views"])
     model = ClipModel.load(Path(settings.model))
     view_cache = ViewCache(Path(cache) / "clip")
-    code = [sha256_of_file(Path(module.__file__)) for module in (clip, crops, onnx_models)]
 
     def embed(view: str) -> np.ndarray:
         masks_path = Path(masks_folder) / f"{view}.npz"
@@ -56,7 +54,7 @@ def run_clip(
                 "model": model.digest,
                 "providers": model.vision.providers,
                 "settings": settings.model_dump(exclude={"model"}),
-                "code": code,
+                "code": code_digest(ClipModel),
             }
         )
 

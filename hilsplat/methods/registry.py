@@ -1,22 +1,20 @@
-"""The baselines by name. A new one is a file with a constant `METHOD` and a line here.
+"""The baselines by name. A new one is a file with a constant `METHOD` and a line here."""
 
-The workflow reads this module at start-up, so the files are imported when they are asked for.
-"""
-
-import importlib
 from typing import TYPE_CHECKING
 
 from hilsplat.base.errors import SettingsError
+from hilsplat.base.plugins import Plugins
 from hilsplat.settings import MethodSettings
 
 if TYPE_CHECKING:
     from hilsplat.methods.method import Method
 
-METHODS: dict[str, str] = {
-    "langsplat": "hilsplat.methods.langsplat",
-    "lifted": "hilsplat.methods.lifted",
-}
-"""Name -> module, whose `METHOD` it is."""
+METHODS: Plugins["Method"] = Plugins(
+    {
+        "langsplat": "hilsplat.methods.langsplat:METHOD",
+        "lifted": "hilsplat.methods.lifted:METHOD",
+    }
+)
 
 OURS: str = MethodSettings().name
 """The method of this repository, whose field the stage `field` solves."""
@@ -45,8 +43,8 @@ def method_of(name: str) -> "Method":
     require_method(name)
     if name == OURS:
         raise SettingsError(
-            f"method.name: {OURS} is no baseline",
+            f"method.name: {OURS} is not a baseline",
             expected=f"one of {', '.join(METHODS)}",
-            fix="run the stage language, which solves its field",
+            fix="run the stage `field`, which solves its field",
         )
-    return importlib.import_module(METHODS[name]).METHOD
+    return METHODS[name]

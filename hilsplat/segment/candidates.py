@@ -1,14 +1,12 @@
 """What the networks say about a view: the costly half of automatic mask generation, which is cached."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Int8, Int32, Int64, UInt8
 
-from hilsplat.base import onnx_models
-from hilsplat.base.artifacts import sha256_of_file, sha256_of_json
-from hilsplat.segment import logit_kernels, sam
+from hilsplat.base.artifacts import sha256_of_json
+from hilsplat.base.identity import code_digest
 from hilsplat.segment.logit_kernels import edge_windows
 from hilsplat.segment.sam import HEADS, Frame, SamModel, point_grid, read_logits
 from hilsplat.settings import MasksSettings
@@ -100,8 +98,6 @@ def crop_boxes(
 
 def candidates_key(image_sha256: str, model: SamModel, settings: MasksSettings) -> str:
     """Cache key of a view's candidates: everything that `decode_candidates` depends on."""
-    code = [sha256_of_file(Path(module.__file__)) for module in (sam, onnx_models, logit_kernels)]
-    code.append(sha256_of_file(Path(__file__)))
     return sha256_of_json(
         {
             "image": image_sha256,
@@ -114,7 +110,7 @@ def candidates_key(image_sha256: str, model: SamModel, settings: MasksSettings) 
             "crop_layers": settings.crop_layers,
             "stability_offset": settings.stability_offset,
             "floors": floors(settings),
-            "code": code,
+            "code": code_digest(decode_candidates),
         }
     )
 

@@ -12,15 +12,15 @@ from hilsplat.base.artifacts import (
     write_index,
 )
 from hilsplat.base.errors import SceneError
+from hilsplat.base.identity import code_digest
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.parallel import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.scene.scene import Scene
-from hilsplat.segment import graph, kernels
-from hilsplat.segment import masks as masks_module
 from hilsplat.segment.candidates import Candidates, candidates_key, decode_candidates
 from hilsplat.segment.coverage_levels import with_coverage_levels
 from hilsplat.segment.generate import masks_from_candidates
+from hilsplat.segment.graph import segment_graph
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.sam import SamModel
 from hilsplat.settings import MasksSettings
@@ -98,12 +98,12 @@ def graph_masks(scene: Scene, view: str, cache: ViewCache, settings: MasksSettin
         {
             "image": sha256_of_file(scene.image_path(view)),
             "settings": [settings.graph_scales, settings.min_area_px],
-            "code": [sha256_of_file(Path(module.__file__)) for module in (graph, masks_module, kernels)],
+            "code": code_digest(segment_graph, HierarchicalMasks),
         }
     )
     arrays = cache.get(
         key,
-        lambda: graph.segment_graph(scene.image(view), settings.graph_scales, settings.min_area_px).arrays(),
+        lambda: segment_graph(scene.image(view), settings.graph_scales, settings.min_area_px).arrays(),
     )
     masks = HierarchicalMasks.from_arrays(arrays)
     return with_coverage_levels(masks, settings) if settings.level_source == "coverage" else masks

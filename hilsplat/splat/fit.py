@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float64
 
 from hilsplat.base.artifacts import sha256_of_json, sha256_of_path
-from hilsplat.base.code_hash import code_hash
 from hilsplat.base.errors import SceneError
+from hilsplat.base.identity import code_digest
 from hilsplat.base.images import to_float
 from hilsplat.base.progress import stage_log, track
 from hilsplat.scene.scene import Scene
@@ -183,7 +183,7 @@ def run_gaussians(
                     settings.model_dump(mode="json"),
                     seed,
                     sha256_of_path(scene_folder),
-                    code_hash("hilsplat.splat.fit"),
+                    code_digest(fit_gaussians),
                 ]
             )
             checkpoint = Path(cache) / "gaussians" / f"{key[:16]}.npz"

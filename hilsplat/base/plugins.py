@@ -1,0 +1,34 @@
+"""Tables of interchangeable parts, such as readers and baselines, imported when they are asked for."""
+
+import importlib
+from collections.abc import Iterator, Mapping
+from typing import Generic, TypeVar
+
+Part = TypeVar("Part")
+
+
+class Plugins(Mapping[str, Part], Generic[Part]):
+    """Parts by name.
+
+    The identity of code (`base.identity`) does not follow the entries: a stage that uses one part depends
+    on that part alone, and adds its place to its roots.
+
+    Attributes:
+        places: name -> "module:constant".
+    """
+
+    def __init__(self, places: Mapping[str, str]) -> None:
+        self.places = dict(places)
+
+    def __getitem__(self, name: str) -> Part:
+        module, _, constant = self.places[name].partition(":")
+        return getattr(importlib.import_module(module), constant)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.places)
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.places  # without importing the part

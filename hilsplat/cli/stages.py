@@ -1,0 +1,48 @@
+"""Which function is which stage."""
+
+from hilsplat.base.errors import HilsplatError
+from hilsplat.base.identity import code_digest
+
+STAGES: dict[str, str] = {
+    "world": "hilsplat.world.stage:run_world",
+    "source": "hilsplat.datasets.sources:export_images",
+    "poses": "hilsplat.scene.poses:run_poses",
+    "gaussians": "hilsplat.splat.fit:run_gaussians",
+    "masks": "hilsplat.segment.stage:run_masks",
+    "truth_masks": "hilsplat.datasets.synthetic.truth_masks:run_truth_masks",
+    "coverage_tree": "hilsplat.segment.coverage_stage:run_coverage_tree",
+    "clip": "hilsplat.embed.stage:run_clip",
+    "langsplat": "hilsplat.embed.langsplat_files",
+    "contributions": "hilsplat.contributions.stage:run_contributions",
+    "semantic_tree": "hilsplat.semantic_tree.tree:run_semantic_tree",
+    "autoencoder": "hilsplat.field.autoencoder:run_autoencoder",
+    "field": "hilsplat.field.field:run_field",
+    "field_reference": "hilsplat.field.reference_trainer:run_reference",
+    "method": "hilsplat.methods.stage:run_method",
+    "evaluate": "hilsplat.evaluate.stage:run_evaluate",
+    "table": "hilsplat.evaluate.tables.build:run_table",
+    "efficiency": "hilsplat.evaluate.tables.efficiency:run_efficiency",
+    "figures": "hilsplat.evaluate.figures.panel:run_figures",
+    "comparison": "hilsplat.evaluate.figures.comparison:run_comparison",
+    "sweep": "hilsplat.evaluate.figures.sweep_plot:run_sweep_plot",
+    "consistency": "hilsplat.evaluate.diagnostics.world_consistency:run_consistency",
+    "mask_truth": "hilsplat.evaluate.diagnostics.mask_truth:run_mask_truth",
+    "tree_truth": "hilsplat.evaluate.diagnostics.tree_truth:run_tree_truth",
+    "models": "hilsplat.world.tiny.train:train_models",
+}
+"""The function, or the functions of a module, that each stage's command calls."""
+
+
+def stage_code(stage: str, plugins: tuple[str, ...] = ()) -> str:
+    """Digest of the code that a stage runs.
+
+    Args:
+        stage: key of `STAGES`.
+        plugins: places of the readers or baselines that this run of it uses (see `base.plugins`).
+
+    Raises:
+        HilsplatError: there is no such stage.
+    """
+    if stage not in STAGES:
+        raise HilsplatError(f"there is no stage {stage!r}", expected=f"one of {', '.join(STAGES)}")
+    return code_digest(STAGES[stage], *plugins)

@@ -1,0 +1,335 @@
+"""The identity of code follows what a function can reach, and nothing else."""
+
+import ast
+import shutil
+from pathlib import Path
+
+import pytest
+
+from hilsplat.base.errors import HilsplatError
+from hilsplat.base.identity import code_digest, reached
+from hilsplat.cli.stages import STAGES
+from hilsplat.datasets.registry import DATASETS
+from hilsplat.methods.registry import METHODS
+
+# ---- on packages of a few lines ---------------------------------------------------------------------
+
+
+def package(folder: Path, **modules: str) -> Path:
+    """A package `hilsplat` with the given modules; `sub__b` is the module `hilsplat.sub.b`."""
+    root = folder / "hilsplat"
+    for name, text in {"__init__": "", **modules}.items():
+        path = root.joinpath(*name.split("__")) if not name.endswith("__init__") else None
+        if path is None:
+            path = root / name.removesuffix("__init__").strip("_") / "__init__"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.with_suffix(".py").write_text(text)
+        (path.parent / "__init__.py").touch()
+    return root
+
+
+def found(folder: Path, **modules: str) -> set[str]:
+    """What hilsplat.a:g reaches, without the package's name."""
+    root = package(folder, **modules)
+    return {name.removeprefix("hilsplat.") for name in reached("hilsplat.a:g", root=root)}
+
+
+def same(folder: Path, one: dict[str, str], other: dict[str, str]) -> bool:
+    """Whether hilsplat.a:g has the same digest in two packages."""
+    digests = {
+        code_digest("hilsplat.a:g", root=package(folder / str(number), **modules))
+        for number, modules in enumerate((one, other))
+    }
+    return len(digests) == 1
+
+
+BASE = {
+    "a": "from hilsplat.b import f\n\ndef g():\n    return f()\n\ndef aside():\n    return 3\n",
+    "b": "ONE = 1\n\ndef f():\n    return ONE\n\ndef unused():\n    return 2\n",
+}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "counts"),
+    [
+        ("def g():\n", 'def g():\n    """A docstring."""\n', False),
+        ("    return f()\n", "    return  f()  # a comment\n", False),
+        ("ONE = 1\n", 'ONE = 1\n"""What it is."""\n', False),
+        ("return 2", "return 20", False),
+        ("return 3", "return 30", False),
+        ("return ONE", "return -ONE", True),
+        ("ONE = 1", "ONE = 11", True),
+        ("return f()", "return f(), 1", True),
+        ("def unused", "class Another(Exception):\n    pass\n\ndef unused", False),
+        ("from hilsplat.b import f", "from hilsplat.b import unused as f", True),
+    ],
+)
+def test_what_is_reached_counts_and_what_is_not_does_not(tmp_path, old, new, counts):
+    edited = {name: text.replace(old, new) for name, text in BASE.items()}
+    assert edited != BASE
+    assert same(tmp_path, BASE, edited) is not counts
+
+
+@pytest.mark.parametrize(
+    ("code", "old", "new", "counts"),
+    [
+        ('    raise ValueError("a word")', "a word", "two words", False),
+        ('    raise ValueError(f"a word of {x}")', "a word", "two words", False),
+        ('    raise ValueError("a word")', "ValueError", "KeyError", True),
+        ('    logger.info("a word %s", x)', "a word", "two words", False),
+        ('    logger.info("a word %s", x)', "x)", "y)", True),
+        ('    return "a word"', "a word", "two words", True),
+        ('    return knob(1, "a word", unit="px", ge=0)', "a word", "two words", False),
+        ('    return knob(1, "a word", unit="px", ge=0)', "px", "mm", False),
+        ('    return knob(1, "a word", unit="px", ge=0)', "(1", "(2", True),
+        ('    return knob(1, "a word", unit="px", ge=0)', "ge=0", "ge=1", True),
+        ('    return Dataset(name="x", licence="free")', "free", "yours", False),
+        ('    return Dataset(name="x", licence="free")', '"x"', '"y"', True),
+        ('    return Plugins({"x": "hilsplat.b:f"})', ":f", ":h", False),
+        ("    y: int = x\n    return y", "int", "float", False),
+    ],
+)
+def test_words_for_people_do_not_count(tmp_path, code, old, new, counts):
+    one = {"a": f"def g(x, y):\n{code}\n"}
+    other = {"a": one["a"].replace(old, new)}
+    assert one != other
+    assert same(tmp_path, one, other) is not counts
+
+
+def test_imports_inside_functions_relative_ones_and_attributes_of_modules_are_followed(tmp_path):
+    a = "def g():\n    from . import b\n    return b.f()\n"
+    b = "import hilsplat.c\n\ndef f():\n    return hilsplat.c.h()\n\ndef unused():\n    return 1\n"
+    assert found(tmp_path, a=a, b=b, c="def h():\n    return 1\n") == {"a:g", "b:f", "c:h"}
+
+
+def test_a_module_that_is_handed_around_counts_as_a_whole(tmp_path):
+    a = "from hilsplat import b\n\ndef g():\n    return vars(b)\n"
+    assert found(tmp_path, a=a, b="def f():\n    return 1\n\nX = 1\n") == {"a:g", "b:f", "b:X"}
+
+
+def test_names_that_a_package_exports_lead_to_their_module(tmp_path):
+    a = "from hilsplat.sub import f\n\ndef g():\n    return f()\n"
+    exports = "from hilsplat.sub.b import f\nfrom hilsplat.sub.c import h\n"
+    modules = {
+        "sub__init__": exports,
+        "sub__b": "def f():\n    return 1\n",
+        "sub__c": "def h():\n    return 1\n",
+    }
+    assert found(tmp_path, a=a, **modules) == {"a:g", "sub.b:f"}
+
+
+def test_a_local_name_hides_the_module_s(tmp_path):
+    a = (
+        "def x():\n    return 1\n\ndef y():\n    return 1\n\ndef z():\n    return 1\n\n"
+        "def g(x):\n    y = 2\n    return x, y, [z for z in (1, 2)]\n"
+    )
+    assert found(tmp_path, a=a) == {"a:g"}
+
+
+def test_methods_see_the_module_and_not_the_names_of_their_class(tmp_path):
+    a = (
+        "def f():\n    return 1\n\nclass C:\n    def f(self):\n        return f()\n\n"
+        "class D:\n    def h(self):\n        return 1\n\ndef g(c: D):\n    return C()\n"
+    )
+    # D is where an argument of the root may come from
+    assert found(tmp_path, a=a) == {"a:g", "a:C", "a:f", "a:D"}
+
+
+def test_annotations_count_for_roots_alone(tmp_path):
+    a = "class D:\n    pass\n\ndef f(d: D) -> D:\n    return d\n\ndef g():\n    return f(1)\n"
+    assert found(tmp_path, a=a) == {"a:g", "a:f"}
+
+
+@pytest.mark.parametrize(
+    ("statement", "counts"),
+    [
+        ("register(1)", True),
+        ("TABLE[1] = 2", True),
+        ("@register\ndef h():\n    return 1", True),
+        ("@cache\ndef h():\n    return 1", False),
+        ("TABLE = {1: 2}", False),
+    ],
+)
+def test_what_importing_a_reached_module_runs_counts(tmp_path, statement, counts):
+    one = {"a": "from hilsplat.b import f\n\ndef g():\n    return f()\n", "b": "def f():\n    return 1\n"}
+    other = {**one, "b": f"{one['b']}\n{statement}\n"}
+    assert same(tmp_path, one, other) is not counts
+
+
+def test_both_branches_that_bind_a_name_count(tmp_path):
+    a = "try:\n    X = 1\nexcept ImportError:\n    X = {}\n\ndef g():\n    return X\n"
+    one, other = ({"a": a.format(number)} for number in (2, 3))
+    assert not same(tmp_path, one, other)
+
+
+@pytest.mark.parametrize(
+    ("root", "a", "message"),
+    [
+        ("hilsplat.zzz", "", r"module hilsplat\.zzz does not exist"),
+        ("hilsplat.a:h", "def g():\n    pass\n", r"hilsplat\.a does not define 'h'"),
+        (
+            "hilsplat.a:g",
+            "from hilsplat.b import x\n\ndef g():\n    x()\n",
+            r"imports hilsplat\.b, which does not",
+        ),
+        (
+            "hilsplat.a:g",
+            "from hilsplat import a\n\ndef g():\n    a.x()\n",
+            r"uses 'x' of hilsplat\.a, which",
+        ),
+        ("hilsplat.a:g", "from hilsplat.a import *\n\ndef g():\n    x()\n", r"a star import of hilsplat\.a"),
+    ],
+)
+def test_what_does_not_exist_is_named(tmp_path, root, a, message):
+    with pytest.raises(HilsplatError, match=message):
+        code_digest(root, root=package(tmp_path, a=a))
+
+
+# ---- on this package --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def copy(project: Path, tmp_path: Path) -> Path:
+    """A copy of the package."""
+    return Path(
+        shutil.copytree(
+            project / "hilsplat", tmp_path / "hilsplat", ignore=shutil.ignore_patterns("__pycache__")
+        )
+    )
+
+
+def digests(root: Path) -> dict[str, str]:
+    return {stage: code_digest(place, root=root) for stage, place in STAGES.items()}
+
+
+def changed(root: Path, project: Path) -> set[str]:
+    """Stages whose digest is another than that of the project."""
+    before, after = digests(project / "hilsplat"), digests(root)
+    return {stage for stage in STAGES if before[stage] != after[stage]}
+
+
+def edit(root: Path, path: str, old: str, new: str) -> None:
+    text = (root / path).read_text()
+    assert text.count(old) == 1, (path, old)
+    (root / path).write_text(text.replace(old, new))
+
+
+def words_of(tree: ast.Module) -> list[ast.Constant]:
+    """Docstrings, other bare strings, descriptions of knobs, and words of `raise` and log statements."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            found.append(node.value)
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "knob":
+            found.append(node.args[1])
+        elif isinstance(node, ast.Raise) or (isinstance(node, ast.Expr) and "logger." in ast.unparse(node)):
+            in_f_strings = {
+                id(c) for f in ast.walk(node) if isinstance(f, ast.JoinedStr) for c in ast.walk(f)
+            }
+            found += [c for c in ast.walk(node) if isinstance(c, ast.Constant) and id(c) not in in_f_strings]
+    return [word for word in found if isinstance(word.value, str)]
+
+
+def test_editing_prose_anywhere_reruns_nothing(copy, project):
+    edits = 0
+    for path in copy.rglob("*.py"):
+        lines = path.read_bytes().splitlines(keepends=True)
+        places = {(word.lineno - 1, word.col_offset) for word in words_of(ast.parse(b"".join(lines)))}
+        for line, column in sorted(places, reverse=True):
+            start = lines[line].index(b'"', column)
+            quotes = 3 if lines[line][start : start + 3] == b'"""' else 1
+            lines[line] = lines[line][: start + quotes] + b"Edited. " + lines[line][start + quotes :]
+        path.write_bytes(b"# edited\n" + b"".join(lines))
+        edits += len(places)
+    assert edits > 2000
+    assert changed(copy, project) == set()
+
+
+def test_an_added_error_and_an_added_knob_elsewhere_rerun_nothing(copy, project):
+    errors = copy / "base/errors.py"
+    errors.write_text(errors.read_text() + '\n\nclass NewError(HilsplatError):\n    """New."""\n')
+    edit(
+        copy,
+        "settings.py",
+        "class FiguresSettings(Section):",
+        "class NewSettings(Section):\n    x: int = 1\n\n\nclass FiguresSettings(Section):",
+    )
+    assert changed(copy, project) == set()
+
+
+def edit_function(root: Path, place: str) -> None:
+    """Add a line to a function, named as "path.py:function"."""
+    path, _, name = place.partition(":")
+    tree = ast.parse((root / path).read_text())
+    [function] = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and node.name == name]
+    function.body.append(ast.parse("EDITED = 1").body[0])
+    (root / path).write_text(ast.unparse(ast.fix_missing_locations(tree)))
+
+
+@pytest.mark.parametrize(
+    ("place", "expected"),
+    [
+        ("segment/coverage_stage.py:run_coverage_tree", {"coverage_tree"}),
+        ("field/losses/part.py:part_loss_literal", {"field"}),
+        ("field/reference_trainer.py:run_reference", {"field_reference"}),
+        ("embed/langsplat_files.py:write_langsplat", {"langsplat"}),
+        ("evaluate/tables/html_page.py:as_html", {"table"}),
+        ("query/field_colours.py:field_colours", {"evaluate", "figures", "comparison"}),
+        ("segment/graph.py:segment_graph", {"masks"}),
+        ("cli/stage.py:stage", set()),
+    ],
+)
+def test_an_edit_reruns_exactly_the_stages_that_can_reach_it(copy, project, place, expected):
+    edit_function(copy, place)
+    assert changed(copy, project) == expected
+
+
+def test_a_reader_and_a_baseline_count_for_the_jobs_that_use_them_alone(copy, project):
+    edit_function(copy, "datasets/images/lerf_ovs.py:open_scene")
+    edit_function(copy, "methods/lifted.py:fit")
+    assert changed(copy, project) == set()
+
+    def edited(stage: str, places: dict[str, str]) -> set[str]:
+        roots = (copy, project / "hilsplat")
+        return {
+            name
+            for name, place in places.items()
+            if len({code_digest(STAGES[stage], place, root=root) for root in roots}) == 2
+        }
+
+    for stage in ("evaluate", "figures", "comparison"):
+        assert edited(stage, DATASETS.places) == {"lerf_ovs"}
+    assert edited("method", METHODS.places) == {"lifted"}
+
+
+def test_every_stage_and_plugin_has_its_code_and_nothing_else_is_imported_by_string(project):
+    for place in (*STAGES.values(), *DATASETS.places.values(), *METHODS.places.values()):
+        assert reached(place), place
+    texts = {path: path.read_text() for path in (project / "hilsplat").rglob("*.py")}
+    by_string = [path for path, text in texts.items() if "import_module" in text or "__import__(" in text]
+    assert by_string == [project / "hilsplat/base/plugins.py"]
+
+
+def test_a_command_does_nothing_for_its_stage_but_call_the_function_that_is_digested(project):
+    calls: dict[str, set[str]] = {}
+    for path in (project / "hilsplat/cli").glob("*_commands.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.With) or not isinstance(node.items[0].context_expr, ast.Call):
+                continue
+            call = node.items[0].context_expr
+            if isinstance(call.func, ast.Name) and call.func.id == "stage":
+                name = ast.literal_eval(call.args[0])
+                statements = [each for each in node.body if not isinstance(each, ast.ImportFrom)]
+                modules = {
+                    alias.name: each.module
+                    for each in node.body
+                    if isinstance(each, ast.ImportFrom)
+                    for alias in each.names
+                }
+                assert len(statements) == 1, (path.name, name, "one call inside `with stage(...)`")
+                function = statements[0].value.func.id
+                calls.setdefault(name, set()).add(f"{modules[function]}:{function}")
+    for name, places in calls.items():
+        expected = STAGES[name]
+        assert places == {expected} or {place.partition(":")[0] for place in places} == {expected}, name
+    assert set(STAGES) - set(calls) == {"efficiency", "models"}
