@@ -28,7 +28,7 @@ from hilsplat.evaluate.truths import annotated_truths, labelled_truths
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.masks import masks_label
+from hilsplat.segment.origin import masks_label
 from hilsplat.settings import EvaluateSettings
 
 logger = logging.getLogger(__name__)

@@ -23,7 +23,7 @@ from hilsplat.query.pictures import (
     show_from_above,
 )
 from hilsplat.scene.finished import FinishedScene
-from hilsplat.segment.masks import made_from_truth, masks_label
+from hilsplat.segment.origin import made_from_truth, masks_label
 from hilsplat.semantic_tree.export import write_selection_ply
 
 LISTED = 10

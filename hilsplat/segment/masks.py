@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32, Int64, UInt8, UInt32
 
-from hilsplat.base.artifacts import read_index, read_npz, write_npz
+from hilsplat.base.artifacts import read_npz, write_npz
 from hilsplat.base.errors import EmptyMaskError
 from hilsplat.base.levels import NONE, Level
 from hilsplat.segment.kernels import areas_and_boxes, paint_runs, shared_pixels, window_of_runs
@@ -255,20 +255,3 @@ class HierarchicalMasks:
     def load(path: Path) -> "HierarchicalMasks":
         """Read `<view>.npz`."""
         return HierarchicalMasks.from_arrays(read_npz(path))
-
-
-def masks_label(masks_folder: Path) -> str:
-    """What made the masks, as rows name it.
-
-    The model folder's name, or the segmenter without one; masks made from true labels bring a label that
-    also tells their faults.
-    """
-    index = read_index(masks_folder)
-    if "label" in index:
-        return str(index["label"])
-    return Path(index["model"]).name if index["model"] else index["segmenter"]
-
-
-def made_from_truth(masks: str) -> bool:
-    """Whether masks with this label were made from true labels: a diagnostic that is no result."""
-    return masks.startswith("truth-perturbed")

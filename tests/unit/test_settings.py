@@ -44,7 +44,9 @@ def test_a_variant_may_not_change_what_all_variants_share() -> None:
 
 
 def test_errors_inside_variants_name_the_variant() -> None:
-    with pytest.raises(SettingsError, match=r"variants\.x\.tree\.theta: Input should be less than 1"):
+    with pytest.raises(
+        SettingsError, match=r"variants\.x\.coverage_tree\.theta: Input should be less than 1"
+    ):
         parse_run({"variants": {"x": {"coverage_tree": {"theta": 3}}}})
 
 
@@ -60,10 +62,10 @@ def test_overrides_apply_in_order_group_then_scene_then_variant() -> None:
             "variants": {"v": {"coverage_tree": {"theta": 0.8}}},
         }
     )
-    assert run.stages().tree.theta == 0.9
-    assert run.stages(scopes=("g", "d/t")).tree.theta == 0.6
-    assert run.stages(scopes=("g", "d/s")).tree.theta == 0.7
-    assert run.stages("v", scopes=("g", "d/s")).tree.theta == 0.8
+    assert run.stages().coverage_tree.theta == 0.9
+    assert run.stages(scopes=("g", "d/t")).coverage_tree.theta == 0.6
+    assert run.stages(scopes=("g", "d/s")).coverage_tree.theta == 0.7
+    assert run.stages("v", scopes=("g", "d/s")).coverage_tree.theta == 0.8
 
 
 def test_only_what_holds_something_random_is_repeated_per_seed() -> None:

@@ -18,7 +18,8 @@ from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.query.pictures import grey, save_png_and_pdf, show
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.masks import HierarchicalMasks, masks_label
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.origin import masks_label
 from hilsplat.segment.overlaps import region_ious
 from hilsplat.segment.pictures import paint_level
 

@@ -14,7 +14,8 @@ from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.evaluate.diagnostics.consistency import Agreement, measure_consistency, neighbours
 from hilsplat.scene.cameras import Cameras
-from hilsplat.segment.masks import HierarchicalMasks, masks_label
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.origin import masks_label
 from hilsplat.world.mesh import TrueMesh
 
 logger = logging.getLogger(__name__)

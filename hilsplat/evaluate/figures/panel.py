@@ -28,7 +28,8 @@ from hilsplat.query.pictures import (
     show,
 )
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.masks import HierarchicalMasks, made_from_truth, masks_label
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.origin import made_from_truth, masks_label
 from hilsplat.segment.pictures import paint_level
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 

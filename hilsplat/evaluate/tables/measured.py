@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from hilsplat.base.levels import LEVELS
 from hilsplat.evaluate.protocols.cards import ANNOTATIONS, LEVEL_AUTO, LEVEL_GIVEN, PATH, SCENE_WIDE
 from hilsplat.evaluate.tables.rows import Block, Cell, Row
-from hilsplat.segment.masks import made_from_truth
+from hilsplat.segment.origin import made_from_truth
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -18,7 +18,7 @@ from hilsplat.evaluate.tables.measured import (
 from hilsplat.evaluate.tables.reported import reported_block
 from hilsplat.evaluate.tables.rows import Block, Cell, Row, Table
 from hilsplat.evaluate.tables.sources import Sources
-from hilsplat.segment.masks import made_from_truth
+from hilsplat.segment.origin import made_from_truth
 
 if TYPE_CHECKING:
     import pandas as pd

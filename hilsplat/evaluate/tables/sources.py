@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from hilsplat.evaluate.tables.rows import Block, Table
-from hilsplat.segment.masks import made_from_truth
+from hilsplat.segment.origin import made_from_truth
 
 if TYPE_CHECKING:
     import pandas as pd

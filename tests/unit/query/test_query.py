@@ -242,14 +242,14 @@ def test_a_variant_answers_with_the_field_it_was_scored_with_and_never_with_anot
     for name in ("gaussians.ply", "default/field.safetensors"):
         (folder / name).touch()
     (folder / "lifted").mkdir()  # begun, and killed
-    with pytest.raises(ArtifactError, match=r"lifted/language\.safetensors is missing"):
+    with pytest.raises(ArtifactError, match=r"lifted/field\.safetensors is missing"):
         FinishedScene.locate(folder, "lifted")
-    inputs = {"language": {"path": "results/synthetic/bear/default/field.safetensors"}}
+    inputs = {"field": {"path": "results/synthetic/bear/default/field.safetensors"}}
     (folder / "theta").mkdir()
     (folder / "theta/scores.csv").touch()
     write_json(provenance_path(folder / "theta/scores.csv"), {"settings": {}, "inputs": inputs})
     found = FinishedScene.locate(folder, "theta")
-    assert found.language == folder / "default/field.safetensors"
+    assert found.field == folder / "default/field.safetensors"
     assert found.semantic_tree == folder / "default/semantic_tree"
     with pytest.raises(ArtifactError, match="no variant 'x'"):
         FinishedScene.locate(folder, "x")

@@ -14,7 +14,7 @@ from hilsplat.evaluate.protocols.flat_views import FlatProtocols
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import measure_view
 from hilsplat.evaluate.scores import COLUMNS, Score, read_scores, write_scores
-from hilsplat.segment.masks import masks_label
+from hilsplat.segment.origin import masks_label
 from hilsplat.settings import EvaluateSettings
 
 SIZE = (10, 10)

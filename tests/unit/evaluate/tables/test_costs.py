@@ -44,7 +44,7 @@ def scene(tmp_path):
             for name in stages
             if name not in ("coverage_tree", "contributions")
         }
-        inputs["language"] = {"path": str(variant / "field.safetensors")}
+        inputs["field"] = {"path": str(variant / "field.safetensors")}
         scores = variant / "scores.csv"
         row = Score(
             "synthetic", "table-1", variant.name, "sam-tiny", "field", "v", "cup", "whole", "iou",

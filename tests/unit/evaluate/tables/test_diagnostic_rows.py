@@ -7,7 +7,7 @@ from hilsplat.base.artifacts import write_index
 from hilsplat.evaluate.figures.panel import draw_panel
 from hilsplat.evaluate.scores import Score, write_scores
 from hilsplat.evaluate.tables.build import run_table
-from hilsplat.segment.masks import made_from_truth, masks_label
+from hilsplat.segment.origin import made_from_truth, masks_label
 from hilsplat.settings import EvaluateSettings
 from tests.conftest import PROJECT
 

@@ -29,13 +29,13 @@ def test_stages_stand_in_the_order_of_the_workflow_with_a_total(tmp_path):
     text = run_efficiency(results, tmp_path / "efficiency.csv")
     assert text.splitlines()[2:] == [
         "| poses | 1 | 10.0 | 10.0 | 10.0 | 0.0 | 0 |",
-        "| language | 2 | 2.0 | 2.5 | 4.0 | 3.0 | 600 |",
+        "| field | 2 | 2.0 | 2.5 | 4.0 | 3.0 | 600 |",
         "| table-lerf | 1 | 1.0 | 1.0 | 1.0 | 0.5 | 90 |",
         "| all | 4 | 3.8 | 10.0 | 15.0 | 3.5 | 600 |",
     ]
     lines = (tmp_path / "efficiency.csv").read_text().splitlines()
     assert lines[1] == "poses,synthetic,one,,10.00,0.00,0"
-    assert lines[2] == "language,synthetic,one,default,2.50,2.00,400"
+    assert lines[2] == "field,synthetic,one,default,2.50,2.00,400"
     assert (tmp_path / "efficiency.md").read_text() == text
 
 

@@ -1,0 +1,22 @@
+"""What made the masks of a scene, as rows and titles name it."""
+
+from pathlib import Path
+
+from hilsplat.base.artifacts import read_index
+
+
+def masks_label(masks_folder: Path) -> str:
+    """What made the masks, as rows name it.
+
+    The model folder's name, or the segmenter without one; masks made from true labels bring a label that
+    also tells their faults.
+    """
+    index = read_index(masks_folder)
+    if "label" in index:
+        return str(index["label"])
+    return Path(index["model"]).name if index["model"] else index["segmenter"]
+
+
+def made_from_truth(masks: str) -> bool:
+    """Whether masks with this label were made from true labels: a diagnostic that is no result."""
+    return masks.startswith("truth-perturbed")
