@@ -16,9 +16,9 @@ include: "rules/common.smk"
 
 
 wildcard_constraints:
-    dataset=any_of(row.dataset for row in ALL_SCENES),
-    scene=any_of(row.scene for row in ALL_SCENES),
-    variant=any_of(RUN.variant_names()),
+    dataset=PLAN.datasets(),
+    scene=PLAN.scene_names(),
+    variant=PLAN.variants(),
 
 
 include: "rules/world.smk"
@@ -38,8 +38,8 @@ include: "rules/report.smk"
 rule all:
     default_target: True
     input:
-        targets_of_run(),
+        PLAN.targets(),
 
 
 onsuccess:
-    print_where_time_went()
+    shell("hilsplat efficiency --results results --out results/efficiency.csv")

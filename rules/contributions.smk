@@ -3,7 +3,7 @@ rule contributions:
     input:
         scene="results/{dataset}/{scene}/scene",
         gaussians="results/{dataset}/{scene}/gaussians.ply",
-        masks=shared("masks", "masks"),
+        masks=PLAN.shared("masks", "masks"),
     output:
         contributions=directory("results/{dataset}/{scene}/{variant}/contributions"),
     log:
@@ -16,9 +16,9 @@ rule contributions:
     resources:
         mem_mb=4000,
     params:
-        settings=settings_of("contributions"),
+        settings=PLAN.settings("contributions"),
         cache="results/.cache",
-        code=code("contributions"),
+        code=PLAN.code("contributions"),
     shell:
         "hilsplat contributions --scene {input.scene} --gaussians {input.gaussians} --masks {input.masks}"
         " --settings {params.settings:q} --threads {threads} --cache {params.cache}"

@@ -2,7 +2,7 @@
 rule clip:
     input:
         scene="results/{dataset}/{scene}/scene",
-        masks=shared("masks", "masks"),
+        masks=PLAN.shared("masks", "masks"),
     output:
         clip=directory("results/{dataset}/{scene}/{variant}/clip"),
     log:
@@ -15,10 +15,10 @@ rule clip:
     resources:
         mem_mb=3000,
     params:
-        settings=settings_of("clip"),
-        model=digest_of_model("clip"),
+        settings=PLAN.settings("clip"),
+        model=PLAN.model("clip"),
         cache="results/.cache",
-        code=code("clip"),
+        code=PLAN.code("clip"),
     shell:
         "hilsplat clip --scene {input.scene} --masks {input.masks} --settings {params.settings:q}"
         " --threads {threads} --cache {params.cache} --out {output.clip} --log {log}"

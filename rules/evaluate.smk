@@ -2,13 +2,13 @@
 rule evaluate:
     input:
         scene="results/{dataset}/{scene}/scene",
-        truth=truth_or_labels_of,
+        truth=PLAN.truth_or_labels,
         gaussians="results/{dataset}/{scene}/gaussians.ply",
-        semantic_tree=shared("semantic_tree", "semantic_tree"),
-        field=shared("field", "field.safetensors"),
-        autoencoder=shared("autoencoder", "autoencoder"),
-        clip=shared("clip", "clip"),
-        masks=shared("masks", "masks"),
+        semantic_tree=PLAN.shared("semantic_tree", "semantic_tree"),
+        field=PLAN.shared("field", "field.safetensors"),
+        autoencoder=PLAN.shared("autoencoder", "autoencoder"),
+        clip=PLAN.shared("clip", "clip"),
+        masks=PLAN.shared("masks", "masks"),
     output:
         scores="results/{dataset}/{scene}/{variant}/scores.csv",
         times="results/{dataset}/{scene}/{variant}/times.csv",
@@ -22,9 +22,9 @@ rule evaluate:
     resources:
         mem_mb=4000,
     params:
-        settings=settings_of("evaluate"),
-        code=code("evaluate", readers_of),
-        truth=truth_option_of,
+        settings=PLAN.settings("evaluate"),
+        code=PLAN.code("evaluate", PLAN.label_readers),
+        truth=PLAN.truth_option,
     shell:
         "hilsplat evaluate --scene {input.scene} {params.truth} --gaussians {input.gaussians}"
         " --semantic-tree {input.semantic_tree} --field {input.field}"
@@ -35,7 +35,7 @@ rule evaluate:
 
 rule table:
     input:
-        scores=lambda wildcards: scores_of(wildcards.table),
+        scores=lambda wildcards: PLAN.scores(wildcards.table),
         published="config/published/{table}.csv",
     output:
         csv="results/tables/{table}.csv",
@@ -52,15 +52,15 @@ rule table:
     benchmark:
         "results/benchmarks/table-{table}.jsonl"
     wildcard_constraints:
-        table="|".join(TABLES),
+        table=any_of(TABLES),
     conda:
         ENVIRONMENT
     resources:
         mem_mb=1000,
     params:
-        labels=json.dumps(dict(RUN.labels)),
-        absent=lambda wildcards: absent_of(wildcards.table),
-        code=code("table"),
+        labels=json.dumps(dict(PLAN.run.labels)),
+        absent=lambda wildcards: PLAN.absent_options(wildcards.table),
+        code=PLAN.code("table"),
     shell:
         "hilsplat table {wildcards.table} --published {input.published} --labels {params.labels:q}"
         " {params.absent} --out {output.csv} --log {log} {input.scores}"
@@ -68,4 +68,4 @@ rule table:
 
 rule tables:
     input:
-        targets_of_tables(),
+        PLAN.tables(),

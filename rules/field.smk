@@ -1,9 +1,9 @@
 # The scene's code of CLIP vectors and the language field.
 rule autoencoder:
     input:
-        clip=shared("clip", "clip"),
-        semantic_tree=shared("semantic_tree", "semantic_tree"),
-        contributions=shared("contributions", "contributions"),
+        clip=PLAN.shared("clip", "clip"),
+        semantic_tree=PLAN.shared("semantic_tree", "semantic_tree"),
+        contributions=PLAN.shared("contributions", "contributions"),
     output:
         autoencoder=directory("results/{dataset}/{scene}/{variant}/autoencoder"),
     log:
@@ -16,9 +16,9 @@ rule autoencoder:
     resources:
         mem_mb=2000,
     params:
-        settings=settings_of("autoencoder"),
-        seed=lambda wildcards: RUN.seed_of(wildcards.variant),
-        code=code("autoencoder"),
+        settings=PLAN.settings("autoencoder"),
+        seed=PLAN.seed,
+        code=PLAN.code("autoencoder"),
     shell:
         "hilsplat autoencoder --clip {input.clip} --semantic-tree {input.semantic_tree}"
         " --contributions {input.contributions} --settings {params.settings:q} --seed {params.seed}"
@@ -27,9 +27,9 @@ rule autoencoder:
 
 rule field:
     input:
-        contributions=shared("contributions", "contributions"),
-        coverage_tree=shared("coverage_tree", "coverage_tree"),
-        autoencoder=shared("autoencoder", "autoencoder"),
+        contributions=PLAN.shared("contributions", "contributions"),
+        coverage_tree=PLAN.shared("coverage_tree", "coverage_tree"),
+        autoencoder=PLAN.shared("autoencoder", "autoencoder"),
     output:
         field="results/{dataset}/{scene}/{variant}/field.safetensors",
     log:
@@ -37,15 +37,15 @@ rule field:
     benchmark:
         "results/{dataset}/{scene}/{variant}/benchmarks/field.jsonl"
     wildcard_constraints:
-        variant=any_of(variants_by_method(baselines=False)),
+        variant=PLAN.variants(by_baseline=False),
     conda:
         ENVIRONMENT
     threads: THREADS
     resources:
         mem_mb=4000,
     params:
-        settings=settings_of("field"),
-        code=code("field"),
+        settings=PLAN.settings("field"),
+        code=PLAN.code("field"),
     shell:
         "hilsplat field --contributions {input.contributions} --coverage-tree {input.coverage_tree}"
         " --autoencoder {input.autoencoder} --settings {params.settings:q}"

@@ -3,9 +3,9 @@ rule method:
     input:
         scene="results/{dataset}/{scene}/scene",
         gaussians="results/{dataset}/{scene}/gaussians.ply",
-        masks=shared("masks", "masks"),
-        contributions=shared("contributions", "contributions"),
-        autoencoder=shared("autoencoder", "autoencoder"),
+        masks=PLAN.shared("masks", "masks"),
+        contributions=PLAN.shared("contributions", "contributions"),
+        autoencoder=PLAN.shared("autoencoder", "autoencoder"),
     output:
         field="results/{dataset}/{scene}/{variant}/field.safetensors",
     log:
@@ -13,16 +13,16 @@ rule method:
     benchmark:
         "results/{dataset}/{scene}/{variant}/benchmarks/field.jsonl"
     wildcard_constraints:
-        variant=any_of(variants_by_method(baselines=True)),
+        variant=PLAN.variants(by_baseline=True),
     conda:
         ENVIRONMENT
     threads: THREADS
     resources:
         mem_mb=6000,
     params:
-        settings=settings_of("method"),
-        seed=lambda wildcards: RUN.seed_of(wildcards.variant),
-        code=code("method", plugin_of_method),
+        settings=PLAN.settings("method"),
+        seed=PLAN.seed,
+        code=PLAN.code("method", PLAN.baseline),
     shell:
         "hilsplat method --scene {input.scene} --gaussians {input.gaussians} --masks {input.masks}"
         " --contributions {input.contributions} --autoencoder {input.autoencoder}"

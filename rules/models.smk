@@ -11,9 +11,9 @@ rule train_models:
     resources:
         mem_mb=8000,
     params:
-        settings=RUN.training.model_dump_json(),
-        seed=RUN.seed,
-        code=code("models"),
+        settings=PLAN.run.training.model_dump_json(),
+        seed=PLAN.run.seed,
+        code=PLAN.code("models"),
     shell:
         "hilsplat models train --out results/models --cache results/.cache/models"
         " --settings {params.settings:q} --seed {params.seed} --threads {threads} --log {log}"

@@ -3,7 +3,7 @@ rule figures:
     input:
         scene="results/{dataset}/{scene}/scene",
         fit="results/{dataset}/{scene}/gaussians",
-        truth=truth_or_labels_of,
+        truth=PLAN.truth_or_labels,
         gaussians="results/{dataset}/{scene}/gaussians.ply",
         masks="results/{dataset}/{scene}/default/masks",
         clip="results/{dataset}/{scene}/default/clip",
@@ -42,11 +42,11 @@ rule figures:
     resources:
         mem_mb=4000,
     params:
-        settings=settings_of("figures"),
-        evaluate=settings_of("evaluate"),
-        queries=queries_of,
-        truth=figure_truth_of,
-        code=code("figures", readers_of),
+        settings=PLAN.settings("figures"),
+        evaluate=PLAN.settings("evaluate"),
+        queries=PLAN.queries,
+        truth=PLAN.figure_truth_option,
+        code=PLAN.code("figures", PLAN.label_readers),
     shell:
         "hilsplat figures --scene {input.scene} {params.truth} --gaussians {input.gaussians}"
         " --fit {input.fit} --masks {input.masks} --clip {input.clip}"
@@ -59,7 +59,7 @@ rule figures:
 rule mask_truth:
     input:
         scene="results/{dataset}/{scene}/scene",
-        truth=truth_of,
+        truth=PLAN.truth,
         masks="results/{dataset}/{scene}/default/masks",
     output:
         picture=report(
@@ -80,17 +80,17 @@ rule mask_truth:
     resources:
         mem_mb=1500,
     params:
-        code=code("mask_truth"),
+        code=PLAN.code("mask_truth"),
     shell:
         "hilsplat world masks {wildcards.dataset}/{wildcards.scene} --out {output.picture} --log {log}"
 
 
 rule comparison:
     input:
-        truth=truth_or_labels_of,
+        truth=PLAN.truth_or_labels,
         scores=lambda wildcards: [
             f"results/{wildcards.dataset}/{wildcards.scene}/{variant}/scores.csv"
-            for variant in RUN.main_variants
+            for variant in PLAN.run.main_variants
         ],
     output:
         methods=report(
@@ -125,13 +125,13 @@ rule comparison:
         mem_mb=6000,
     params:
         folder="results/{dataset}/{scene}",
-        variants=json.dumps(RUN.main_variants),
-        names=json.dumps(dict(RUN.labels)),
-        settings=settings_of("figures"),
-        evaluate=settings_of("evaluate"),
-        queries=queries_of,
-        truth=figure_truth_of,
-        code=code("comparison", readers_of),
+        variants=json.dumps(PLAN.run.main_variants),
+        names=json.dumps(dict(PLAN.run.labels)),
+        settings=PLAN.settings("figures"),
+        evaluate=PLAN.settings("evaluate"),
+        queries=PLAN.queries,
+        truth=PLAN.figure_truth_option,
+        code=PLAN.code("comparison", PLAN.label_readers),
     shell:
         "hilsplat comparison --folder {params.folder} --variants {params.variants:q}"
         " --names {params.names:q} {params.truth} --queries {params.queries:q}"
@@ -160,6 +160,6 @@ rule sweep_plot:
     resources:
         mem_mb=1000,
     params:
-        code=code("sweep"),
+        code=PLAN.code("sweep"),
     shell:
         "hilsplat sweep {wildcards.sweep} --table {input.table} --out {output.plot} --log {log}"

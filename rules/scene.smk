@@ -1,7 +1,7 @@
 # Camera poses: structure from motion, or import.
 rule source:
     input:
-        source_files_of,
+        PLAN.source_files,
     output:
         directory("results/{dataset}/{scene}/source"),
     log:
@@ -14,16 +14,16 @@ rule source:
     resources:
         mem_mb=4000,
     params:
-        name=lambda wildcards: "/".join(published(row_of(wildcards).source)),
-        root=str(Path(RUN.data_root)),
-        code=code("source", reader_of_source),
+        name=PLAN.source_name,
+        root=str(Path(PLAN.run.data_root)),
+        code=PLAN.code("source", PLAN.source_reader),
     shell:
         "hilsplat datasets export {params.name:q} --data-root {params.root:q} --out {output} --log {log}"
 
 
 rule poses:
     input:
-        image_files_of,
+        PLAN.image_files,
     output:
         scene=directory("results/{dataset}/{scene}/scene"),
     log:
@@ -36,14 +36,12 @@ rule poses:
     resources:
         mem_mb=2000,
     params:
-        images=images_of,
-        unit=lambda wildcards: row_of(wildcards).unit,
-        lens=lambda wildcards: (
-            "--render" if row_of(wildcards).world else "--no-render"
-        ),
-        settings=settings_of("poses"),
-        seed=RUN.seed,
-        code=code("poses"),
+        images=PLAN.images,
+        unit=lambda wildcards: PLAN.row(wildcards).unit,
+        lens=PLAN.lens,
+        settings=PLAN.settings("poses"),
+        seed=PLAN.run.seed,
+        code=PLAN.code("poses"),
     shell:
         "hilsplat poses --images {params.images:q} --name {wildcards.dataset}/{wildcards.scene}"
         " --unit {params.unit} {params.lens} --settings {params.settings:q} --seed {params.seed}"

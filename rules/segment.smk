@@ -2,7 +2,7 @@
 rule masks:
     input:
         scene="results/{dataset}/{scene}/scene",
-        truth=truth_of_masks,  # nothing, but for the diagnostic segmenter
+        truth=PLAN.masks_truth,  # nothing, but for the diagnostic segmenter
     output:
         masks=directory("results/{dataset}/{scene}/{variant}/masks"),
     log:
@@ -15,11 +15,11 @@ rule masks:
     resources:
         mem_mb=4000,
     params:
-        settings=settings_of("masks"),
-        model=digest_of_model("masks"),
-        truth=truth_option_of_masks,
+        settings=PLAN.settings("masks"),
+        model=PLAN.model("masks"),
+        truth=PLAN.masks_truth_option,
         cache="results/.cache",
-        code=code(stage_of_masks),
+        code=PLAN.code(PLAN.masks_stage),
     shell:
         "hilsplat masks --scene {input.scene} --settings {params.settings:q} {params.truth}"
         " --threads {threads} --cache {params.cache} --out {output.masks} --log {log}"
@@ -27,7 +27,7 @@ rule masks:
 
 rule coverage_tree:
     input:
-        masks=shared("masks", "masks"),
+        masks=PLAN.shared("masks", "masks"),
     output:
         coverage_tree=directory("results/{dataset}/{scene}/{variant}/coverage_tree"),
     log:
@@ -40,8 +40,8 @@ rule coverage_tree:
     resources:
         mem_mb=2000,
     params:
-        settings=settings_of("coverage_tree"),
-        code=code("coverage_tree"),
+        settings=PLAN.settings("coverage_tree"),
+        code=PLAN.code("coverage_tree"),
     shell:
         "hilsplat coverage-tree --masks {input.masks} --settings {params.settings:q}"
         " --out {output.coverage_tree} --log {log}"

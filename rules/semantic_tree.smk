@@ -1,9 +1,9 @@
 # Masks of all views, linked into a tree of 3D nodes.
 rule semantic_tree:
     input:
-        contributions=shared("contributions", "contributions"),
-        masks=shared("masks", "masks"),
-        clip=shared("clip", "clip"),
+        contributions=PLAN.shared("contributions", "contributions"),
+        masks=PLAN.shared("masks", "masks"),
+        clip=PLAN.shared("clip", "clip"),
     output:
         semantic_tree=directory("results/{dataset}/{scene}/{variant}/semantic_tree"),
     log:
@@ -16,8 +16,8 @@ rule semantic_tree:
     resources:
         mem_mb=3000,
     params:
-        settings=settings_of("semantic_tree"),
-        code=code("semantic_tree"),
+        settings=PLAN.settings("semantic_tree"),
+        code=PLAN.code("semantic_tree"),
     shell:
         "hilsplat semantic-tree --contributions {input.contributions} --masks {input.masks}"
         " --clip {input.clip} --settings {params.settings:q} --threads {threads}"

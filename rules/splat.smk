@@ -2,7 +2,7 @@
 rule gaussians:
     input:
         scene="results/{dataset}/{scene}/scene",
-        brought=brought_gaussians_of,
+        brought=PLAN.brought,
     output:
         ply="results/{dataset}/{scene}/gaussians.ply",
         coordinates="results/{dataset}/{scene}/gaussians.json",
@@ -17,11 +17,11 @@ rule gaussians:
     resources:
         mem_mb=3000,
     params:
-        settings=settings_of("gaussians"),
-        brought=brought_option_of,
-        seed=RUN.seed,
+        settings=PLAN.settings("gaussians"),
+        brought=PLAN.brought_option,
+        seed=PLAN.run.seed,
         cache="results/.cache",
-        code=code("gaussians"),
+        code=PLAN.code("gaussians"),
     shell:
         "hilsplat gaussians --scene {input.scene} --settings {params.settings:q} --seed {params.seed}"
         " {params.brought} --threads {threads} --cache {params.cache} --report {output.report}"

@@ -13,9 +13,9 @@ rule world:
     resources:
         mem_mb=2000,
     params:
-        source=lambda wildcards: row_of(wildcards).source,
-        settings=settings_of("world"),
-        code=code("world"),
+        source=lambda wildcards: PLAN.row(wildcards).source,
+        settings=PLAN.settings("world"),
+        code=PLAN.code("world"),
         out="results/{dataset}/{scene}/world",
     shell:
         "hilsplat world make --source {params.source:q} --settings {params.settings:q}"

@@ -12,7 +12,7 @@ import typer
 
 from hilsplat.base.artifacts import output_lock, require_free_space
 from hilsplat.base.errors import HilsplatError
-from hilsplat.cli.stages import stage_code
+from hilsplat.workflow.stages import stage_code
 
 PathIn = Annotated[Path, typer.Option(help="input", show_default=False)]
 PathOut = Annotated[Path, typer.Option(help="output; written atomically", show_default=False)]

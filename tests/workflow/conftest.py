@@ -65,11 +65,9 @@ class Project:
 
     def planned(self, *words: str) -> set[str]:
         """Rules that a dry run would run."""
-        result = self.snakemake("-n", "--quiet", "rules", *words)
-        dry = self.snakemake("-n", *words).stdout if "Nothing to be done" not in result.stdout else ""
         return {
             line.split()[1].rstrip(":")
-            for line in dry.splitlines()
+            for line in self.snakemake("-n", *words).stdout.splitlines()
             if line.startswith(("rule ", "localrule "))
         } - {"all"}
 

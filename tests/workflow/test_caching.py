@@ -1,5 +1,7 @@
 """What an edit reruns, and what it leaves alone."""
 
+import ast
+
 import pytest
 
 from tests.workflow.conftest import Project
@@ -20,30 +22,33 @@ def test_nothing_is_planned_after_a_finished_run(copy_of_finished: Project) -> N
     assert copy_of_finished.planned() == set()
 
 
-def test_a_comment_and_a_docstring_rerun_nothing(copy_of_finished: Project) -> None:
+def test_prose_and_what_no_stage_reaches_rerun_nothing(copy_of_finished: Project) -> None:
     for path in ("hilsplat/segment/coverage.py", "hilsplat/field/field.py", "hilsplat/base/images.py"):
         file = copy_of_finished.root / path
-        file.write_text(file.read_text() + "\n# a comment\n")
-    copy_of_finished.edit(
-        "hilsplat/base/images.py", '"""Reading and writing images', '"""Reading, writing images'
-    )
+        file.write_text(file.read_text() + "\n# a comment\nUNUSED = 1\n")
+    copy_of_finished.edit("hilsplat/base/images.py", '"""Reading and', '"""Edited. Reading and')
+    copy_of_finished.edit("hilsplat/settings.py", '"coverage threshold"', '"the coverage threshold"')
     assert copy_of_finished.planned() == set()
 
 
 @pytest.mark.parametrize(
-    ("module", "expected"),
+    ("module", "function", "expected"),
     [
-        ("hilsplat/field/field.py", AFTER_FIELD | {"method"}),
-        ("hilsplat/embed/stage.py", VARIANT_STAGES - {"masks", "coverage_tree", "contributions"}),
-        ("hilsplat/evaluate/tables/hierarchy.py", {"table", "sweep_plot"}),
-        ("hilsplat/methods/lifted.py", {"method", "evaluate", "table", "comparison"}),
+        ("hilsplat/field/field.py", "run_field", AFTER_FIELD),
+        ("hilsplat/embed/stage.py", "run_clip", VARIANT_STAGES - {"masks", "coverage_tree", "contributions"}),
+        ("hilsplat/evaluate/tables/hierarchy.py", "hierarchy_table", {"table", "sweep_plot"}),
+        ("hilsplat/methods/lifted.py", "fit", {"method", "evaluate", "table", "sweep_plot", "comparison"}),
+        ("hilsplat/datasets/images/lerf_ovs.py", "open_scene", set()),
     ],
 )
 def test_an_edit_reruns_its_stage_and_what_follows(
-    copy_of_finished: Project, module: str, expected: set[str]
+    copy_of_finished: Project, module: str, function: str, expected: set[str]
 ) -> None:
     file = copy_of_finished.root / module
-    file.write_text(file.read_text() + "\nEDITED = True\n")
+    tree = ast.parse(file.read_text())
+    [node] = [each for each in tree.body if isinstance(each, ast.FunctionDef) and each.name == function]
+    node.body.append(ast.parse("EDITED = 1").body[0])
+    file.write_text(ast.unparse(ast.fix_missing_locations(tree)))
     assert copy_of_finished.planned() == expected
 
 
@@ -75,4 +80,4 @@ def test_every_rule_carries_the_digest_of_its_code(project) -> None:
     for path in sorted((project / "rules").glob("*.smk")):
         for rule in path.read_text().split("\nrule ")[1:]:
             if "shell:" in rule:
-                assert "code=code(" in rule, (path.name, rule.split(":")[0])
+                assert "code=PLAN.code(" in rule, (path.name, rule.split(":")[0])

@@ -8,9 +8,9 @@ import pytest
 
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.identity import code_digest, reached
-from hilsplat.cli.stages import STAGES
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.methods.registry import METHODS
+from hilsplat.workflow.stages import STAGES
 
 # ---- on packages of a few lines ---------------------------------------------------------------------
 

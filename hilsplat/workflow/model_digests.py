@@ -1,0 +1,30 @@
+"""Digests of model folders, kept while sizes and times of their files stay: ViT-H takes seconds to read."""
+
+import functools
+import json
+from pathlib import Path
+
+from hilsplat.base.artifacts import sha256_of_path, write_json
+
+
+@functools.cache
+def model_digest(folder: Path, cache: Path) -> str:
+    """Digest of a folder's files; says so if the folder is missing, for the stage itself says what to do.
+
+    Args:
+        folder: model folder.
+        cache: folder of the file that keeps digests.
+    """
+    if not folder.is_dir():
+        return f"{folder} is missing"
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    stamp = json.dumps([[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files])
+    memo = cache / "digests.json"
+    try:
+        known = json.loads(memo.read_text())
+    except (OSError, ValueError):
+        known = {}
+    if stamp not in known:
+        known[stamp] = sha256_of_path(folder)
+        write_json(memo, known)
+    return known[stamp]

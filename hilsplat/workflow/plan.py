@@ -1,0 +1,400 @@
+"""The plan of a run: its scenes, what each job reads and gets as parameters, and what is built.
+
+The rules fill in paths by asking this module. It knows nothing of Snakemake: a *job* is anything with the
+attributes `dataset` and `scene`, and `variant` for the stages that variants share or change, such as the
+wildcards of a rule.
+"""
+
+import functools
+import json
+import re
+import shlex
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+from hilsplat.base.errors import SettingsError
+from hilsplat.configuration import UPSTREAM, StageSettings, parse_run
+from hilsplat.datasets.registry import DATASETS
+from hilsplat.datasets.sources import (
+    absence,
+    image_files,
+    is_exported,
+    label_files,
+    label_sets,
+    published,
+)
+from hilsplat.evaluate.tables.build import TABLES
+from hilsplat.methods.registry import METHODS, OURS, require_method
+from hilsplat.scene.sheet import SceneRow, choose_scenes, read_sheet
+from hilsplat.workflow.model_digests import model_digest
+from hilsplat.workflow.stages import stage_code
+
+CACHE = Path("results/.cache")
+
+
+@runtime_checkable
+class Job(Protocol):
+    """What the wildcards of every rule say."""
+
+    @property
+    def dataset(self) -> str: ...
+    @property
+    def scene(self) -> str: ...
+
+
+@runtime_checkable
+class VariantJob(Job, Protocol):
+    """What the wildcards of a variant's rules say."""
+
+    @property
+    def variant(self) -> str: ...
+
+
+class Plan:
+    """Scenes, settings and targets of a configuration.
+
+    Attributes:
+        run: the validated configuration.
+        rows: every scene of the sheet.
+        scenes: those that are run.
+        absent: scenes that were chosen and are skipped -> why.
+    """
+
+    def __init__(self, config: Mapping[str, Any]) -> None:
+        """Validate a configuration and read the scene sheet.
+
+        Raises:
+            HilsplatError: a setting, a method or a line of the sheet cannot be used, or no scene is left.
+        """
+        self.run = run = parse_run(dict(config))
+        for name in run.variant_names():
+            require_method(run.stages(name).method.name)
+        sheet = Path(run.scenes)
+        self.rows = tuple(read_sheet(sheet, run.groups, run.data_root))
+        chosen = choose_scenes(self.rows, run.groups, run.only)
+        if more := {row.group for row in chosen} - set(run.groups):  # check the sources of these too
+            read_sheet(sheet, {*run.groups, *more}, run.data_root)
+        reasons = {row.name: absence(row.source, run.data_root) for row in chosen}
+        self.absent = {name: reason for name, reason in reasons.items() if reason is not None}
+        self.scenes = tuple(row for row in chosen if row.name not in self.absent)
+        if not self.scenes:
+            raise SettingsError(
+                "there is no scene to run",
+                expected=f"scenes of {sheet}: {', '.join(f'{row.name} ({row.group})' for row in self.rows)}",
+                found=f"groups {list(run.groups)}, only {list(run.only)}, data_root {run.data_root!r}",
+                fix="name other groups or scenes, or set data_root",
+            )
+        self._stages = functools.cache(run.stages)
+
+    # ---- wildcards and threads ----------------------------------------------------------------------
+
+    def threads(self, cores: int) -> int:
+        """Threads of a job: with at least as many scenes as cores, one each keeps all cores busy."""
+        return max(1, cores // min(len(self.scenes), cores))
+
+    def datasets(self) -> str:
+        """Regular expression of the wildcard `dataset`."""
+        return any_of(row.dataset for row in self.rows)
+
+    def scene_names(self) -> str:
+        """Regular expression of the wildcard `scene`."""
+        return any_of(row.scene for row in self.rows)
+
+    def variants(self, by_baseline: bool | None = None) -> str:
+        """Regular expression of the wildcard `variant`.
+
+        Args:
+            by_baseline: variants whose field a baseline writes, or those whose field is ours; None: all.
+        """
+        return any_of(
+            name
+            for name in self.run.variant_names()
+            if by_baseline is None or (self._stages(name).method.name != OURS) == by_baseline
+        )
+
+    # ---- parameters ---------------------------------------------------------------------------------
+
+    def row(self, job: Job) -> SceneRow:
+        """Row of the scene sheet."""
+        return next(row for row in self.rows if (row.dataset, row.scene) == (job.dataset, job.scene))
+
+    def stages(self, job: Job) -> StageSettings:
+        """All settings of a scene and, if the job has one, a variant."""
+        return self._stages(getattr(job, "variant", "default"), scopes_of(self.row(job)))
+
+    def settings(self, section: str) -> Callable[[Job], str]:
+        """Parameter: a section's settings, as JSON."""
+        return lambda job: getattr(self.stages(job), section).model_dump_json()
+
+    def seed(self, job: VariantJob) -> int:
+        """Parameter: the seed of a variant's networks."""
+        return self.run.seed_of(job.variant)
+
+    def code(
+        self,
+        stage: str | Callable[[Any], str],
+        plugins: Callable[[Any], tuple[str, ...]] = lambda job: (),
+    ) -> Callable[[Any], str]:
+        """Parameter: digest of the code of a stage, with the readers or the baseline that a job uses."""
+        return lambda job: stage_code(stage(job) if callable(stage) else stage, plugins(job))
+
+    def model(self, section: str) -> Callable[[Job], str]:
+        """Parameter: digest of the model folder that a stage reads; "none" if it reads none."""
+
+        def digest(job: Job) -> str:
+            stages = self.stages(job)
+            if section == "masks" and stages.masks.segmenter != "sam":
+                return "none"
+            return model_digest(Path(getattr(stages, section).model), CACHE)
+
+        return digest
+
+    def shared(self, stage: str, path: str) -> Callable[[VariantJob], str]:
+        """Input: a stage's output, under the first variant with the same settings up to that stage.
+
+        A sweep over Omega thus retrains fields and shares masks, trees and embeddings with `default`.
+        """
+        return lambda job: self.output(job, self.shared_variant(stage, job), path)
+
+    def output(self, job: Job, *parts: str) -> str:
+        """A path in a scene's folder."""
+        return "/".join(["results", job.dataset, job.scene, *parts])
+
+    def shared_variant(self, stage: str, job: VariantJob) -> str:
+        """First variant whose settings, up to a stage, equal those of the job's variant."""
+        scopes = scopes_of(self.row(job))
+        seed = self.run.seed_of(job.variant) if self._is_random(stage, job.variant, scopes) else None
+        wanted = self._stages(job.variant, scopes)
+        for name in self.run.variant_names():
+            other = self._stages(name, scopes)
+            same = all(getattr(other, part) == getattr(wanted, part) for part in UPSTREAM[stage])
+            if same and seed in (None, self.run.seed_of(name)):
+                return name
+        return str(job.variant)
+
+    def _is_random(self, stage: str, variant: str, scopes: tuple[str, ...]) -> bool:
+        stages = self._stages(variant, scopes)
+        return any(getattr(stages, section).is_random for section in UPSTREAM[stage])
+
+    # ---- photographs and poses ----------------------------------------------------------------------
+
+    def images(self, job: Job) -> str:
+        """Folder that the poses of a scene are found from."""
+        row = self.row(job)
+        if row.world:
+            return self.output(job, "world/images")
+        return self.output(job, "source") if is_exported(row.source) else str(row.folder)
+
+    def image_files(self, job: Job) -> str | list[str]:
+        """Input of poses: a folder that a rule writes, or each file of a folder of photographs."""
+        row = self.row(job)
+        if row.world or is_exported(row.source):
+            return self.images(job)
+        labels = set(self._label_files(row))
+        return sorted(
+            str(path)
+            for path in row.folder.rglob("*")
+            if path.is_file() and not path.name.startswith(".") and str(path) not in labels
+        )
+
+    def lens(self, job: Job) -> str:
+        """Option of poses: whether the images are renders."""
+        return "--render" if self.row(job).world else "--no-render"
+
+    def source_files(self, job: Job) -> list[str]:
+        """Input of source: files of a data set that images and poses are written from."""
+        return [str(path) for path in image_files(self.row(job).source, self.run.data_root)]
+
+    def source_name(self, job: Job) -> str:
+        """Parameter of source: data set and scene."""
+        return "/".join(published(self.row(job).source))
+
+    def source_reader(self, job: Job) -> tuple[str, ...]:
+        """The reader of the data set that a scene's images are exported from."""
+        return (DATASETS.places[published(self.row(job).source)[0]],)
+
+    def brought(self, job: Job) -> list[str]:
+        """Input: somebody's PLY that takes the place of a fit, with the JSON beside it; mostly nothing."""
+        ply = self.row(job).gaussians
+        if ply is None:
+            return []
+        beside = ply.with_suffix(".json")
+        return [str(ply), *([str(beside)] if beside.is_file() else [])]
+
+    def brought_option(self, job: Job) -> str:
+        """Option that brings somebody's PLY, else nothing."""
+        ply = self.row(job).gaussians
+        return f"--brought {shlex.quote(str(ply))}" if ply is not None else ""
+
+    # ---- masks and methods --------------------------------------------------------------------------
+
+    def masks_stage(self, job: VariantJob) -> str:
+        """Stage that makes the masks: the diagnostic segmenter is one of its own."""
+        diagnostic = self.stages(job).masks.segmenter == "truth-perturbed"
+        return "truth_masks" if diagnostic else "masks"
+
+    def masks_truth(self, job: VariantJob) -> list[str]:
+        """Input of masks: the true labels for the diagnostic segmenter, else nothing.
+
+        Raises:
+            SettingsError: it is asked for on a scene without true labels.
+        """
+        if self.masks_stage(job) == "masks":
+            return []
+        row = self.row(job)
+        if not row.world:
+            raise SettingsError(
+                f"{row.name}, variant {job.variant}: masks.segmenter truth-perturbed needs the true labels "
+                "of a synthetic scene, and this one has none",
+                fix="name another segmenter, or run the variant on synthetic scenes only",
+            )
+        return self.truth(job)
+
+    def masks_truth_option(self, job: VariantJob) -> str:
+        """Options of the diagnostic segmenter, else nothing."""
+        truth = self.masks_truth(job)
+        if not truth:
+            return ""
+        faults = self.stages(job).perturb.model_dump_json()
+        return f"--truth {shlex.quote(truth[0])} --perturb {shlex.quote(faults)}"
+
+    def baseline(self, job: VariantJob) -> tuple[str, ...]:
+        """The baseline that writes a variant's field."""
+        return (METHODS.places[self.stages(job).method.name],)
+
+    # ---- annotations: for evaluation and figures alone ------------------------------------------------
+
+    def labels(self, row: SceneRow) -> tuple[str, ...]:
+        """Labels of a scene of a published data set, as `data set/scene`; several may share its images."""
+        return label_sets(row.source, self.run.data_root)
+
+    def label_readers(self, job: Job) -> tuple[str, ...]:
+        """The readers of a scene's labels."""
+        datasets = {labels.partition("/")[0] for labels in self.labels(self.row(job))}
+        return tuple(DATASETS.places[name] for name in sorted(datasets))
+
+    def _label_files(self, row: SceneRow) -> list[str]:
+        """Files that only evaluation reads: an edited one reruns nothing before it."""
+        return [
+            str(path.resolve())
+            for labels in self.labels(row)
+            for path in label_files(labels, self.run.data_root)
+        ]
+
+    def truth(self, job: Job) -> list[str]:
+        """Input: the annotations of a synthetic scene, else nothing."""
+        return [self.output(job, "world/truth")] if self.row(job).world else []
+
+    def truth_or_labels(self, job: Job) -> list[str]:
+        """Input of evaluate: the annotations of a synthetic scene, or the label files of a published one."""
+        return self.truth(job) or self._label_files(self.row(job))
+
+    def truth_option(self, job: Job) -> str:
+        """Options of evaluate: what a scene is scored against."""
+        row = self.row(job)
+        if row.world:
+            return f"--truth {shlex.quote(self.truth(job)[0])} --kind {row.world[0]}"
+        options = [f"--labels {shlex.quote(labels)}" for labels in self.labels(row)]
+        return " ".join([*options, self._data_root_option()])
+
+    def figure_truth_option(self, job: Job) -> str:
+        """Options of figures: what names the queries and is outlined, if there is something."""
+        row = self.row(job)
+        if row.world:
+            return f"--truth {shlex.quote(self.truth(job)[0])}"
+        on_images = [labels for labels in self.labels(row) if not is_exported(f"data:{labels}")]
+        if not on_images:
+            return ""
+        return f"--labels {shlex.quote(on_images[-1])} {self._data_root_option()}"
+
+    def _data_root_option(self) -> str:
+        return f"--data-root {shlex.quote(str(Path(self.run.data_root)))}"
+
+    def queries(self, job: Job) -> str:
+        """Parameter: texts for the panel of a scene without labels on images, as JSON."""
+        of_dataset = self.run.queries.get(job.dataset, ())
+        return json.dumps(self.run.queries.get(f"{job.dataset}/{job.scene}", of_dataset))
+
+    # ---- tables ---------------------------------------------------------------------------------------
+
+    def scores(self, table: str) -> list[str]:
+        """Score files that a table is built from; sweeps take the scenes that are named for them."""
+        kind = TABLES[table]
+        rows = [row for row in self._labelled() if self._data_of(row) in kind.data]
+        if kind.is_sweep and self.run.sweep_scenes:
+            rows = [row for row in rows if row.scene in self.run.sweep_scenes]
+        return [
+            f"results/{row.dataset}/{row.scene}/{name}/scores.csv"
+            for row in rows
+            for variant in getattr(self.run, kind.variants)
+            for name in self.run.seeded(variant, scopes_of(row))
+        ]
+
+    def absent_options(self, table: str) -> str:
+        """Options that say which scenes of a table's data sets were not measured."""
+        by_dataset: dict[str, list[tuple[str, str]]] = {}
+        for row in self.rows:
+            reason = absence(row.source, self.run.data_root)
+            place = published(row.source)
+            if place and place[0] in TABLES[table].data and reason is not None:
+                by_dataset.setdefault(row.dataset, []).append((row.scene, reason))
+        sentences = []
+        for dataset, scenes in by_dataset.items():
+            reasons = {reason for _, reason in scenes}
+            others = "" if len(reasons) == 1 else " The others cannot be read either."
+            listed = some([scene for scene, _ in scenes])
+            sentences.append(f"{dataset} ({listed}): {scenes[0][1]}.{others}")
+        return " ".join(f"--absent {shlex.quote(sentence)}" for sentence in sentences)
+
+    def _labelled(self) -> list[SceneRow]:
+        """Scenes that have annotations or labels to be scored against."""
+        return [row for row in self.scenes if row.world or self.labels(row)]
+
+    @staticmethod
+    def _data_of(row: SceneRow) -> str:
+        """What a scene is to a table: its kind of synthetic scene, or its published data set."""
+        if row.world:
+            return row.world[0]
+        place = published(row.source)
+        return place[0] if place else ""
+
+    # ---- targets --------------------------------------------------------------------------------------
+
+    def tables(self) -> list[str]:
+        """Every table, measured on whatever scenes there are; the paper's rows are always there."""
+        return [f"results/tables/{name}.csv" for name in TABLES]
+
+    def targets(self) -> list[str]:
+        """Pictures of every scene, and tables and plots if the run has a scene to measure.
+
+        A run of photographs would leave tables of reported rows where a benchmark's were.
+        """
+        plots = [f"results/figures/sweep-{name}.png" for name in ("theta", "omega")]
+        return [*self.figures(), *(self.tables() + plots if self._labelled() else [])]
+
+    def figures(self) -> list[str]:
+        """The panel of every scene, masks against the truth if it is known, and methods side by side in the
+        scenes of the sweeps."""
+        found = []
+        for row in self.scenes:
+            compared = not self.run.sweep_scenes or row.scene in self.run.sweep_scenes
+            pictures = ["panel", *(["masks"] if row.world else []), *(["comparison"] if compared else [])]
+            found += [f"results/figures/{row.dataset}/{row.scene}/{picture}.png" for picture in pictures]
+        return found
+
+
+def scopes_of(row: SceneRow) -> tuple[str, str]:
+    """Keys of `overrides` that apply to a scene, general first."""
+    return (row.group, f"{row.dataset}/{row.scene}")
+
+
+def any_of(names: Collection[str] | Any) -> str:
+    """Regular expression that matches exactly these names; nothing if there is no name."""
+    return "|".join(sorted({re.escape(name) for name in names})) or "(?!)"
+
+
+def some(names: list[str]) -> str:
+    """The first three of some names, and how many more there are."""
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return ", ".join(names[:3]) + more

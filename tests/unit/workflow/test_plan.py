@@ -1,0 +1,192 @@
+"""What the rules ask the plan of a run."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from hilsplat.base.errors import HilsplatError, SettingsError
+from hilsplat.workflow.model_digests import model_digest
+from hilsplat.workflow.plan import Plan, any_of, some
+
+SHEET = """dataset\tscene\tgroup\tsource\tunit
+synthetic\tone\tbenchmark\tworld:tabletop:1\tmetre
+synthetic\ttwo\tbenchmark\tworld:tabletop:2\tmetre
+rooms\troom\tbenchmark\tworld:room:1\tmetre
+lerf\tfigurines\tlerf\tdata:lerf_ovs/figurines\tarbitrary
+photos\tdesk\tphotos\tdesk\tarbitrary
+"""
+NETWORK = {"code": "network", "latent": 3}
+VARIANTS = {
+    "theta": {"coverage_tree": {"theta": 0.6}},
+    "network": {"autoencoder": NETWORK},
+    "lifted": {"method": {"name": "lifted"}},
+    "truth": {"masks": {"segmenter": "truth-perturbed"}},
+}
+
+
+@dataclass(frozen=True)
+class Job:
+    dataset: str
+    scene: str
+    variant: str = "default"
+
+
+def plan(folder: Path, **config: object) -> Plan:
+    (folder / "config").mkdir(exist_ok=True)
+    (folder / "desk").mkdir(exist_ok=True)
+    (folder / "desk/1.jpg").touch()
+    sheet = folder / "config/scenes.tsv"
+    sheet.write_text(SHEET)
+    more = {"main_variants": ["default", *VARIANTS], "variants": VARIANTS}
+    return Plan({"scenes": str(sheet), **more, **config})
+
+
+def test_scenes_of_the_groups_are_run_and_missing_data_is_named(tmp_path):
+    found = plan(tmp_path, groups=["benchmark", "lerf"])
+    assert [row.name for row in found.scenes] == ["synthetic/one", "synthetic/two", "rooms/room"]
+    assert found.absent == {"lerf/figurines": "data_root is not set"}
+    options = found.absent_options("lerf")
+    assert options == "--absent 'lerf (figurines): data_root is not set.'"
+    assert found.absent_options("replica") == ""
+
+
+def test_a_run_without_scenes_says_what_there_is(tmp_path):
+    with pytest.raises(SettingsError, match=r"no scene to run(.|\n)*rooms/room \(benchmark\)"):
+        plan(tmp_path, groups=["ci"])
+
+
+def test_an_unknown_method_stops_at_once(tmp_path):
+    with pytest.raises(HilsplatError, match="there is no method 'magic'"):
+        plan(tmp_path, variants={**VARIANTS, "lifted": {"method": {"name": "magic"}}})
+
+
+@pytest.mark.parametrize(
+    ("stage", "variant", "owner"),
+    [
+        ("masks", "theta", "default"),
+        ("coverage_tree", "theta", "theta"),
+        ("contributions", "theta", "default"),
+        ("autoencoder", "theta", "default"),
+        ("field", "theta", "theta"),
+        ("autoencoder", "network", "network"),
+        ("autoencoder", "network.seed1", "network.seed1"),
+        ("semantic_tree", "network.seed1", "default"),
+        ("field", "lifted", "lifted"),
+        ("autoencoder", "lifted", "default"),
+        ("masks", "truth", "truth"),
+    ],
+)
+def test_a_variant_shares_stages_up_to_the_first_that_it_changes(tmp_path, stage, variant, owner):
+    job = Job("synthetic", "one", variant)
+    assert plan(tmp_path, seeds=2).shared(stage, "file")(job) == f"results/synthetic/one/{owner}/file"
+
+
+def test_an_override_of_one_scene_changes_what_it_shares(tmp_path):
+    found = plan(tmp_path, overrides={"synthetic/two": {"coverage_tree": {"theta": 0.6}}})
+    shared = found.shared("field", "f")
+    assert shared(Job("synthetic", "one", "theta")).split("/")[3] == "theta"
+    assert shared(Job("synthetic", "two", "theta")).split("/")[3] == "default"
+    assert json.loads(found.settings("coverage_tree")(Job("synthetic", "two")))["theta"] == 0.6
+
+
+def test_fields_are_ours_or_a_baseline_s(tmp_path):
+    found = plan(tmp_path)
+    assert found.variants(by_baseline=True) == "lifted"
+    assert found.variants(by_baseline=False) == "default|network|theta|truth"
+    assert found.baseline(Job("synthetic", "one", "lifted")) == ("hilsplat.methods.lifted:METHOD",)
+
+
+def test_true_labels_reach_masks_of_the_diagnostic_segmenter_alone(tmp_path):
+    found = plan(tmp_path)
+    truth = Job("synthetic", "one", "truth")
+    assert found.masks_truth(Job("synthetic", "one")) == [] and found.masks_stage(truth) == "truth_masks"
+    assert found.masks_truth(truth) == ["results/synthetic/one/world/truth"]
+    assert found.masks_truth_option(truth).startswith(
+        "--truth results/synthetic/one/world/truth --perturb '{"
+    )
+    with pytest.raises(SettingsError, match="photos/desk, variant truth: masks"):
+        found.masks_truth(Job("photos", "desk", "truth"))
+
+
+def test_each_photograph_is_an_input_and_hidden_files_are_not(tmp_path):
+    found = plan(tmp_path, groups=["photos"])
+    (tmp_path / "desk/.hidden").touch()
+    (tmp_path / "desk/0.jpg").touch()
+    files = found.image_files(Job("photos", "desk"))
+    assert [Path(file).name for file in files] == ["0.jpg", "1.jpg"]
+    assert found.lens(Job("photos", "desk")) == "--no-render"
+    assert found.image_files(Job("synthetic", "one")) == "results/synthetic/one/world/images"
+    assert found.lens(Job("synthetic", "one")) == "--render"
+
+
+def test_labels_of_a_published_scene_bring_their_reader_and_their_options(tmp_path):
+    for part in ("lerf_ovs/figurines/images", "lerf_ovs/figurines/sparse/0", "lerf_ovs/label/figurines"):
+        (tmp_path / part).mkdir(parents=True)
+    (tmp_path / "lerf_ovs/label/figurines/frame_1.json").touch()
+    found = plan(tmp_path, groups=["lerf"], data_root=str(tmp_path))
+    job = Job("lerf", "figurines")
+    assert found.label_readers(job) == ("hilsplat.datasets.images.lerf_ovs:DATASET",)
+    assert [Path(file).name for file in found.truth_or_labels(job)] == ["frame_1.json"]
+    assert found.truth_option(job) == f"--labels lerf_ovs/figurines --data-root {tmp_path}"
+    assert found.truth_option(Job("rooms", "room")) == "--truth results/rooms/room/world/truth --kind room"
+    assert found.label_readers(Job("rooms", "room")) == ()
+
+
+def test_tables_take_the_scenes_and_variants_that_are_theirs(tmp_path):
+    found = plan(tmp_path, main_variants=["default"], theta_variants=["theta"], sweep_scenes=["two"], seeds=2)
+    assert found.scores("replica") == ["results/rooms/room/default/scores.csv"]
+    assert found.scores("theta") == ["results/synthetic/two/theta/scores.csv"]
+    assert found.scores("waymo") == []
+    with_network = plan(tmp_path, main_variants=["default", "network"], seeds=2)
+    assert [path.split("/")[3] for path in with_network.scores("waymo") + with_network.scores("replica")] == [
+        "default",
+        "network",
+        "network.seed1",
+    ]
+
+
+def test_a_run_of_photographs_leaves_tables_alone(tmp_path):
+    assert plan(tmp_path, groups=["photos"]).targets() == [
+        "results/figures/photos/desk/panel.png",
+        "results/figures/photos/desk/comparison.png",
+    ]
+    targets = plan(tmp_path, sweep_scenes=["one"]).targets()
+    assert "results/figures/synthetic/one/comparison.png" in targets
+    assert "results/figures/synthetic/two/comparison.png" not in targets
+    assert "results/figures/synthetic/two/masks.png" in targets
+    assert "results/tables/lerf.csv" in targets and "results/figures/sweep-theta.png" in targets
+
+
+def test_queries_of_a_scene_come_before_those_of_its_data_set(tmp_path):
+    found = plan(tmp_path, queries={"photos": ["cup"], "photos/desk": ["mug"]})
+    assert json.loads(found.queries(Job("photos", "desk"))) == ["mug"]
+    assert json.loads(found.queries(Job("photos", "other"))) == ["cup"]
+
+
+def test_threads_go_to_scenes_first(tmp_path):
+    assert plan(tmp_path).threads(6) == 2
+    assert plan(tmp_path, only=["one"]).threads(6) == 6
+    assert plan(tmp_path).threads(2) == 1
+
+
+def test_a_model_folder_counts_by_its_bytes(tmp_path):
+    found = plan(tmp_path, masks={"segmenter": "graph"}, clip={"model": str(tmp_path / "none")})
+    assert found.model("masks")(Job("synthetic", "one")) == "none"
+    assert found.model("clip")(Job("synthetic", "one")) == f"{tmp_path}/none is missing"
+    folder = tmp_path / "model"
+    folder.mkdir()
+    (folder / "a.onnx").write_bytes(b"1")
+    first = model_digest(folder, tmp_path / "cache")
+    model_digest.cache_clear()  # as in another process, which reads what this one kept
+    assert model_digest(folder, tmp_path / "cache") == first
+    model_digest.cache_clear()
+    (folder / "a.onnx").write_bytes(b"22")
+    assert model_digest(folder, tmp_path / "cache") != first
+
+
+def test_names_match_themselves_alone():
+    assert any_of([]) == "(?!)"
+    assert any_of(["b", "a.c"]) == r"a\.c|b"
+    assert some(["a", "b", "c", "d", "e"]) == "a, b, c and 2 more"
