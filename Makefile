@@ -28,7 +28,7 @@ lint: $(STAMP)
 	ruff check hilsplat tests benchmarks
 	ruff format --check hilsplat tests benchmarks
 	lint-imports
-	snakefmt --check Snakefile rules
+	snakefmt --check Snakefile workflow/Snakefile rules
 	snakemake --lint --configfile config/ci.yaml
 
 test: lint

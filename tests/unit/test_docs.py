@@ -34,7 +34,7 @@ def prose(page: Path) -> str:
 
 def inline_code(page: Path) -> list[str]:
     """What a page writes between single backquotes."""
-    return re.findall(r"`([^`\n]+)`", prose(page))
+    return re.findall(r"`([^`]+)`", " ".join(prose(page).split()))
 
 
 def anchors(page: Path) -> set[str]:
