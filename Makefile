@@ -1,6 +1,9 @@
-# make run    set up and run the default configuration (synthetic scenes, to tables and figures)
-# make test   set up and run lint and all tests
-# make bench  set up and time what must be fast; tables go to results/benchmarks (docs/benchmarks.md)
+# make run     set up, then run the default configuration: synthetic scenes, tables, figures
+# make test    set up, then run lint and all tests
+# make lint    set up, then check style, imports and rules
+# make bench   set up, then time the fast paths; tables go to results/benchmarks (docs/benchmarks.md)
+# make report  set up, run, and write results/report.html
+# make setup   create .venv with everything that the targets above need
 PYTHON ?= python3
 CORES ?= 2
 VENV := .venv
@@ -25,7 +28,7 @@ lint: $(STAMP)
 	ruff check hilsplat tests benchmarks
 	ruff format --check hilsplat tests benchmarks
 	lint-imports
-	snakefmt --check Snakefile rules
+	snakefmt --check Snakefile workflow/Snakefile rules
 	snakemake --lint --configfile config/ci.yaml
 
 test: lint

@@ -1,0 +1,136 @@
+"""What the documentation names exists: links, commands, options, knobs, configurations, files, functions."""
+
+import ast
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from hilsplat.cli.main import app
+from hilsplat.configuration import SECTIONS
+from tests.conftest import PROJECT
+
+PAGES = sorted(
+    path
+    for pattern in ("*.md", "docs/*.md", "config/*.md", "models/*/*.md", "workflow/*.md")
+    for path in PROJECT.glob(pattern)
+)
+ROOTS = ("hilsplat/", "rules/", "config/", "workflow/", "tests/", "docs/", "benchmarks/", "models/")
+FILES = ("ply", "json", "safetensors", "csv", "png", "md", "py", "smk")
+"""What follows the dot in `gaussians.ply`, which is a file and not a knob."""
+
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.M | re.S)
+
+of_every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(PROJECT)))
+
+
+def prose(page: Path) -> str:
+    """A page without its code blocks."""
+    return FENCE.sub("", page.read_text())
+
+
+def inline_code(page: Path) -> list[str]:
+    """What a page writes between single backquotes."""
+    return re.findall(r"`([^`]+)`", " ".join(prose(page).split()))
+
+
+def anchors(page: Path) -> set[str]:
+    """Anchors of a page's headings as GitHub makes them."""
+    found: dict[str, int] = {}
+    names = set()
+    for heading in re.findall(r"^#+ (.+)$", prose(page), re.M):
+        slug = re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+        names.add(slug if slug not in found else f"{slug}-{found[slug]}")
+        found[slug] = found.get(slug, 0) + 1
+    return names
+
+
+def shell_lines(page: Path) -> list[str]:
+    """Lines of a page's shell blocks, continued ones joined, and inline code that begins with a command."""
+    blocks = [text for language, text in FENCE.findall(page.read_text()) if language in ("bash", "")]
+    lines = "".join(blocks).replace("\\\n", " ").splitlines()
+    return [*lines, *(code for code in inline_code(page) if re.match(r"(hilsplat|snakemake) [a-z-]", code))]
+
+
+def command_of(words: list[str]) -> tuple[Any, list[str]]:
+    """The command that the words after `hilsplat` name, None if there is none, and the rest of the words."""
+    command: Any = typer.main.get_command(app)
+    while words and hasattr(command, "commands") and not words[0].startswith("-"):
+        command, words = command.commands.get(words[0]), words[1:]
+    return command, words
+
+
+@of_every_page
+def test_every_relative_link_leads_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
+        if re.match(r"[a-z]+:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        place = (page.parent / path).resolve() if path else page
+        assert place.exists(), f"{target} is missing"
+        assert not anchor or anchor in anchors(place), f"{target}: no such heading"
+
+
+@of_every_page
+def test_every_command_and_option_exists(page: Path) -> None:
+    for line in shell_lines(page):
+        if not line.startswith("hilsplat "):
+            continue
+        words = shlex.split(line.replace("...", ""), comments=True)[1:]
+        command, rest = command_of(words)
+        assert command is not None, f"{line}: no such command"
+        options = {
+            "--help",
+            *(name for each in command.params for name in (*each.opts, *each.secondary_opts)),
+        }
+        unknown = [word for word in rest if word.startswith("--") and word not in options]
+        assert not unknown, f"{line}: no option {', '.join(unknown)}"
+
+
+@of_every_page
+def test_every_configuration_and_forced_rule_exists(page: Path) -> None:
+    rules = "".join(path.read_text() for path in sorted((PROJECT / "rules").glob("*.smk")))
+    for line in shell_lines(page):
+        for name in re.findall(r"--(?:configfile|workflow-profile) (\S+)", line):
+            assert (PROJECT / name).exists(), f"{line}: {name} is missing"
+        for name in re.findall(r"--forcerun (\S+)", line):
+            assert f"rule {name}:" in rules, f"{line}: no such rule"
+
+
+@of_every_page
+def test_every_knob_exists(page: Path) -> None:
+    """`section.knob`, alone or before its value."""
+    for code in inline_code(page):
+        match = re.fullmatch(r"(\w+)\.(\w+)(?::.*)?", code)
+        if match and match[1] in SECTIONS and match[2] not in FILES:
+            assert match[2] in SECTIONS[match[1]].model_fields, f"`{code}`: no such knob"
+
+
+def test_every_page_is_linked_from_the_readme() -> None:
+    links = set(re.findall(r"\]\((docs/[^)#]+\.md)", (PROJECT / "README.md").read_text()))
+    assert links == {f"docs/{path.name}" for path in (PROJECT / "docs").glob("*.md")}
+
+
+def test_every_page_that_the_code_names_exists() -> None:
+    sources = [*(PROJECT / "hilsplat").rglob("*.py"), *(PROJECT / "rules").glob("*.smk")]
+    sources += [PROJECT / "Makefile", *(PROJECT / "config").glob("*.yaml")]
+    for source in sources:
+        for name in re.findall(r"docs/\w+\.md", source.read_text()):
+            assert (PROJECT / name).exists(), f"{source.relative_to(PROJECT)} names {name}"
+
+
+def test_every_place_in_the_architecture_exists() -> None:
+    """`path` is a file or folder, `path:name` a definition in it; `path:Class.method` likewise."""
+    places = [code for code in inline_code(PROJECT / "docs/architecture.md") if code.startswith(ROOTS)]
+    assert len(places) > 60
+    for place in places:
+        path, _, name = place.partition(":")
+        assert (PROJECT / path).exists(), f"{path} is missing"
+        scope: ast.AST | None = ast.parse((PROJECT / path).read_text()) if name else None
+        for part in name.split(".") if name else ():
+            definitions = {each.name: each for each in ast.iter_child_nodes(scope) if hasattr(each, "name")}
+            assert part in definitions, f"{place}: {path} does not define {part}"
+            scope = definitions[part]
