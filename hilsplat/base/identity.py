@@ -17,7 +17,7 @@ name, and definitions whose decorators may register them, for importing it runs 
 import ast
 import functools
 import hashlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -424,7 +424,7 @@ class _Names:
             for child in ast.iter_child_nodes(node):
                 self._visit(child)
 
-    def _inside(self, scope: _Scope, body: list[ast.AST]) -> None:
+    def _inside(self, scope: _Scope, body: Sequence[ast.AST]) -> None:
         self.scopes.append(scope)
         for each in body:
             self._visit(each)
@@ -441,7 +441,7 @@ class _Names:
                 return
         self.names[chain] = None
 
-    def _imported(self, body: list[ast.AST]) -> dict[str, _Import]:
+    def _imported(self, body: Sequence[ast.AST]) -> dict[str, _Import]:
         found: dict[str, _Import] = {}
         for node in _own(body):
             if isinstance(node, ast.Import | ast.ImportFrom):

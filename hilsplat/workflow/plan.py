@@ -17,6 +17,7 @@ from hilsplat.base.errors import SettingsError
 from hilsplat.configuration import UPSTREAM, StageSettings, parse_run
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.sources import (
+    DATA_PREFIX,
     absence,
     image_files,
     is_exported,
@@ -191,6 +192,7 @@ class Plan:
         row = self.row(job)
         if row.world or is_exported(row.source):
             return self.images(job)
+        assert row.folder is not None, row.name  # absent data were skipped
         labels = set(self._label_files(row))
         return sorted(
             str(path)
@@ -208,11 +210,11 @@ class Plan:
 
     def source_name(self, job: Job) -> str:
         """Parameter of source: data set and scene."""
-        return "/".join(published(self.row(job).source))
+        return self.row(job).source.removeprefix(DATA_PREFIX)
 
     def source_reader(self, job: Job) -> tuple[str, ...]:
         """The reader of the data set that a scene's images are exported from."""
-        return (DATASETS.places[published(self.row(job).source)[0]],)
+        return (DATASETS.places[self.source_name(job).partition("/")[0]],)
 
     def brought(self, job: Job) -> list[str]:
         """Input: somebody's PLY that takes the place of a fit, with the JSON beside it; mostly nothing."""
@@ -303,7 +305,7 @@ class Plan:
         row = self.row(job)
         if row.world:
             return f"--truth {shlex.quote(self.truth(job)[0])}"
-        on_images = [labels for labels in self.labels(row) if not is_exported(f"data:{labels}")]
+        on_images = [labels for labels in self.labels(row) if not is_exported(f"{DATA_PREFIX}{labels}")]
         if not on_images:
             return ""
         return f"--labels {shlex.quote(on_images[-1])} {self._data_root_option()}"
