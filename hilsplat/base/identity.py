@@ -207,6 +207,7 @@ class _Module:
     effects: list[_Statement] = field(default_factory=list)
 
 
+@functools.cache
 def _path(module: str, root: Path) -> Path | None:
     parts = module.split(".")
     if parts[0] != PACKAGE:
@@ -219,10 +220,14 @@ def _path(module: str, root: Path) -> Path | None:
 def _module(module: str, root: Path) -> _Module:
     path = _path(module, root)
     assert path is not None, module
-    tree = ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    return _parse(path.read_text(encoding="utf-8"), package)
+
+
+@functools.cache
+def _parse(text: str, package: str) -> _Module:
     facts = _Module()
-    for node in tree.body:
+    for node in ast.parse(text).body:
         if _is_bare_string(node):
             continue
         if isinstance(node, ast.Import | ast.ImportFrom):
