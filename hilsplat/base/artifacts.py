@@ -81,7 +81,7 @@ def _full_disk_told(path: Path) -> Iterator[None]:
 
 
 def require_free_space(folder: Path, needed_mib: float) -> None:
-    """Refuse to begin where the disk cannot hold what is about to be written.
+    """Refuse to begin if the disk cannot hold what is about to be written.
 
     Raises:
         DiskSpaceError: less than `needed_mib` MiB is free on the folder's disk.
@@ -114,7 +114,7 @@ def read_json(path: Path) -> Any:
     """Read JSON.
 
     Raises:
-        ArtifactError: the file is missing or is no JSON.
+        ArtifactError: the file is missing or is not valid JSON.
     """
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
@@ -260,7 +260,7 @@ class ViewCache:
     model and code, and the settings.
 
     Args:
-        folder: where entries live, such as `results/.cache/masks`.
+        folder: holds the entries, such as `results/.cache/masks`.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -273,7 +273,7 @@ class ViewCache:
         return self.folder / key[:2] / f"{key}.npz"
 
     def get(self, key: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-        """Return the entry, computing and storing it where it is missing or damaged."""
+        """Return the entry, computing and storing it if it is missing or damaged."""
         path = self.path(key)
         if path.is_file():
             try:

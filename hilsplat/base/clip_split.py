@@ -1,6 +1,6 @@
 """Cutting the one network of an exported CLIP into the two that we read.
 
-Optimum writes a CLIP as `model.onnx`, which wants a picture and a text at once. Its picture vectors
+Optimum writes a CLIP as `model.onnx`, which takes a picture and a text at once. Its picture vectors
 depend on the picture alone and its text vectors on the text alone, so each half is a subgraph.
 """
 
@@ -20,7 +20,7 @@ HALVES = {
 
 
 def whole_clip(folder: Path) -> Path | None:
-    """The network of both halves, where a folder has one."""
+    """The network of both halves, if a folder has one."""
     places = (Path(folder) / WHOLE, Path(folder) / "onnx" / WHOLE)
     return next((place for place in places if place.is_file()), None)
 
@@ -55,7 +55,7 @@ def split_clip(folder: Path) -> list[Path]:
     ]
     if missing:
         raise ModelError(
-            f"network {whole} is no whole CLIP: it lacks {', '.join(sorted(missing))}",
+            f"network {whole} is not a whole CLIP: it lacks {', '.join(sorted(missing))}",
             expected="; ".join(f"{' and '.join(a)} -> {b[0]}" for a, b in HALVES.values()),
             found=f"{', '.join(sorted(inputs))} -> {', '.join(sorted(outputs))}",
             fix="export it with optimum's task feature-extraction",

@@ -61,7 +61,7 @@ def box_with_margin(
 
 
 def background_colour(image: UInt8[np.ndarray, "H W 3"], background: str) -> UInt8[np.ndarray, " 3"]:
-    """What stands where a square is not filled: black, or the image's mean colour with `mean`."""
+    """The colour of the rest of a square: black, or the image's mean colour with `mean`."""
     if background != "mean":
         return np.zeros(3, np.uint8)
     return (image.reshape(-1, 3).mean(axis=0) + 0.5).astype(np.uint8)

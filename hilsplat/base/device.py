@@ -1,4 +1,4 @@
-"""Where the sparse algebra of the language stages runs: the CPU's own kernels, or torch on CUDA."""
+"""What runs the sparse algebra after the fit: our kernels on the CPU, or torch on CUDA."""
 
 import logging
 from functools import cache
@@ -13,7 +13,7 @@ ComputeDevice = Literal["cpu", "cuda"]
 
 @cache
 def cuda_missing() -> str | None:
-    """Why torch cannot use CUDA here; None where it can."""
+    """Why torch cannot use CUDA here; None if it can."""
     import torch
 
     return None if torch.cuda.is_available() else f"torch {torch.__version__} finds no CUDA device"
@@ -28,7 +28,7 @@ def compute_device(wanted: ComputeDevice) -> ComputeDevice:
             same bytes.
 
     Raises:
-        DeviceError: `cuda` was asked for and torch finds no device. There is no falling back.
+        DeviceError: `cuda` was asked for and torch finds no device. There is no fallback.
     """
     if wanted == "cpu":
         return "cpu"

@@ -57,7 +57,7 @@ class MisalignedArtifactError(ArtifactError):
 
 
 class EmptyMaskError(HilsplatError):
-    """A mask has no pixel where one is needed."""
+    """A mask without a pixel was given to something that needs one."""
 
 
 class DiskSpaceError(HilsplatError):

@@ -42,7 +42,9 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
             if upright.mode.startswith("I"):  # Pillow would clip what exceeds 255
                 values = np.asarray(upright).astype(np.int64)
                 if values.min() < 0 or values.max() > DEEP_MAX:
-                    raise ValueError(f"its grey values, {values.min()} to {values.max()}, are no 16 bits")
+                    raise ValueError(
+                        f"its grey values, {values.min()} to {values.max()}, are not 16-bit values"
+                    )
                 upright = Image.fromarray(((values + 128) // 257).astype(np.uint8))
             if upright.mode == "F":
                 raise ValueError("its pixels are floating-point numbers of unknown range")

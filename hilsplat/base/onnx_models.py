@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 
 Axes = tuple[int | None, ...]
-"""Axes of an array: their lengths where these are part of the layout, None where any will do."""
+"""Axes of an array: their lengths if the layout fixes them, None if any will do."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class NetworkSpec:
     Attributes:
         inputs: names and axes of the inputs that must be there.
         outputs: names and axes of the outputs that must be there; others are ignored.
-        optional: names of inputs that are fed where the network has them.
+        optional: names of inputs that are fed if the network has them.
     """
 
     inputs: Mapping[str, Axes]
@@ -108,7 +108,7 @@ class ModelFolder:
 
     @property
     def digest(self) -> str:
-        """SHA-256 over names and bytes of the files used; independent of where the folder stands."""
+        """SHA-256 over names and bytes of the files used; independent of the folder's path."""
         return sha256_of_json(
             [(path.relative_to(self.folder).as_posix(), sha256_of_file(path)) for path in self.files]
         )
@@ -128,7 +128,7 @@ def open_model_folder(folder: Path, kind: str | None = None, *, fix: str = "") -
     Args:
         folder: the model folder.
         kind: "sam" or "clip"; None accepts either.
-        fix: an additional way out, for the message where the folder is missing.
+        fix: an additional way out, for the message about a missing folder.
 
     Raises:
         ModelError: the folder or some of its files are missing, or it holds another kind of model.
@@ -220,7 +220,7 @@ def model_digest(folder: Path) -> str:
 
 
 def execution_providers() -> list[str]:
-    """onnxruntime's execution providers in the order we ask for them: CUDA where there is one, CPU."""
+    """onnxruntime's execution providers in the order we ask for them: CUDA if there is one, CPU."""
     available = onnxruntime.get_available_providers()
     return [name for name in ("CUDAExecutionProvider", "CPUExecutionProvider") if name in available]
 
@@ -253,7 +253,7 @@ class Network:
             raise ModelError(
                 f"network {path} cannot be opened: {error}",
                 found=f"a file of {path.stat().st_size} bytes",
-                fix="export it again, or fetch a whole copy (with its .onnx_data file, where it has one)",
+                fix="export it again, or fetch a whole copy (with its .onnx_data file, if it has one)",
             ) from error
         self.inputs = {item.name: item for item in self.session.get_inputs()}
         self.outputs = {item.name: item for item in self.session.get_outputs()}
@@ -285,12 +285,12 @@ class Network:
             )
 
     def declared_axis(self, name: str, axis: int) -> int | None:
-        """Length of an output's axis where the network says it."""
+        """Length of an output's axis, if the network states it."""
         shape = self.outputs[name].shape
         return shape[axis] if shape and isinstance(shape[axis], int) else None
 
     def fixed_axis(self, name: str, axis: int) -> int | None:
-        """Length of an input's axis where the network fixes it."""
+        """Length of an input's axis, if the network fixes it."""
         shape = self.inputs[name].shape
         return shape[axis] if shape and isinstance(shape[axis], int) else None
 

@@ -14,7 +14,7 @@ Item = TypeVar("Item")
 logger = logging.getLogger(__name__)
 
 LOG_EVERY_S = 15.0
-"""Seconds between progress lines where there is no terminal to draw a bar on."""
+"""Seconds between progress lines if there is no terminal to draw a bar on."""
 
 
 def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterator[Item]:
@@ -23,7 +23,7 @@ def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterato
     Args:
         items: what is worked through.
         what: a few words, such as "masks of views".
-        total: number of items, where `len(items)` is not available.
+        total: number of items, if `len(items)` is not available.
     """
     if total is None:
         total = len(items) if hasattr(items, "__len__") else None  # type: ignore[arg-type]

@@ -25,7 +25,7 @@ LIBRARIES = (
 
 
 def provenance_path(artifact: Path) -> Path:
-    """Where the provenance of a file or folder artifact stands: beside it, under its name."""
+    """Path of the provenance of a file or folder artifact: beside it, under its name."""
     artifact = Path(artifact)
     return artifact.with_name(f"{artifact.name}.provenance.json")
 
@@ -76,7 +76,7 @@ def library_versions() -> dict[str, str]:
 
 @functools.cache
 def git_commit() -> str:
-    """Commit of the checkout, with "+edits" where the tree has changes; "unknown" outside one."""
+    """Commit of the checkout, with "+edits" if the tree has changes; "unknown" outside one."""
     folder = Path(__file__).resolve().parent
 
     def git(*words: str) -> str:

@@ -22,7 +22,7 @@ def read_csv(path: Path, columns: Sequence[str], fix: str) -> list[dict[str, str
     Args:
         path: the file.
         columns: that it must have, in their order.
-        fix: what to do where the file is missing or another one.
+        fix: what to do if the file is missing or has other columns.
 
     Raises:
         ArtifactError: the file is missing or has other columns.

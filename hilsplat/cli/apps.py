@@ -11,7 +11,7 @@ app = typer.Typer(
 world_app = typer.Typer(help="The synthetic world.", no_args_is_help=True)
 models_app = typer.Typer(help="Model folders (SAM, CLIP).", no_args_is_help=True)
 datasets_app = typer.Typer(
-    help="Benchmarks: layouts, licences, and what is there of them.", no_args_is_help=True
+    help="Benchmarks: layouts, licences, and what is found of them.", no_args_is_help=True
 )
 cache_app = typer.Typer(help="Caches of finished views.", invoke_without_command=True)
 langsplat_app = typer.Typer(help="LangSplat's files of masks and CLIP vectors.", no_args_is_help=True)

@@ -30,16 +30,16 @@ def cache_show(
 def cache_prune(
     context: typer.Context,
     days: Annotated[
-        float | None, typer.Option(min=0, help="delete what was not used for so many days")
+        float | None, typer.Option(min=0, help="delete what was not used for this many days")
     ] = None,
     max_mib: Annotated[
-        float | None, typer.Option(min=0, help="delete the longest unused until so much is left")
+        float | None, typer.Option(min=0, help="delete the longest unused until this much is left")
     ] = None,
     stage: Annotated[
         list[str] | None, typer.Option(help="masks, clip, contributions; default: all of them")
     ] = None,
 ) -> None:
-    """Delete finished views; they are computed again where a stage needs them."""
+    """Delete finished views; a stage that needs one computes it again."""
     from hilsplat.base.cache import prune_cache, size_table
 
     number, freed_mib = prune_cache(context.obj, stage or [], days=days, max_mib=max_mib)

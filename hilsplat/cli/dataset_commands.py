@@ -1,4 +1,4 @@
-"""Benchmarks: what they are, whether they are there, world scenes in their layouts."""
+"""Benchmarks: what they are, which are here, and world scenes in their layouts."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +18,7 @@ from hilsplat.cli.stage import (
 def datasets_list(
     data_root: Annotated[Path | None, typer.Option(help="folder of the data sets' folders")] = None,
 ) -> None:
-    """List data sets: citation, licence, layout and, with --data-root, which scenes are there."""
+    """List data sets: citation, licence, layout and, with --data-root, the scenes found."""
     start_logging(None)
     from hilsplat.datasets.overview import overview
 
@@ -30,10 +30,10 @@ def datasets_check(
     name: Annotated[str, typer.Argument(help="data set, such as lerf_ovs")],
     data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders", show_default=False)],
     scene: Annotated[
-        list[str] | None, typer.Option(help="scene to read; default: all that are there")
+        list[str] | None, typer.Option(help="scene to read; default: all that are found")
     ] = None,
 ) -> None:
-    """Read every label of a data set, scene by scene, and say what was found and what is odd."""
+    """Read every label of a data set, scene by scene, and report findings and warnings."""
     start_logging(None)
     from hilsplat.datasets.overview import check
     from hilsplat.datasets.registry import dataset_of

@@ -29,7 +29,7 @@ from hilsplat.cli import world_commands, model_commands, dataset_commands  # noq
 
 
 def main() -> None:
-    """Run the command; a mistake a user can fix is told in a sentence, without a traceback."""
+    """Run the command; a mistake that a user can fix ends in a sentence, without a traceback."""
     try:
         app()
     except HilsplatError as error:
@@ -41,7 +41,7 @@ def main() -> None:
 def version(
     show: Annotated[bool, typer.Option("--version", help="print the version and exit")] = False,
 ) -> None:
-    """Print the version, where asked."""
+    """Print the version if asked."""
     if show:
         from hilsplat.base.provenance import library_versions
 

@@ -48,7 +48,7 @@ def models_train(
 ) -> None:
     """Train the small SAM and CLIP on training scenes of the synthetic world.
 
-    A killed training goes on where it was; a finished one goes on when it is asked for more minutes.
+    A killed training resumes; a finished one continues if it is given more minutes.
     """
     start_logging(log)
     from hilsplat.world.tiny.train import train_models

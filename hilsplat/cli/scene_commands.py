@@ -27,7 +27,7 @@ def new(
     photos: Annotated[Path, typer.Argument(help="folder of photographs")],
     sheet: Annotated[Path, typer.Option(help="scene sheet")] = Path("config/scenes.tsv"),
 ) -> None:
-    """Add a folder of photographs to the scene sheet and tell what was found."""
+    """Add a folder of photographs to the scene sheet and report what was found."""
     start_logging(None)
     from hilsplat.scene.photos import add_scene
 
@@ -67,14 +67,15 @@ def gaussians(
     report: Annotated[Path, typer.Option(help="folder of the fit's report")],
     settings: Settings = "{}",
     brought: Annotated[
-        Path | None, typer.Option(help="somebody's 3DGS PLY in the source's coordinates; skips the fit")
+        Path | None,
+        typer.Option(help="a 3DGS PLY of your own, in the source's coordinates; replaces the fit"),
     ] = None,
     cache: Cache = DEFAULT_CACHE,
     seed: Seed = 0,
     threads: Threads = 1,
     log: Log = None,
 ) -> None:
-    """Fit 3D Gaussians to the training views, or take somebody's; the JSON beside them holds coordinates."""
+    """Fit 3D Gaussians to the training views, or take your own; the JSON beside them holds coordinates."""
     section = section_of("gaussians", settings)
     inputs = {"scene": scene, **({"brought": brought} if brought else {})}
     with stage("gaussians", out, log, settings=section, seed=seed, threads=threads, inputs=inputs):

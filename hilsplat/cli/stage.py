@@ -28,7 +28,7 @@ MIN_FREE_MIB = 200.0
 
 
 def start_logging(log: Path | None) -> None:
-    """Send log records to the terminal (short) and, where given, to a file (with times)."""
+    """Send log records to the terminal (short) and, if given, to a file (with times)."""
     root = logging.getLogger()
     root.setLevel(logging.INFO)
     root.handlers.clear()
@@ -85,7 +85,7 @@ def stage(
             )
     except HilsplatError:
         raise
-    except Exception:  # a mistake of ours: the traceback belongs into the log
+    except Exception:  # a mistake of ours: the traceback belongs in the log
         logging.getLogger("hilsplat").exception("%s failed on %s", name, out)
         sys.exit(1)
 

@@ -80,10 +80,12 @@ def world_inconsistency(
     scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has masks")],
     variant: Annotated[str, typer.Option(help="variant whose masks are measured")] = "default",
     results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
-    neighbours: Annotated[int, typer.Option(min=1, help="nearest views that each view is compared with")] = 2,
+    neighbours: Annotated[
+        int, typer.Option(min=1, help="number of nearest views that each view is compared with")
+    ] = 2,
     out: Annotated[Path | None, typer.Option(help="CSV to write; default: beside the masks")] = None,
 ) -> None:
-    """Measure how often a surface point gets other masks in the next view, with exact geometry."""
+    """Measure how often a surface point gets different masks in neighbouring views, by exact geometry."""
     truth, masks_folder = results / scene / "world" / "truth", results / scene / variant / "masks"
     target = out or masks_folder.with_name("consistency.csv")
     with stage("consistency", target, None, inputs={"truth": truth, "masks": masks_folder}):
@@ -103,7 +105,7 @@ def world_masks(
     ] = None,
     log: Log = None,
 ) -> None:
-    """Measure the masks against the true regions by level, and picture where they fail."""
+    """Measure the masks against the true regions by level, and draw where they fail."""
     folder = results / scene
     truth, masks_folder = folder / "world" / "truth", folder / variant / "masks"
     target = out or masks_folder.with_name("masks_truth.png")

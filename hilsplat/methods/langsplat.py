@@ -53,7 +53,7 @@ class ViewPixels:
 
     Attributes:
         weights: their compositing weights (pixels x Gaussians), rows summing to 1.
-        labels: row of the mask painted there at each level, -1 where there is none.
+        labels: row of the mask painted there at each level, -1 if there is none.
         latents: code of each mask of the view.
     """
 

@@ -67,7 +67,7 @@ class MethodInputs:
         return normalised_weights(weights)
 
     def view_labels(self, view: str) -> Int32[np.ndarray, "P 3"]:
-        """Row of the view's painted mask at each pixel and level, -1 where there is none."""
+        """Row of the view's painted mask at each pixel and level, -1 if there is none."""
         return label_maps(HierarchicalMasks.load(Path(self.masks_folder) / f"{view}.npz"))
 
     def view_size_hw(self, view: str) -> tuple[int, int]:
@@ -91,7 +91,7 @@ class Method:
     Attributes:
         name: key in the registry, and value of `method.name` in a variant.
         title: as tables may write it.
-        source: repository or text it follows, and where it departs.
+        source: repository or text it follows, and how it departs from it.
         fit: (inputs, settings, seed) to the features of every Gaussian and level, (N, 3, D).
     """
 

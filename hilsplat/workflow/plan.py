@@ -217,7 +217,7 @@ class Plan:
         return (DATASETS.places[self.source_name(job).partition("/")[0]],)
 
     def brought(self, job: Job) -> list[str]:
-        """Input: somebody's PLY that takes the place of a fit, with the JSON beside it; mostly nothing."""
+        """Input: a PLY that replaces the fit, with the JSON beside it; usually nothing."""
         ply = self.row(job).gaussians
         if ply is None:
             return []
@@ -225,7 +225,7 @@ class Plan:
         return [str(ply), *([str(beside)] if beside.is_file() else [])]
 
     def brought_option(self, job: Job) -> str:
-        """Option that brings somebody's PLY, else nothing."""
+        """Option that names such a PLY, else nothing."""
         ply = self.row(job).gaussians
         return f"--brought {shlex.quote(str(ply))}" if ply is not None else ""
 

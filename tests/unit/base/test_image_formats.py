@@ -65,5 +65,5 @@ def test_pixels_of_unknown_range_are_refused(tmp_path):
     with pytest.raises(ImageError, match=r"image.tif cannot be read(.|\n)*floating-point"):
         read_image(path)
     path = saved(tmp_path, Image.fromarray(np.full((2, 2), 70000, np.int32)), ".tif")
-    with pytest.raises(ImageError, match=r"70000, are no 16 bits"):
+    with pytest.raises(ImageError, match=r"70000, are not 16-bit values"):
         read_image(path)
