@@ -242,7 +242,7 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
 
 
 def config_schema() -> dict[str, Any]:
-    """JSON schema of the configuration, for editors and for `snakemake`'s users."""
+    """JSON schema of the configuration, for editors that check YAML (`hilsplat settings --schema`)."""
     schema = RunSettings.model_json_schema()
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 

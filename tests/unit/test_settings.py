@@ -1,10 +1,11 @@
-"""Settings: one default per knob, told errors, shared variants."""
+"""Settings: one default per knob, errors that name the key, shared variants."""
 
 import json
 from pathlib import Path
 
 import pytest
 import yaml
+from jsonschema import Draft202012Validator
 from snakemake.utils import update_config
 
 from hilsplat.base.errors import SettingsError
@@ -24,7 +25,7 @@ def test_shipped_configurations_are_valid(project: Path, name: str) -> None:
 
 
 def test_a_misspelt_key_is_named_with_the_likely_one() -> None:
-    with pytest.raises(SettingsError, match=r"tree\.thetaa: unknown key; did you mean 'theta'\?"):
+    with pytest.raises(SettingsError, match=r"coverage_tree\.thetaa: unknown key; did you mean 'theta'\?"):
         parse_run({"coverage_tree": {"thetaa": 0.5}})
 
 
@@ -34,7 +35,7 @@ def test_a_misspelt_section_is_named() -> None:
 
 
 def test_a_value_out_of_range_is_named_with_place_and_value() -> None:
-    with pytest.raises(SettingsError, match=r"tree\.theta: Input should be less than 1; found 2"):
+    with pytest.raises(SettingsError, match=r"coverage_tree\.theta: Input should be less than 1; found 2"):
         parse_run({"coverage_tree": {"theta": 2}})
 
 
@@ -44,7 +45,7 @@ def test_a_variant_may_not_change_what_all_variants_share() -> None:
 
 
 def test_errors_inside_variants_name_the_variant() -> None:
-    with pytest.raises(SettingsError, match=r"variants\.x\.tree\.theta: Input should be less than 1"):
+    with pytest.raises(SettingsError, match=r"variants\.x\.coverage_tree\.theta: Input should be less than 1"):
         parse_run({"variants": {"x": {"coverage_tree": {"theta": 3}}}})
 
 
@@ -60,10 +61,10 @@ def test_overrides_apply_in_order_group_then_scene_then_variant() -> None:
             "variants": {"v": {"coverage_tree": {"theta": 0.8}}},
         }
     )
-    assert run.stages().tree.theta == 0.9
-    assert run.stages(scopes=("g", "d/t")).tree.theta == 0.6
-    assert run.stages(scopes=("g", "d/s")).tree.theta == 0.7
-    assert run.stages("v", scopes=("g", "d/s")).tree.theta == 0.8
+    assert run.stages().coverage_tree.theta == 0.9
+    assert run.stages(scopes=("g", "d/t")).coverage_tree.theta == 0.6
+    assert run.stages(scopes=("g", "d/s")).coverage_tree.theta == 0.7
+    assert run.stages("v", scopes=("g", "d/s")).coverage_tree.theta == 0.8
 
 
 def test_only_what_holds_something_random_is_repeated_per_seed() -> None:
@@ -97,11 +98,15 @@ def test_every_knob_has_description_and_origin() -> None:
             assert field.json_schema_extra["origin"], f"{section}.{name}"
 
 
-def test_the_committed_schema_is_the_generated_one(project: Path) -> None:
-    committed = json.loads((project / "workflow" / "schemas" / "config.schema.json").read_text())
-    assert committed == json.loads(json.dumps(config_schema())), (
-        "run: hilsplat settings --schema > workflow/schemas/config.schema.json"
-    )
+def test_the_schema_for_editors_takes_the_shipped_configuration_and_refuses_a_misspelt_key(
+    project: Path,
+) -> None:
+    validator = Draft202012Validator(json.loads(json.dumps(config_schema())))
+    config = yaml.safe_load((project / "config" / "config.yaml").read_text())
+    validator.validate(config)
+    config["coverage_tree"]["thetaa"] = 0.9
+    (error,) = validator.iter_errors(config)
+    assert "thetaa" in error.message
 
 
 def test_sections_round_trip_through_json() -> None:
