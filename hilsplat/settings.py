@@ -2,7 +2,7 @@
 
 The configuration files hold choices; this module holds what may be chosen. A section is what one
 stage (or family of stages) depends on, so a changed knob reruns exactly the stages whose sections
-hold it. `workflow/schemas/` is generated from here.
+hold it. `hilsplat settings --schema` makes the JSON schema for editors from here.
 """
 
 from typing import Annotated, Any, Literal
@@ -42,9 +42,6 @@ class WorldSettings(Section):
     min_area_px: int = knob(
         60, "wholes and parts with a smaller visible region are not scored", unit="px", ge=1
     )
-    min_subpart_area_px: int = knob(
-        100, "the same for subparts in views of 384 px; scales with the area of the view", unit="px", ge=1
-    )
 
 
 class PosesSettings(Section):
@@ -57,16 +54,17 @@ class PosesSettings(Section):
         "auto", "lens model; auto takes simple_radial for photographs and simple_pinhole for renders"
     )
     single_camera: Literal["auto", "yes", "no"] = knob(
-        "auto", "all photographs share one camera; auto: those of equal size and EXIF focal length do"
+        "auto",
+        "whether photographs share one camera; auto: those of equal size and EXIF focal length do",
+        origin="COLMAP",
     )
     matcher: Literal["auto", "exhaustive", "sequential"] = knob(
-        "auto", "pairs to match; auto: exhaustive up to 200 views, else sequential"
+        "auto", "pairs to match; auto: exhaustive up to 200 views, else sequential", origin="COLMAP"
     )
     mapper: Literal["incremental", "global"] = knob(
         "incremental", "structure-from-motion algorithm", origin="COLMAP"
     )
     max_features: int = knob(4096, "SIFT features per image", ge=100, le=32768, origin="COLMAP: 8192")
-    first_octave: Literal[-1, 0] = knob(-1, "-1 doubles the image first: more features, four times the time")
     min_registered_share: float = knob(
         0.7, "the stage fails where the largest model holds fewer of the views", unit="share", gt=0, le=1
     )
@@ -154,17 +152,6 @@ class MasksSettings(Section):
     stability_min: float = knob(
         0.5, "masks below are dropped", ge=0, le=1, origin="SAM: 0.95, LangSplat: 0.85"
     )
-    level_source: Literal["sam", "coverage"] = knob(
-        "sam",
-        "level of a mask: sam: the head (or scale) that gave it; coverage: its depth in the coverage tree",
-        origin="paper, LangSplat: sam",
-    )
-    level_theta: float = knob(
-        0.9,
-        "share of a mask inside another one that makes it deeper; level_source: coverage only",
-        gt=0.5,
-        lt=1,
-    )
     stability_offset: float = knob(1.0, "logit offset of the stability test", gt=0, origin="SAM")
     box_nms_iou: float = knob(0.7, "box IoU above which the worse mask is dropped", gt=0, le=1, origin="SAM")
     min_area_px: int = knob(
@@ -228,17 +215,15 @@ class CoverageTreeSettings(Section):
     """Coverage tree of each view."""
 
     theta: float = knob(0.9, "coverage threshold", unit="share", gt=0.5, lt=1, origin="paper: 0.9")
-    parents: Literal["coarser", "any"] = knob("coarser", "levels a parent may come from")
 
 
 class ClipSettings(Section):
     """One CLIP vector per mask."""
 
     model: str = knob("models/clip-tiny", "folder of a CLIP in the Hugging Face ONNX export layout")
-    background: Literal["black", "mean", "keep", "dim"] = knob(
+    background: Literal["black", "keep"] = knob(
         "black", "pixels of the crop outside the mask", origin="LangSplat: black"
     )
-    context: float = knob(0.0, "margin around the box, as a share of its side", ge=0, le=1)
     batch: int = knob(64, "crops per network call", ge=1, le=4096)
 
 
@@ -258,33 +243,13 @@ class ContributionsSettings(Section):
 class SemanticTreeSettings(Section):
     """3D semantic tree: masks linked across views by the Gaussians they share."""
 
-    overlap: Literal["tanimoto", "soft"] = knob(
-        "tanimoto", "overlap of two masks on their Gaussians; soft suits Gaussians that keep to one region"
-    )
     link_threshold: float = knob(
         0.3, "pooled average IoU above which clusters of masks are joined", gt=0, lt=1
     )
     min_views: int = knob(3, "a node is seen in at least this many views", ge=1)
-    min_member_share: float = knob(
-        0.15, "a Gaussian joins its best node where more than this share of its weight lies in it", ge=0, lt=1
-    )
-    min_visible_px: float = knob(
-        0.3, "a Gaussian counts as visible in a view from this mass", unit="px", ge=0
-    )
-    min_covisible: float = knob(
-        0.2,
-        "pairs of masks that see less than this share of each other are no evidence",
-        unit="share",
-        ge=0,
-        lt=1,
-    )
-    min_fit: float = knob(
-        0.25, "a mask stands for the node it fits best above this IoU in its view", ge=0, lt=1
-    )
     parent_coverage: float = knob(
         0.5, "share of a node inside a coarser one that makes it a child", gt=0, lt=1
     )
-    nested: bool = knob(True, "make every child a subset of its parent")
     device: Literal["cpu", "cuda"] = knob("cpu", "what forms the evidence; cuda: torch, equal to rounding")
 
 
@@ -323,7 +288,7 @@ class FieldSettings(Section):
     weight_clustering: float = knob(0.0, "weight of L_h (Eq. 2)", ge=0, origin="paper: 1")
     weight_instance: float = knob(0.0, "weight of L_ins (Eq. 3), lambda_1", ge=0, origin="paper: e-6")
     weight_part: float = knob(0.01, "weight of L_part (Eq. 5), lambda_2", ge=0, origin="paper: e-5")
-    instance_mode: Literal["literal", "coverage_tree", "logratio"] = knob(
+    instance_mode: Literal["literal", "coverage_tree"] = knob(
         "coverage_tree", "reading of L_ins", origin="paper: literal"
     )
     part_mode: Literal["literal", "disentangle"] = knob(
@@ -345,9 +310,6 @@ class FieldSettings(Section):
     cg_steps: int = knob(10, "conjugate-gradient steps of the quadratic part", ge=0)
     lbfgs_steps: int = knob(10, "L-BFGS steps where L_ins or L_part are on", ge=0)
     min_mask_px: int = knob(50, "smaller masks stay out of L_ins and L_part", unit="px", ge=1)
-    max_masks_per_level: int = knob(
-        96, "masks of one view and level in L_ins and L_part, largest first", ge=2
-    )
     prune_cosine: float = knob(
         1.0,
         "L_ins and L_part drop a mask whose mean is more alike to a larger one of its view and level; "
@@ -367,7 +329,6 @@ class ReferenceSettings(Section):
     loss: Literal["l1", "squared"] = knob(
         "l1", "l1: LangSplat's masked L1; squared: the language loss of the fast solver", origin="LangSplat"
     )
-    log_every: int = knob(1000, "steps between two lines of the report's curve", ge=1)
 
 
 class MethodSettings(Section):
@@ -412,7 +373,7 @@ class EvaluateSettings(Section):
     relevancy_threshold: float = knob(
         0.4, "a map's mask is what exceeds it", ge=0, lt=1, origin="LangSplat, paper"
     )
-    threshold_on: Literal["normalised_pm1", "normalised_01", "raw"] = knob(
+    threshold_on: Literal["normalised_pm1", "raw"] = knob(
         "normalised_pm1",
         "scale of the threshold; normalised_pm1: 0.4 means min-max above 0.7",
         origin="LangSplat's code",
@@ -444,9 +405,6 @@ class EvaluateSettings(Section):
         "how labelled points get what Gaussians know: the nearest opaque one, a vote of 5 within 10 cm, the "
         "densest 8, or each its own (gaussians.initial: frozen, or brought Gaussians that are the points)",
         origin="OpenGaussian: frozen",
-    )
-    consistency_texts: int = knob(
-        4, "texts per level and view whose consistency between views is measured; 0: none", ge=0
     )
 
 

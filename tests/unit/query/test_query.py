@@ -50,7 +50,9 @@ def scene(tmp_path_factory) -> LanguageScene:
     run_semantic_tree(contributions, world.masks, world.clip, folder / "st", SemanticTreeSettings())
     settings = AutoencoderSettings(code="network", latent=4, epochs=1, min_steps=400, learning_rate=2e-3)
     run_autoencoder(world.clip, folder / "st", contributions, folder / "ae", settings, 0)
-    run_field(contributions, world.coverage_tree, folder / "ae", folder / "field.safetensors", FieldSettings(), 1)
+    run_field(
+        contributions, world.coverage_tree, folder / "ae", folder / "field.safetensors", FieldSettings(), 1
+    )
     rng = np.random.default_rng(9)
     vectors = {name: world.region_vectors[row] for row, (name, *_) in enumerate(REGIONS)}
 
