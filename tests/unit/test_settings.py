@@ -45,7 +45,9 @@ def test_a_variant_may_not_change_what_all_variants_share() -> None:
 
 
 def test_errors_inside_variants_name_the_variant() -> None:
-    with pytest.raises(SettingsError, match=r"variants\.x\.coverage_tree\.theta: Input should be less than 1"):
+    with pytest.raises(
+        SettingsError, match=r"variants\.x\.coverage_tree\.theta: Input should be less than 1"
+    ):
         parse_run({"variants": {"x": {"coverage_tree": {"theta": 3}}}})
 
 

@@ -358,4 +358,4 @@ DATASET = Dataset(
 
 SCANNET200_DATASET = replace(DATASET, name="scannet200", title="ScanNet200")
 """The same scans and files with other labels. The paper does not say which scans it scored with 200 classes:
-the ten, or the benchmark's validation scans (`classes.scannet_splits.VALIDATION_SCANS`)."""
+the ten, or the benchmark's 312 validation scans (ScanNet's `Tasks/Benchmark/scannetv2_val.txt`)."""

@@ -9,8 +9,8 @@ from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
 from hilsplat.datasets.images.lerf_mask import check_scene, open_scene
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, write_hierarchy
-from hilsplat.datasets.synthetic.true_world import TrueWorld, write_sparse
-from hilsplat.datasets.synthetic.write_labelled import write_lerf_mask
+from tests.unit.datasets.writers.labelled import write_lerf_mask
+from tests.unit.datasets.writers.true_world import TrueWorld, write_sparse
 
 
 @pytest.fixture

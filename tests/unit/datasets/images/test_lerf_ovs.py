@@ -9,10 +9,11 @@ from hilsplat.base.errors import SceneError
 from hilsplat.base.images import write_png
 from hilsplat.datasets.images.isat import read_isat
 from hilsplat.datasets.images.lerf_ovs import DATASET, check_scene, open_scene
-from hilsplat.datasets.images.polygons import fill_polygon, polygons_of
+from hilsplat.datasets.images.polygons import fill_polygon
 from hilsplat.datasets.labelled import posed_images
 from hilsplat.datasets.published import PAIRS, PROMPTS
-from hilsplat.datasets.synthetic.write_labelled import write_lerf_ovs
+from tests.unit.datasets.writers.labelled import write_lerf_ovs
+from tests.unit.datasets.writers.polygons import polygons_of
 
 SQUARE = [[2.0, 3.0], [5.0, 3.0], [5.0, 6.0], [2.0, 6.0]]
 

@@ -8,11 +8,11 @@ from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
 from hilsplat.datasets.images.ovs3d import check_scene, open_scene, read_classes
 from hilsplat.datasets.labelled import posed_images
-from hilsplat.datasets.synthetic.write_labelled import write_3d_ovs
-from hilsplat.scene.llff import read_poses_bounds, write_poses_bounds
+from hilsplat.scene.llff import read_poses_bounds
 from hilsplat.scene.poses import run_poses
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import PosesSettings
+from tests.unit.datasets.writers.labelled import write_3d_ovs, write_poses_bounds
 
 
 @pytest.fixture

@@ -22,8 +22,8 @@ from hilsplat.datasets.waymo.geometry import (
 )
 from hilsplat.datasets.waymo.reader import RECORD, check_segment, open_segment
 from hilsplat.datasets.waymo.records import fields_of, masked_crc32c, matrix, packed_varints
-from hilsplat.datasets.waymo.write import write_segment
 from tests.conftest import PROJECT
+from tests.unit.datasets.writers.waymo import write_segment
 
 SEGMENT = "1_2_000_3_000"
 SQRT2 = np.sqrt(2.0)
