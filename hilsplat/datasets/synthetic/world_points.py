@@ -1,15 +1,11 @@
 """What ScanNet, Replica and Waymo call the things of a synthetic room or street."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Int32
 
 from hilsplat.datasets.classes import replica, scannet, scannet200, waymo
-from hilsplat.datasets.points.point_files import ply_column, ply_faces, ply_places, read_ply
-from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 
 OTHERPROP = 40
 """NYU40's class of small things that have none of their own."""
@@ -51,39 +47,6 @@ undefined: Waymo has no class for them."""
 
 COUNTABLE = frozenset({"car", "truck", "bus", "bicyclist", "pedestrian"})
 """Classes whose instances are told apart."""
-
-
-@dataclass(frozen=True, eq=False)
-class LabelledMesh:
-    """The labelled surface of a synthetic scene.
-
-    Attributes:
-        xyz: vertices, metres.
-        whole: row of `texts` of each vertex, -1 none.
-        faces: corners of triangles.
-        whole_of_face: likewise, of faces.
-        texts: class of each node.
-    """
-
-    xyz: Float32[np.ndarray, "P 3"]
-    whole: Int32[np.ndarray, " P"]
-    faces: Int32[np.ndarray, "F 3"]
-    whole_of_face: Int32[np.ndarray, " F"]
-    texts: tuple[str, ...]
-
-    @staticmethod
-    def open(world: Path) -> "LabelledMesh":
-        """Read `truth/mesh.ply` and the texts of `truth/annotations.json`."""
-        path = Path(world) / "truth" / "mesh.ply"
-        mesh = read_ply(path, 3)
-        nodes = HierarchyAnnotations.load(path.parent).nodes
-        return LabelledMesh(
-            ply_places(path, mesh),
-            ply_column(path, mesh, "vertex", "whole").astype(np.int32),
-            ply_faces(path, mesh),
-            ply_column(path, mesh, "face", "whole").astype(np.int32),
-            tuple(node.text for node in nodes),
-        )
 
 
 def scannet_ids(text: str) -> tuple[int, int]:

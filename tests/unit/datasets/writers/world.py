@@ -1,18 +1,20 @@
 """Write a finished synthetic room as ScanNet or Replica, a street as Waymo: known truth for the readers."""
 
 import io
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32, Int32
 from PIL import Image
 
 from hilsplat.base.artifacts import read_npz
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.images import read_image
+from hilsplat.datasets.points.point_files import ply_column, ply_faces, ply_places, read_ply
 from hilsplat.datasets.points.posed_images import PosedImage
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
-from hilsplat.datasets.synthetic.world_points import LabelledMesh, replica_id, scannet_ids, waymo_labels
+from hilsplat.datasets.synthetic.world_points import replica_id, scannet_ids, waymo_labels
 from hilsplat.datasets.waymo.frames import CameraShot, LidarFrame, LidarReturn
 from hilsplat.datasets.waymo.geometry import CV_FROM_WAYMO, WaymoCamera, column_azimuths, rotation_of
 from hilsplat.scene.cameras import Cameras
@@ -26,6 +28,39 @@ LIDAR_AT = (1.4, 0.0, 2.2)
 LIDAR_TURN_DEG = 148.0
 """The lidar is mounted turned, as Waymo's is: columns are counted from the vehicle's back all the same."""
 FRAME_MICROS = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledMesh:
+    """The labelled surface of a synthetic scene.
+
+    Attributes:
+        xyz: vertices, metres.
+        whole: row of `texts` of each vertex, -1 none.
+        faces: corners of triangles.
+        whole_of_face: likewise, of faces.
+        texts: class of each node.
+    """
+
+    xyz: Float32[np.ndarray, "P 3"]
+    whole: Int32[np.ndarray, " P"]
+    faces: Int32[np.ndarray, "F 3"]
+    whole_of_face: Int32[np.ndarray, " F"]
+    texts: tuple[str, ...]
+
+    @staticmethod
+    def open(world: Path) -> "LabelledMesh":
+        """Read `truth/mesh.ply` and the texts of `truth/annotations.json`."""
+        path = Path(world) / "truth" / "mesh.ply"
+        mesh = read_ply(path, 3)
+        nodes = HierarchyAnnotations.load(path.parent).nodes
+        return LabelledMesh(
+            ply_places(path, mesh),
+            ply_column(path, mesh, "vertex", "whole").astype(np.int32),
+            ply_faces(path, mesh),
+            ply_column(path, mesh, "face", "whole").astype(np.int32),
+            tuple(node.text for node in nodes),
+        )
 
 
 def posed_images(world: Path) -> list[PosedImage]:
