@@ -37,8 +37,8 @@ class Dataset:
         citation: authors, title, venue, year.
         layout: the expected tree, from `folder` down, for people.
         required: places below `folder` that a scene cannot do without, relative.
-        open: reads a scene: (the data set's folder, scene) to a `LabelledScene` or its like for points.
-        check: reads everything of a scene and reports.
+        open: reads a scene: (the data set's folder, scene) to a `LabelledScene` or `PointScene`.
+        open_part: the same with a part of the images, which is enough for a check; None: `open`.
         protocols: names of the protocols that it is scored under (`evaluate.protocols.cards`), beside
             those of every labelled image.
         label_places: glob patterns below `folder` of the files of a scene that only evaluation reads.
@@ -55,9 +55,13 @@ class Dataset:
     layout: str
     required: Callable[[str], tuple[str, ...]]
     open: Callable[[Path, str], Any]
-    check: Callable[[Path, str], SceneReport]
+    open_part: Callable[[Path, str], Any] | None = None
     protocols: tuple[str, ...] = ()
     label_places: Callable[[str], tuple[str, ...]] = lambda scene: ()
+
+    def check(self, root: Path, scene: str) -> SceneReport:
+        """Read everything of a scene and say what was found."""
+        return (self.open_part or self.open)(root, scene).report()
 
     def missing(self, root: Path, scene: str) -> tuple[str, ...]:
         """Required places of a scene that are not below the data set's folder `root`."""

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import list_images
 from hilsplat.datasets.classes.replica import SCENES
-from hilsplat.datasets.dataset import Dataset, SceneReport
+from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.datasets.points.numbered import by_number, size_of_image
 from hilsplat.datasets.points.point_files import UNPACK_AGAIN, listing, read_json_object, read_numbers
@@ -194,12 +194,6 @@ def open_scene(root: Path, scene: str, every: int = 1) -> PointScene:
     return PointScene(scene, images, {"replica": truth}, warnings)
 
 
-def check_scene(root: Path, scene: str) -> SceneReport:
-    """Read everything of a scene and say what was found."""
-    found = open_scene(root, scene)
-    return SceneReport(found.facts(), found.warnings)
-
-
 DATASET = Dataset(
     name="replica",
     title="Replica",
@@ -219,7 +213,6 @@ DATASET = Dataset(
     results/frame000000.jpg depth000000.png ...""",
     required=lambda scene: (f"{scene}/habitat/mesh_semantic.ply", f"{scene}/habitat/info_semantic.json"),
     open=open_scene,
-    check=check_scene,
     protocols=("replica/per-scene", "replica/opennerf", "replica/conceptgraphs"),
     label_places=lambda scene: (f"{scene}/habitat/*",),
 )

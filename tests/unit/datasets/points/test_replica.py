@@ -10,7 +10,7 @@ from PIL import Image
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.classes.replica import REPLICA_48, REPLICA_51
 from hilsplat.datasets.points.posed_images import PosedImage
-from hilsplat.datasets.points.replica import check_scene, open_scene, read_images
+from hilsplat.datasets.points.replica import open_scene, read_images
 from hilsplat.datasets.points.replica_mesh import (
     class_of_objects,
     object_of_vertices,
@@ -149,7 +149,7 @@ def test_a_scene_is_read_from_either_sequence(tmp_path):
     write_sequence(tmp_path / "room0", make_images(tmp_path / "own", 2))
     scene = open_scene(tmp_path, "room_0")
     assert [image.name for image in scene.images] == ["frame000000.jpg", "frame000001.jpg"]
-    assert check_scene(tmp_path, "room_0").facts["replica classes"] == 2
+    assert open_scene(tmp_path, "room_0").report().facts["replica classes"] == 2
     assert DATASETS["replica"].found(tmp_path) == ("room_0",)
 
 

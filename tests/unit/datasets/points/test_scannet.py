@@ -12,7 +12,7 @@ from hilsplat.datasets.classes.replica import REPLICA_48
 from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_19
 from hilsplat.datasets.classes.scannet200 import SCANNET200, SCANNET200_INSTANCES
 from hilsplat.datasets.points.posed_images import PosedImage, write_posed_images
-from hilsplat.datasets.points.scannet import LABEL_TABLE, check_scan, open_scan, read_label_table
+from hilsplat.datasets.points.scannet import LABEL_TABLE, open_scan, read_label_table
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.sources import export_images
 from hilsplat.scene.known_poses import find_known_poses
@@ -288,7 +288,7 @@ def test_the_mesh_becomes_the_sparse_points_in_its_order(root, tmp_path):
 
 
 def test_registry_checks_a_scan(root):
-    report = check_scan(root, SCAN)
+    report = open_scan(root, SCAN).report()
     assert report.facts["posed images"] == 12
     assert report.facts["nyu40 points with a class"] == 4
     assert report.facts["scannet200 classes"] == 3

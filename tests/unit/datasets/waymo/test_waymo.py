@@ -19,7 +19,7 @@ from hilsplat.datasets.waymo.geometry import (
     range_image_points,
     rotation_of,
 )
-from hilsplat.datasets.waymo.reader import RECORD, check_segment, open_segment
+from hilsplat.datasets.waymo.reader import RECORD, open_segment
 from hilsplat.datasets.waymo.records import MESSAGES, matrix, message_classes
 from tests.conftest import PROJECT
 from tests.unit.datasets.writers.waymo import write_segment
@@ -193,7 +193,7 @@ def test_registry_finds_and_checks_the_segments_that_are_there(root):
     dataset = DATASETS["waymo"]
     assert dataset.locate(root.parent) == root and dataset.found(root) == (SEGMENT,)
     assert dataset.missing(root, SEGMENT) == ()
-    report = check_segment(root, SEGMENT)
+    report = DATASETS["waymo"].check(root, SEGMENT)
     assert report.facts["waymo points that a camera sees"] == 6
     (root / "validation" / "vehicle_pose" / f"{SEGMENT}.parquet").unlink()
     assert dataset.missing(root, SEGMENT) == (f"validation/vehicle_pose/{SEGMENT}.parquet",)
