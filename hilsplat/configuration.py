@@ -51,10 +51,7 @@ class StageSettings(Section):
     training: TrainingSettings = TrainingSettings()
 
 
-SECTIONS: dict[str, type[Section]] = {
-    name: field.annotation  # type: ignore[misc]
-    for name, field in StageSettings.model_fields.items()
-}
+SECTIONS: dict[str, type[Section]] = {name: type(section) for name, section in StageSettings()}
 
 
 def parse_section(name: str, text: str) -> Any:

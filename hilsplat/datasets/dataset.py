@@ -75,7 +75,7 @@ class Dataset:
         """The data set's folder below `data_root`.
 
         Raises:
-            SceneError: it is not there, or lies one level higher or deeper.
+            SceneError: it is not there, or it is one level higher or deeper.
         """
         data_root = Path(data_root).expanduser()
         root = data_root / self.folder
@@ -84,7 +84,7 @@ class Dataset:
         for deeper in _folders(root):
             if self._has_begun(deeper):
                 raise SceneError(
-                    f"{self.title} lies one level too deep in {root}",
+                    f"{self.title} is one level too deep in {root}",
                     expected=f"its scenes in {root}",
                     found=f"them in {deeper}",
                     fix=f"move the content of {deeper} one level up",
@@ -132,7 +132,7 @@ class Dataset:
             _at(root, place).exists()
             for scene in self.scenes
             for place in self.required(scene)
-            if not place.startswith("..")  # what lies beside the folder says nothing about it
+            if not place.startswith("..")  # what is beside the folder says nothing about it
         )
 
 

@@ -221,7 +221,7 @@ def check_label_size(
         None where they are equal, else the sentence that says that the label is resized.
 
     Raises:
-        SceneError: one is no scaled copy of the other.
+        SceneError: one is not a scaled copy of the other.
     """
     if label_hw == image_hw:
         return None
@@ -275,7 +275,7 @@ def posed_images(folder: Path, dataset: str) -> dict[str, KnownView]:
             f"the cameras of {known.files[0]} are distorted",
             expected="PINHOLE or SIMPLE_PINHOLE, the model of the undistorted images",
             found=", ".join(bent),
-            fix="take the model that lies beside the undistorted images, or undistort images and labels",
+            fix="take the model of the undistorted images, or undistort images and labels",
         )
     return {Path(view.name).stem: view for view in sorted(views, key=lambda view: Path(view.name).stem)}
 

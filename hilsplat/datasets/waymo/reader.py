@@ -1,7 +1,7 @@
 """Waymo perception: labelled points of the top lidar and the images of the five cameras of a segment.
 
 Release 2.0.1 (parquet) or 1.4.3 (TFRecord), which hold the same. Coordinates are those of the vehicle at
-the segment's first frame: the files' world lies kilometres from its origin, too far for float32.
+the segment's first frame: the files' places are kilometres from their origin, too far for float32.
 """
 
 import logging
