@@ -35,15 +35,6 @@ class Evidence:
     seen: Float64[np.ndarray, "M V"]
     view: Int32[np.ndarray, " M"]
 
-    def pair(self, a: int, b: int) -> tuple[float, float]:
-        """Intersection and union of two masks."""
-        row = slice(self.intersection.indptr[a], self.intersection.indptr[a + 1])
-        found = np.flatnonzero(self.intersection.indices[row] == b)
-        if len(found):
-            at = row.start + int(found[0])
-            return float(self.intersection.data[at]), float(self.union.data[at])
-        return 0.0, float(self.seen[a, self.view[b]] + self.seen[b, self.view[a]])
-
 
 def mask_evidence(
     shares: sp.csr_matrix,
