@@ -178,7 +178,7 @@ def test_linkage_of_a_synthetic_scene(benchmark):
     def link_three_levels() -> int:
         found = 0
         for _ in LEVELS:
-            evidence = mask_evidence(shares, np.ones(60_000), visible, view, 0.2, "tanimoto")
+            evidence = mask_evidence(shares, np.ones(60_000), visible, view, 0.2)
             found += pooled_linkage(evidence, 0.3)[0].max() + 1
         return found
 

@@ -17,7 +17,7 @@ from hilsplat.segment.coverage import coverage_tree
 from hilsplat.segment.generate import masks_from_candidates
 from hilsplat.segment.graph import segment_graph
 from hilsplat.segment.suppression import suppress_masks
-from hilsplat.settings import CoverageTreeSettings, MasksSettings
+from hilsplat.settings import MasksSettings
 
 SETTINGS = MasksSettings(predicted_iou_min=0.7, stability_min=0.5, min_area_px=100)
 """Nothing falls to the filters, so that 1024 candidates a level reach the suppression."""
@@ -43,7 +43,7 @@ def image() -> np.ndarray:
 def finish(candidates, model, folder) -> int:
     """From candidates to files of masks and tree."""
     masks = masks_from_candidates(candidates, VIEW_HW, model, SETTINGS)
-    parent, depth = coverage_tree(masks, CoverageTreeSettings())
+    parent, depth = coverage_tree(masks, 0.9)
     masks.save(folder / "masks.npz")
     write_npz(folder / "tree.npz", parent=parent, depth=depth)
     return len(masks)

@@ -51,10 +51,7 @@ class StageSettings(Section):
     training: TrainingSettings = TrainingSettings()
 
 
-SECTIONS: dict[str, type[Section]] = {
-    name: field.annotation  # type: ignore[misc]
-    for name, field in StageSettings.model_fields.items()
-}
+SECTIONS: dict[str, type[Section]] = {name: type(section) for name, section in StageSettings()}
 
 
 def parse_section(name: str, text: str) -> Any:
@@ -242,7 +239,7 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
 
 
 def config_schema() -> dict[str, Any]:
-    """JSON schema of the configuration, for editors and for `snakemake`'s users."""
+    """JSON schema of the configuration, for editors that check YAML (`hilsplat settings --schema`)."""
     schema = RunSettings.model_json_schema()
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 

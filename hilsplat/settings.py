@@ -2,7 +2,7 @@
 
 The configuration files hold choices; this module holds what may be chosen. A section is what one
 stage (or family of stages) depends on, so a changed knob reruns exactly the stages whose sections
-hold it. `workflow/schemas/` is generated from here.
+hold it. `hilsplat settings --schema` makes the JSON schema for editors from here.
 """
 
 from typing import Annotated, Any, Literal
@@ -42,9 +42,6 @@ class WorldSettings(Section):
     min_area_px: int = knob(
         60, "wholes and parts with a smaller visible region are not scored", unit="px", ge=1
     )
-    min_subpart_area_px: int = knob(
-        100, "the same for subparts in views of 384 px; scales with the area of the view", unit="px", ge=1
-    )
 
 
 class PosesSettings(Section):
@@ -57,21 +54,26 @@ class PosesSettings(Section):
         "auto", "lens model; auto takes simple_radial for photographs and simple_pinhole for renders"
     )
     single_camera: Literal["auto", "yes", "no"] = knob(
-        "auto", "all photographs share one camera; auto: those of equal size and EXIF focal length do"
+        "auto",
+        "whether photographs share one camera; auto: those of equal size and EXIF focal length do",
+        origin="COLMAP",
     )
     matcher: Literal["auto", "exhaustive", "sequential"] = knob(
-        "auto", "pairs to match; auto: exhaustive up to 200 views, else sequential"
+        "auto", "pairs to match; auto: exhaustive up to 200 views, else sequential", origin="COLMAP"
     )
     mapper: Literal["incremental", "global"] = knob(
         "incremental", "structure-from-motion algorithm", origin="COLMAP"
     )
     max_features: int = knob(4096, "SIFT features per image", ge=100, le=32768, origin="COLMAP: 8192")
-    first_octave: Literal[-1, 0] = knob(-1, "-1 doubles the image first: more features, four times the time")
     min_registered_share: float = knob(
-        0.7, "the stage fails where the largest model holds fewer of the views", unit="share", gt=0, le=1
+        0.7,
+        "the stage fails if the largest model holds a smaller share of the views",
+        unit="share",
+        gt=0,
+        le=1,
     )
     several_models: Literal["largest", "stop"] = knob(
-        "largest", "what to do where the photographs fall into several models"
+        "largest", "what to do if the photographs fall into several models"
     )
     test_every: int = knob(
         8, "every n-th view is held out for testing; 0: none", unit="views", ge=0, origin="3DGS"
@@ -82,7 +84,7 @@ class GaussiansSettings(Section):
     """Base 3D Gaussian Splatting fit."""
 
     iterations: int = knob(3000, "optimisation steps, one view each", ge=1, origin="3DGS: 30000")
-    max_gaussians: int = knob(50_000, "the fit never holds more", ge=100)
+    max_gaussians: int = knob(50_000, "most Gaussians at any step", ge=100)
     image_scale: float = knob(1.0, "images are shrunk by this factor for the fit", gt=0, le=1)
     sh_degree: int = knob(2, "degree of the colour's spherical harmonics", ge=0, le=3, origin="3DGS: 3")
     ssim_weight: float = knob(0.2, "weight of D-SSIM against L1", ge=0, le=1, origin="3DGS")
@@ -107,7 +109,7 @@ class GaussiansSettings(Section):
         4e-4, "screen-space gradient above which a Gaussian is cloned or split", gt=0, origin="3DGS: 2e-4"
     )
     opacity_reset_every: int = knob(3000, "steps between opacity resets", ge=1, origin="3DGS")
-    min_opacity: float = knob(0.005, "Gaussians below are pruned", gt=0, lt=1, origin="3DGS")
+    min_opacity: float = knob(0.005, "Gaussians of lower opacity are pruned", gt=0, lt=1, origin="3DGS")
     background: Literal["black", "white", "random"] = knob(
         "black", "colour behind the Gaussians", origin="3DGS"
     )
@@ -132,7 +134,7 @@ class GaussiansSettings(Section):
     )
     checkpoint_every: int = knob(1000, "steps between checkpoints", ge=1)
     device: Literal["auto", "cpu", "cuda"] = knob(
-        "auto", "what rasterises; auto: cuda where torch finds a device and gsplat is installed, else cpu"
+        "auto", "what rasterises; auto: cuda if torch finds a device and gsplat is installed, else cpu"
     )
 
 
@@ -149,21 +151,10 @@ class MasksSettings(Section):
     points_per_batch: int = knob(64, "prompts per decoder call", ge=1, le=4096, origin="LangSplat: 64")
     crop_layers: int = knob(0, "layers of overlapping crops", ge=0, le=2, origin="LangSplat: 1")
     predicted_iou_min: float = knob(
-        0.35, "masks below are dropped", ge=0, le=1, origin="SAM: 0.88, LangSplat: 0.7"
+        0.35, "masks with a lower predicted IoU are dropped", ge=0, le=1, origin="SAM: 0.88, LangSplat: 0.7"
     )
     stability_min: float = knob(
-        0.5, "masks below are dropped", ge=0, le=1, origin="SAM: 0.95, LangSplat: 0.85"
-    )
-    level_source: Literal["sam", "coverage"] = knob(
-        "sam",
-        "level of a mask: sam: the head (or scale) that gave it; coverage: its depth in the coverage tree",
-        origin="paper, LangSplat: sam",
-    )
-    level_theta: float = knob(
-        0.9,
-        "share of a mask inside another one that makes it deeper; level_source: coverage only",
-        gt=0.5,
-        lt=1,
+        0.5, "less stable masks are dropped", ge=0, le=1, origin="SAM: 0.95, LangSplat: 0.85"
     )
     stability_offset: float = knob(1.0, "logit offset of the stability test", gt=0, origin="SAM")
     box_nms_iou: float = knob(0.7, "box IoU above which the worse mask is dropped", gt=0, le=1, origin="SAM")
@@ -174,7 +165,7 @@ class MasksSettings(Section):
         0.8, "mask IoU above which the worse mask is dropped", gt=0, le=1, origin="LangSplat"
     )
     nms_score: float = knob(
-        0.0, "masks whose predicted IoU x stability is below are dropped", ge=0, le=1, origin="LangSplat: 0.7"
+        0.0, "masks with a lower predicted IoU x stability are dropped", ge=0, le=1, origin="LangSplat: 0.7"
     )
     nms_inner: float = knob(0.5, "inner-mask suppression threshold", ge=0, le=1, origin="LangSplat")
     graph_scales: tuple[float, float, float] = knob(
@@ -210,7 +201,7 @@ class PerturbSettings(Section):
     missing_level: tuple[Probability, Probability, Probability] = knob(
         (0.0, 0.0, 0.0), "probability that a view lacks the level altogether: whole, part, subpart"
     )
-    wrong_level: float = knob(0.02, "probability that a mask stands one level beside its own", ge=0, le=1)
+    wrong_level: float = knob(0.02, "probability that a mask is one level off", ge=0, le=1)
     dropped_views: float = knob(0.0, "probability that a view has no masks at all", ge=0, le=1)
     systematic_merge: float = knob(
         0.02, "probability per node, drawn once per scene, of the same wrong merge in most views", ge=0, le=1
@@ -228,64 +219,44 @@ class CoverageTreeSettings(Section):
     """Coverage tree of each view."""
 
     theta: float = knob(0.9, "coverage threshold", unit="share", gt=0.5, lt=1, origin="paper: 0.9")
-    parents: Literal["coarser", "any"] = knob("coarser", "levels a parent may come from")
 
 
 class ClipSettings(Section):
     """One CLIP vector per mask."""
 
     model: str = knob("models/clip-tiny", "folder of a CLIP in the Hugging Face ONNX export layout")
-    background: Literal["black", "mean", "keep", "dim"] = knob(
+    background: Literal["black", "keep"] = knob(
         "black", "pixels of the crop outside the mask", origin="LangSplat: black"
     )
-    context: float = knob(0.0, "margin around the box, as a share of its side", ge=0, le=1)
     batch: int = knob(64, "crops per network call", ge=1, le=4096)
 
 
 class ContributionsSettings(Section):
     """The frozen-geometry matrices."""
 
-    min_weight: float = knob(1 / 255, "weights of a Gaussian at a pixel below are dropped", ge=0, lt=1)
+    min_weight: float = knob(1 / 255, "lower weights of a Gaussian at a pixel are dropped", ge=0, lt=1)
     keep: Literal["auto", "gram", "weights"] = knob(
         "auto",
         "gram: pairs of Gaussians; weights: pixel weights of all views; auto: the one with fewer non-zeros",
     )
     device: Literal["auto", "cpu", "cuda"] = knob(
-        "auto", "what rasterises; auto: cuda where torch finds a device and gsplat is installed, else cpu"
+        "auto", "what rasterises; auto: cuda if torch finds a device and gsplat is installed, else cpu"
     )
 
 
 class SemanticTreeSettings(Section):
     """3D semantic tree: masks linked across views by the Gaussians they share."""
 
-    overlap: Literal["tanimoto", "soft"] = knob(
-        "tanimoto", "overlap of two masks on their Gaussians; soft suits Gaussians that keep to one region"
-    )
     link_threshold: float = knob(
         0.3, "pooled average IoU above which clusters of masks are joined", gt=0, lt=1
     )
     min_views: int = knob(3, "a node is seen in at least this many views", ge=1)
-    min_member_share: float = knob(
-        0.15, "a Gaussian joins its best node where more than this share of its weight lies in it", ge=0, lt=1
-    )
-    min_visible_px: float = knob(
-        0.3, "a Gaussian counts as visible in a view from this mass", unit="px", ge=0
-    )
-    min_covisible: float = knob(
-        0.2,
-        "pairs of masks that see less than this share of each other are no evidence",
-        unit="share",
-        ge=0,
-        lt=1,
-    )
-    min_fit: float = knob(
-        0.25, "a mask stands for the node it fits best above this IoU in its view", ge=0, lt=1
-    )
     parent_coverage: float = knob(
         0.5, "share of a node inside a coarser one that makes it a child", gt=0, lt=1
     )
-    nested: bool = knob(True, "make every child a subset of its parent")
-    device: Literal["cpu", "cuda"] = knob("cpu", "what forms the evidence; cuda: torch, equal to rounding")
+    device: Literal["cpu", "cuda"] = knob(
+        "cpu", "what computes the evidence; cuda: torch, equal up to rounding"
+    )
 
 
 class AutoencoderSettings(Section):
@@ -297,11 +268,11 @@ class AutoencoderSettings(Section):
     latent: int = knob(16, "latent numbers d", ge=1, le=64, origin="paper, LangSplat: 3")
     targets: Literal["node", "mask"] = knob(
         "node",
-        "node: the view-averaged vector of the mask's node, where it fits one; mask: its own",
+        "node: the view-averaged vector of the mask's node, if it fits one; mask: its own",
         origin="paper: mask",
     )
     epochs: int = knob(100, "passes over all vectors", ge=1, origin="LangSplat: 100")
-    min_steps: int = knob(2000, "steps at least, however few vectors there are", ge=1)
+    min_steps: int = knob(2000, "least number of steps, however few vectors there are", ge=1)
     batch: int = knob(64, "vectors per step", ge=2, origin="LangSplat: 64")
     learning_rate: float = knob(2e-3, "first Adam step, cosine-decayed", gt=0, origin="LangSplat: 7e-4")
     cosine_weight: float = knob(
@@ -323,7 +294,7 @@ class FieldSettings(Section):
     weight_clustering: float = knob(0.0, "weight of L_h (Eq. 2)", ge=0, origin="paper: 1")
     weight_instance: float = knob(0.0, "weight of L_ins (Eq. 3), lambda_1", ge=0, origin="paper: e-6")
     weight_part: float = knob(0.01, "weight of L_part (Eq. 5), lambda_2", ge=0, origin="paper: e-5")
-    instance_mode: Literal["literal", "coverage_tree", "logratio"] = knob(
+    instance_mode: Literal["literal", "coverage_tree"] = knob(
         "coverage_tree", "reading of L_ins", origin="paper: literal"
     )
     part_mode: Literal["literal", "disentangle"] = knob(
@@ -337,26 +308,25 @@ class FieldSettings(Section):
     ridge: float = knob(0.1, "pull towards the lift, in units of the visible mass", ge=0)
     min_labelled_share: float = knob(
         0.3,
-        "a Gaussian of which masks of a level hold less than this share keeps no latent there; 0: all do",
+        "Gaussians with a smaller share of their weight in masks of a level get no latent there; 0: all do",
         ge=0,
         lt=1,
         origin="paper, LangSplat: 0",
     )
     cg_steps: int = knob(10, "conjugate-gradient steps of the quadratic part", ge=0)
-    lbfgs_steps: int = knob(10, "L-BFGS steps where L_ins or L_part are on", ge=0)
+    lbfgs_steps: int = knob(10, "L-BFGS steps if L_ins or L_part is on", ge=0)
     min_mask_px: int = knob(50, "smaller masks stay out of L_ins and L_part", unit="px", ge=1)
-    max_masks_per_level: int = knob(
-        96, "masks of one view and level in L_ins and L_part, largest first", ge=2
-    )
     prune_cosine: float = knob(
         1.0,
-        "L_ins and L_part drop a mask whose mean is more alike to a larger one of its view and level; "
-        "1: keep all",
+        "L_ins and L_part drop a mask whose mean has a higher cosine than this with that of a larger one of "
+        "its view and level; 1: keep all",
         ge=0,
         le=1,
         origin="paper: pruning, no number",
     )
-    device: Literal["cpu", "cuda"] = knob("cpu", "what multiplies; cuda: torch, equal to rounding")
+    device: Literal["cpu", "cuda"] = knob(
+        "cpu", "what multiplies matrices; cuda: torch, equal up to rounding"
+    )
 
 
 class ReferenceSettings(Section):
@@ -367,7 +337,6 @@ class ReferenceSettings(Section):
     loss: Literal["l1", "squared"] = knob(
         "l1", "l1: LangSplat's masked L1; squared: the language loss of the fast solver", origin="LangSplat"
     )
-    log_every: int = knob(1000, "steps between two lines of the report's curve", ge=1)
 
 
 class MethodSettings(Section):
@@ -410,9 +379,9 @@ class EvaluateSettings(Section):
     )
     mix: bool = knob(True, "average the filtered relevancy with the relevancy itself", origin="LangSplat")
     relevancy_threshold: float = knob(
-        0.4, "a map's mask is what exceeds it", ge=0, lt=1, origin="LangSplat, paper"
+        0.4, "a map's mask is the pixels above it", ge=0, lt=1, origin="LangSplat, paper"
     )
-    threshold_on: Literal["normalised_pm1", "normalised_01", "raw"] = knob(
+    threshold_on: Literal["normalised_pm1", "raw"] = knob(
         "normalised_pm1",
         "scale of the threshold; normalised_pm1: 0.4 means min-max above 0.7",
         origin="LangSplat's code",
@@ -420,33 +389,30 @@ class EvaluateSettings(Section):
     majority: bool = knob(True, "smooth a map's mask by the majority of 7 x 7 px", origin="LangSplat's code")
     level_rule: Literal["max", "mean_in_mask"] = knob(
         "max",
-        "level of a map where none is given: highest value, or highest mean in its mask",
+        "level of a map if none is given: highest value, or highest mean in its mask",
         origin="LangSplat: max",
     )
     node_select: float = knob(
         0.95,
-        "nodes are selected that lie at most 1 less this of the range of their level's cosine margins below "
-        "the best one, and three times as far if they look like it",
+        "how close to the best node others must come to be selected too: their cosine margin may be lower by "
+        "1 minus this share of the range of margins at their level, three times that if they look like it",
         ge=0,
         le=1,
     )
     ancestors: float = knob(
         0.2,
-        "share of the mean margin of a node's ancestors that is added to its own where nodes compete",
+        "share of the mean margin of a node's ancestors that is added to its own margin when nodes compete",
         ge=0,
     )
     min_region_px: int = knob(60, "smaller true regions are not scored", unit="px", ge=1)
     methods: tuple[Literal["tree", "tree-path", "field"], ...] = knob(
-        ("tree", "tree-path", "field"), "what answers; each becomes a row"
+        ("tree", "tree-path", "field"), "what answers the queries; each becomes a row of the tables"
     )
     points: Literal["nearest", "vote", "density", "frozen"] = knob(
         "nearest",
         "how labelled points get what Gaussians know: the nearest opaque one, a vote of 5 within 10 cm, the "
         "densest 8, or each its own (gaussians.initial: frozen, or brought Gaussians that are the points)",
         origin="OpenGaussian: frozen",
-    )
-    consistency_texts: int = knob(
-        4, "texts per level and view whose consistency between views is measured; 0: none", ge=0
     )
 
 
@@ -463,8 +429,10 @@ class TrainingSettings(Section):
     scenes: int = knob(700, "training scenes, of all kinds", ge=1)
     views: int = knob(3, "views of each", ge=1)
     validation_scenes: int = knob(40, "further scenes, on which nothing is trained", ge=1)
-    sam_minutes: float = knob(60.0, "training of the segmenter; 0: no limit", unit="min", ge=0)
-    sam_steps: int = knob(0, "the same in steps, which repeat themselves; 0: no limit", ge=0)
+    sam_minutes: float = knob(60.0, "minutes of training of the segmenter; 0: no limit", unit="min", ge=0)
+    sam_steps: int = knob(
+        0, "the same in steps, so that a second run gives the same bytes; 0: no limit", ge=0
+    )
     clip_minutes: float = knob(20.0, "training of CLIP; 0: no limit", unit="min", ge=0)
     clip_steps: int = knob(0, "the same in steps; 0: no limit", ge=0)
     segmented_views: int = knob(

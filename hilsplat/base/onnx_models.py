@@ -210,15 +210,6 @@ def open_model_folder(folder: Path, kind: str | None = None, *, fix: str = "") -
     )
 
 
-def model_digest(folder: Path) -> str:
-    """SHA-256 over the files of a model folder that take part in its results.
-
-    Raises:
-        ModelError: the folder is incomplete.
-    """
-    return open_model_folder(folder).digest
-
-
 def execution_providers() -> list[str]:
     """onnxruntime's execution providers in the order we ask for them: CUDA if there is one, CPU."""
     available = onnxruntime.get_available_providers()

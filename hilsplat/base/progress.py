@@ -3,7 +3,7 @@
 import logging
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sized
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -26,7 +26,7 @@ def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterato
         total: number of items, if `len(items)` is not available.
     """
     if total is None:
-        total = len(items) if hasattr(items, "__len__") else None  # type: ignore[arg-type]
+        total = len(items) if isinstance(items, Sized) else None
     if sys.stderr.isatty():
         columns = (
             TextColumn("{task.description}"),

@@ -80,7 +80,9 @@ def export(
 
 @app.command()
 def settings(
-    schema: Annotated[bool, typer.Option(help="print the JSON schema of the configuration instead")] = False,
+    schema: Annotated[
+        bool, typer.Option(help="print the JSON schema of the configuration, for editors")
+    ] = False,
 ) -> None:
     """Print every knob: default, unit, range, origin."""
     import json

@@ -37,8 +37,8 @@ class Dataset:
         citation: authors, title, venue, year.
         layout: the expected tree, from `folder` down, for people.
         required: places below `folder` that a scene cannot do without, relative.
-        open: reads a scene: (the data set's folder, scene) to a `LabelledScene` or its like for points.
-        check: reads everything of a scene and reports.
+        open: reads a scene: (the data set's folder, scene) to a `LabelledScene` or `PointScene`.
+        open_part: the same with a part of the images, which is enough for a check; None: `open`.
         protocols: names of the protocols that it is scored under (`evaluate.protocols.cards`), beside
             those of every labelled image.
         label_places: glob patterns below `folder` of the files of a scene that only evaluation reads.
@@ -55,9 +55,13 @@ class Dataset:
     layout: str
     required: Callable[[str], tuple[str, ...]]
     open: Callable[[Path, str], Any]
-    check: Callable[[Path, str], SceneReport]
+    open_part: Callable[[Path, str], Any] | None = None
     protocols: tuple[str, ...] = ()
     label_places: Callable[[str], tuple[str, ...]] = lambda scene: ()
+
+    def check(self, root: Path, scene: str) -> SceneReport:
+        """Read everything of a scene and say what was found."""
+        return (self.open_part or self.open)(root, scene).report()
 
     def missing(self, root: Path, scene: str) -> tuple[str, ...]:
         """Required places of a scene that are not below the data set's folder `root`."""
@@ -71,7 +75,7 @@ class Dataset:
         """The data set's folder below `data_root`.
 
         Raises:
-            SceneError: it is not there, or lies one level higher or deeper.
+            SceneError: it is not there, or it is one level higher or deeper.
         """
         data_root = Path(data_root).expanduser()
         root = data_root / self.folder
@@ -80,7 +84,7 @@ class Dataset:
         for deeper in _folders(root):
             if self._has_begun(deeper):
                 raise SceneError(
-                    f"{self.title} lies one level too deep in {root}",
+                    f"{self.title} is one level too deep in {root}",
                     expected=f"its scenes in {root}",
                     found=f"them in {deeper}",
                     fix=f"move the content of {deeper} one level up",
@@ -128,7 +132,7 @@ class Dataset:
             _at(root, place).exists()
             for scene in self.scenes
             for place in self.required(scene)
-            if not place.startswith("..")  # what lies beside the folder says nothing about it
+            if not place.startswith("..")  # what is beside the folder says nothing about it
         )
 
 

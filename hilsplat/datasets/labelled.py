@@ -112,6 +112,32 @@ class LabelledScene:
             )
         return {view: by_stem[view] for view in self.views}
 
+    def report(self) -> SceneReport:
+        """Read every mask of the scene, and its poses, and say what is there."""
+        warnings = list(self.warnings)
+        empty = [
+            f"{view}: {region.text}"
+            for view, regions in self.views.items()
+            for region in regions
+            if not region.mask().any()
+        ]
+        if empty:
+            warnings.append(f"regions without a pixel: {'; '.join(empty)}")
+        facts: dict[str, object] = {
+            "images": len(self.images),
+            "labelled views": len(self.views),
+            "regions": sum(map(len, self.views.values())),
+            "pairs of view and text": self.num_pairs,
+            "texts": len(self.prompts),
+        }
+        if self.poses is None:
+            warnings.append("no poses come with this scene: they are computed from its images")
+        else:
+            posed = posed_images(self.poses, self.dataset)
+            facts["posed views"] = len(posed)
+            self.posed_views(posed)
+        return SceneReport(facts, tuple(warnings))
+
 
 def resize_nearest(mask: Bool[np.ndarray, "H W"], size_hw: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
     """Each new pixel takes the old one under its centre."""
@@ -195,7 +221,7 @@ def check_label_size(
         None where they are equal, else the sentence that says that the label is resized.
 
     Raises:
-        SceneError: one is no scaled copy of the other.
+        SceneError: one is not a scaled copy of the other.
     """
     if label_hw == image_hw:
         return None
@@ -249,36 +275,9 @@ def posed_images(folder: Path, dataset: str) -> dict[str, KnownView]:
             f"the cameras of {known.files[0]} are distorted",
             expected="PINHOLE or SIMPLE_PINHOLE, the model of the undistorted images",
             found=", ".join(bent),
-            fix="take the model that lies beside the undistorted images, or undistort images and labels",
+            fix="take the model of the undistorted images, or undistort images and labels",
         )
     return {Path(view.name).stem: view for view in sorted(views, key=lambda view: Path(view.name).stem)}
-
-
-def report_of(scene: LabelledScene) -> SceneReport:
-    """Read every mask of a scene, and its poses, and say what is there."""
-    warnings = list(scene.warnings)
-    empty = [
-        f"{view}: {region.text}"
-        for view, regions in scene.views.items()
-        for region in regions
-        if not region.mask().any()
-    ]
-    if empty:
-        warnings.append(f"regions without a pixel: {'; '.join(empty)}")
-    facts: dict[str, object] = {
-        "images": len(scene.images),
-        "labelled views": len(scene.views),
-        "regions": sum(map(len, scene.views.values())),
-        "pairs of view and text": scene.num_pairs,
-        "texts": len(scene.prompts),
-    }
-    if scene.poses is None:
-        warnings.append("no poses come with this scene: they are computed from its images")
-    else:
-        posed = posed_images(scene.poses, scene.dataset)
-        facts["posed views"] = len(posed)
-        scene.posed_views(posed)
-    return SceneReport(facts, tuple(warnings))
 
 
 def _some(names: list[str]) -> str:

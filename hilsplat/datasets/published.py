@@ -232,11 +232,3 @@ PROMPTS: dict[str, dict[str, tuple[str, ...]]] = {
 PAIRS: dict[str, int] = {"figurines": 56, "ramen": 71, "teatime": 59, "waldo_kitchen": 22}
 """Pairs of frame and category of LERF-OVS: the smallest counts of which all published localization figures
 are whole fractions (derived)."""
-
-LABEL_SIZES_WH: dict[str, tuple[int, int]] = {
-    "figurines": (986, 728),
-    "ramen": (988, 731),
-    "teatime": (988, 730),
-    "waldo_kitchen": (985, 725),
-}
-"""Width and height of the images that LERF-OVS labels were drawn on, px (the label files)."""

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float16, Float32, UInt8
 from tokenizers import Tokenizer
 
-from hilsplat.base.crops import background_colour, box_with_margin, crop_to_square
+from hilsplat.base.crops import crop_to_square
 from hilsplat.base.errors import MisalignedArtifactError, ModelError
 from hilsplat.base.onnx_models import ModelFolder, input_side_px, open_model_folder, require_one_space
 from hilsplat.base.parallel import in_order
@@ -118,21 +118,17 @@ class ClipModel:
         Args:
             image: the view.
             masks: its masks.
-            settings: what stands outside the mask, margin, crops per network call; None: defaults.
+            settings: what is shown outside the mask, crops per network call; None: defaults.
         """
         settings = settings or ClipSettings()
-
-        fill = background_colour(image, settings.background)
 
         def embed(start: int) -> np.ndarray:
             crops = []
             for row in range(start, min(len(masks), start + settings.batch)):
                 # only the box is unpacked: a photograph may have 40 million pixels
-                x0, y0, x1, y1 = box = box_with_margin(masks.box_xyxy[row], settings.context, masks.size_hw)
+                x0, y0, x1, y1 = box = tuple(masks.box_xyxy[row].tolist())
                 inside = masks.window(row, box)
-                crops.append(
-                    crop_to_square(image[y0:y1, x0:x1], inside, settings.background, fill, self.side_px)
-                )
+                crops.append(crop_to_square(image[y0:y1, x0:x1], inside, settings.background, self.side_px))
             return self.embed_crops(np.stack(crops))
 
         parts = list(in_order(embed, range(0, len(masks), settings.batch), self.threads))

@@ -70,7 +70,7 @@ def read_view(
     maps, vectors = read_npy(maps_path), read_npy(vectors_path)
     if maps.ndim != 3 or len(maps) != len(MAPS):
         raise ArtifactError(
-            f"{maps_path} is no LangSplat map",
+            f"{maps_path} is not a LangSplat map",
             expected="an array of shape (4, height, width): default, s, m, l",
             found=f"shape {maps.shape}",
         )

@@ -95,7 +95,6 @@ def run_clip(
             model=settings.model,
             model_sha256=model.digest,
             background=settings.background,
-            context=settings.context,
         )
         counts.update(
             views=len(views),

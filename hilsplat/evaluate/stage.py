@@ -135,7 +135,7 @@ def run_evaluate(
                     if not seconds and of_view.categories:
                         texts = [query.text for query in of_view.categories[:TIMED_TEXTS]]
                         seconds = timed(answers, selections, view, texts, settings)
-                if isinstance(known, TrueAnnotations) and truths and settings.consistency_texts:
+                if isinstance(known, TrueAnnotations) and truths:
                     found = measure_world_consistency(
                         answers, selections, truths, kept, known.folder, settings
                     )

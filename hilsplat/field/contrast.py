@@ -14,13 +14,12 @@ from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.mask_operator import MaskProducts
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.losses.distances import common_ancestor_depth
-from hilsplat.field.losses.instance import (
-    instance_loss_literal,
-    instance_loss_logratio,
-    instance_loss_tree,
-)
+from hilsplat.field.losses.instance import instance_loss_literal, instance_loss_tree
 from hilsplat.field.losses.part import part_loss_disentangle, part_loss_literal
 from hilsplat.settings import FieldSettings
+
+MAX_MASKS_PER_LEVEL = 96
+"""Masks of one view and level that take part: the losses compare all pairs."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ def view_relations(
     Args:
         contributions: rows.
         parents: per view, the coverage tree's parent of each mask (row among the view's masks).
-        settings: least size and greatest number of masks, and pruning.
+        settings: least size of masks, and pruning.
         means: mean lifted feature of each mask, by which look-alikes are pruned; None keeps all.
     """
     relations = []
@@ -67,7 +66,7 @@ def view_relations(
         chosen: dict[Level, np.ndarray] = {}
         for level in LEVELS:
             local = np.flatnonzero(usable & (contributions.level[rows] == int(level)))
-            order = local[np.lexsort((local, -pixels[local]))][: settings.max_masks_per_level]
+            order = local[np.lexsort((local, -pixels[local]))][:MAX_MASKS_PER_LEVEL]
             if means is not None and settings.prune_cosine < 1:
                 order = order[
                     distinct(means[rows[order]], depth[np.ix_(order, order)], settings.prune_cosine)
@@ -129,10 +128,8 @@ def instance_term(
         chosen = means[view.rows]
         if settings.instance_mode == "literal":
             losses.append(instance_loss_literal(chosen, view.level, settings.omega))
-        elif settings.instance_mode == "coverage_tree":
-            losses.append(instance_loss_tree(chosen, view.depth, settings.omega))
         else:
-            losses.append(instance_loss_logratio(chosen, view.depth, settings.omega))
+            losses.append(instance_loss_tree(chosen, view.depth, settings.omega))
     return torch.stack(losses).mean() if losses else means.sum() * 0
 
 

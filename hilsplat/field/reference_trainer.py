@@ -37,6 +37,9 @@ from hilsplat.splat.rasterise.device import choose_device
 
 logger = logging.getLogger(__name__)
 
+CURVE_POINTS = 30
+"""Points of the report's curve of loss over seconds."""
+
 
 def rendered_loss(
     rendered: Float[Tensor, "H W C"],
@@ -111,6 +114,7 @@ def run_reference(
     draws = np.random.default_rng(seed)
     curve: list[dict[str, float]] = []
     recent: list[float] = []
+    log_every = max(1, settings.steps // CURVE_POINTS)
     start = time.perf_counter()
     with stage_log("reference field", scene.name) as counts, one_torch_thread():
         for step in range(1, settings.steps + 1):
@@ -130,7 +134,7 @@ def run_reference(
             loss.backward()
             optimiser.step()
             recent.append(float(loss.detach()))
-            if step % settings.log_every == 0 or step == settings.steps:
+            if step % log_every == 0 or step == settings.steps:
                 seconds = time.perf_counter() - start
                 curve.append({"step": step, "loss": float(np.mean(recent)), "seconds": round(seconds, 2)})
                 logger.info("reference field: step %d, loss %.5f", step, curve[-1]["loss"])

@@ -184,7 +184,6 @@ def extract_features(
     options.use_gpu = False
     options.max_image_size = settings.max_side_px
     options.sift.max_num_features = settings.max_features
-    options.sift.first_octave = settings.first_octave
     options.sift.peak_threshold = PEAK_THRESHOLD
     pycolmap.extract_features(
         database, folder, list(views), extraction_options=options, device=pycolmap.Device.cpu

@@ -88,17 +88,3 @@ def llff_views(
         )
         views.append((image, camera, pose))
     return views
-
-
-def write_poses_bounds(
-    path: Path,
-    cam_from_world: Float64[np.ndarray, "N 4 4"],
-    height_width_focal: Float64[np.ndarray, "N 3"],
-    bounds: Float64[np.ndarray, "N 2"],
-) -> None:
-    """Write the file, the inverse of `read_poses_bounds`."""
-    world_from_cam = np.linalg.inv(cam_from_world)
-    right, down, forward = (world_from_cam[:, :3, column] for column in range(3))
-    matrices = np.stack([down, right, -forward, world_from_cam[:, :3, 3], height_width_focal], axis=2)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.save(path, np.concatenate([matrices.reshape(-1, 15), bounds], axis=1), allow_pickle=False)

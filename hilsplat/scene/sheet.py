@@ -15,7 +15,7 @@ from hilsplat.base.files import IMAGE_SUFFIXES, list_images
 COLUMNS = ("dataset", "scene", "group", "source", "unit")
 OPTIONAL_COLUMNS = ("gaussians",)
 NOTHING = ("", "-")
-"""Cells of an optional column that say nothing."""
+"""Values that leave an optional cell empty."""
 GROUPS = (
     "benchmark",
     "development",
@@ -41,7 +41,7 @@ MAX_NAME = 100
 NAME_RULE = "letters a-z A-Z, digits, dot, dash and underscore, beginning with a letter or digit"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 DATA_PREFIX = "data:"
-"""Begins a source that lies below the folder of real data sets (`data_root`)."""
+"""Prefix of a source below the folder of real data sets (`data_root`)."""
 WORLD_SOURCE = re.compile(r"world:([a-z][a-z0-9_-]*):([0-9]{1,9})")
 
 
@@ -103,7 +103,7 @@ def project_root(sheet: Path) -> Path:
 
 
 def photo_folder(folder: Path) -> Path:
-    """Where the photographs of a source are: the folder itself, or its `images/` where it has none."""
+    """Where the photographs of a source are: the folder itself, or its `images/` if it has none."""
     folder = Path(folder)
     if not list_images(folder) and (folder / "images").is_dir():
         return folder / "images"
@@ -208,7 +208,7 @@ def content_lines(path: Path) -> list[tuple[int, str]]:
         raise SceneError(f"scene sheet {path} is a folder", fix="give the path of a file") from error
     except UnicodeDecodeError as error:
         raise SceneError(
-            f"scene sheet {path} is no UTF-8 text", fix="save it as tab-separated text in UTF-8"
+            f"scene sheet {path} is not UTF-8 text", fix="save it as tab-separated text in UTF-8"
         ) from error
     return [
         (number, line)
@@ -267,8 +267,8 @@ def _row(
     if source.startswith("world:"):
         if not WORLD_SOURCE.fullmatch(source):
             raise SceneError(
-                f"{where}: {source!r} names no synthetic world",
-                expected="world:<kind>:<seed>, such as world:tabletop:201",
+                f"{where}: {source!r} is not the name of a synthetic world",
+                expected="world:<kind>:<seed>, as in world:tabletop:201",
                 fix="correct the source",
             )
         folder = None
@@ -283,7 +283,7 @@ def _row(
         where = f"{path}, line {line}, column gaussians"
         if gaussians is None and folder is not None and is_checked:
             raise SceneError(
-                f"{where}: {cell!r} lies below data_root, which is not set",
+                f"{where}: {cell!r} is relative to data_root, which is not set",
                 fix="set data_root, or give a path that starts from the project folder",
             )
         if gaussians is not None and is_checked:
@@ -304,7 +304,7 @@ def _resolved(sheet: Path, place: str, data_root: str) -> Path | None:
 
 
 def _check_gaussians(where: str, ply: Path) -> None:
-    """Refuse a path that is no PLY file."""
+    """Refuse a path that is not a PLY file."""
     if not ply.is_file():
         problem = "is a folder" if ply.exists() else "is missing"
     else:
@@ -312,7 +312,7 @@ def _check_gaussians(where: str, ply: Path) -> None:
             head = stream.read(4)
         if head in (b"ply\n", b"ply\r"):
             return
-        problem = f"is no PLY: it begins with {head!r}"
+        problem = f"is not a PLY: it begins with {head!r}"
     raise SceneError(
         f"{where}: file {ply} {problem}",
         expected="a 3DGS PLY; relative paths start from the project folder",

@@ -1,16 +1,15 @@
 """The coverage tree of a view: which mask lies in which (paper, Sec. III-B)."""
 
 import numpy as np
-from jaxtyping import Bool, Int32, Int64, UInt8
+from jaxtyping import Int32, Int64, UInt8
 
 from hilsplat.base.errors import EmptyMaskError
 from hilsplat.base.levels import NONE
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.settings import CoverageTreeSettings
 
 
 def coverage_parents(
-    masks: Bool[np.ndarray, "M H W"], theta: float, level: UInt8[np.ndarray, " M"] | None = None
+    overlap_px: Int64[np.ndarray, "M M"], level: UInt8[np.ndarray, " M"], theta: float
 ) -> Int32[np.ndarray, " M"]:
     """Find the parent of every mask of one view (paper, Sec. III-B).
 
@@ -18,33 +17,25 @@ def coverage_parents(
     than `theta` of `b` lies in `a`. The smallest such `b` is the parent; of two equally
     small ones, the lower row.
 
+    Departs: the paper leaves open which levels a parent may come from. Here it is coarser than
+    its child; a subpart may hang directly under a whole.
+
     Args:
-        masks: one mask per row, none empty. Masks may overlap.
+        overlap_px: pixels that each pair of masks shares; the diagonal holds their areas.
+        level: `Level` of each mask.
         theta: coverage threshold, a share in (0, 1); the paper uses 0.9.
-        level: where given, a parent must stand at a coarser level than its child; a subpart may
-            hang directly under a whole. The paper leaves this open; without it two masks of one
-            level can be parent and child.
 
     Returns:
-        Row of each mask's parent, or `NONE` where no mask covers it.
+        Row of each mask's parent, or `NONE` if no mask covers it.
 
     Raises:
-        EmptyMaskError: a row has no pixel, so its coverage is undefined.
+        EmptyMaskError: a mask has no pixel, so its coverage is undefined.
 
     Example:
-        >>> whole, part = [[1, 1, 1, 1]], [[1, 1, 0, 0]]
-        >>> coverage_parents(np.array([whole, part], dtype=bool), theta=0.9)
+        >>> overlap_px = np.array([[4, 2], [2, 2]])  # the second mask lies in the first
+        >>> coverage_parents(overlap_px, np.array([1, 2], np.uint8), theta=0.9)
         array([-1,  0], dtype=int32)
     """
-    pixels = masks.reshape(len(masks), masks.shape[1] * masks.shape[2]).astype(np.float32)
-    # float32 counts exactly up to 2**24 px per mask, beyond any image we read.
-    return parents_from_overlaps((pixels @ pixels.T).astype(np.int64), theta, level)
-
-
-def parents_from_overlaps(
-    overlap_px: Int64[np.ndarray, "M M"], theta: float, level: UInt8[np.ndarray, " M"] | None = None
-) -> Int32[np.ndarray, " M"]:
-    """`coverage_parents` from the pixels that each pair of masks shares."""
     area_px = np.diagonal(overlap_px)
     if not area_px.all():
         empty = np.flatnonzero(area_px == 0).tolist()
@@ -55,9 +46,7 @@ def parents_from_overlaps(
     if not len(area_px):
         return np.zeros(0, dtype=np.int32)
     share = overlap_px / area_px[:, None]  # [a, b]: share of a inside b
-    covered = (share > theta) & (share < theta).T
-    if level is not None:
-        covered &= level[None, :] < level[:, None]
+    covered = (share > theta) & (share < theta).T & (level[None, :] < level[:, None])
     # covered[a, b] implies area[a] < area[b]: chains of parents cannot form a cycle.
     area_of_cover = np.where(covered, area_px[None, :], np.inf)
     parents = np.where(covered.any(axis=1), area_of_cover.argmin(axis=1), NONE)
@@ -76,9 +65,8 @@ def depths(parent: Int32[np.ndarray, " M"]) -> UInt8[np.ndarray, " M"]:
 
 
 def coverage_tree(
-    masks: HierarchicalMasks, settings: CoverageTreeSettings
+    masks: HierarchicalMasks, theta: float
 ) -> tuple[Int32[np.ndarray, " M"], UInt8[np.ndarray, " M"]]:
     """Parent (row or `NONE`) and depth (roots 1) of every mask of a view, always a forest."""
-    level = masks.level if settings.parents == "coarser" else None
-    parent = parents_from_overlaps(masks.overlaps_px(), settings.theta, level)
+    parent = coverage_parents(masks.overlaps_px(), masks.level, theta)
     return parent, depths(parent)

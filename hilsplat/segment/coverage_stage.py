@@ -18,14 +18,14 @@ def run_coverage_tree(masks_folder: Path, out: Path, settings: CoverageTreeSetti
         masks_folder: what `run_masks` wrote.
         out: folder to write: `<view>.npz` with `parent` i32 (M) and `depth` u8 (M), rows as the
             masks, and `index.json`.
-        settings: threshold and where a parent may come from.
+        settings: threshold.
     """
     masks_index = read_index(masks_folder)
     index: dict[str, Any] = {}
     with stage_log("coverage_tree", masks_index["scene"]) as counts, atomic_folder(out) as folder:
         for view in track(list(masks_index["views"]), "coverage trees"):
             masks = HierarchicalMasks.load(Path(masks_folder) / f"{view}.npz")
-            parent, depth = coverage_tree(masks, settings)
+            parent, depth = coverage_tree(masks, settings.theta)
             write_npz(folder / f"{view}.npz", parent=parent, depth=depth)
             has_parent = parent != NONE
             index[view] = {
@@ -35,7 +35,7 @@ def run_coverage_tree(masks_folder: Path, out: Path, settings: CoverageTreeSetti
                 "subpart_with_parent": int(has_parent[masks.rows_of(Level.SUBPART)].sum()),
                 "deepest": int(depth.max(initial=0)),
             }
-        write_index(folder, index, scene=masks_index["scene"], theta=settings.theta, parents=settings.parents)
+        write_index(folder, index, scene=masks_index["scene"], theta=settings.theta)
         counts.update(
             views=len(index),
             masks=sum(entry["masks"] for entry in index.values()),

@@ -12,7 +12,6 @@ from jaxtyping import Bool, Int32, Int64
 from hilsplat.base.levels import Level
 from hilsplat.segment import sam
 from hilsplat.segment.candidates import Candidates, crop_boxes
-from hilsplat.segment.coverage_levels import with_coverage_levels
 from hilsplat.segment.kernels import mended_runs, upscaled_runs
 from hilsplat.segment.masks import HierarchicalMasks, take_runs
 from hilsplat.segment.sam import HEADS, Frame, SamModel
@@ -58,8 +57,6 @@ def masks_from_candidates(
             masks = masks.take(keep)
         streams.append(masks)
     pooled = HierarchicalMasks.concatenate(streams, size_hw)
-    if settings.level_source == "coverage":
-        return with_coverage_levels(pooled, settings)
     return suppress_masks(
         pooled,
         iou_max=settings.nms_iou,

@@ -18,7 +18,6 @@ from hilsplat.base.parallel import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.candidates import Candidates, candidates_key, decode_candidates
-from hilsplat.segment.coverage_levels import with_coverage_levels
 from hilsplat.segment.generate import masks_from_candidates
 from hilsplat.segment.graph import segment_graph
 from hilsplat.segment.masks import HierarchicalMasks
@@ -105,5 +104,4 @@ def graph_masks(scene: Scene, view: str, cache: ViewCache, settings: MasksSettin
         key,
         lambda: segment_graph(scene.image(view), settings.graph_scales, settings.min_area_px).arrays(),
     )
-    masks = HierarchicalMasks.from_arrays(arrays)
-    return with_coverage_levels(masks, settings) if settings.level_source == "coverage" else masks
+    return HierarchicalMasks.from_arrays(arrays)

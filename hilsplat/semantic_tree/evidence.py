@@ -35,15 +35,6 @@ class Evidence:
     seen: Float64[np.ndarray, "M V"]
     view: Int32[np.ndarray, " M"]
 
-    def pair(self, a: int, b: int) -> tuple[float, float]:
-        """Intersection and union of two masks."""
-        row = slice(self.intersection.indptr[a], self.intersection.indptr[a + 1])
-        found = np.flatnonzero(self.intersection.indices[row] == b)
-        if len(found):
-            at = row.start + int(found[0])
-            return float(self.intersection.data[at]), float(self.union.data[at])
-        return 0.0, float(self.seen[a, self.view[b]] + self.seen[b, self.view[a]])
-
 
 def mask_evidence(
     shares: sp.csr_matrix,
@@ -51,7 +42,6 @@ def mask_evidence(
     visible: Bool[np.ndarray, "V N"],
     view: Int32[np.ndarray, " M"],
     min_covisible: float,
-    overlap: str,
     threads: int = 1,
     device: str = "cpu",
 ) -> Evidence:
@@ -59,9 +49,9 @@ def mask_evidence(
 
     With s the share of a Gaussian's visible weight that lies in a mask and w its importance, the
     intersection of a and b is sum w s_a s_b, the size of a as seen from the view of b is the sum of
-    w s_a^2 (Tanimoto) or w s_a (soft) over Gaussians visible there. For shares of 0 and 1 the two
-    agree. A fitted Gaussian reaches across borders and has shares between: there soft sizes shrink
-    the IoU of one region with itself (shares of 0.3 give 0.18), Tanimoto keeps it at 1.
+    w s_a^2 over Gaussians visible there (Tanimoto). A fitted Gaussian reaches across borders and has
+    shares between 0 and 1; with squares the IoU of one region with itself stays 1, whereas the sum of
+    w s_a as the size would shrink it (shares of 0.3 give 0.18).
 
     Two masks of one view are different things: they are evidence against a link (intersection 0,
     union both full sizes). Masks that share Gaussians but see less than `min_covisible` of each
@@ -74,7 +64,6 @@ def mask_evidence(
         visible: which Gaussians each view sees.
         view: view of each mask.
         min_covisible: share below which a pair is dropped.
-        overlap: "tanimoto" or "soft".
         threads: rows are shared among them; the bytes do not depend on it.
         device: "cpu", or where torch forms the two products (see `cuda_algebra`).
     """
@@ -84,7 +73,7 @@ def mask_evidence(
 
     share = shares.data.astype(np.float64)
     weight = importance.astype(np.float64)[shares.indices]
-    size = weight * (np.square(share) if overlap == "tanimoto" else share)
+    size = weight * np.square(share)
     products = (like(share), like(weight * share), like(size), visible, view, min_covisible)
     if device == "cpu":
         upper, seen = _evidence_by_loops(*products, threads)

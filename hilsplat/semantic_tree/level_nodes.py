@@ -13,6 +13,15 @@ from hilsplat.semantic_tree.linkage import pooled_linkage
 from hilsplat.semantic_tree.nodes import gaussian_nodes, level_fits
 from hilsplat.settings import SemanticTreeSettings
 
+MIN_COVISIBLE = 0.2
+"""Pairs of masks that see less than this share of each other are no evidence."""
+
+MIN_MEMBER_SHARE = 0.15
+"""A Gaussian joins its best node if more than this share of its weight lies in it."""
+
+MIN_FIT = 0.25
+"""A mask shows the node that it fits best, if their IoU in its view is above this."""
+
 
 @dataclass(frozen=True)
 class LevelNodes:
@@ -66,8 +75,7 @@ def level_nodes(
         importance,
         visible,
         view,
-        settings.min_covisible,
-        settings.overlap,
+        MIN_COVISIBLE,
         threads,
         compute_device(settings.device),
     )
@@ -81,10 +89,10 @@ def level_nodes(
         of_cluster = np.full(len(quality) + 1, NONE, np.int64)
         of_cluster[kept] = np.arange(len(kept))
         return of_cluster, *gaussian_nodes(
-            of_cluster[cluster], len(kept), weights, view, mass, total_mass, settings.min_member_share
+            of_cluster[cluster], len(kept), weights, view, mass, total_mass, MIN_MEMBER_SHARE
         )
 
-    fits = level_fits(winners(kept)[1], len(kept), weights, mass, view, settings.min_fit)
+    fits = level_fits(winners(kept)[1], len(kept), weights, mass, view, MIN_FIT)
     kept = kept[np.bincount(fits[fits >= 0], minlength=len(kept)) >= settings.min_views]
     of_cluster, node, share = winners(kept)
     # A node that wins no Gaussian selects nothing: it is dropped.

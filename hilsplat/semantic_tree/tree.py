@@ -30,7 +30,7 @@ from hilsplat.base.progress import stage_log
 from hilsplat.contributions.rows import Contributions, mask_embeddings, read_full_index
 from hilsplat.semantic_tree.boxes import node_boxes
 from hilsplat.semantic_tree.export import readable_nodes
-from hilsplat.semantic_tree.level_nodes import level_nodes
+from hilsplat.semantic_tree.level_nodes import MIN_FIT, level_nodes
 from hilsplat.semantic_tree.nodes import (
     mask_fits,
     nest_nodes,
@@ -38,6 +38,9 @@ from hilsplat.semantic_tree.nodes import (
     renumbered_without_empty,
 )
 from hilsplat.settings import SemanticTreeSettings
+
+MIN_VISIBLE_PX = 0.3
+"""A Gaussian counts as visible in a view from this mass."""
 
 logger = logging.getLogger(__name__)
 
@@ -140,7 +143,7 @@ def build_tree(
         settings: thresholds.
         threads: for the evidence; results do not depend on it.
     """
-    visible = mass > settings.min_visible_px
+    visible = mass > MIN_VISIBLE_PX
     num_visible = visible.sum(axis=0)
     total_mass = mass.sum(axis=0, dtype=np.float64)
     importance = np.einsum("vn,vn->n", mass, visible, dtype=np.float64) / np.maximum(num_visible, 1)
@@ -165,15 +168,14 @@ def build_tree(
     levels = np.array(level, np.uint8)
     num = len(levels)
     parent = node_parents(node_of_gaussian, levels, total_mass, settings.parent_coverage)
-    if settings.nested:
-        nested = nest_nodes(node_of_gaussian, levels, parent)
-        membership[nested != node_of_gaussian] = 0
-        node_of_gaussian = nested
-        renumber = renumbered_without_empty(node_of_gaussian, num)
-        kept = np.flatnonzero(renumber[:num] != NONE)
-        node_of_gaussian, cluster_of_mask = renumber[node_of_gaussian], renumber[cluster_of_mask]
-        levels, parent, num = levels[kept], renumber[parent[kept]], len(kept)
-        quality = [quality[node] for node in kept]
+    nested = nest_nodes(node_of_gaussian, levels, parent)
+    membership[nested != node_of_gaussian] = 0
+    node_of_gaussian = nested
+    renumber = renumbered_without_empty(node_of_gaussian, num)
+    kept = np.flatnonzero(renumber[:num] != NONE)
+    node_of_gaussian, cluster_of_mask = renumber[node_of_gaussian], renumber[cluster_of_mask]
+    levels, parent, num = levels[kept], renumber[parent[kept]], len(kept)
+    quality = [quality[node] for node in kept]
     view_area = np.zeros((num, len(contributions.views)), np.float64)
     own = np.flatnonzero(cluster_of_mask >= 0)
     np.add.at(view_area, (cluster_of_mask[own], contributions.view[own]), contributions.area_px[own])
@@ -194,7 +196,7 @@ def build_tree(
         node_of_gaussian=node_of_gaussian,
         membership=membership,
         node_of_mask=mask_fits(
-            node_of_gaussian, num, S, mass, contributions.view, contributions.level, settings.min_fit
+            node_of_gaussian, num, S, mass, contributions.view, contributions.level, MIN_FIT
         ),
         view_area_px=view_area.astype(np.float32),
         view_names=contributions.views,

@@ -13,7 +13,7 @@ from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.scene.cameras import Camera
 from hilsplat.world.objects.builder import ObjectModel
-from hilsplat.world.objects.catalogue import TABLETOP, build_object, maker_of
+from hilsplat.world.objects.catalogue import TABLETOP, build_object
 from hilsplat.world.paints import Paint
 from hilsplat.world.render import label_view, render_view
 from hilsplat.world.scenes.kinds import build_scene, scene_cameras
@@ -57,24 +57,6 @@ def draw_classes(out: Path, names: Sequence[str] = TABLETOP, seed: int = 0) -> N
         axes.set_title(name, fontsize=10, pad=3)
     figure.subplots_adjust(left=0.005, right=0.995, bottom=0.005, top=0.965, wspace=0.03, hspace=0.17)
     _write(figure, out)
-
-
-def class_table(names: Sequence[str] = TABLETOP) -> str:
-    """Markdown table of classes: other names, parts, and the subparts of each part in brackets."""
-    lines = ["| class | also called | parts (subparts) |", "|---|---|---|"]
-    for name in names:
-        model = build_object(name, np.random.default_rng(0))
-        parts: dict[str, dict[str, None]] = {}  # dicts keep the order and drop repeated legs
-        for node in model.nodes[1:]:
-            word = node.text.removeprefix(f"{name} ")
-            if node.level == Level.PART:
-                parts.setdefault(word, {})
-            else:
-                parts[model.nodes[node.parent].text.removeprefix(f"{name} ")][word] = None
-        shown = [f"{part} ({', '.join(fine)})" if fine else part for part, fine in parts.items()]
-        also = ", ".join(maker_of(name).aliases)
-        lines.append(f"| {name} | {also} | {'; '.join(shown)} |")
-    return "\n".join(lines)
 
 
 def _alone(model: ObjectModel) -> tuple[WorldScene, Camera]:

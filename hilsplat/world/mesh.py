@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
@@ -42,7 +43,7 @@ class TrueMesh:
         return TrueMesh(corners[np.stack(faces)])
 
     @cached_property
-    def embree(self) -> object:
+    def embree(self) -> Any:
         """Ray-casting structure, built on first use."""
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
@@ -60,6 +61,6 @@ class TrueMesh:
         # directions of depth 1: the distance that Embree returns then is the depth
         directions = (pixels @ np.linalg.inv(camera.K).T @ rotation).astype(np.float32)
         origins = np.ascontiguousarray(np.broadcast_to(camera.centre.astype(np.float32), directions.shape))
-        hit = self.embree.run(origins, directions, query="INTERSECT", output=True)  # type: ignore[attr-defined]
+        hit = self.embree.run(origins, directions, query="INTERSECT", output=True)
         depth = np.where(hit["primID"] >= 0, hit["tfar"], np.inf)
         return depth.reshape(height, width).astype(np.float32)

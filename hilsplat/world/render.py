@@ -10,7 +10,7 @@ import math
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Float32, Int32, UInt8
+from jaxtyping import Int32, UInt8
 
 from hilsplat.base.compiled import compiled
 from hilsplat.scene.cameras import Camera
@@ -38,15 +38,6 @@ def label_view(scene: WorldScene, camera: Camera) -> Int32[np.ndarray, "3 H W"]:
     hit = _cast(scene, origins, directions)["primID"]
     ids = np.where((hit >= 0)[:, None], scene.node_ids[hit], -1)
     return np.ascontiguousarray(ids.T.reshape(3, *camera.size_hw)).astype(np.int32)
-
-
-def depth_view(scene: WorldScene, camera: Camera) -> Float32[np.ndarray, "H W"]:
-    """Depth along the optical axis through each pixel's centre, scene units; inf where nothing is."""
-    origins, directions = _rays(camera, 1)
-    result = _cast(scene, origins, directions)
-    forward = camera.cam_from_world[2, :3].astype(np.float32)
-    depth = np.where(result["primID"] >= 0, result["tfar"] * (directions @ forward), np.inf)
-    return depth.reshape(camera.size_hw).astype(np.float32)
 
 
 def render_view(

@@ -78,7 +78,7 @@ def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> 
             raise SceneError(f"no object found a place in {source}", fix="take another seed")
         cameras = scene_cameras(scene, settings.views, settings.image_px, settings.arc_deg)
         require_free_space(out, needed_mib=5 + settings.views * settings.image_px**2 * 4 / 2**20)
-        smallest = smallest_areas(settings.image_px, settings.min_area_px, settings.min_subpart_area_px)
+        smallest = smallest_areas(settings.image_px, settings.min_area_px)
         labels, annotated = {}, {}
         size = {"height": settings.image_px, "width": settings.image_px}
         with atomic_folder(out / "images") as folder:

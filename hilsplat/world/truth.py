@@ -13,23 +13,25 @@ from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
 from hilsplat.scene.cameras import Cameras
 from hilsplat.world.scenes.scene import WorldScene
 
-SUBPART_AREA_AT_PX = 384
-"""Size of the view for which the smallest area of a subpart is stated."""
+MIN_SUBPART_AREA = 100 / 384**2
+"""Subparts with a smaller visible region, as a share of the view, are not scored: 100 px of 384 x 384."""
 
 HIDDEN_BY = 2e-3
 """A point counts as hidden where something is nearer to the camera by this share of its distance."""
 
 
-def smallest_areas(image_px: int, min_area_px: int, min_subpart_area_px: int) -> dict[Level, float | int]:
+def smallest_areas(image_px: int, min_area_px: int) -> dict[Level, float | int]:
     """Area from which a text is annotated in a view, per level, px.
 
     Args:
         image_px: height and width of the view.
         min_area_px: for wholes and parts, whatever the size of the view.
-        min_subpart_area_px: for subparts in a view of 384 px; scales with the area of the view.
     """
-    scaled = min_subpart_area_px * (image_px / SUBPART_AREA_AT_PX) ** 2
-    return {Level.WHOLE: min_area_px, Level.PART: min_area_px, Level.SUBPART: scaled}
+    return {
+        Level.WHOLE: min_area_px,
+        Level.PART: min_area_px,
+        Level.SUBPART: MIN_SUBPART_AREA * image_px**2,
+    }
 
 
 def annotated_nodes(

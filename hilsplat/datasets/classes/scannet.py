@@ -51,9 +51,6 @@ NYU40: dict[int, str] = {
 }
 """NYU40 id -> query. ScanNet's tsv spells 24 `refridgerator`; the paper writes 28 in two words."""
 
-OPENGAUSSIAN_SPELLINGS: dict[int, str] = {28: "showercurtain"}
-"""Queries of OpenGaussian's stored text features that differ from ours."""
-
 OPENGAUSSIAN_SCENES: tuple[str, ...] = tuple(
     f"scene{number:04d}_00" for number in (0, 62, 70, 97, 140, 200, 347, 400, 590, 645)
 )

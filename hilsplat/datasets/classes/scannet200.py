@@ -209,23 +209,6 @@ CLASSES: tuple[tuple[int, str, str], ...] = (  # id, name, split
     (1191, "mattress", "common"),
 )
 
-TRAIN_ONLY: frozenset[str] = frozenset(
-    {
-        "alarm clock",
-        "bicycle",
-        "candle",
-        "cd case",
-        "guitar case",
-        "luggage",
-        "music stand",
-        "purse",
-        "storage container",
-        "storage organizer",
-        "structure",
-    }
-)
-"""Classes that occur in no validation scan: 189 are left."""
-
 SCANNET200 = ClassSet(
     "scannet200",
     "ScanNet200 benchmark",

@@ -15,7 +15,7 @@ import numpy as np
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.levels import Level
-from hilsplat.datasets.dataset import Dataset, SceneReport
+from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.images.isat import IsatFile, IsatObject, read_isat
 from hilsplat.datasets.images.lerf_ovs import label_files
 from hilsplat.datasets.labelled import (
@@ -25,7 +25,6 @@ from hilsplat.datasets.labelled import (
     image_size_hw,
     images_by_stem,
     missing_frames,
-    report_of,
 )
 from hilsplat.datasets.published import FRAMES
 
@@ -181,9 +180,6 @@ def _dataset(name: str, title: str, frame: str) -> Dataset:
     def open_scene(root: Path, scene: str) -> LabelledScene:
         return open_hi(name, root, scene)
 
-    def check_scene(root: Path, scene: str) -> SceneReport:
-        return report_of(open_scene(root, scene))
-
     images = IMAGES_OF[name]
     return Dataset(
         name=name,
@@ -197,7 +193,6 @@ def _dataset(name: str, title: str, frame: str) -> Dataset:
         layout=_layout(name, images, frame),
         required=lambda scene: (f"label/{scene}", f"../{images}/{scene}/images"),
         open=open_scene,
-        check=check_scene,
         label_places=lambda scene: (f"label/{scene}/*.json",),
     )
 

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from hilsplat.base.artifacts import write_json
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.images.polygons import fill_polygon, outside_px
 
@@ -184,37 +183,3 @@ def _box(
         warnings.append(f"{where}: bbox {box.tolist()} differs from the polygon's extent {extent.tolist()}")
     # Tests ask x1 <= x <= x2 of whole numbers x: rounding inwards keeps every answer.
     return np.concatenate([np.ceil(box[:2]), np.floor(box[2:])]).astype(np.int64)
-
-
-def write_isat(path: Path, image: str, size_hw: tuple[int, int], objects: list[dict[str, Any]]) -> None:
-    """Write a label file in the same layout.
-
-    Args:
-        path: the file.
-        image: name of its image.
-        size_hw: size of the image, px.
-        objects: keys of each object; `category` and `segmentation` at least.
-    """
-    info = {"name": image, "width": size_hw[1], "height": size_hw[0], "depth": 3, "note": ""}
-    write_json(path, {"info": info, "objects": objects})
-
-
-def isat_object(category: str, polygons: list[np.ndarray], area_px: int, **keys: Any) -> dict[str, Any]:
-    """Keys of one object as the tool writes them: a single polygon is not nested."""
-    points = np.concatenate(polygons)
-    lists = [
-        # A single pixel or a line repeats its last vertex: a polygon has three.
-        [[float(x), float(y)] for x, y in [*polygon, *[polygon[-1]] * (3 - len(polygon))]]
-        for polygon in polygons
-    ]
-    return {
-        "category": category,
-        "group": 1,
-        "segmentation": lists[0] if len(lists) == 1 else lists,
-        "area": float(area_px),
-        "layer": 1.0,
-        "bbox": [float(n) for n in (*points.min(axis=0), *points.max(axis=0))],
-        "iscrowd": 0,
-        "note": "",
-        **keys,
-    }

@@ -7,7 +7,7 @@ to the first of them, `test_mask/1` to the second. Every mask file there is one 
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.dataset import Dataset, SceneReport
+from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.labelled import (
     LabelledRegion,
     LabelledScene,
@@ -16,7 +16,6 @@ from hilsplat.datasets.labelled import (
     images_by_stem,
     posed_images,
     read_mask_file,
-    report_of,
     unlisted_texts,
 )
 from hilsplat.datasets.published import PROMPTS
@@ -131,11 +130,6 @@ def _mask_folders(folder: Path, test: tuple[str, ...]) -> dict[str, Path]:
     return {view: place for view, (_, place) in zip(test, numbers, strict=True)}
 
 
-def check_scene(root: Path, scene: str) -> SceneReport:
-    """Read everything of a scene."""
-    return report_of(open_scene(root, scene))
-
-
 DATASET = Dataset(
     name="lerf_mask",
     title="LERF-Mask",
@@ -150,7 +144,6 @@ DATASET = Dataset(
         f"{scene}/{part}" for part in ("images", "images_train", "sparse", "test_mask")
     ),
     open=open_scene,
-    check=check_scene,
     protocols=("lerf-mask/gaussian-grouping",),
     label_places=lambda scene: (f"{scene}/test_mask/**/*",),
 )

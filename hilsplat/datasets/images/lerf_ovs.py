@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.dataset import Dataset, SceneReport
+from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.images.isat import IsatFile, IsatObject, read_isat
 from hilsplat.datasets.labelled import (
     LabelledRegion,
@@ -21,7 +21,6 @@ from hilsplat.datasets.labelled import (
     image_size_hw,
     images_by_stem,
     missing_frames,
-    report_of,
     unlisted_texts,
 )
 from hilsplat.datasets.published import FRAMES, PAIRS, PROMPTS
@@ -123,11 +122,6 @@ def union_mask(objects: Sequence[IsatObject], size_hw: tuple[int, int]) -> np.nd
     return np.any([thing.mask(size_hw) for thing in objects], axis=0)
 
 
-def check_scene(root: Path, scene: str) -> SceneReport:
-    """Read everything of a scene."""
-    return report_of(open_scene(root, scene))
-
-
 DATASET = Dataset(
     name="lerf_ovs",
     title="LERF-OVS",
@@ -140,7 +134,6 @@ DATASET = Dataset(
     layout=LAYOUT,
     required=lambda scene: (f"{scene}/images", f"{scene}/sparse", f"label/{scene}"),
     open=open_scene,
-    check=check_scene,
     protocols=("lerf/langsplat-v2", "lerf/paper-filter", "lerf/paper-mean"),
     label_places=lambda scene: (f"label/{scene}/*.json",),
 )

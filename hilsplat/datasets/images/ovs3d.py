@@ -7,7 +7,7 @@ test view is a folder with one mask per class. Only the value 255 is foreground.
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.dataset import Dataset, SceneReport
+from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.labelled import (
     LabelledRegion,
     LabelledScene,
@@ -16,7 +16,6 @@ from hilsplat.datasets.labelled import (
     images_by_stem,
     missing_frames,
     read_mask_file,
-    report_of,
     unlisted_texts,
 )
 from hilsplat.datasets.published import FRAMES, PROMPTS
@@ -138,11 +137,6 @@ def _regions(
     return tuple(regions)
 
 
-def check_scene(root: Path, scene: str) -> SceneReport:
-    """Read everything of a scene."""
-    return report_of(open_scene(root, scene))
-
-
 DATASET = Dataset(
     name="3d_ovs",
     title="3D-OVS",
@@ -155,7 +149,6 @@ DATASET = Dataset(
     layout=LAYOUT,
     required=lambda scene: (f"{scene}/images", f"{scene}/segmentations/classes.txt"),
     open=open_scene,
-    check=check_scene,
     protocols=("3d-ovs/langsplat", "3d-ovs/langsplat-raw", "3d-ovs/langsplat-v2", "3d-ovs/argmax"),
     label_places=lambda scene: (f"{scene}/segmentations/**/*",),
 )

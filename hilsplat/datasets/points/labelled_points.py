@@ -12,6 +12,7 @@ from hilsplat.datasets.classes.replica import REPLICA_48, REPLICA_51
 from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_15, SCANNET_19, SCANNET_20
 from hilsplat.datasets.classes.scannet200 import SCANNET200, SCANNET200_INSTANCES
 from hilsplat.datasets.classes.waymo import WAYMO_22
+from hilsplat.datasets.dataset import SceneReport
 from hilsplat.datasets.points.posed_images import PosedImage
 
 LABELLINGS: dict[str, tuple[ClassSet, ...]] = {
@@ -79,12 +80,14 @@ class PointScene:
     truth: Mapping[str, LabelledPoints]
     warnings: tuple[str, ...] = ()
 
-    def facts(self) -> dict[str, object]:
-        """What was read, in words and numbers."""
+    def report(self) -> SceneReport:
+        """What was read, in words and numbers, and what was not."""
         facts: dict[str, object] = {"posed images": len(self.images)}
         for labelling, points in self.truth.items():
             facts[f"{labelling} points"] = len(points)
             facts[f"{labelling} points with a class"] = int((points.class_id > 0).sum())
             facts[f"{labelling} classes"] = len(np.unique(points.class_id[points.class_id > 0]))
             facts[f"{labelling} instances"] = len(np.unique(points.instance_id[points.instance_id > 0]))
-        return facts
+            if points.visible is not None:
+                facts[f"{labelling} points that a camera sees"] = int(points.visible.sum())
+        return SceneReport(facts, self.warnings)

@@ -1,13 +1,11 @@
 """Reading the kinds of file that labelled points come in, with messages that say what to do."""
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from plyfile import PlyData, PlyParseError
 
-from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.errors import SceneError
 
 UNPACK_AGAIN = "unpack or download it again; the copy is not whole"
@@ -155,33 +153,3 @@ def ply_faces(path: Path, content: PlyData) -> np.ndarray:
             fix=UNPACK_AGAIN,
         )
     return faces
-
-
-PLY_TYPES = {"f4": "float", "u1": "uchar", "u2": "ushort", "i4": "int"}
-
-
-def write_ply(
-    path: Path, vertices: Mapping[str, np.ndarray], faces: np.ndarray, of_faces: Mapping[str, np.ndarray]
-) -> None:
-    """Write a binary little-endian mesh: columns of vertices, corners of faces, columns of faces."""
-    names = [(name, f"<{column.dtype.str[1:]}") for name, column in vertices.items()]
-    rows = np.empty(len(next(iter(vertices.values()))), dtype=names)
-    for name, column in vertices.items():
-        rows[name] = column
-    more = [(name, f"<{column.dtype.str[1:]}") for name, column in of_faces.items()]
-    polygons = np.empty(len(faces), dtype=[("count", "u1"), ("corners", "<i4", faces.shape[1:]), *more])
-    polygons["count"], polygons["corners"] = faces.shape[1], faces
-    for name, column in of_faces.items():
-        polygons[name] = column
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(rows)}",
-        *(f"property {PLY_TYPES[column.dtype.str[1:]]} {name}" for name, column in vertices.items()),
-        f"element face {len(polygons)}",
-        "property list uchar int vertex_indices",
-        *(f"property {PLY_TYPES[column.dtype.str[1:]]} {name}" for name, column in of_faces.items()),
-        "end_header\n",
-    ]
-    with atomic_path(path) as temporary:
-        temporary.write_bytes("\n".join(header).encode() + rows.tobytes() + polygons.tobytes())

@@ -15,13 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32
-from PIL import Image, UnidentifiedImageError
+from jaxtyping import Float
 
-from hilsplat.base.errors import ImageError, SceneError
+from hilsplat.base.errors import SceneError
 from hilsplat.base.files import list_images
 from hilsplat.datasets.classes.replica import SCENES
-from hilsplat.datasets.dataset import Dataset, SceneReport
+from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.datasets.points.numbered import by_number, size_of_image
 from hilsplat.datasets.points.point_files import UNPACK_AGAIN, listing, read_json_object, read_numbers
@@ -37,19 +36,15 @@ class Layout:
 
     Attributes:
         colour: folder of the images and prefix of their names.
-        depth: likewise; may be the same folder.
         poses: file of poses.
-        depth_per_metre: value of a depth image at one metre.
     """
 
     colour: tuple[str, str]
-    depth: tuple[str, str]
     poses: str
-    depth_per_metre: float
 
 
-NICE_SLAM = Layout(("results", "frame"), ("results", "depth"), "traj.txt", 6553.5)
-SEMANTIC_NERF = Layout(("rgb", "rgb_"), ("depth", "depth_"), "traj_w_c.txt", 1000.0)
+NICE_SLAM = Layout(("results", "frame"), "traj.txt")
+SEMANTIC_NERF = Layout(("rgb", "rgb_"), "traj_w_c.txt")
 
 
 def layout_of(folder: Path) -> Layout:
@@ -148,25 +143,6 @@ def read_images(folder: Path, every: int = 1) -> tuple[tuple[PosedImage, ...], t
     return images, (f"{more} poses have no image and are passed over",) if more else ()
 
 
-def read_depth(folder: Path, number: int) -> Float32[np.ndarray, "H W"]:
-    """Depth of a frame along the optical axis, metres; 0 where nothing is (windows, mirrors).
-
-    Raises:
-        SceneError: the sequence or the frame is missing.
-        ImageError: the image cannot be read.
-    """
-    layout = layout_of(folder)
-    path = dict(frames_of(folder, layout.depth)).get(number)
-    if path is None:
-        raise SceneError(f"frame {number} of {folder} has no depth image", fix=UNPACK_AGAIN)
-    try:
-        with Image.open(path) as image:
-            values = np.asarray(image)
-    except (UnidentifiedImageError, OSError) as error:
-        raise ImageError(f"depth image {path} cannot be read: {error}", fix=UNPACK_AGAIN) from error
-    return (values / layout.depth_per_metre).astype(np.float32)
-
-
 def sequence_folder(root: Path, scene: str) -> Path:
     """The rendered sequence of a scene: `room0/` (NICE-SLAM), `room_0/imap/00` (vMAP) or `room_0/Sequence_1`.
 
@@ -218,12 +194,6 @@ def open_scene(root: Path, scene: str, every: int = 1) -> PointScene:
     return PointScene(scene, images, {"replica": truth}, warnings)
 
 
-def check_scene(root: Path, scene: str) -> SceneReport:
-    """Read everything of a scene and say what was found."""
-    found = open_scene(root, scene)
-    return SceneReport(found.facts(), found.warnings)
-
-
 DATASET = Dataset(
     name="replica",
     title="Replica",
@@ -243,7 +213,6 @@ DATASET = Dataset(
     results/frame000000.jpg depth000000.png ...""",
     required=lambda scene: (f"{scene}/habitat/mesh_semantic.ply", f"{scene}/habitat/info_semantic.json"),
     open=open_scene,
-    check=check_scene,
     protocols=("replica/per-scene", "replica/opennerf", "replica/conceptgraphs"),
     label_places=lambda scene: (f"{scene}/habitat/*",),
 )

@@ -17,7 +17,7 @@ from hilsplat.base.errors import SceneError
 from hilsplat.base.files import list_images
 from hilsplat.datasets.classes.scannet import OPENGAUSSIAN_SCENES
 from hilsplat.datasets.classes.scannet200 import SCANNET200
-from hilsplat.datasets.dataset import Dataset, SceneReport
+from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
 from hilsplat.datasets.points.numbered import by_number, size_of_image
 from hilsplat.datasets.points.point_files import (
@@ -299,12 +299,6 @@ def open_scan(root: Path, scan: str, every: int = 1, aligned: bool = False) -> P
     return PointScene(scan, images, truth, (*of_images, *of_labels))
 
 
-def check_scan(root: Path, scan: str) -> SceneReport:
-    """Read everything of a scan and say what was found."""
-    scene = open_scan(root, scan)
-    return SceneReport(scene.facts(), scene.warnings)
-
-
 DATASET = Dataset(
     name="scannet",
     title="ScanNet v2",
@@ -340,7 +334,6 @@ DATASET = Dataset(
         )
     ),
     open=open_scan,
-    check=check_scan,
     protocols=(
         "scannet/opengaussian-19",
         "scannet/opengaussian-15",
@@ -358,4 +351,4 @@ DATASET = Dataset(
 
 SCANNET200_DATASET = replace(DATASET, name="scannet200", title="ScanNet200")
 """The same scans and files with other labels. The paper does not say which scans it scored with 200 classes:
-the ten, or the benchmark's validation scans (`classes.scannet_splits.VALIDATION_SCANS`)."""
+the ten, or the benchmark's 312 validation scans (ScanNet's `Tasks/Benchmark/scannetv2_val.txt`)."""

@@ -9,9 +9,9 @@ from jaxtyping import Int32
 from hilsplat.base.artifacts import read_npz
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.points.labelled_points import LabelledPoints
-from hilsplat.datasets.points.point_files import ply_column, read_ply
+from hilsplat.datasets.points.point_files import ply_column, ply_places, read_ply
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
-from hilsplat.datasets.synthetic.world_points import LabelledMesh, replica_id, scannet_ids, waymo_labels
+from hilsplat.datasets.synthetic.world_points import replica_id, scannet_ids, waymo_labels
 
 
 def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
@@ -33,15 +33,17 @@ def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
         raise SceneError(
             f"a world of kind {kind!r} has no labelled points", expected="room or street", fix="leave it out"
         )
-    mesh = LabelledMesh.open(world)
     path = world / "truth" / "mesh.ply"
-    seen = ply_column(path, read_ply(path, 3), "vertex", "views") > 0
-    whole, xyz = mesh.whole[seen], mesh.xyz[seen].astype(np.float64)
-    ids = [scannet_ids(text) for text in mesh.texts]
+    mesh = read_ply(path, 3)
+    texts = [node.text for node in HierarchyAnnotations.load(world / "truth").nodes]
+    seen = ply_column(path, mesh, "vertex", "views") > 0
+    whole = ply_column(path, mesh, "vertex", "whole").astype(np.int32)[seen]
+    xyz = ply_places(path, mesh)[seen].astype(np.float64)
+    ids = [scannet_ids(text) for text in texts]
     instance = (whole + 1).astype(np.int32)
     fine = _of_nodes([fine for fine, _ in ids], whole)
     nyu40 = LabelledPoints(xyz, _of_nodes([broad for _, broad in ids], whole), instance, "nyu40")
-    replica = _of_nodes([replica_id(text) for text in mesh.texts], whole)
+    replica = _of_nodes([replica_id(text) for text in texts], whole)
     return {
         "nyu40": nyu40,
         "scannet200": replace(nyu40, class_id=fine, labelling="scannet200"),

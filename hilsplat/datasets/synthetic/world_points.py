@@ -1,27 +1,11 @@
-"""Write a finished synthetic room as ScanNet or Replica, a street as Waymo: known truth for the readers."""
+"""What ScanNet, Replica and Waymo call the things of a synthetic room or street."""
 
-import io
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
-from PIL import Image
+from jaxtyping import Int32
 
-from hilsplat.base.artifacts import read_npz
-from hilsplat.base.errors import MisalignedArtifactError
-from hilsplat.base.images import read_image
 from hilsplat.datasets.classes import replica, scannet, scannet200, waymo
-from hilsplat.datasets.points.point_files import ply_column, ply_faces, ply_places, read_ply
-from hilsplat.datasets.points.posed_images import PosedImage
-from hilsplat.datasets.points.replica_write import write_semantic_mesh, write_sequence
-from hilsplat.datasets.points.scannet_write import write_label_table, write_scan
-from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
-from hilsplat.datasets.waymo.frames import CameraShot, LidarFrame, LidarReturn
-from hilsplat.datasets.waymo.geometry import CV_FROM_WAYMO, WaymoCamera, column_azimuths, rotation_of
-from hilsplat.datasets.waymo.write import write_segment
-from hilsplat.scene.cameras import Cameras
 
 OTHERPROP = 40
 """NYU40's class of small things that have none of their own."""
@@ -64,57 +48,6 @@ undefined: Waymo has no class for them."""
 COUNTABLE = frozenset({"car", "truck", "bus", "bicyclist", "pedestrian"})
 """Classes whose instances are told apart."""
 
-VEHICLE_FROM_CAM = np.array([[1.0, 0, 0, 1.5], [0, 1, 0, 0], [0, 0, 1, 2.1], [0, 0, 0, 1]])
-LIDAR_AT = (1.4, 0.0, 2.2)
-"""Place of the lidar on the vehicle, metres; that of the true drive is in its poses."""
-LIDAR_TURN_DEG = 148.0
-"""The lidar is mounted turned, as Waymo's is: columns are counted from the vehicle's back all the same."""
-FRAME_MICROS = 100_000
-
-
-@dataclass(frozen=True, eq=False)
-class LabelledMesh:
-    """The labelled surface of a synthetic scene.
-
-    Attributes:
-        xyz: vertices, metres.
-        whole: row of `texts` of each vertex, -1 none.
-        faces: corners of triangles.
-        whole_of_face: likewise, of faces.
-        texts: class of each node.
-    """
-
-    xyz: Float32[np.ndarray, "P 3"]
-    whole: Int32[np.ndarray, " P"]
-    faces: Int32[np.ndarray, "F 3"]
-    whole_of_face: Int32[np.ndarray, " F"]
-    texts: tuple[str, ...]
-
-    @staticmethod
-    def open(world: Path) -> "LabelledMesh":
-        """Read `truth/mesh.ply` and the texts of `truth/annotations.json`."""
-        path = Path(world) / "truth" / "mesh.ply"
-        mesh = read_ply(path, 3)
-        nodes = HierarchyAnnotations.load(path.parent).nodes
-        return LabelledMesh(
-            ply_places(path, mesh),
-            ply_column(path, mesh, "vertex", "whole").astype(np.int32),
-            ply_faces(path, mesh),
-            ply_column(path, mesh, "face", "whole").astype(np.int32),
-            tuple(node.text for node in nodes),
-        )
-
-
-def posed_images(world: Path) -> list[PosedImage]:
-    """Images of a synthetic scene with their true cameras."""
-    cameras = Cameras.load(Path(world) / "truth" / "cameras.npz")
-    found = []
-    for name in cameras.names:
-        camera = cameras[name]
-        path = Path(world) / "images" / name
-        found.append(PosedImage(name, path, camera.cam_from_world, camera.K, camera.size_hw))
-    return found
-
 
 def scannet_ids(text: str) -> tuple[int, int]:
     """ScanNet200 id (0 for none) and NYU40 id of a class of the world."""
@@ -130,78 +63,6 @@ def replica_id(text: str) -> int:
     return {query: number for number, query in replica.NAMES.items()}.get(name, 0)
 
 
-def write_room_as_scannet(world: Path, root: Path, scan: str) -> None:
-    """Write a room as `scans/<scan>`; nodes count as objects in their order.
-
-    Args:
-        world: what the world stage wrote: `images/` and `truth/`.
-        root: the data set's folder. Its table of labels is replaced by one of all classes of this room.
-        scan: name of the scan.
-    """
-    mesh = LabelledMesh.open(world)
-    categories = {text: scannet_ids(text) for text in mesh.texts}
-    write_label_table(root, categories)
-    write_scan(root, scan, posed_images(world), mesh.xyz, mesh.faces, mesh.whole, mesh.texts, categories)
-
-
-def write_room_as_replica(
-    world: Path, root: Path, scene: str, depths: Sequence[Float32[np.ndarray, "H W"]] = ()
-) -> None:
-    """Write a room as a scene of Replica with the sequence in the layout of NICE-SLAM.
-
-    Args:
-        world: what the world stage wrote.
-        root: the data set's folder.
-        scene: such as room_0.
-        depths: depth of each view, metres, where there is one.
-    """
-    mesh = LabelledMesh.open(world)
-    classes = [replica_id(text) for text in mesh.texts]
-    write_semantic_mesh(Path(root) / scene / "habitat", mesh.xyz, mesh.faces, mesh.whole_of_face, classes)
-    write_sequence(Path(root) / scene.replace("_", ""), posed_images(world), depths)
-
-
-def write_street_as_waymo(
-    world: Path, split: Path, segment: str, azimuth_steps: int = 400, beams: int = 64
-) -> None:
-    """Write a street as a segment of Waymo's release 2: range images of its scan, its views as FRONT.
-
-    Args:
-        world: what the world stage wrote.
-        split: folder such as `validation`.
-        segment: context name.
-        azimuth_steps: directions per turn of the scan; columns of the range images.
-        beams: evenly spaced beams of the scanner; rows of the range images.
-
-    Raises:
-        MisalignedArtifactError: the scan has other directions.
-    """
-    scan = read_npz(Path(world) / "truth" / "lidar.npz")
-    nodes = HierarchyAnnotations.load(Path(world) / "truth").nodes
-    labels = waymo_labels(scan["node_ids"], [node.text for node in nodes])
-    images = posed_images(world)
-    shots = [_shot(image, FRAME_MICROS * (number + 1)) for number, image in enumerate(images)]
-    centres = np.stack([image.world_from_cam[:3, 3] for image in images])
-    up = np.arcsin((scan["points"] - scan["origins"][scan["pose_index"]])[:, 2] / scan["range_m"])
-    slope, start = np.polyfit(scan["beam"], up.astype(np.float64), 1)
-    inclinations = (start + slope * np.arange(beams))[::-1]
-    frames = []
-    for pose, origin in enumerate(scan["origins"]):
-        view = int(np.linalg.norm(centres - origin, axis=1).argmin())
-        rows = scan["pose_index"] == pose
-        frames.append(
-            _lidar_frame(
-                {name: scan[name][rows] for name in ("points", "range_m", "beam")},
-                labels[rows],
-                origin,
-                inclinations,
-                shots[view],
-                azimuth_steps,
-            )
-        )
-    write_segment(split, segment, frames, shots)
-
-
 def waymo_labels(node_ids: Int32[np.ndarray, "P 3"], texts: Sequence[str]) -> Int32[np.ndarray, "P 2"]:
     """Instance and Waymo class of points, from the nodes (whole, part, subpart) they belong to."""
     number = {query: label for label, _, query in waymo.CLASSES}
@@ -210,69 +71,3 @@ def waymo_labels(node_ids: Int32[np.ndarray, "P 3"], texts: Sequence[str]) -> In
     classes = np.where(part > 0, part, whole)
     countable = np.isin(classes, [number[name] for name in COUNTABLE])
     return np.stack([np.where(countable, node_ids[:, 0] + 1, 0), classes], axis=1).astype(np.int32)
-
-
-def _shot(image: PosedImage, time: int) -> CameraShot:
-    """A view as an image of the front camera."""
-    assert isinstance(image.image, Path)
-    K = image.K
-    lens = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], 0, 0, 0, 0, 0], dtype=np.float64)
-    stream = io.BytesIO()
-    Image.fromarray(read_image(image.image)).save(stream, format="JPEG", quality=95)
-    world_from_vehicle = image.world_from_cam @ CV_FROM_WAYMO @ np.linalg.inv(VEHICLE_FROM_CAM)
-    camera = WaymoCamera("FRONT", lens, VEHICLE_FROM_CAM, image.size_hw)
-    return CameraShot(time, camera, stream.getvalue(), world_from_vehicle)
-
-
-def _lidar_frame(
-    scan: dict[str, np.ndarray],
-    labels: np.ndarray,
-    origin: Float[np.ndarray, " 3"],
-    inclinations: Float[np.ndarray, " H"],
-    shot: CameraShot,
-    width: int,
-) -> LidarFrame:
-    """One turn of the scan as a range image. The vehicle heads along the axis x of the world."""
-    height = len(inclinations)
-    turn = np.radians(LIDAR_TURN_DEG)
-    vehicle_from_lidar = np.eye(4)
-    vehicle_from_lidar[:3, :3] = rotation_of(np.array([0.0, 0.0, turn]))
-    vehicle_from_lidar[:3, 3] = LIDAR_AT
-    world_from_vehicle = np.eye(4)
-    world_from_vehicle[:3, 3] = origin - np.array(LIDAR_AT)
-    away = scan["points"] - origin
-    azimuth = np.arctan2(away[:, 1], away[:, 0])
-    first = column_azimuths(width, vehicle_from_lidar)[0] + turn
-    column = (first - azimuth) / (2 * np.pi / width)
-    if np.abs(column - column.round()).max(initial=0) > 0.1:
-        raise MisalignedArtifactError(
-            "the scan has other directions than the columns of a range image",
-            expected=f"azimuths at odd multiples of 180 / {width} degrees",
-            found=f"up to {np.abs(column - column.round()).max():.2f} columns off",
-            fix="give the number of directions per turn of the scan",
-        )
-    place = height - 1 - scan["beam"], column.round().astype(int) % width
-    image = np.zeros((height, width, 4), dtype=np.float32)
-    image[..., 0] = -1
-    image[*place, 0] = scan["range_m"]
-    of_pixel = np.zeros((height, width, 2), dtype=np.int32)
-    of_pixel[place] = labels
-    in_camera = np.linalg.inv(shot.world_from_vehicle @ shot.camera.vehicle_from_cam)
-    pixel, valid = shot.camera.project(
-        scan["points"].astype(np.float64) @ in_camera[:3, :3].T + in_camera[:3, 3]
-    )
-    rows, columns = shot.camera.size_hw
-    inside = valid & (pixel >= 0).all(axis=1) & (pixel < [columns, rows]).all(axis=1)
-    cells = np.zeros((height, width, 6), dtype=np.int32)
-    cells[place] = np.where(
-        inside[:, None], np.stack([inside, *np.floor(pixel.T), *np.zeros((3, len(pixel)))], axis=1), 0
-    )
-    pose = np.tile(np.float32([0, 0, 0, *world_from_vehicle[:3, 3]]), (height, width, 1))
-    return LidarFrame(
-        shot.timestamp_micros,
-        world_from_vehicle,
-        vehicle_from_lidar,
-        inclinations,
-        pose,
-        (LidarReturn(image, of_pixel, cells),),
-    )

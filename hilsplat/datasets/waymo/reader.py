@@ -1,17 +1,18 @@
 """Waymo perception: labelled points of the top lidar and the images of the five cameras of a segment.
 
 Release 2.0.1 (parquet) or 1.4.3 (TFRecord), which hold the same. Coordinates are those of the vehicle at
-the segment's first frame: the files' world lies kilometres from its origin, too far for float32.
+the segment's first frame: the files' places are kilometres from their origin, too far for float32.
 """
 
 import logging
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.dataset import Dataset, SceneReport
+from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.datasets.points.point_files import listing
 from hilsplat.datasets.waymo import parquet, records
@@ -109,16 +110,6 @@ def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
     return PointScene(segment, images, {"waymo": truth}, tuple(warnings))
 
 
-def check_segment(root: Path, segment: str) -> SceneReport:
-    """Read everything of a segment, the images of every tenth frame, and say what was found."""
-    found = open_segment(root, segment, every=10)
-    facts = found.facts()
-    truth = found.truth["waymo"]
-    if truth.visible is not None:
-        facts["waymo points that a camera sees"] = int(truth.visible.sum())
-    return SceneReport(facts, found.warnings)
-
-
 @dataclass(frozen=True)
 class Segments(Dataset):
     """A data set of which the paper names no scenes: the segments that are there are its scenes."""
@@ -158,7 +149,7 @@ DATASET = Segments(
   individual_files_validation_segment-<segment>_with_camera_labels.tfrecord     or release 1.4.3""",
     required=lambda segment: tuple(f"{SPLITS[0]}/{tag}/{segment}.parquet" for tag in parquet.COMPONENTS),
     open=open_segment,
-    check=check_segment,
+    open_part=partial(open_segment, every=10),
     protocols=("waymo/segmentation",),
     label_places=lambda segment: (f"*/lidar_segmentation/{segment}.parquet",),
 )

@@ -21,6 +21,8 @@ from hilsplat.settings import EvaluateSettings
 from hilsplat.world.mesh import TrueMesh
 
 METHODS = ("field", "tree")
+TEXTS_PER_LEVEL = 4
+"""Texts per level and view that are asked in two views."""
 MaskOf = Callable[[str, str, Query], Bool[np.ndarray, "H W"]]
 """(method, view, query) -> answer at the query's level."""
 
@@ -43,7 +45,7 @@ def measure_world_consistency(
         truths: annotated views.
         answered: answers that were given in them (`views.measure_view`).
         truth: truth folder of a synthetic scene.
-        settings: methods, the map rule, how many texts.
+        settings: methods, the map rule.
     """
     if not (Path(truth) / "mesh.ply").is_file():
         return
@@ -58,7 +60,7 @@ def measure_world_consistency(
         points = thinned(
             shared_points(true[pair[0]], mesh.depth(true[pair[0]]), true[pair[1]], mesh.depth(true[pair[1]]))
         )
-        queries = spread(truths[view]().queries, settings.consistency_texts)
+        queries = spread(truths[view]().queries, TEXTS_PER_LEVEL)
         mask_of = answers_of(answers, selections, answered, pair, queries, settings)
         for row in consistency_rows(pair, points, queries, mask_of, settings):
             yield view, row

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
 BOUNDARY_RATIO = 0.02
 """Width of a boundary as a share of the image diagonal (Cheng et al. 2021)."""
@@ -66,18 +66,3 @@ def exceeds(prediction: Bool[np.ndarray, "H W"], truth: Bool[np.ndarray, "H W"],
     Source: yanmin-wu/OpenGaussian `scripts/compute_lerf_iou.py`.
     """
     return float(iou(prediction, truth) > threshold)
-
-
-def foreground(
-    grey: UInt8[np.ndarray, "h w"], above: int, size_hw: tuple[int, int]
-) -> Bool[np.ndarray, "H W"]:
-    """Mask of a grey image: pixels above a value, resized to another size by the nearest pixel.
-
-    Above 128 for LERF-Mask (lkeab/gaussian-grouping), above 10 for the JPEG masks that OpenGaussian
-    compares with, above 254 for 3D-OVS.
-    """
-    import cv2
-
-    if grey.shape != tuple(size_hw):
-        grey = cv2.resize(grey, (size_hw[1], size_hw[0]), interpolation=cv2.INTER_NEAREST)
-    return grey > above

@@ -71,33 +71,3 @@ METRICS: dict[str, Metric] = {
     "ap50": Metric("instances.ap50", False, SHARE, SCANS),
     "ap25": Metric("instances.ap25", False, SHARE, SCANS),
 }
-
-BUILDING_BLOCKS: frozenset[str] = frozenset(
-    {
-        "masks.boundary",
-        "masks.boundary_width_px",
-        "masks.foreground",
-        "relevancy_rule.filter_side_px",
-        "relevancy_rule.level_by_mean_in_mask",
-        "relevancy_rule.majority_smooth",
-        "relevancy_rule.mean_filter",
-        "relevancy_rule.relevancy_mask",
-        "relevancy_rule.threshold_mask",
-        "localization.box_of",
-        "localization.peak_points",
-        "hierarchy.consistency_of_families",
-        "hierarchy.family_consistency",
-        "hierarchy.mean_over_parents",
-        "averages.accuracy_at",
-        "averages.mean_over_classes",
-        "averages.mean_over_levels",
-        "averages.mean_over_pairs",
-        "averages.mean_over_scenes",
-        "instances.average_precision",
-        "instances.curve_area",
-        "instances.match_instances",
-        "pixel_classes.argmax_masks",
-        "point_classes.pooled",
-    }
-)
-"""Public functions of this package that are no metric of a row; a test lets none be in neither list."""

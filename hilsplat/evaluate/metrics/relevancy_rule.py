@@ -14,7 +14,7 @@ from hilsplat.base.levels import LEVELS, Level
 MAJORITY_REACH_PX = 3
 """The majority window reaches so far up and left, and as far down and right: 7 x 7."""
 
-ThresholdOn = Literal["normalised_pm1", "normalised_01", "raw"]
+ThresholdOn = Literal["normalised_pm1", "raw"]
 LevelRule = Literal["max", "mean_in_mask"]
 Border = Literal["langsplat", "inside"]
 
@@ -29,7 +29,7 @@ class RelevancyRule:
         mix: average the filtered map with the map itself.
         threshold: what the scores must exceed.
         threshold_on: `normalised_pm1`: min-max mapped to [-1, 1], clipped at 0, so that 0.4 means
-            min-max above 0.7; `normalised_01`: min-max; `raw`: the relevancy itself.
+            min-max above 0.7; `raw`: the relevancy itself.
         majority: smooth the mask with the 7 x 7 majority filter.
         level_rule: `max`: the level whose (mixed) map has the highest value; `mean_in_mask`: the
             highest mean inside its own mask (LangSplat's text on 3D-OVS).
@@ -102,8 +102,6 @@ def threshold_mask(
         return relevancy > threshold
     shifted = relevancy - relevancy.min()
     normalised = shifted / (shifted.max() + 1e-9)
-    if on == "normalised_01":
-        return normalised > threshold
     return np.clip(2 * normalised - 1, 0, 1) > threshold
 
 

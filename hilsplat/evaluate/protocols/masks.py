@@ -33,8 +33,8 @@ def measure_masks(
     Args:
         card: such as `lerf-mask/gaussian-grouping`; its metrics and what a missing prediction counts.
         method: what made the masks.
-        predictions: mask per text, at the size of the truth (`metrics.masks.foreground` resizes); a text
-            that is absent or None has no prediction. Texts that the truth of this view lacks are ignored.
+        predictions: mask per text, at the size of the truth; a text that is absent or None has no
+            prediction. Texts that the truth of this view lacks are ignored.
         truths: true region per text.
         queries: all texts that are asked in the scene, in whatever view; a prediction for another one is
             refused, as the misspelt text would count 0 silently. None: not checked.

@@ -1,4 +1,8 @@
-"""A table as an HTML fragment for the report."""
+"""A table as an HTML fragment for the report.
+
+Not by pandas' Styler: that takes as many lines here, and writes an id and three classes for every cell,
+1.6 to 2.5 times the bytes.
+"""
 
 import html
 

@@ -1,4 +1,7 @@
-"""A table as LaTeX: booktabs, best three marked."""
+"""A table as LaTeX: booktabs, best three marked.
+
+Not by pandas' Styler: it leaves < and ± as they are, and has no footnotes.
+"""
 
 from hilsplat.evaluate.tables.rows import Cell, Table, shown_columns
 

@@ -1,4 +1,4 @@
-"""The instance-wise loss L_ins (paper, Eq. 3) in three readings."""
+"""The instance-wise loss L_ins (paper, Eq. 3) in two readings."""
 
 import math
 
@@ -47,32 +47,3 @@ def instance_loss_tree(
     """
     target = depth.to(means.dtype) * math.log(omega)
     return off_diagonal_mean((-soft_distances(means).log() - target).square())
-
-
-def instance_loss_logratio(
-    means: Float[Tensor, "M D"], depth: Int[Tensor, "M M"], omega: float
-) -> Float[Tensor, ""]:
-    """L_ins in the log-ratio form it cites: only ratios of distances are matched.
-
-    For every anchor a and pair i < j: (log d_ai / d_aj - log y_ai / y_aj)^2 with the wanted distance
-    y = Omega^-depth. Scaling all features changes nothing (but for the softening).
-
-    Source: Kim et al., CVPR 2019 (log-ratio loss), with the degrees of the coverage tree.
-
-    Args:
-        means: mean rendered feature of each mask of one view, all levels.
-        depth: `common_ancestor_depth` of every pair.
-        omega: similarity degree, above 1.
-
-    Returns:
-        mean over triplets of distinct masks; 0 for fewer than three.
-    """
-    rows = len(means)
-    if rows < 3:
-        return means.sum() * 0
-    excess = soft_distances(means).log() + depth.to(means.dtype) * math.log(omega)
-    excess = excess - excess.diag().diag()  # the anchor itself is no member of its triplets
-    others = rows - 1
-    # The pairs' squared differences of one anchor: others * sum of squares - square of sum.
-    pairs = others * excess.square().sum(1) - excess.sum(1).square()
-    return pairs.sum() / (rows * others * (others - 1) / 2)

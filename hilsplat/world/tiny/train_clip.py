@@ -1,6 +1,5 @@
 """Train the small CLIP on captioned crops."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -168,8 +167,3 @@ class Scale(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.logarithm = nn.Parameter(torch.tensor(np.log(10.0), dtype=torch.float32))
-
-
-def texts_of(crops: Sequence[CropTable]) -> list[str]:
-    """The queries of all nodes that some crop shows."""
-    return sorted({phrases[0] for table in crops for phrases in table.phrase_sets})

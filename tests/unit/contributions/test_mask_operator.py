@@ -94,7 +94,7 @@ def test_torch_finds_the_same_evidence(device, monkeypatch):
     shares = sp.random(20, 40, 0.3, random_state=rng, format="csr")
     visible = rng.random((4, 40)) < 0.8
     shares = sp.csr_matrix(shares.multiply(visible[view]))
-    arguments = (shares, rng.random(40), visible, view, 0.2, "tanimoto")
+    arguments = (shares, rng.random(40), visible, view, 0.2)
     loops = mask_evidence(*arguments)
     if device == "cpu":  # torch's CPU stands in for the device
         by_torch = module._evidence_by_torch

@@ -5,9 +5,9 @@ from typer.testing import CliRunner
 
 from hilsplat.base.errors import SceneError
 from hilsplat.cli.main import app
-from hilsplat.datasets.published import FRAMES, LABEL_SIZES_WH, PAIRS, PROMPTS
+from hilsplat.datasets.published import FRAMES, PAIRS, PROMPTS
 from hilsplat.datasets.registry import DATASETS, dataset_of
-from hilsplat.datasets.synthetic.write_labelled import write_lerf_ovs
+from tests.unit.datasets.writers.labelled import write_lerf_ovs
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def test_published_lists_have_the_published_counts():
         "ramen": 6,
         "teatime": 10,
     }
-    assert PAIRS.keys() == LABEL_SIZES_WH.keys() == FRAMES["lerf_ovs"].keys()
+    assert PAIRS.keys() == FRAMES["lerf_ovs"].keys()
     assert not any("." in text for texts in PROMPTS["lerf_mask"].values() for text in texts)
 
 

@@ -101,9 +101,8 @@ def test_pixels_outside_the_mask_do_not_reach_the_vector(colour_clip):
 
 def test_kept_background_mixes_in_by_hand(colour_clip):
     image, mask = two_colours()
-    # margin of 0.5 x 8 = 4 px: the box grows to the whole image, half red and half green
-    settings = ClipSettings(background="keep", context=0.5)
-    vectors = ClipModel.load(colour_clip).embed_masks(image, pack(mask), settings)
+    mask[0, 7] = True  # the box is the whole image, half red and half green
+    vectors = ClipModel.load(colour_clip).embed_masks(image, pack(mask), ClipSettings(background="keep"))
     np.testing.assert_allclose(vectors, [[0.5**0.5, 0.5**0.5, 0]], atol=1e-3)
 
 

@@ -138,7 +138,7 @@ def test_maps_of_another_size_are_refused_or_resized(ours, tmp_path):
 @pytest.mark.parametrize(
     ("maps", "vectors", "words"),
     [
-        (np.zeros((3, 6, 8)), np.zeros((1, 5)), "is no LangSplat map"),
+        (np.zeros((3, 6, 8)), np.zeros((1, 5)), "is not a LangSplat map"),
         (np.full((4, 6, 8), 7.0), np.zeros((7, 5)), "does not belong to a_f.npy"),
         (np.full((4, 6, 8), 0.5), np.zeros((7, 5)), "does not belong to a_f.npy"),
         (np.full((4, 6, 8), np.nan), np.zeros((7, 5)), "does not belong to a_f.npy"),

@@ -16,7 +16,6 @@ from hilsplat.contributions.stage import painted_indicator
 from hilsplat.field.autoencoder import run_autoencoder
 from hilsplat.field.contrast import Contrast, ViewRelations, distinct, instance_term, part_term
 from hilsplat.field.field import LanguageField, run_field
-from hilsplat.field.losses.clustering import clustering_loss
 from hilsplat.field.losses.latent_regression import latent_regression_loss
 from hilsplat.field.minimise import lbfgs
 from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
@@ -26,6 +25,7 @@ from hilsplat.methods.method import MethodInputs
 from hilsplat.semantic_tree.tree import run_semantic_tree
 from hilsplat.settings import AutoencoderSettings, FieldSettings, ReferenceSettings, SemanticTreeSettings
 from hilsplat.splat.gaussians import Gaussians
+from tests.unit.field.clustering import clustering_loss
 
 PIXELS, GAUSSIANS, CHANNELS = 60, 12, 2
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
@@ -157,7 +157,7 @@ def test_lbfgs_finds_the_minimum_of_a_bowl():
     assert lbfgs(bowl, np.zeros(3, np.float32), 20, 0.1) == pytest.approx(np.ones(3), abs=1e-3)
 
 
-@pytest.mark.parametrize("instance", ["literal", "coverage_tree", "logratio"])
+@pytest.mark.parametrize("instance", ["literal", "coverage_tree"])
 @pytest.mark.parametrize("part", ["literal", "disentangle"])
 def test_contrastive_gradients_equal_autograd_through_the_means(instance, part):
     toy = Toy((1.0, 0.3, 0.1))
@@ -326,10 +326,10 @@ def test_the_reference_trainer_lowers_its_loss(boxes_with_latents, monkeypatch):
     monkeypatch.setattr("hilsplat.field.reference_trainer.load_ply", lambda path: flat)
     out = world.folder / "reference" / "field.safetensors"
     arguments = (world.scene, world.ply, world.masks, contributions, autoencoder, out)
-    settings = ReferenceSettings(steps=60, rate=0.05, log_every=20)
+    settings = ReferenceSettings(steps=60, rate=0.05)
     run_reference(*arguments, settings, "cpu", 0, 1)
     curve = read_json(world.folder / "reference" / "field.report.json")["curve"]
-    assert [point["step"] for point in curve] == [20, 40, 60]
+    assert [point["step"] for point in curve] == list(range(2, 61, 2))
     assert curve[-1]["loss"] < 0.7 * curve[0]["loss"]
     before = out.read_bytes()
     run_reference(*arguments, settings, "cpu", 0, 2)

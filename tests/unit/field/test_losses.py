@@ -8,7 +8,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilsplat.field.losses.clustering import clustering_loss
 from hilsplat.field.losses.distances import (
     SOFTENING,
     common_ancestor_depth,
@@ -17,11 +16,11 @@ from hilsplat.field.losses.distances import (
 )
 from hilsplat.field.losses.instance import (
     instance_loss_literal,
-    instance_loss_logratio,
     instance_loss_tree,
 )
 from hilsplat.field.losses.latent_regression import latent_regression_loss
 from hilsplat.field.losses.part import part_loss_disentangle, part_loss_literal
+from tests.unit.field.clustering import clustering_loss
 
 
 def doubles(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -100,31 +99,6 @@ def test_tree_instance_loss_puts_relatives_close_whatever_their_level():
     assert instance_loss_tree(means, related, 10.0).item() == pytest.approx(math.log(10) ** 2, rel=1e-5)
 
 
-def test_logratio_matches_a_loop_over_triplets():
-    means, omega = doubles(5, 3), 3.0
-    depth = torch.tensor(common_ancestor_depth(np.array([-1, 0, 0, 1, -1], dtype=np.int32)))
-    distance = soft_distances(means)
-    terms = [
-        (
-            torch.log(distance[a, i] / distance[a, j])
-            - math.log(omega ** -int(depth[a, i]) / omega ** -int(depth[a, j]))
-        )
-        ** 2
-        for a in range(5)
-        for i in range(5)
-        for j in range(i + 1, 5)
-        if a not in (i, j)
-    ]
-    expected = sum(terms) / len(terms)
-    assert instance_loss_logratio(means, depth, omega).item() == pytest.approx(expected.item())
-
-
-def test_logratio_ignores_the_scale_of_features():
-    means, depth = doubles(6, 3) * 100, torch.zeros(6, 6, dtype=torch.long)
-    twice = instance_loss_logratio(2 * means, depth, 10.0).item()
-    assert twice == pytest.approx(instance_loss_logratio(means, depth, 10.0).item(), rel=1e-6)
-
-
 @given(st.permutations(range(5)))
 def test_instance_losses_ignore_the_order_of_masks(order):
     means = doubles(5, 3)
@@ -134,7 +108,6 @@ def test_instance_losses_ignore_the_order_of_masks(order):
     same = depth[order][:, order]
     for before, after in (
         (instance_loss_tree(means, depth, 10.0), instance_loss_tree(means[order], same, 10.0)),
-        (instance_loss_logratio(means, depth, 10.0), instance_loss_logratio(means[order], same, 10.0)),
         (instance_loss_literal(means, level, 10.0), instance_loss_literal(means[order], level[order], 10.0)),
     ):
         assert after.item() == pytest.approx(before.item())
@@ -192,7 +165,6 @@ def test_gradients_agree_with_finite_differences():
     for loss in (
         lambda x: instance_loss_literal(x, level, 10.0),
         lambda x: instance_loss_tree(x, depth, 10.0),
-        lambda x: instance_loss_logratio(x, depth, 10.0),
         lambda x: part_loss_literal(x, parent, parents, 0.5),
         lambda x: part_loss_disentangle(x, other, has, parents, 0.5),
         lambda x: clustering_loss(x[None], labels),

@@ -102,7 +102,7 @@ def test_missing_and_misspelt_columns_are_named(tmp_path):
     [
         (("world", "a", "paper", "world:tabletop:1", "metre"), "column group: 'paper' is unknown"),
         (("world", "a", "ci", "world:tabletop:1", "cm"), "column unit: 'cm' is unknown"),
-        (("world", "a", "ci", "world:tabletop", "metre"), "names no synthetic world"),
+        (("world", "a", "ci", "world:tabletop", "metre"), "is not the name of a synthetic world"),
         (("photos", "a", "photos", "gone", "arbitrary"), "gone is missing"),
         (("photos", "a", "photos", "", "arbitrary"), "column source: it is empty"),
     ],
@@ -214,7 +214,7 @@ def test_a_ply_of_somebody_is_found_from_the_project_folder(tmp_path):
     [
         ("gone.ply", "is missing"),
         ("desk", "is a folder"),
-        ("notes.txt", "is no PLY: it begins with b'hell'"),
+        ("notes.txt", "is not a PLY: it begins with b'hell'"),
         ("data:theirs.ply", "data_root, which is not set"),
     ],
 )

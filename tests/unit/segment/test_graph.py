@@ -6,7 +6,6 @@ import pytest
 from hilsplat.base.levels import NONE, Level
 from hilsplat.segment.coverage import coverage_tree
 from hilsplat.segment.graph import cut, merge_regions, segment_graph
-from hilsplat.settings import CoverageTreeSettings
 
 SCALES = (0.12, 0.04, 0.015)
 
@@ -59,7 +58,7 @@ def test_every_level_covers_the_image_and_levels_nest():
 
 def test_parents_of_the_detail_is_the_square():
     masks = segment_graph(mosaic(), SCALES, min_area_px=16)
-    parent, _ = coverage_tree(masks, CoverageTreeSettings())
+    parent, _ = coverage_tree(masks, theta=0.9)
     smallest = int(masks.area_px.argmin())
     assert parent[smallest] != NONE
     assert masks.area_px[parent[smallest]] == pytest.approx(80 * 80, rel=0.05)

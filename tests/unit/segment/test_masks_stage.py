@@ -8,7 +8,7 @@ import pytest
 from hilsplat.base.artifacts import read_index, read_npz, sha256_of_path
 from hilsplat.base.errors import ArtifactError, ModelError
 from hilsplat.base.images import read_image
-from hilsplat.base.onnx_models import Network, model_digest, open_model_folder
+from hilsplat.base.onnx_models import Network, open_model_folder
 from hilsplat.segment.coverage_stage import run_coverage_tree
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.pictures import THUMB_PX, masks_overview
@@ -64,7 +64,7 @@ def test_index_names_the_model_and_test_views_stay_out(make_scene, tmp_path, set
     run_masks(make_scene(views=3), tmp_path / "masks", tmp_path / "cache", settings, threads=1)
     index = read_index(tmp_path / "masks")
     assert list(index["views"]) == ["000.png", "001.png"]
-    assert index["model_sha256"] == model_digest(disc_sam)
+    assert index["model_sha256"] == open_model_folder(disc_sam).digest
     assert len(HierarchicalMasks.load(tmp_path / "masks" / "000.png.npz")) == 12
 
 
@@ -142,7 +142,7 @@ def test_four_masks_per_prompt_are_refused(make_disc_sam, tmp_path):
 
 def test_digest_follows_content_and_not_place(make_disc_sam, tmp_path):
     first, second = make_disc_sam(tmp_path / "a"), make_disc_sam(tmp_path / "b")
-    assert model_digest(first) == model_digest(second)
+    assert open_model_folder(first).digest == open_model_folder(second).digest
     settings = json.loads((second / "preprocessor_config.json").read_text())
     (second / "preprocessor_config.json").write_text(json.dumps(settings | {"resample": 3}))
-    assert model_digest(first) != model_digest(second)
+    assert open_model_folder(first).digest != open_model_folder(second).digest

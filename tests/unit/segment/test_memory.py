@@ -9,7 +9,7 @@ from benchmarks.canned_sam import CannedSam, NetworkClock
 from hilsplat.segment.candidates import decode_candidates
 from hilsplat.segment.coverage import coverage_tree
 from hilsplat.segment.generate import masks_from_candidates
-from hilsplat.settings import CoverageTreeSettings, MasksSettings
+from hilsplat.settings import MasksSettings
 
 CLEAR = Path("/proc/self/clear_refs")
 
@@ -28,7 +28,7 @@ def test_three_thousand_candidates_stay_below_the_bound():
     before = status_mib("VmRSS")
     candidates = decode_candidates(image, model, settings)
     masks = masks_from_candidates(candidates, (728, 986), model, settings)
-    coverage_tree(masks, CoverageTreeSettings())
+    coverage_tree(masks, theta=0.9)
     assert len(candidates) >= 3000
     assert len(masks) > 100
     # the bound is 1.5 GiB; one call of 64 prompts alone holds 50 MiB of logits, here twice

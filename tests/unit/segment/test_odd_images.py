@@ -10,7 +10,7 @@ from hilsplat.segment.generate import masks_from_candidates
 from hilsplat.segment.graph import segment_graph
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.sam import SamModel
-from hilsplat.settings import CoverageTreeSettings, MasksSettings
+from hilsplat.settings import MasksSettings
 
 SCALES = MasksSettings().graph_scales
 SETTINGS = MasksSettings(points_per_side=3, stability_min=0, min_area_px=1)
@@ -32,7 +32,7 @@ def test_an_image_of_one_pixel_width_has_masks_of_its_size(model, size_hw, crop_
     masks = by_sam(image, model, SETTINGS.model_copy(update={"crop_layers": crop_layers}))
     assert masks.size_hw == size_hw
     assert len(masks) > 0
-    parent, _ = coverage_tree(masks, CoverageTreeSettings())
+    parent, _ = coverage_tree(masks, theta=0.9)
     assert len(parent) == len(masks)
 
 
@@ -52,7 +52,7 @@ def test_a_view_without_masks_goes_through(model):
     none = by_sam(np.zeros((32, 32, 3), np.uint8), model, SETTINGS.model_copy(update={"min_area_px": 5000}))
     assert len(none) == 0
     assert none.size_hw == (32, 32)
-    parent, depth = coverage_tree(none, CoverageTreeSettings())
+    parent, depth = coverage_tree(none, theta=0.9)
     assert len(parent) == len(depth) == 0
 
 
@@ -64,7 +64,7 @@ def test_a_photograph_of_40_megapixels_needs_no_picture_per_mask(model):
     part = masks.area_px[masks.rows_of(Level.PART)].max()
     assert part == pytest.approx(np.pi * (6 * 7300 / 32) ** 2, rel=0.2)
     assert masks.runs.nbytes < 2**22
-    coverage_tree(masks, CoverageTreeSettings())
+    coverage_tree(masks, theta=0.9)
 
 
 def test_the_graph_segmenter_takes_40_megapixels():

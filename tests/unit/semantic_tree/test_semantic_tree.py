@@ -129,17 +129,6 @@ def test_second_run_writes_the_same_bytes(tree_of_boxes):
     assert sha256_of_path(out) == before
 
 
-def test_soft_overlap_sees_less_agreement_where_gaussians_cross_borders(two_boxes_contributions):
-    world, contributions = two_boxes_contributions
-    quality = {}
-    for overlap in ("tanimoto", "soft"):
-        out = world.folder / overlap
-        settings = SemanticTreeSettings(overlap=overlap, link_threshold=0.12)
-        run_semantic_tree(contributions, world.masks, world.clip, out, settings)
-        quality[overlap] = SemanticTree.load(out).quality
-    assert (quality["soft"] < quality["tanimoto"]).all()
-
-
 def test_more_views_asked_for_than_there_are_leave_an_empty_tree(two_boxes_contributions, caplog):
     world, contributions = two_boxes_contributions
     out = world.folder / "empty"

@@ -15,9 +15,10 @@ from hilsplat.world.lidar import (
     beam_directions,
     scan_street,
 )
-from hilsplat.world.render import depth_view, label_view
+from hilsplat.world.render import label_view
 from hilsplat.world.scenes.kinds import scene_cameras
 from hilsplat.world.stage import run_world
+from tests.unit.world.depth import depth_view
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,9 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.scene.cameras import Cameras
 from hilsplat.settings import WorldSettings
 from hilsplat.world.mesh import TrueMesh
-from hilsplat.world.render import depth_view
 from hilsplat.world.scenes.kinds import build_scene
 from hilsplat.world.stage import run_world
+from tests.unit.world.depth import depth_view
 
 
 def test_depth_from_the_truth_folder_is_the_renderers(tmp_path):

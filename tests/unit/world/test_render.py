@@ -6,13 +6,14 @@ import pytest
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
 from hilsplat.scene.cameras import Camera
 from hilsplat.world.paints import Paint
-from hilsplat.world.render import depth_view, label_view, render_view
+from hilsplat.world.render import label_view, render_view
 from hilsplat.world.scenes.kinds import build_scene
 from hilsplat.world.scenes.scene import Style, WorldScene
 from hilsplat.world.scenes.tabletop import ring_cameras, training_camera
 from hilsplat.world.shapes import Mesh, box, joined, sphere
 from hilsplat.world.textures import albedo, pattern
 from hilsplat.world.views import looking_at, pinhole
+from tests.unit.world.depth import depth_view
 
 GREY = Paint("grey", "mottled", (0.5, 0.5, 0.5), (0.5, 0.5, 0.5), 9.0, 0.0, 10.0, 0.0, (5.0, 6.0, 7.0))
 STONE = Paint("grey", "stone", (0.6, 0.5, 0.4), (0.3, 0.3, 0.3), 8.0, 0.0, 10.0, 0.3, (5.0, 6.0, 7.0))

@@ -100,8 +100,8 @@ def test_instances_of_a_text_are_annotated_together_or_not_at_all():
 
 
 def test_the_smallest_subpart_scales_with_the_area_of_the_view():
-    assert smallest_areas(384, 60, 100) == {Level.WHOLE: 60, Level.PART: 60, Level.SUBPART: 100}
-    assert smallest_areas(192, 60, 100)[Level.SUBPART] == pytest.approx(25)
+    assert smallest_areas(384, 60) == {Level.WHOLE: 60, Level.PART: 60, Level.SUBPART: 100}
+    assert smallest_areas(192, 60)[Level.SUBPART] == pytest.approx(25)
 
 
 @pytest.mark.parametrize("source", ["tabletop:100", "world:forest:1", "world:tabletop:-1", "world:tabletop"])

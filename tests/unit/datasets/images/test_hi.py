@@ -8,7 +8,7 @@ import pytest
 from hilsplat.base.errors import SceneError
 from hilsplat.base.levels import Level
 from hilsplat.datasets.images.hi import HI_3DOVS, HI_LERF
-from hilsplat.datasets.synthetic.write_labelled import LERF_STEMS, OVS_STEMS, write_hi
+from tests.unit.datasets.writers.labelled import LERF_STEMS, OVS_STEMS, write_hi
 
 
 @pytest.fixture

@@ -7,10 +7,10 @@ from PIL import Image
 from hilsplat.base.errors import ImageError, SceneError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
-from hilsplat.datasets.images.lerf_mask import check_scene, open_scene
+from hilsplat.datasets.images.lerf_mask import open_scene
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, write_hierarchy
-from hilsplat.datasets.synthetic.true_world import TrueWorld, write_sparse
-from hilsplat.datasets.synthetic.write_labelled import write_lerf_mask
+from tests.unit.datasets.writers.labelled import write_lerf_mask
+from tests.unit.datasets.writers.true_world import TrueWorld, write_sparse
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def test_a_written_world_is_read_back_equal(true_world, root):
         assert [region.text for region in scene.views[view]] == ["head", "paw"]
         for region in scene.views[view]:
             assert np.array_equal(region.mask(), true_world.mask(name, nodes[region.text]))
-    assert check_scene(root, "teatime").facts["posed views"] == 4
+    assert open_scene(root, "teatime").report().facts["posed views"] == 4
 
 
 def test_test_views_are_posed_images_that_images_train_lacks(root):

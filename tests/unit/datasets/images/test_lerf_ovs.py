@@ -8,11 +8,12 @@ import pytest
 from hilsplat.base.errors import SceneError
 from hilsplat.base.images import write_png
 from hilsplat.datasets.images.isat import read_isat
-from hilsplat.datasets.images.lerf_ovs import DATASET, check_scene, open_scene
-from hilsplat.datasets.images.polygons import fill_polygon, polygons_of
+from hilsplat.datasets.images.lerf_ovs import DATASET, open_scene
+from hilsplat.datasets.images.polygons import fill_polygon
 from hilsplat.datasets.labelled import posed_images
 from hilsplat.datasets.published import PAIRS, PROMPTS
-from hilsplat.datasets.synthetic.write_labelled import write_lerf_ovs
+from tests.unit.datasets.writers.labelled import write_lerf_ovs
+from tests.unit.datasets.writers.polygons import polygons_of
 
 SQUARE = [[2.0, 3.0], [5.0, 3.0], [5.0, 6.0], [2.0, 6.0]]
 
@@ -196,7 +197,7 @@ def test_a_label_of_another_release_is_refused(root):
 
 
 def test_unlisted_texts_and_missing_frames_are_told(root):
-    told = "; ".join(check_scene(root, "figurines").warnings)
+    told = "; ".join(open_scene(root, "figurines").report().warnings)
     assert "published frames without label: frame_00041, frame_00105, frame_00152, frame_00195" in told
     assert "texts that the published list lacks: Ring, bear, head, nose, paw" in told
 

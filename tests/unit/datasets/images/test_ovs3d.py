@@ -6,13 +6,13 @@ import pytest
 from hilsplat.base.errors import SceneError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
-from hilsplat.datasets.images.ovs3d import check_scene, open_scene, read_classes
+from hilsplat.datasets.images.ovs3d import open_scene, read_classes
 from hilsplat.datasets.labelled import posed_images
-from hilsplat.datasets.synthetic.write_labelled import write_3d_ovs
-from hilsplat.scene.llff import read_poses_bounds, write_poses_bounds
+from hilsplat.scene.llff import read_poses_bounds
 from hilsplat.scene.poses import run_poses
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import PosesSettings
+from tests.unit.datasets.writers.labelled import write_3d_ovs, write_poses_bounds
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def test_a_written_world_is_read_back_equal(true_world, root):
     # The ring of the first view: rows 5 to 13, columns 26 to 34. The last view does not show it.
     assert scene.views["00"][0].boxes().tolist() == [[26, 5, 34, 13]]
     assert scene.views["03"][0].boxes().shape == (0, 4)
-    assert "regions without a pixel: 03: Ring" in check_scene(root, "bed").warnings
+    assert "regions without a pixel: 03: Ring" in open_scene(root, "bed").report().warnings
 
 
 def test_poses_of_llff_are_read_back_equal(true_world, root):
@@ -172,7 +172,7 @@ def test_a_segmented_view_without_image_is_named(root):
 def test_a_scene_without_any_pose_says_so(root):
     (root / "bed" / "poses_bounds.npy").unlink()
     assert open_scene(root, "bed").poses is None
-    assert any("no poses" in line for line in check_scene(root, "bed").warnings)
+    assert any("no poses" in line for line in open_scene(root, "bed").report().warnings)
 
 
 def test_missing_views_are_told(root):

@@ -9,9 +9,8 @@ from PIL import Image
 
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.classes.replica import REPLICA_48, REPLICA_51
-from hilsplat.datasets.points.point_files import write_ply
 from hilsplat.datasets.points.posed_images import PosedImage
-from hilsplat.datasets.points.replica import check_scene, open_scene, read_depth, read_images
+from hilsplat.datasets.points.replica import open_scene, read_images
 from hilsplat.datasets.points.replica_mesh import (
     class_of_objects,
     object_of_vertices,
@@ -19,8 +18,9 @@ from hilsplat.datasets.points.replica_mesh import (
     read_semantic_mesh,
     triangles_of,
 )
-from hilsplat.datasets.points.replica_write import write_semantic_mesh, write_sequence
 from hilsplat.datasets.registry import DATASETS
+from tests.unit.datasets.writers.ply import write_ply
+from tests.unit.datasets.writers.replica import write_semantic_mesh, write_sequence
 
 # Three quads in a row, of objects 2, 1 and 3:   0--1--2--3
 #                                                4--5--6--7
@@ -121,20 +121,6 @@ def test_published_lens_of_nice_slam(tmp_path):
     assert images[0].K[0, 0] == 600 and images[0].K[:2, 2].tolist() == [600, 340]  # 599.5, 339.5 from 0
 
 
-def test_depth_scales_differ_by_layout(tmp_path):
-    images = make_images(tmp_path / "own", 1)
-    depth = np.full((6, 10), 2.5, np.float32)
-    depth[0, 0] = np.inf
-    write_sequence(tmp_path / "slam" / "room0", images, [depth])
-    stored = np.asarray(Image.open(tmp_path / "slam" / "room0" / "results" / "depth000000.png"))
-    assert stored[1, 1] == round(2.5 * 6553.5) and stored[0, 0] == 0
-    slam = read_depth(tmp_path / "slam" / "room0", 0)
-    assert slam[1, 1] == pytest.approx(2.5, abs=1e-4) and slam[0, 0] == 0
-    assert read_depth(make_semantic_nerf(tmp_path / "nerf", 1), 0)[1, 1] == 2.5  # 2500 millimetres
-    with pytest.raises(SceneError, match=r"frame 7 of .* has no depth image"):
-        read_depth(tmp_path / "nerf", 7)
-
-
 def test_labels_per_vertex_as_text(tmp_path):
     places = {axis: XYZ[:, column] for column, axis in enumerate("xyz")}
     for mesh, faces in (("quads", QUADS), ("triangles", QUADS[:, :3])):
@@ -163,7 +149,7 @@ def test_a_scene_is_read_from_either_sequence(tmp_path):
     write_sequence(tmp_path / "room0", make_images(tmp_path / "own", 2))
     scene = open_scene(tmp_path, "room_0")
     assert [image.name for image in scene.images] == ["frame000000.jpg", "frame000001.jpg"]
-    assert check_scene(tmp_path, "room_0").facts["replica classes"] == 2
+    assert open_scene(tmp_path, "room_0").report().facts["replica classes"] == 2
     assert DATASETS["replica"].found(tmp_path) == ("room_0",)
 
 

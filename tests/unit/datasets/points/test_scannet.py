@@ -11,15 +11,13 @@ from hilsplat.base.errors import MisalignedArtifactError, SceneError
 from hilsplat.datasets.classes.replica import REPLICA_48
 from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_19
 from hilsplat.datasets.classes.scannet200 import SCANNET200, SCANNET200_INSTANCES
-from hilsplat.datasets.classes.scannet_splits import VALIDATION_SCANS
 from hilsplat.datasets.points.posed_images import PosedImage, write_posed_images
-from hilsplat.datasets.points.scannet import LABEL_TABLE, check_scan, open_scan, read_label_table
-from hilsplat.datasets.points.scannet_write import write_label_table, write_scan
+from hilsplat.datasets.points.scannet import LABEL_TABLE, open_scan, read_label_table
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.sources import export_images
 from hilsplat.scene.known_poses import find_known_poses
 from hilsplat.scene.known_views import read_transforms
-from tests.conftest import PROJECT
+from tests.unit.datasets.writers.scannet import write_label_table, write_scan
 
 SCAN = "scene0000_00"
 CATEGORIES = {
@@ -170,7 +168,7 @@ def break_json(folder: Path) -> None:
 
 def break_labels(folder: Path) -> None:
     # the plain mesh gets a vertex more than its labels
-    from hilsplat.datasets.points.point_files import write_ply
+    from tests.unit.datasets.writers.ply import write_ply
 
     more = np.concatenate([XYZ, XYZ[:1]])
     write_ply(folder / f"{SCAN}_vh_clean_2.ply", {a: more[:, i] for i, a in enumerate("xyz")}, FACES, {})
@@ -289,17 +287,8 @@ def test_the_mesh_becomes_the_sparse_points_in_its_order(root, tmp_path):
     np.testing.assert_array_equal(xyz, truth.truth["nyu40"].xyz.astype(np.float32))
 
 
-def test_validation_scans_are_the_benchmarks():
-    assert len(VALIDATION_SCANS) == len(set(VALIDATION_SCANS)) == 312
-    assert "scene0645_00" in VALIDATION_SCANS and "scene0000_00" not in VALIDATION_SCANS
-    path = PROJECT.parent / "shared/reference/samples/scannet/scannetv2_val.txt"
-    if not path.is_file():
-        pytest.skip("ScanNet's list of scans is not beside the checkout (shared/reference/samples/scannet)")
-    assert set(path.read_text().split()) == set(VALIDATION_SCANS)
-
-
 def test_registry_checks_a_scan(root):
-    report = check_scan(root, SCAN)
+    report = open_scan(root, SCAN).report()
     assert report.facts["posed images"] == 12
     assert report.facts["nyu40 points with a class"] == 4
     assert report.facts["scannet200 classes"] == 3

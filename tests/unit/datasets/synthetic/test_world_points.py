@@ -12,16 +12,7 @@ from hilsplat.datasets.registry import open_labels
 from hilsplat.datasets.sources import export_images
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.datasets.synthetic.world_labels import labelled_points
-from hilsplat.datasets.synthetic.world_points import (
-    LabelledMesh,
-    posed_images,
-    replica_id,
-    scannet_ids,
-    waymo_labels,
-    write_room_as_replica,
-    write_room_as_scannet,
-    write_street_as_waymo,
-)
+from hilsplat.datasets.synthetic.world_points import replica_id, scannet_ids, waymo_labels
 from hilsplat.datasets.waymo import reader as waymo
 from hilsplat.scene.importers import import_poses
 from hilsplat.scene.known_poses import find_known_poses
@@ -29,6 +20,13 @@ from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings, PosesSettings, WorldSettings
 from hilsplat.splat.fit import fit_gaussians
 from hilsplat.world.stage import run_world
+from tests.unit.datasets.writers.world import (
+    LabelledMesh,
+    posed_images,
+    write_room_as_replica,
+    write_room_as_scannet,
+    write_street_as_waymo,
+)
 
 SETTINGS = WorldSettings(views=3, image_px=48, samples=1, objects=2)
 

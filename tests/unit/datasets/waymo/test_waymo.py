@@ -1,4 +1,4 @@
-"""Waymo by hand: a range image of one row, a camera with round numbers, records made by protobuf itself."""
+"""Waymo by hand: a range image of one row, a camera with round numbers, records made by protobuf."""
 
 import struct
 import zlib
@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.registry import DATASETS
@@ -20,10 +19,10 @@ from hilsplat.datasets.waymo.geometry import (
     range_image_points,
     rotation_of,
 )
-from hilsplat.datasets.waymo.reader import RECORD, check_segment, open_segment
-from hilsplat.datasets.waymo.records import fields_of, masked_crc32c, matrix, packed_varints
-from hilsplat.datasets.waymo.write import write_segment
+from hilsplat.datasets.waymo.reader import RECORD, open_segment
+from hilsplat.datasets.waymo.records import MESSAGES, matrix, message_classes
 from tests.conftest import PROJECT
+from tests.unit.datasets.writers.waymo import write_segment
 
 SEGMENT = "1_2_000_3_000"
 SQRT2 = np.sqrt(2.0)
@@ -194,7 +193,7 @@ def test_registry_finds_and_checks_the_segments_that_are_there(root):
     dataset = DATASETS["waymo"]
     assert dataset.locate(root.parent) == root and dataset.found(root) == (SEGMENT,)
     assert dataset.missing(root, SEGMENT) == ()
-    report = check_segment(root, SEGMENT)
+    report = DATASETS["waymo"].check(root, SEGMENT)
     assert report.facts["waymo points that a camera sees"] == 6
     (root / "validation" / "vehicle_pose" / f"{SEGMENT}.parquet").unlink()
     assert dataset.missing(root, SEGMENT) == (f"validation/vehicle_pose/{SEGMENT}.parquet",)
@@ -241,76 +240,26 @@ def test_images_and_classes_that_do_not_fit_are_refused():
 
 # --- release 1 ------------------------------------------------------------------------------------
 
-DOUBLE, FLOAT, INT64, INT32, STRING, MESSAGE, BYTES = 1, 2, 3, 5, 9, 11, 12
-FIELDS = {  # message -> name, number, type, repeated; a type that is a word is a message
-    "Shape": [("dims", 1, INT32, True)],
-    "MatrixFloat": [("data", 1, FLOAT, True), ("shape", 2, "Shape", False)],
-    "MatrixInt32": [("data", 1, INT32, True), ("shape", 2, "Shape", False)],
-    "Transform": [("transform", 1, DOUBLE, True)],
-    "CameraCalibration": [
-        ("name", 1, INT32, False), ("intrinsic", 2, DOUBLE, True), ("extrinsic", 3, "Transform", False),
-        ("width", 4, INT32, False), ("height", 5, INT32, False),
-    ],
-    "LaserCalibration": [
-        ("name", 1, INT32, False), ("beam_inclinations", 2, DOUBLE, True), ("low", 3, DOUBLE, False),
-        ("high", 4, DOUBLE, False), ("extrinsic", 5, "Transform", False),
-    ],
-    "Context": [
-        ("name", 1, STRING, False), ("cameras", 2, "CameraCalibration", True),
-        ("lasers", 3, "LaserCalibration", True),
-    ],
-    "RangeImage": [("range", 2, BYTES, False), ("cells", 3, BYTES, False), ("pose", 4, BYTES, False),
-                   ("labels", 6, BYTES, False)],
-    "Laser": [("name", 1, INT32, False), ("first", 2, "RangeImage", False),
-              ("second", 3, "RangeImage", False)],
-    "Image": [("name", 1, INT32, False), ("image", 2, BYTES, False), ("pose", 3, "Transform", False)],
-    "Frame": [
-        ("context", 1, "Context", False), ("timestamp_micros", 2, INT64, False),
-        ("pose", 3, "Transform", False),
-        ("images", 4, "Image", True), ("lasers", 5, "Laser", True),
-    ],
-}  # fmt: skip
-
-
-def protobuf_messages():
-    """Waymo's messages, as far as they are read, built by protobuf: the reference for our own reader."""
-    file = descriptor_pb2.FileDescriptorProto(name="w.proto", package="w", syntax="proto2")
-    for message, fields in FIELDS.items():
-        described = file.message_type.add(name=message)
-        for name, number, kind, repeated in fields:
-            field = described.field.add(name=name, number=number, label=3 if repeated else 1)
-            if isinstance(kind, str):
-                field.type, field.type_name = MESSAGE, f".w.{kind}"
-            else:
-                field.type = kind
-                field.options.packed = repeated and kind in (FLOAT, INT32) and name == "data"
-    pool = descriptor_pool.DescriptorPool()
-    pool.Add(file)
-    find = pool.FindMessageTypeByName
-    return {name: message_factory.GetMessageClass(find(f"w.{name}")) for name in FIELDS}
-
-
-PROTO = protobuf_messages()
-
 
 def compressed(image: np.ndarray) -> bytes:
     kind = "MatrixInt32" if image.dtype.kind == "i" else "MatrixFloat"
-    message = PROTO[kind](data=image.ravel().tolist(), shape={"dims": image.shape})
+    message = MESSAGES[kind](data=image.ravel().tolist(), shape={"dims": image.shape})
     return zlib.compress(message.SerializeToString())
 
 
 def encoded(frame: LidarFrame, shots: list[CameraShot], labelled: bool = True) -> bytes:
-    message = PROTO["Frame"](timestamp_micros=frame.timestamp_micros)
+    message = MESSAGES["Frame"](timestamp_micros=frame.timestamp_micros)
     message.pose.transform.extend(frame.world_from_vehicle.ravel())
-    message.context.name = SEGMENT
     for number, name in ((4, "SIDE_LEFT"), (1, "FRONT")):
         lens = next(shot.camera for shot in shots if shot.camera.name == name)
-        added = message.context.cameras.add(
+        added = message.context.camera_calibrations.add(
             name=number, intrinsic=lens.intrinsic, width=lens.size_hw[1], height=lens.size_hw[0]
         )
         added.extrinsic.transform.extend(lens.vehicle_from_cam.ravel())
-    message.context.lasers.add(name=2)
-    laser = message.context.lasers.add(name=1, low=-0.1, high=0.1)  # one beam in the middle: 0
+    message.context.laser_calibrations.add(name=2)
+    laser = message.context.laser_calibrations.add(
+        name=1, beam_inclination_min=-0.1, beam_inclination_max=0.1
+    )  # one beam in the middle: 0
     laser.extrinsic.transform.extend(frame.vehicle_from_lidar.ravel())
     for shot in shots:
         if shot.timestamp_micros == frame.timestamp_micros:
@@ -318,12 +267,13 @@ def encoded(frame: LidarFrame, shots: list[CameraShot], labelled: bool = True) -
             image.pose.transform.extend(shot.world_from_vehicle.ravel())
     message.lasers.add(name=2)
     top = message.lasers.add(name=1)
-    for name, part in zip(("first", "second"), frame.returns, strict=True):
+    for name, part in zip(("ri_return1", "ri_return2"), frame.returns, strict=True):
         target = getattr(top, name)
-        target.range, target.cells = compressed(part.image), compressed(part.projection)
+        target.range_image_compressed = compressed(part.image)
+        target.camera_projection_compressed = compressed(part.projection)
         if labelled:
-            target.labels = compressed(part.labels)
-    top.first.pose = compressed(frame.pixel_pose)
+            target.segmentation_label_compressed = compressed(part.labels)
+    top.ri_return1.range_image_pose_compressed = compressed(frame.pixel_pose)
     return message.SerializeToString()
 
 
@@ -332,33 +282,24 @@ def write_records(path: Path, records: list[bytes]) -> Path:
     with path.open("wb") as stream:
         for record in records:
             length = struct.pack("<Q", len(record))
-            stream.write(length + struct.pack("<I", masked_crc32c(length)) + record + b"\0\0\0\0")
+            stream.write(length + b"\0\0\0\0" + record + b"\0\0\0\0")
     return path
 
 
-def test_checksum_is_the_one_of_tfrecords():
-    # CRC-32C of "123456789" is e3069283 (RFC 3720); turned by 15 bits, plus a282ead8
-    crc = 0xE3069283
-    assert masked_crc32c(b"123456789") == ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
+def test_a_matrix_by_hand():
+    # field 1, three bytes: 1 and 300 (ac 02); field 2, four bytes: dims 2 and 1
+    message = b"\x0a\x03\x01\xac\x02" + b"\x12\x04\x08\x02\x08\x01"
+    assert matrix(zlib.compress(message), np.int32).tolist() == [[1], [300]]
+    with pytest.raises(ValueError, match="reshape"):
+        matrix(zlib.compress(message[:-1] + b"\x02"), np.int32)
 
 
-def test_packed_numbers_and_fields_by_hand():
-    assert packed_varints(b"\x01\xac\x02\x00").tolist() == [1, 300, 0]  # 300 is ac 02
-    assert packed_varints(b"\xff" * 9 + b"\x01").tolist() == [-1]
-    assert packed_varints(b"").tolist() == []
-    fields = fields_of(b"\x08\x96\x01\x12\x02hi\x08\x01")  # 1: 150, 2: "hi", 1: 1
-    assert fields[1] == [150, 1] and bytes(fields[2][0]) == b"hi"
-    for damaged in (b"\x08\x96", b"\x12\x05hi", b"\x0b"):
-        with pytest.raises(ValueError, match=r"ends inside|wire type 3"):
-            fields_of(damaged)
-
-
-def test_matrices_agree_with_protobuf():
+def test_matrices_keep_values_and_shape():
     rng = np.random.default_rng(1)
     whole = rng.integers(-(2**31), 2**31, (3, 4, 2)).astype(np.int32)
-    np.testing.assert_array_equal(matrix(compressed(whole), whole_numbers=True), whole)
+    np.testing.assert_array_equal(matrix(compressed(whole), np.int32), whole)
     real = rng.normal(size=(2, 3, 4)).astype(np.float32)
-    np.testing.assert_array_equal(matrix(compressed(real), whole_numbers=False), real)
+    np.testing.assert_array_equal(matrix(compressed(real), np.float32), real)
 
 
 def test_both_releases_give_the_same_scene(root, tmp_path):
@@ -396,7 +337,7 @@ def test_a_record_that_is_cut_off_or_unlabelled_is_refused(tmp_path):
     with pytest.raises(SceneError, match=r"record 0 is damaged"):
         open_segment(tmp_path, SEGMENT)
     write_records(path, [b"\x0b"])
-    with pytest.raises(SceneError, match=r"frame 0 cannot be read: wire type 3"):
+    with pytest.raises(SceneError, match=r"frame 0 cannot be read: Error parsing message"):
         open_segment(tmp_path, SEGMENT)
 
 
@@ -405,12 +346,17 @@ def test_published_label_file_holds_all_classes():
     path = PROJECT.parent / "shared/reference/samples/waymo/fake_segmentation_groundtruths.bin"
     if not path.is_file():
         pytest.skip("Waymo's test files are not beside the checkout (shared/reference/samples/waymo)")
-    frames = [fields_of(frame) for frame in fields_of(path.read_bytes())[1]]
-    assert [frame[3] for frame in frames] == [[0], [1000000], [2000000]] * 2
+    kinds = message_classes("""
+RangeImage: optional bytes segmentation_label_compressed 6
+Laser: required RangeImage ri_return1 2, required RangeImage ri_return2 3
+SegmentationFrame: required Laser segmentation_labels 1, required int64 timestamp_micros 3
+SegmentationFrameList: repeated SegmentationFrame frames 1""")
+    frames = kinds["SegmentationFrameList"].FromString(path.read_bytes()).frames
+    assert [frame.timestamp_micros for frame in frames] == [0, 1000000, 2000000] * 2
     labels = [
-        matrix(fields_of(fields_of(frame[1][0])[number][0])[6][0], whole_numbers=True)
+        matrix(image.segmentation_label_compressed, np.int32)
         for frame in frames
-        for number in (2, 3)
+        for image in (frame.segmentation_labels.ri_return1, frame.segmentation_labels.ri_return2)
     ]
     assert len(labels) == 12 and all(image.size == 50 * 1000 for image in labels)
     assert set(np.unique(np.concatenate([image.ravel() for image in labels]))) >= set(range(1, 23))

@@ -22,7 +22,6 @@ from hilsplat.evaluate.metrics.masks import (
     boundary_iou,
     boundary_width_px,
     exceeds,
-    foreground,
     iou,
 )
 from hilsplat.evaluate.metrics.pixel_classes import argmax_masks, pixel_accuracy
@@ -74,12 +73,8 @@ def test_threshold_means_min_max_above_0_7():
     assert iou(expected, truth) == pytest.approx(3 / 5)
 
 
-def test_threshold_on_min_max_and_on_raw_relevancy():
-    # min-max above 0.4 leaves out .0 and .35; all raw values but 0.30 are above 0.4
-    np.testing.assert_array_equal(
-        threshold_mask(RELEVANCY, 0.4, "normalised_01"),
-        np.array([[0, 1, 1], [0, 1, 1], [1, 1, 1]], dtype=bool),
-    )
+def test_threshold_on_raw_relevancy():
+    # all values but 0.30 are above 0.4
     np.testing.assert_array_equal(
         threshold_mask(RELEVANCY, 0.4, "raw"), np.array([[0, 1, 1], [1, 1, 1], [1, 1, 1]], dtype=bool)
     )
@@ -255,15 +250,6 @@ def test_accuracy_of_a_pair_needs_more_than_the_threshold():
     truth, quarter = rectangle((0, 1), (0, 4)), rectangle((0, 1), (0, 1))  # IoU 1/4
     assert exceeds(quarter, truth, 0.25) == 0
     assert exceeds(rectangle((0, 1), (0, 2)), truth, 0.25) == 1
-
-
-def test_foreground_is_above_the_value_and_resized_by_the_nearest_pixel():
-    grey = np.array([[128, 129], [255, 0]], dtype=np.uint8)
-    np.testing.assert_array_equal(foreground(grey, 128, (2, 2)), [[False, True], [True, False]])
-    np.testing.assert_array_equal(foreground(grey, 254, (2, 2)), [[False, False], [True, False]])
-    np.testing.assert_array_equal(
-        foreground(grey, 128, (4, 4)), np.kron([[0, 1], [1, 0]], np.ones((2, 2))).astype(bool)
-    )
 
 
 # --- every pixel a class --------------------------------------------------------------------------

@@ -35,7 +35,7 @@ from hilsplat.evaluate.metrics.point_classes import (
     miou_over_occurring,
     miou_over_present,
 )
-from hilsplat.evaluate.metrics.registry import BUILDING_BLOCKS, METRICS
+from hilsplat.evaluate.metrics.registry import METRICS
 
 # Every metric as a function of two label images with labels 0 .. 3, of which the second is the truth.
 # Masks are where a label is 1; families are label 1 or 2 (parent) with its part of label 2 (child).
@@ -124,6 +124,36 @@ label_images = hnp.arrays(np.int64, (4, 5), elements=st.integers(0, 3))
 truths = label_images.filter(lambda labels: all((labels == label).any() for label in (1, 2, 3)))
 few = settings(max_examples=15, deadline=None)  # each example runs every metric
 NOTHING = np.zeros((4, 5), dtype=np.int64)
+
+
+BUILDING_BLOCKS = frozenset(
+    {
+        "masks.boundary",
+        "masks.boundary_width_px",
+        "relevancy_rule.filter_side_px",
+        "relevancy_rule.level_by_mean_in_mask",
+        "relevancy_rule.majority_smooth",
+        "relevancy_rule.mean_filter",
+        "relevancy_rule.relevancy_mask",
+        "relevancy_rule.threshold_mask",
+        "localization.box_of",
+        "localization.peak_points",
+        "hierarchy.consistency_of_families",
+        "hierarchy.family_consistency",
+        "hierarchy.mean_over_parents",
+        "averages.accuracy_at",
+        "averages.mean_over_classes",
+        "averages.mean_over_levels",
+        "averages.mean_over_pairs",
+        "averages.mean_over_scenes",
+        "instances.average_precision",
+        "instances.curve_area",
+        "instances.match_instances",
+        "pixel_classes.argmax_masks",
+        "point_classes.pooled",
+    }
+)
+"""Public functions of the metrics that are no metric of a row."""
 
 
 def public_functions():

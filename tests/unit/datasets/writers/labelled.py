@@ -6,15 +6,17 @@ exact. Each writer returns the new stem of every view.
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
-from hilsplat.base.artifacts import write_text
+from hilsplat.base.artifacts import write_json, write_text
 from hilsplat.base.errors import SceneError
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.datasets.images.isat import isat_object, write_isat
-from hilsplat.datasets.images.polygons import polygons_of
-from hilsplat.datasets.synthetic.true_world import (
+from hilsplat.scene.llff import POSES_BOUNDS
+from tests.unit.datasets.writers.polygons import polygons_of
+from tests.unit.datasets.writers.true_world import (
     TrueWorld,
     chosen_views,
     stems_from,
@@ -22,7 +24,6 @@ from hilsplat.datasets.synthetic.true_world import (
     write_mask,
     write_sparse,
 )
-from hilsplat.scene.llff import POSES_BOUNDS, write_poses_bounds
 
 LERF_STEMS = ("frame_{:05d}", 1)
 OVS_STEMS = ("{:02d}", 0)
@@ -168,3 +169,51 @@ def _depth_range(world: TrueWorld, cam_from_world: np.ndarray) -> np.ndarray:
     depth = world.points_xyz @ cam_from_world[2, :3] + cam_from_world[2, 3]
     depth = depth[depth > 0]
     return np.array([depth.min(), depth.max()]) if len(depth) else np.array([0.0, 1.0])
+
+
+def write_isat(path: Path, image: str, size_hw: tuple[int, int], objects: list[dict[str, Any]]) -> None:
+    """Write a label file in the same layout.
+
+    Args:
+        path: the file.
+        image: name of its image.
+        size_hw: size of the image, px.
+        objects: keys of each object; `category` and `segmentation` at least.
+    """
+    info = {"name": image, "width": size_hw[1], "height": size_hw[0], "depth": 3, "note": ""}
+    write_json(path, {"info": info, "objects": objects})
+
+
+def isat_object(category: str, polygons: list[np.ndarray], area_px: int, **keys: Any) -> dict[str, Any]:
+    """Keys of one object as the tool writes them: a single polygon is not nested."""
+    points = np.concatenate(polygons)
+    lists = [
+        # A single pixel or a line repeats its last vertex: a polygon has three.
+        [[float(x), float(y)] for x, y in [*polygon, *[polygon[-1]] * (3 - len(polygon))]]
+        for polygon in polygons
+    ]
+    return {
+        "category": category,
+        "group": 1,
+        "segmentation": lists[0] if len(lists) == 1 else lists,
+        "area": float(area_px),
+        "layer": 1.0,
+        "bbox": [float(n) for n in (*points.min(axis=0), *points.max(axis=0))],
+        "iscrowd": 0,
+        "note": "",
+        **keys,
+    }
+
+
+def write_poses_bounds(
+    path: Path,
+    cam_from_world: Float64[np.ndarray, "N 4 4"],
+    height_width_focal: Float64[np.ndarray, "N 3"],
+    bounds: Float64[np.ndarray, "N 2"],
+) -> None:
+    """Write the file, the inverse of `read_poses_bounds`."""
+    world_from_cam = np.linalg.inv(cam_from_world)
+    right, down, forward = (world_from_cam[:, :3, column] for column in range(3))
+    matrices = np.stack([down, right, -forward, world_from_cam[:, :3, 3], height_width_focal], axis=2)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, np.concatenate([matrices.reshape(-1, 15), bounds], axis=1), allow_pickle=False)

@@ -1,4 +1,4 @@
-"""The hierarchical clustering loss L_h (paper, Eq. 2)."""
+"""The hierarchical clustering loss L_h (paper, Eq. 2) pixel by pixel; the solver has a matrix product."""
 
 from jaxtyping import Float, Int
 from torch import Tensor

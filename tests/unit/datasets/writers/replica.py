@@ -8,11 +8,10 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from hilsplat.base.artifacts import atomic_folder, write_json, write_text
-from hilsplat.base.images import write_png
 from hilsplat.datasets.classes.replica import NAMES
-from hilsplat.datasets.points.point_files import write_ply
 from hilsplat.datasets.points.posed_images import HALF_PIXEL, PosedImage
 from hilsplat.datasets.points.replica import NICE_SLAM
+from tests.unit.datasets.writers.ply import write_ply
 
 UNDEFINED, NO_OBJECT = -1, -2
 """Class of an object that none of Replica's fits, and of object 0, which is none."""
@@ -55,21 +54,16 @@ def write_semantic_mesh(
         write_text(folder / "info_semantic.json", json.dumps(info, indent=1))
 
 
-def write_sequence(
-    folder: Path, images: Sequence[PosedImage], depths: Sequence[Float32[np.ndarray, "H W"]] = ()
-) -> None:
+def write_sequence(folder: Path, images: Sequence[PosedImage]) -> None:
     """Write a sequence in the layout of NICE-SLAM: `traj.txt`, `results/`, and `cam_params.json` beside it.
 
     Args:
         folder: such as `room0`; the lens in the folder above is that of all its sequences.
         images: image files with their cameras, in order; all share K and size.
-        depths: depth of each image, metres; none or one per image.
     """
     K, (height, width) = images[0].K - HALF_PIXEL, images[0].size_hw
     lens = {"w": width, "h": height, "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    write_json(
-        Path(folder).parent / "cam_params.json", {"camera": {**lens, "scale": NICE_SLAM.depth_per_metre}}
-    )
+    write_json(Path(folder).parent / "cam_params.json", {"camera": {**lens, "scale": 6553.5}})
     with atomic_folder(folder) as temporary:
         place, prefix = NICE_SLAM.colour
         lines = []
@@ -79,8 +73,4 @@ def write_sequence(
             target.parent.mkdir(exist_ok=True)
             target.write_bytes(image.image.read_bytes())
             lines.append(" ".join(repr(float(value)) for value in image.world_from_cam.ravel()))
-        for number, depth in enumerate(depths):
-            place, prefix = NICE_SLAM.depth
-            values = np.where(np.isfinite(depth), depth * NICE_SLAM.depth_per_metre, 0).round()
-            write_png(temporary / place / f"{prefix}{number:06d}.png", values.astype(np.uint16))
         write_text(temporary / NICE_SLAM.poses, "\n".join(lines) + "\n")

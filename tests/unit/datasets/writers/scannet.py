@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from hilsplat.base.artifacts import atomic_folder, atomic_path, write_text
-from hilsplat.datasets.points.point_files import write_ply
 from hilsplat.datasets.points.posed_images import HALF_PIXEL, PosedImage
 from hilsplat.datasets.points.scannet import LABEL_TABLE
+from tests.unit.datasets.writers.ply import write_ply
 
 SEGMENT_STEP = 7
 """Segment ids are not contiguous in real scans; neither are ours."""
