@@ -28,6 +28,7 @@ lint: $(STAMP)
 	ruff check hilsplat tests benchmarks
 	ruff format --check hilsplat tests benchmarks
 	lint-imports
+	mypy
 	snakefmt --check Snakefile workflow/Snakefile rules
 	snakemake --lint --configfile config/ci.yaml
 
