@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32, Int64, UInt8, UInt32
@@ -263,7 +264,11 @@ def masks_label(masks_folder: Path) -> str:
     The model folder's name, or the segmenter without one; masks made from true labels bring a label that
     also tells their faults.
     """
-    index = read_index(masks_folder)
+    return label_of_index(read_index(masks_folder))
+
+
+def label_of_index(index: dict[str, Any]) -> str:
+    """The same, from the index of a masks artifact."""
     if "label" in index:
         return str(index["label"])
     return Path(index["model"]).name if index["model"] else index["segmenter"]
