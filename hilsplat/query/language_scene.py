@@ -305,9 +305,15 @@ class LanguageScene:
         return self.scene.cameras.names
 
     def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
-        """The undistorted photograph of a view."""
+        """The undistorted photograph of a view; read-only, as it is kept: copy it to draw on it."""
         self._camera(view)
-        return self._views.get(("image", view), lambda: self.scene.image(view), lambda kept: kept.nbytes)
+
+        def read() -> np.ndarray:
+            pixels = self.scene.image(view)
+            pixels.setflags(write=False)
+            return pixels
+
+        return self._views.get(("image", view), read, lambda kept: kept.nbytes)
 
     def _camera(self, view: str) -> Camera:
         """Camera of a view.
