@@ -22,19 +22,20 @@ class Doubt:
 
     Attributes:
         text: the text.
-        level: the level at which it was searched.
-        score: of the best node there, at most 0.5; 0 if there is none.
+        level: the level at which it was searched, if nodes of another level do answer it; else None.
+        score: of the best node of that level, or of any; at most 0.5, and 0 if there is none.
     """
 
     text: str
-    level: Level
+    level: Level | None
     score: float
 
     def __str__(self) -> str:
         """The doubt in a sentence."""
+        who = "nothing" if self.level is None else f"no {self.level.label}"
         return (
-            f"nothing here answers to {self.text!r} better than to a generic word "
-            f"(the best {self.level.label} scores {self.score:.2f})"
+            f"{who} here answers to {self.text!r} better than to a generic word "
+            f"(the best score is {self.score:.2f})"
         )
 
 
@@ -106,6 +107,10 @@ def hits_of(scene: "LanguageScene", found: NodeHits, limit: int) -> list[Hit]:
 
 def doubts_of(scene: "LanguageScene", found: NodeHits) -> tuple[Doubt, ...]:
     """Texts of a query that nothing answers better than a generic word."""
-    return tuple(
-        Doubt(each.text, each.level, scene.score(each.margin)) for each in found.texts if each.is_doubtful
-    )
+    doubts = []
+    for each in found.texts:
+        if each.anywhere <= 0:
+            doubts.append(Doubt(each.text, None, scene.score(each.anywhere)))
+        elif each.is_doubtful:
+            doubts.append(Doubt(each.text, each.level, scene.score(each.margin)))
+    return tuple(doubts)

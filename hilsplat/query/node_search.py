@@ -37,11 +37,13 @@ class TextAnswer:
         text: the text.
         level: the level at which it was searched.
         margin: cosine margin of the best node that competed there; -inf if none did.
+        anywhere: of the best node of any level that may answer; likewise.
     """
 
     text: str
     level: Level
     margin: float
+    anywhere: float
 
     @property
     def is_doubtful(self) -> bool:
@@ -101,15 +103,16 @@ def search(
         SettingsError: the path is empty or longer than the levels down to the last text's.
     """
     margin = margin.astype(np.float64)
+    anywhere = (margin if shown is None else margin[:, shown]).max(axis=1, initial=-np.inf).tolist()
     if len(path) != 1:
-        return _search_path(tree, margin, vectors, path, threshold, level, shown)
+        return _search_path(tree, margin, anywhere, vectors, path, threshold, level, shown)
     (own,) = margin
     level = automatic_level(tree, own, shown) if level is None else level
     nodes = tree.nodes_of(level)
     added = ancestors * ancestor_margins(tree, own)
     chosen = best_nodes(own + added, vectors, nodes, threshold, shown)
     best = own[nodes if shown is None else nodes[shown[nodes]]].max(initial=-np.inf)
-    return NodeHits(chosen, own[chosen], "flat", (TextAnswer(path[0], level, float(best)),))
+    return NodeHits(chosen, own[chosen], "flat", (TextAnswer(path[0], level, float(best), *anywhere),))
 
 
 def best_nodes(
@@ -198,6 +201,7 @@ def margin_range(margin: Float64[np.ndarray, " n"]) -> float:
 def _search_path(
     tree: SemanticTree,
     margin: Float64[np.ndarray, "T n"],
+    anywhere: list[float],
     vectors: Float32[np.ndarray, "n C"],
     path: tuple[str, ...],
     threshold: float,
@@ -230,7 +234,7 @@ def _search_path(
     ancestors = tree.ancestors()
     found = [_search_way(tree, margin, ancestors, vectors, way, threshold, shown) for way in ways]
     best = max(found, key=lambda way: (way.complete, way.total))
-    texts = tuple(map(TextAnswer, path, best.levels, best.margins))
+    texts = tuple(map(TextAnswer, path, best.levels, best.margins, anywhere))
     return NodeHits(best.ids, margin[-1][best.ids], best.route, texts)
 
 
