@@ -109,7 +109,7 @@ class FinishedScene:
         if provenance_path(scores).is_file():
             return _section(EvaluateSettings, _recorded_settings(scores))
         place = self.folder.resolve()
-        panel = place.parents[1] / "figures" / place.parent.name / place.name / "panel.png"
+        panel = place.parent.parent / "figures" / place.parent.name / place.name / "panel.png"
         if not provenance_path(panel).is_file():
             logger.warning(
                 "%s: neither %s nor %s tells how texts were asked; the default settings answer",

@@ -137,6 +137,16 @@ def test_a_scene_that_is_not_there_is_named(elsewhere):
         hilsplat.open("results/photos/desk")
 
 
+def test_a_copy_that_lost_its_settings_says_so(desk, elsewhere, caplog):
+    shutil.copytree(desk / SCENE, elsewhere / "desk")
+    shutil.copytree(desk / "models", elsewhere / "models")
+    hilsplat.open("desk")
+    assert "the default settings answer" not in caplog.text
+    (elsewhere / "desk/default/scores.csv.provenance.json").unlink()
+    hilsplat.open("desk")
+    assert "the default settings answer" in caplog.text
+
+
 def test_an_unknown_device_is_named(desk):
     with pytest.raises(SettingsError, match="device 'tpu' is unknown"):
         hilsplat.open(desk / SCENE, device="tpu")
