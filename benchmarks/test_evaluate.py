@@ -33,11 +33,8 @@ class Answers:
 
     node_relevancy_map = field_relevancy
 
-    def select_nodes(self, text, *, level=None, threshold=0.95, view=None):
-        return SimpleNamespace(ids=np.array([list(self.regions).index(text)]), level=level)
-
-    def select_path(self, path, *, level=None, threshold=0.95, view=None):
-        return self.select_nodes(path[-1])
+    def select(self, path, *, level=None, view=None):
+        return SimpleNamespace(ids=np.array([list(self.regions).index(path[-1])]), level=level)
 
     def node_masks(self, view, ids):
         return list(self.regions.values())[ids[0]]
@@ -70,7 +67,7 @@ def annotated_view() -> tuple[Answers, ViewTruth]:
 def test_scoring_a_view(benchmark, method):
     answers, truth = annotated_view()
     settings = EvaluateSettings(methods=(method,))
-    selections = Selections(answers, settings.node_select)
+    selections = Selections(answers)
     benchmark.extra_info |= {"case": scoring(method), "count": len(truth.queries), "of": "queries"}
     assert benchmark(lambda: list(measure_view(answers, selections, truth, VIEW, SIZE_HW, settings)))
 

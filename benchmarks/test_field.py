@@ -129,7 +129,7 @@ def test_path_query_on_the_tree(benchmark):
 @one_thread
 def test_mask_of_an_answer(benchmark):
     scene = open_scene("network")
-    ids = scene.find("mug handle", "subpart", 0.5).ids
+    ids = scene.find("mug handle", "subpart", threshold=0.5).ids
     benchmark.extra_info |= {"case": MASK, "count": SIZE_HW[0] * SIZE_HW[1], "of": "px"}
     assert benchmark(lambda: scene.node_masks(VIEW, ids)).shape == SIZE_HW
 

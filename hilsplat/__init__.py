@@ -1,0 +1,48 @@
+"""Photographs in, a 3D Gaussian scene out that answers text queries at three semantic levels.
+
+    import hilsplat
+
+    scene = hilsplat.open("results/photos/desk")
+    for hit in scene.query("mug > handle"):
+        print(hit.score, hit.level.label, hit.gaussians)
+
+What is named here is the public interface (docs/python.md); everything else may change. Importing it loads
+nothing heavy.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hilsplat.base.errors import HilsplatError
+    from hilsplat.base.levels import Level
+    from hilsplat.query.hits import Doubt, Hit
+    from hilsplat.query.language_scene import LanguageScene
+
+__all__ = ["Doubt", "HilsplatError", "Hit", "LanguageScene", "Level", "open"]
+
+
+def open(
+    folder: Path | str, variant: str = "default", *, threads: int = 1, device: str = "cpu"
+) -> "LanguageScene":
+    """Open a finished scene, `results/<dataset>/<scene>` or a copy of it: see `LanguageScene.open`."""
+    from hilsplat.query.language_scene import LanguageScene
+
+    return LanguageScene.open(folder, variant, threads=threads, device=device)
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public type when it is asked for."""
+    if name == "HilsplatError":
+        from hilsplat.base.errors import HilsplatError
+
+        return HilsplatError
+    if name == "Level":
+        from hilsplat.base.levels import Level
+
+        return Level
+    if name in ("Doubt", "Hit", "LanguageScene"):
+        from hilsplat.query import hits, language_scene
+
+        return getattr(language_scene if name == "LanguageScene" else hits, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -252,6 +252,22 @@ def read_index(folder: Path) -> dict[str, Any]:
     return read_json(path)
 
 
+def read_full_index(folder: Path, *entries: str) -> dict[str, Any]:
+    """Read a folder artifact's index and check that it has some entries.
+
+    Raises:
+        ArtifactError: there is none, or another version of the program wrote it.
+    """
+    index = read_index(folder)
+    if missing := [entry for entry in entries if entry not in index]:
+        raise ArtifactError(
+            f"{folder} is of another version",
+            expected=f"{', '.join(missing)} in {INDEX}",
+            fix="run its stage again",
+        )
+    return index
+
+
 class ViewCache:
     """Finished views of a long stage, kept outside its declared output and keyed by content.
 

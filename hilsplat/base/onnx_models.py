@@ -8,6 +8,7 @@ network's input is read from the folder, so folder and digest together are the m
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -106,9 +107,9 @@ class ModelFolder:
     networks: dict[str, Path]
     files: tuple[Path, ...]
 
-    @property
+    @cached_property
     def digest(self) -> str:
-        """SHA-256 over names and bytes of the files used; independent of the folder's path."""
+        """SHA-256 over names and bytes of the files used, whatever the folder's path. Hashed once."""
         return sha256_of_json(
             [(path.relative_to(self.folder).as_posix(), sha256_of_file(path)) for path in self.files]
         )

@@ -1,7 +1,7 @@
 """Scores, tables and figures."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,6 +16,9 @@ from hilsplat.cli.stage import (
     stage,
     start_logging,
 )
+
+if TYPE_CHECKING:
+    from hilsplat.scene.finished import SceneParts
 
 
 @app.command()
@@ -32,11 +35,12 @@ def evaluate(
     name: Annotated[str, typer.Option(help="scene, for the rows")],
     truth: Annotated[Path | None, typer.Option(help="annotations of a synthetic scene")] = None,
     labels: Annotated[
-        list[str] | None, typer.Option(help="or labels of published data sets, as lerf_ovs/figurines")
+        list[str] | None, typer.Option(help="or labels of published data sets, such as lerf_ovs/figurines")
     ] = None,
     data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders")] = Path(),
     kind: Annotated[
-        str, typer.Option(help="kind of a synthetic scene, tabletop, room or street: what it stands in for")
+        str,
+        typer.Option(help="of a synthetic scene: tabletop, room or street; the data sets it stands in for"),
     ] = "",
     variant: Annotated[str, typer.Option(help="variant, for the rows")] = "default",
     settings: Settings = "{}",
@@ -45,38 +49,31 @@ def evaluate(
 ) -> None:
     """Ask every annotated text in every test view, or every labelled one, and score the answers."""
     section = section_of("evaluate", settings)
-    inputs = {
-        "scene": scene,
-        **({"truth": truth} if truth else {}),
-        "gaussians": gaussians,
-        "semantic_tree": semantic_tree,
-        "field": field,
-        "autoencoder": autoencoder,
-        "clip": clip,
-        "masks": masks,
-    }
+    parts = _parts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
+    inputs = {**parts.as_inputs(), **({"truth": truth} if truth else {})}
     with stage("evaluate", out, log, settings=section, threads=threads, inputs=inputs):
-        from hilsplat.evaluate.asked import Asked
         from hilsplat.evaluate.stage import run_evaluate
 
         run_evaluate(
-            labels=[Asked.open(name, data_root) for name in labels or ()],
-            asked=Asked.of_world(kind),
-            scene_folder=scene,
-            truth=truth,
-            gaussians=gaussians,
-            semantic_tree=semantic_tree,
-            field=field,
-            autoencoder=autoencoder,
-            clip_folder=clip,
-            masks_folder=masks,
-            out=out,
-            settings=section,
+            parts,
+            out,
+            section,
             dataset=dataset,
             scene=name,
             variant=variant,
+            truth=truth,
+            kind=kind,
+            labels=labels or (),
+            data_root=data_root,
             threads=threads,
         )
+
+
+def _parts(*paths: Path) -> "SceneParts":
+    """The parts of a scene, in the order of `SceneParts`."""
+    from hilsplat.scene.finished import SceneParts
+
+    return SceneParts(*paths)
 
 
 @app.command()
@@ -113,10 +110,10 @@ def figures(
     field: PathIn,
     autoencoder: PathIn,
     out: Annotated[Path, typer.Option(help="panel PNG; registration.png and fit.png go beside it")],
-    truth: Annotated[Path | None, typer.Option(help="truth folder, where the scene has one")] = None,
-    labels: Annotated[str, typer.Option(help="or a labelled scene, as lerf_ovs/figurines")] = "",
+    truth: Annotated[Path | None, typer.Option(help="truth folder of a synthetic scene")] = None,
+    labels: Annotated[str, typer.Option(help="or a labelled scene, such as lerf_ovs/figurines")] = "",
     data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders")] = Path(),
-    queries: Annotated[str, typer.Option(help="JSON list of texts, where the scene has no labels")] = "[]",
+    queries: Annotated[str, typer.Option(help="JSON list of texts, for a scene without labels")] = "[]",
     settings: Settings = "{}",
     evaluate: Settings = "{}",
     threads: Threads = 1,
@@ -124,38 +121,25 @@ def figures(
 ) -> None:
     """Draw a scene's panel: photograph, masks, field, relevancy, answers, truth."""
     import json
-    import shutil
-
-    from hilsplat.base.artifacts import atomic_path
 
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
-    inputs = {"scene": scene, "gaussians": gaussians, "masks": masks, "field": field}
+    parts = _parts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
+    inputs = {**parts.as_inputs(), "fit": fit, **({"truth": truth} if truth else {})}
     recorded = {"figures": section, "evaluate": protocol}
     with stage("figures", out, log, settings=recorded, threads=threads, inputs=inputs):
-        from hilsplat.datasets.registry import open_labelled
         from hilsplat.evaluate.figures.panel import run_figures
 
-        for source, name in (
-            (scene / "registration.png", "registration.png"),
-            (fit / "test_views.png", "fit.png"),
-        ):
-            with atomic_path(out.with_name(name)) as temporary:
-                shutil.copyfile(source, temporary)
         run_figures(
-            scene_folder=scene,
+            parts,
+            out,
+            section,
+            protocol,
+            fit=fit,
             truth=truth,
-            masks_folder=masks,
-            gaussians=gaussians,
-            semantic_tree=semantic_tree,
-            field=field,
-            autoencoder=autoencoder,
-            clip_folder=clip,
-            out=out,
-            settings=section,
-            evaluate=protocol,
+            labels=labels,
+            data_root=data_root,
             queries=json.loads(queries),
             threads=threads,
-            labels=open_labelled(labels, data_root) if labels else None,
         )
 
 
@@ -165,10 +149,10 @@ def comparison(
     variants: Annotated[str, typer.Option(help="JSON list of variants that are compared")],
     out: Annotated[Path, typer.Option(help="PNG; views.png, features.png and PDFs are written beside it")],
     names: Annotated[str, typer.Option(help="JSON: how figures name a variant")] = "{}",
-    truth: Annotated[Path | None, typer.Option(help="truth folder, where the scene has one")] = None,
-    labels: Annotated[str, typer.Option(help="or a labelled scene, as lerf_ovs/figurines")] = "",
+    truth: Annotated[Path | None, typer.Option(help="truth folder of a synthetic scene")] = None,
+    labels: Annotated[str, typer.Option(help="or a labelled scene, such as lerf_ovs/figurines")] = "",
     data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders")] = Path(),
-    queries: Annotated[str, typer.Option(help="JSON list of texts, where the scene has no labels")] = "[]",
+    queries: Annotated[str, typer.Option(help="JSON list of texts, for a scene without labels")] = "[]",
     settings: Settings = "{}",
     evaluate: Settings = "{}",
     threads: Threads = 1,
@@ -178,19 +162,21 @@ def comparison(
     import json
 
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
-    with stage("comparison", out, log, settings=section, threads=threads):
-        from hilsplat.datasets.registry import open_labelled
+    recorded, compared = {"figures": section, "evaluate": protocol}, json.loads(variants)
+    inputs = {f"scores of {variant}": folder / variant / "scores.csv" for variant in compared}
+    with stage("comparison", out, log, settings=recorded, threads=threads, inputs=inputs):
         from hilsplat.evaluate.figures.comparison import run_comparison
 
         run_comparison(
             folder,
-            json.loads(variants),
+            compared,
             json.loads(names),
             out,
             section,
             protocol,
             truth=truth,
-            labels=open_labelled(labels, data_root) if labels else None,
+            labels=labels,
+            data_root=data_root,
             queries=json.loads(queries),
             threads=threads,
         )

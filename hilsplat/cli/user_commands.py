@@ -11,42 +11,56 @@ from hilsplat.cli.stage import (
     start_logging,
 )
 
+SceneName = Annotated[
+    str,
+    typer.Argument(help="dataset/scene in the results folder, such as photos/desk, or a path to its folder"),
+]
+Results = Annotated[Path, typer.Option(help="results folder")]
+
 
 @app.command()
 def query(
-    scene: Annotated[str, typer.Argument(help="dataset/scene, such as photos/bear")],
+    scene: SceneName,
     text: Annotated[
         str,
         typer.Argument(
-            help="what to look for; 'bear > nose' is a nose of a bear, 'bear > head > nose' one of its head"
+            help="what to look for; 'mug > handle' finds handles of mugs, 'bear > head > nose' the nose on a "
+            "bear's head"
         ),
     ],
     level: Annotated[
-        str, typer.Option(help="auto, whole, part or subpart: where (the last of) the text is searched")
+        str,
+        typer.Option(help="level of the answers (of a path: of its last text): auto, whole, part, subpart"),
     ] = "auto",
     variant: Annotated[str, typer.Option(help="variant whose files answer")] = "default",
-    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    results: Results = Path("results"),
     views: Annotated[int, typer.Option(min=1, max=8, help="views in the panel")] = 3,
-    answerer: Annotated[str, typer.Option(help="tree, or field: the paper's")] = "tree",
+    answerer: Annotated[
+        str, typer.Option(help="tree: nodes of the semantic tree answer; field: the paper's language field")
+    ] = "tree",
     view: Annotated[
-        str | None, typer.Option(help="ask only for what this view shows, such as 000.png")
+        str | None, typer.Option(help="look only at what this view shows, such as 000.png")
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
-            help="folder of panel.png and selection.ply; default: queries/TEXT in the scene's folder"
+            help="folder for panel.png and selection.ply; default: queries/TEXT in the scene's folder"
         ),
     ] = None,
-    device: Annotated[str, typer.Option(help="cpu or cuda: where the field is looked up")] = "cpu",
+    device: Annotated[str, typer.Option(help="cpu or cuda: what looks up the field")] = "cpu",
     threads: Threads = 2,
 ) -> None:
-    """Ask a finished scene for a text: score, level, position, box, views; a panel PNG and a PLY."""
+    """Find what a text names in a finished scene.
+
+    Prints score, level, position, size and best views of each answer; writes a picture (panel.png) and the
+    answer's Gaussians (selection.ply).
+    """
     start_logging(None)
     from hilsplat.query.answer import answer
 
     typer.echo(
         answer(
-            results / scene,
+            _folder(scene, results),
             text,
             level=level,
             variant=variant,
@@ -62,9 +76,9 @@ def query(
 
 @app.command()
 def export(
-    scene: Annotated[str, typer.Argument(help="dataset/scene, such as photos/bear")],
+    scene: SceneName,
     variant: Annotated[str, typer.Option(help="variant whose tree is written")] = "default",
-    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    results: Results = Path("results"),
     out: Annotated[
         Path | None, typer.Option(help="folder to write; default: export/VARIANT in the scene's folder")
     ] = None,
@@ -74,8 +88,13 @@ def export(
     start_logging(None)
     from hilsplat.query.tree_picture import export_tree
 
-    folder = results / scene
-    typer.echo(export_tree(folder, variant, out or folder / "export" / variant, threads))
+    typer.echo(export_tree(_folder(scene, results), variant, out, threads))
+
+
+def _folder(scene: str, results: Path) -> Path:
+    """Folder of a scene that is named by data set and name, or by its path."""
+    named, path = results / scene, Path(scene)
+    return path if path.is_dir() and not named.is_dir() else named
 
 
 @app.command()

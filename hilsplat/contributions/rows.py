@@ -2,13 +2,12 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float32, Int32, Int64, UInt8
 
-from hilsplat.base.artifacts import INDEX, read_index, read_into, read_npy
+from hilsplat.base.artifacts import read_full_index, read_into, read_npy
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.contributions.quadratic import Quadratic, load_quadratic
@@ -89,22 +88,6 @@ class Contributions:
             gaussians_sha256=index["gaussians_sha256"],
             min_weight=index["min_weight"],
         )
-
-
-def read_full_index(folder: Path, *entries: str) -> dict[str, Any]:
-    """Read a folder artifact's index and check that it has some entries.
-
-    Raises:
-        ArtifactError: there is none, or another version of the program wrote it.
-    """
-    index = read_index(folder)
-    if missing := [entry for entry in entries if entry not in index]:
-        raise ArtifactError(
-            f"{folder} is of another version",
-            expected=f"{', '.join(missing)} in {INDEX}",
-            fix="run its stage again",
-        )
-    return index
 
 
 def _mapped(path: Path) -> np.ndarray:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float16, Float32, UInt8
 from tokenizers import Tokenizer
 
+from hilsplat.base.artifacts import read_full_index
 from hilsplat.base.crops import crop_to_square
 from hilsplat.base.errors import MisalignedArtifactError, ModelError
 from hilsplat.base.onnx_models import ModelFolder, input_side_px, open_model_folder, require_one_space
@@ -15,6 +16,12 @@ from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ClipSettings
 
 logger = logging.getLogger(__name__)
+
+INSTALLED = Path(__file__).resolve().parents[2]
+"""The project that this package runs from; its `models/` are there in a checkout."""
+
+MODEL_PATTERNS = ("*/config.json", "*/*/config.json")
+"""Where a folder `models/` holds model folders."""
 
 
 class ClipModel:
@@ -168,3 +175,45 @@ def unit(vectors: Float32[np.ndarray, "N C"]) -> Float32[np.ndarray, "N C"]:
     """Scale rows to length 1; a zero row stays zero."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return (vectors / np.where(length > 0, length, 1)).astype(np.float32)
+
+
+def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> ClipModel:
+    """Open the CLIP that embedded the masks of a clip artifact, wherever its folder is now.
+
+    It is recognised by its digest. Looked at are the recorded path and every folder in `models/`, each
+    relative to the working directory, to the folders around the artifact (the project that holds the results
+    is among them) and to the project that this package runs from.
+
+    Args:
+        clip_folder: what the clip stage wrote.
+        threads: as in `ClipModel.load`.
+        template: as in `ClipModel.load`.
+
+    Raises:
+        ModelError: none of the CLIPs found has the digest of the one that embedded the masks.
+    """
+    index = read_full_index(clip_folder, "model", "model_sha256")
+    recorded, wanted = Path(index["model"]), index["model_sha256"]
+    roots = list(dict.fromkeys([Path.cwd(), *Path(clip_folder).resolve().parents, INSTALLED]))
+    stores = [root / "models" for root in roots if (root / "models").is_dir()]
+    configs = [config for store in stores for pattern in MODEL_PATTERNS for config in store.glob(pattern)]
+    seen: dict[Path, str] = {}
+    for folder in [*(root / recorded for root in roots), *sorted(config.parent for config in configs)]:
+        place = folder.resolve()
+        if place in seen or not place.is_dir():
+            continue
+        try:
+            model = open_model_folder(folder, "clip")
+        except ModelError:
+            continue  # SAM, or half a copy
+        if model.digest == wanted:
+            return ClipModel(model, threads, template)
+        seen[place] = model.digest
+    raise ModelError(
+        f"the CLIP that embedded the masks in {clip_folder} was not found",
+        expected=f"a model folder with digest {wanted[:12]}; it was {recorded}",
+        found=", ".join(f"{folder} with digest {digest[:12]}" for folder, digest in seen.items())
+        or f"no CLIP at {recorded} or in {', '.join(map(str, stores)) or 'any folder models/'}",
+        fix="copy that model folder into models/ beside the results folder, or run the clip stage again with "
+        "the CLIP you have",
+    )

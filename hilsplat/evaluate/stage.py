@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hilsplat.base.artifacts import read_index
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.datasets.points.labelled_points import PointScene
@@ -27,6 +26,7 @@ from hilsplat.evaluate.tables.costs import time_queries, write_times
 from hilsplat.evaluate.truths import annotated_truths, labelled_truths
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.finished import SceneParts
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.origin import masks_label
 from hilsplat.settings import EvaluateSettings
@@ -34,91 +34,69 @@ from hilsplat.settings import EvaluateSettings
 logger = logging.getLogger(__name__)
 
 MAX_CAMERA_ERROR_M = 0.1
-"""Camera poses that are off by more make scores of points meaningless, which is told."""
+"""Camera poses that are off by more make scores of points meaningless; the log warns."""
 
 TIMED_TEXTS = 3
 """Queries that are timed, in one view."""
 
 
 def run_evaluate(
-    scene_folder: Path,
-    truth: Path | None,
-    gaussians: Path,
-    semantic_tree: Path,
-    field: Path,
-    autoencoder: Path,
-    clip_folder: Path,
-    masks_folder: Path,
+    parts: SceneParts,
     out: Path,
     settings: EvaluateSettings,
+    *,
     dataset: str,
     scene: str,
-    variant: str,
-    threads: int,
-    labels: Sequence[tuple[str, LabelledScene | PointScene, Asked]] = (),
-    asked: Asked | None = None,
+    variant: str = "default",
+    truth: Path | None = None,
+    kind: str = "",
+    labels: Sequence[str] = (),
+    data_root: Path = Path(),
+    threads: int = 1,
 ) -> None:
     """Score every annotated query in every annotated test view, and every labelled point (`protocols`).
 
     With the labels of a published data set every labelled view is scored, held out or not: most of them
-    train on all views. Beside `scores.csv` stand `times.csv` (seconds per query) and, where instances are
-    scored, `instances.npz`.
+    train on all views. `times.csv` (seconds per query) and, for instances, `instances.npz` are written beside
+    `scores.csv`.
 
     Args:
-        scene_folder: scene artifact; its test views were held out of every stage before.
-        truth: truth folder of a synthetic scene; None and no labels give a file with a header only.
-        gaussians: 3DGS PLY.
-        semantic_tree: semantic tree artifact.
-        field: language field.
-        autoencoder: autoencoder artifact.
-        clip_folder: mask embeddings; their index names the CLIP model, which embeds the texts.
-        masks_folder: masks artifact; its index says what made the masks.
-        out: `scores.csv`.
+        parts: the finished scene; its test views were held out of every stage before.
+        out: `scores.csv`; without truth and labels a file with a header only.
         settings: queries and protocols.
         dataset: written into every row, as are `scene` and `variant`.
         scene: scene name.
         variant: named set of settings.
+        truth: truth folder of a synthetic scene.
+        kind: kind of the synthetic scene, which decides what it stands in for (`Asked.of_world`).
+        labels: labels of published data sets, such as "lerf_ovs/figurines", in place of a truth.
+        data_root: folder of the data sets' folders.
         threads: threads for rendering.
-        labels: in place of annotations, labels of published data sets on images or points: the data set,
-            which names its rows, its labels of this scene, and the protocols that it asks for.
-        asked: protocols of annotations beyond those of every labelled image.
 
     Raises:
         MisalignedArtifactError: label images are of another size than the cameras.
-        SceneError: a labelled view has no pose, or labels are of another shape than their view.
+        SceneError: a data set or a kind is unknown, a labelled view has no pose, or labels are of another
+            shape than their view.
     """
     scores: list[Score] = []
     matches: dict[tuple[str, ...], InstanceMatches] = {}
     seconds: dict[str, float] = {}
-    label = masks_label(masks_folder)
+    label = masks_label(parts.masks)
 
     def keep(data: str, view: str, measured: Measured) -> None:
         names = {"dataset": data, "scene": scene, "variant": variant, "masks": label}
         scores.append(Score(**names, view=view, **vars(measured)))
 
     with stage_log("evaluate", f"{dataset}/{scene}/{variant}") as counts:
-        if truth is None and not labels:
+        scored = [Asked.open(name, data_root) for name in labels]
+        if truth is not None:
+            scored.append((dataset, TrueAnnotations(truth), Asked.of_world(kind)))
+        if not scored:
             logger.info("%s/%s has no annotations: nothing to score", dataset, scene)
         else:
-            posed = Scene.load(scene_folder)
-            answers = LanguageScene.from_parts(
-                scene_folder,
-                gaussians,
-                semantic_tree,
-                field,
-                autoencoder,
-                Path(read_index(clip_folder)["model"]),
-                canonical=settings.canonical,
-                template=settings.template,
-                relevancy_scale=settings.relevancy_scale,
-                ancestors=settings.ancestors,
-                threads=threads,
-            )
-            selections = Selections(answers, settings.node_select)
-            parts = list(labels)
-            if truth is not None:
-                parts.append((dataset, TrueAnnotations(truth), asked or Asked()))
-            for data, known, wanted in parts:
+            answers = LanguageScene.from_parts(parts, settings, threads=threads)
+            posed, selections = answers.scene, Selections(answers)
+            for data, known, wanted in scored:
                 truths = known_truths(known, posed, settings)
                 counts[f"views of {data}"] = len(truths)
                 kept: dict[str, PackedMasks] = {}
@@ -162,7 +140,7 @@ class TrueAnnotations:
 def known_truths(
     known: LabelledScene | PointScene | TrueAnnotations, posed: Scene, settings: EvaluateSettings
 ) -> Mapping[str, Callable[[], ViewTruth]]:
-    """What is true in views; none for labels on points."""
+    """What is true in views; nothing for labels on points."""
     if isinstance(known, PointScene):
         return {}
     if isinstance(known, LabelledScene):
@@ -181,7 +159,7 @@ def point_rows(
     settings: EvaluateSettings,
     threads: int,
 ) -> Iterator[Measured | tuple[str, InstanceMatches]]:
-    """Rows of labelled points, and the matches of instances; nothing where no protocol asks for points."""
+    """Rows of labelled points, and the matches of instances; nothing if no protocol asks for points."""
     if not asked.points or isinstance(known, LabelledScene):
         return
     if isinstance(known, PointScene):
@@ -196,7 +174,7 @@ def point_rows(
         error = camera_error(true, found, transform)
         if error > MAX_CAMERA_ERROR_M:
             logger.warning(
-                "%s: cameras lie %.2f m from the true ones (median); points are asked where nothing is",
+                "%s: cameras are %.2f m from the true ones (median); labelled points miss the Gaussians",
                 answers.scene.name,
                 error,
             )
@@ -222,8 +200,7 @@ def timed(
         return relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)
 
     def by_tree(text: str) -> object:
-        hits = answers.select_nodes(text, level=None, threshold=settings.node_select, view=view)
-        return selections.mask(view, hits.ids, size_hw)
+        return selections.mask(view, answers.select((text,), view=view).ids, size_hw)
 
     asks = {"field": by_field, "tree": by_tree}
     return time_queries(

@@ -3,16 +3,13 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from hilsplat.base.device import ComputeDevice
-from hilsplat.base.errors import SettingsError
-from hilsplat.base.levels import LEVELS, Level
-from hilsplat.query.hits import Hit
-from hilsplat.query.language_scene import PATH_SEPARATOR, LanguageScene
+from hilsplat.base.levels import LEVELS
+from hilsplat.query.hits import Hit, doubts_of, hits_of
+from hilsplat.query.language_scene import PATH_SEPARATOR, LanguageScene, path_of
 from hilsplat.query.node_search import NodeHits
 from hilsplat.query.pictures import (
     label_left,
@@ -27,7 +24,7 @@ from hilsplat.segment.origin import made_from_truth, masks_label
 from hilsplat.semantic_tree.export import write_selection_ply
 
 LISTED = 10
-"""Answers told at most."""
+"""Answers listed at most."""
 
 
 def answer(
@@ -43,16 +40,16 @@ def answer(
     device: str = "cpu",
     threads: int = 1,
 ) -> str:
-    """Ask a scene; write `panel.png` and `selection.ply`, and tell what was found.
+    """Ask a scene; write `panel.png` and `selection.ply`, and say what was found.
 
     Args:
-        folder: `results/<dataset>/<scene>`.
+        folder: `results/<dataset>/<scene>`, or wherever that folder is now.
         text: words, or a path such as "bear > head > nose".
         level: auto, whole, part or subpart.
         variant: whose files answer.
         views: views in the panel.
         answerer: "tree" or "field", see `LanguageScene.query`.
-        view: asks only for what it shows, and stands first in the panel; None: the whole scene.
+        view: asks only for what it shows, and comes first in the panel; None: the whole scene.
         out: folder of both files; by default `queries/<text>` in the scene's folder.
         device: "cpu" or "cuda": where the field is looked up.
         threads: threads for rendering.
@@ -62,24 +59,20 @@ def answer(
         SettingsError: level, answerer, view or device are unknown.
         DeviceError: cuda was asked for and torch finds no device.
     """
-    folder = Path(folder)
-    if device not in get_args(ComputeDevice):
-        raise SettingsError(
-            f"device {device!r} is unknown", expected=" or ".join(get_args(ComputeDevice)), found=device
-        )
-    parts = FinishedScene.locate(folder, variant)
-    scene = LanguageScene.open(folder, variant, threads=threads, device=device)
-    hits = scene.query(text, level, answerer=answerer, view=view, limit=LISTED)
-    panel = (Path(out) if out is not None else folder / "queries" / file_name(text)) / "panel.png"
+    found = FinishedScene.locate(Path(folder), variant)
+    settings = found.evaluate_settings()
+    scene = LanguageScene.from_parts(found.parts, settings, threads=threads, device=device)
+    nodes = scene.find(text, level, answerer=answerer, view=view)
+    hits = hits_of(scene, nodes, LISTED)
+    panel = (Path(out) if out is not None else found.folder / "queries" / file_name(text)) / "panel.png"
     shown = list(dict.fromkeys([*([view] if view else []), *views_of(scene, hits, views)]))[:views]
-    label = masks_label(parts.masks)
+    label = masks_label(found.parts.masks)
     note = f"; a diagnostic, masks made from the true labels: {label}" if made_from_truth(label) else ""
     asked = "" if view is None else f", of what {view} shows"
-    found = scene.find(text, level, answerer=answerer, view=view)
-    query_panel(scene, text, found, shown, panel, note=asked + note, answerer=answerer)
+    query_panel(scene, text, nodes, shown, panel, note=asked + note, answerer=answerer)
     selection = panel.with_name("selection.ply")
-    write_selection_ply(parts.gaussians, scene.gaussians_of(found.ids), selection)
-    return "\n".join([told(text, hits, scene.scene.unit, view) + note, f"wrote {panel} and {selection.name}"])
+    write_selection_ply(found.parts.gaussians, scene.gaussians_of(nodes.ids), selection)
+    return f"{report(scene, text, nodes, view)}{note}\nwrote {panel} and {selection.name}"
 
 
 def query_panel(
@@ -94,23 +87,21 @@ def query_panel(
 ) -> None:
     """Draw a query: per view photograph, answer and relevancy at three levels; the scene from above.
 
-    `note` stands in the title, after what was found. With the answerer "field", relevancy is the field's.
+    `note` ends the title, and doubts follow it. With the answerer "field", relevancy is the field's.
     """
-    last = text.split(PATH_SEPARATOR)[-1].strip()
+    last = path_of(text)[-1]
     size_hw = scene.scene.cameras[views[0]].size_hw
     width_in, columns = 13.0, 5
     row_in = width_in / columns * size_hw[0] / size_hw[1] + 0.1
     map_in = 4.2
     figure = Figure(figsize=(width_in, len(views) * row_in + map_in + 0.6), layout="constrained")
     found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
-    figure.suptitle(f"“{text}” in {scene.scene.name}: {found}{note}", fontsize=12, fontweight="bold")
+    title = f"“{text}” in {scene.scene.name}: {found}{note}"
+    figure.suptitle("\n".join([title, *map(str, doubts_of(scene, hits))]), fontsize=12, fontweight="bold")
     upper, lower = figure.subfigures(2, 1, height_ratios=[len(views) * row_in, map_in])
     grid = upper.subplots(len(views), columns, squeeze=False)
     for axes, view in zip(grid, views, strict=True):
-        image = scene.scene.image(view)
-        mask = (
-            np.asarray(scene.node_masks(view, hits.ids)) if len(hits.ids) else np.zeros(image.shape[:2], bool)
-        )
+        image, mask = scene.image(view), scene.node_masks(view, hits.ids)
         if answerer == "tree":
             relevancy = scene.node_relevancy_map([last], view)[0]
         else:
@@ -139,16 +130,17 @@ def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]
     return list(dict.fromkeys([*best, *spread, *every]))[:count]
 
 
-def told(text: str, hits: Sequence[Hit], unit: str, view: str | None = None) -> str:
-    """The answers in words; with a view, to what was asked of it alone."""
-    if not hits and view is not None:
-        return f"no node that {view} shows answers {text!r}; try --level part or subpart, or no --view"
+def report(scene: LanguageScene, text: str, found: NodeHits, view: str | None = None) -> str:
+    """The answers in words, and what is doubtful about them; with a view, to what was asked of it alone."""
+    place = scene.scene.name if view is None else f"what {view} shows of {scene.scene.name}"
+    hits, doubts = hits_of(scene, found, LISTED), doubts_of(scene, found)
     if not hits:
-        return f"no node of the scene answers {text!r}; try --level part or subpart"
-    lengths = "metres" if unit == "metre" else "scene units"
+        levels = ", ".join(f"--level {each.label}" for each in LEVELS if each is not found.level)
+        more = "" if view is None else ", or leave --view out"
+        return f"nothing in {place} answers to {text!r} at level {found.level.label}; try {levels}{more}"
+    lengths = "metres" if scene.scene.unit == "metre" else "scene units"
     lines = [
-        f"{counted(len(hits), 'answer')} to {text!r}; lengths in {lengths}; "
-        "a relevancy of 0.5 is no better than a generic phrase",
+        f"{counted(len(hits), 'answer')} to {text!r} in {place}; lengths in {lengths}",
         f"{'node':>5}  {'level':<8} {'score':>5}  {'position':<24} {'box size':<20} best views",
     ]
     for hit in hits:
@@ -156,15 +148,17 @@ def told(text: str, hits: Sequence[Hit], unit: str, view: str | None = None) -> 
         size = " x ".join(f"{side:.2f}" for side in hit.oriented_box.size)
         views = ", ".join(hit.best_views)
         lines.append(
-            f"{hit.node:>5}  {Level(hit.level).label:<8} {hit.score:>5.2f}  {position:<24} {size:<20} {views}"
+            f"{hit.node:>5}  {hit.level.label:<8} {hit.score:>5.2f}  {position:<24} {size:<20} {views}"
         )
+    if more := len(found.ids) - len(hits):
+        lines.append(f"and {counted(more, 'weaker answer')}, which the pictures show too")
+    lines.append('a score of 0.5 is no better than a generic word such as "object"')
     if hits[0].route == "fallback":
+        first = path_of(text)[0]
         lines.append(
-            "nothing of the kind lies in what answers the first text: everything else was searched instead"
+            f"no answer is part of anything that answers to {first!r}: the whole scene was searched instead"
         )
-    if hits[0].score < 0.5:
-        lines.append("all scores are below 0.5: the scene may hold nothing of the kind")
-    return "\n".join(lines)
+    return "\n".join([*lines, *(f"doubtful: {doubt}" for doubt in doubts)])
 
 
 def counted(count: int, noun: str) -> str:
@@ -174,5 +168,5 @@ def counted(count: int, noun: str) -> str:
 
 def file_name(text: str) -> str:
     """A folder name that is safe on every system, such as `bear--nose`."""
-    words = [re.sub(r"[^\w.-]+", "-", part.strip()).strip("-.") for part in text.split(PATH_SEPARATOR)]
+    words = [re.sub(r"[^\w.-]+", "-", part).strip("-.") for part in text.split(PATH_SEPARATOR)]
     return "--".join(word for word in words if word) or "query"

@@ -1,14 +1,42 @@
-"""One answer to a text, for people: what was found, where, and in which views."""
+"""One answer to a text, for people: what was found, where, in which views, and what is doubtful about it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Bool, Int64
 
 from hilsplat.base.levels import Level
+from hilsplat.query.node_search import NodeHits
 from hilsplat.semantic_tree.boxes import OrientedBox
-from hilsplat.semantic_tree.tree import SemanticTree
+
+if TYPE_CHECKING:
+    from hilsplat.query.language_scene import LanguageScene
 
 BEST_VIEWS = 3
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """A text of a query that nothing in the scene answers better than a generic word.
+
+    Attributes:
+        text: the text.
+        level: the level at which it was searched, if nodes of another level do answer it; else None.
+        score: of the best node of that level, or of any; at most 0.5, and 0 if there is none.
+    """
+
+    text: str
+    level: Level | None
+    score: float
+
+    def __str__(self) -> str:
+        """The doubt in a sentence."""
+        who = "nothing" if self.level is None else f"no {self.level.label}"
+        return (
+            f"{who} here answers to {self.text!r} better than to a generic word "
+            f"(the best score is {self.score:.2f})"
+        )
 
 
 @dataclass(frozen=True)
@@ -18,12 +46,13 @@ class Hit:
     Attributes:
         node: row of the semantic tree.
         level: its level.
-        score: relevancy in (0, 1); 0.5 is no better than a generic phrase.
+        score: relevancy in (0, 1); 0.5 is no better than a generic word.
         centroid: scene units.
         box: axis-aligned, lower and upper corner, scene units.
         oriented_box: the box along the node's own axes.
         best_views: up to three train views that show it largest.
         route: as in `NodeHits`.
+        doubts: texts of the query that nothing answers; the whole path is worth no more than its first text.
     """
 
     node: int
@@ -34,20 +63,54 @@ class Hit:
     oriented_box: OrientedBox
     best_views: tuple[str, ...]
     route: str
+    doubts: tuple[Doubt, ...]
+    _scene: "LanguageScene" = field(repr=False, compare=False)
 
-    @staticmethod
-    def of(tree: SemanticTree, node: int, score: float, route: str) -> "Hit":
-        """Describe a node that answered."""
+    @property
+    def gaussians(self) -> Int64[np.ndarray, " g"]:
+        """Rows of `gaussians.ply` that belong to the node."""
+        return self._scene.gaussians_of([self.node])
+
+    def mask(self, view: str) -> Bool[np.ndarray, "H W"]:
+        """Pixels of a view of which the node's Gaussians make up more than half.
+
+        Raises:
+            SettingsError: the scene has no such view.
+        """
+        return self._scene.node_masks(view, [self.node])
+
+
+def hits_of(scene: "LanguageScene", found: NodeHits, limit: int) -> list[Hit]:
+    """Describe the best of the nodes that answered, at most `limit`."""
+    tree, doubts = scene.tree, doubts_of(scene, found)
+    hits = []
+    for node, margin in zip(found.ids[:limit].tolist(), found.margins[:limit], strict=True):
         area = tree.view_area_px[node]
         order = np.lexsort((np.arange(len(area)), -area))[:BEST_VIEWS]
         low, high = tree.box[node].tolist()
-        return Hit(
-            node,
-            Level(int(tree.level[node])),
-            score,
-            tuple(tree.centroid[node].tolist()),
-            (tuple(low), tuple(high)),
-            OrientedBox.from_array(tree.oriented_box[node]),
-            tuple(tree.view_names[row] for row in order if area[row] > 0),
-            route,
+        hits.append(
+            Hit(
+                node,
+                Level(int(tree.level[node])),
+                scene.score(margin),
+                tuple(tree.centroid[node].tolist()),
+                (tuple(low), tuple(high)),
+                OrientedBox.from_array(tree.oriented_box[node]),
+                tuple(tree.view_names[row] for row in order if area[row] > 0),
+                found.route,
+                doubts,
+                scene,
+            )
         )
+    return hits
+
+
+def doubts_of(scene: "LanguageScene", found: NodeHits) -> tuple[Doubt, ...]:
+    """Texts of a query that nothing answers better than a generic word."""
+    doubts = []
+    for each in found.texts:
+        if each.anywhere <= 0:
+            doubts.append(Doubt(each.text, None, scene.score(each.anywhere)))
+        elif each.is_doubtful:
+            doubts.append(Doubt(each.text, each.level, scene.score(each.margin)))
+    return tuple(doubts)

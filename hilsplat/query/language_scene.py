@@ -1,25 +1,21 @@
-"""Answer texts: rank the nodes of the semantic tree, search along a path, or decode the rendered field.
+"""A finished scene that answers texts, by the nodes of its semantic tree or by its decoded language field.
 
-from hilsplat.query.language_scene import LanguageScene
-
-scene = LanguageScene.open("results/photos/desk")
-for hit in scene.query("mug handle", level="auto"):
-    print(hit.score, hit.level.label, hit.centroid, hit.oriented_box.size, hit.best_views)
-scene.query("mug > handle")                     # a handle inside a mug
-scene.node_masks("000.png", [hit.node])         # (H, W) bool
-scene.gaussians_of([hit.node])                  # rows of gaussians.ply
+`hilsplat.open` opens it, docs/python.md shows how to ask it. A text reaches its Gaussians in one chain:
+`query` reads it, `select` searches the tree by cosine margins (`node_search.search`), and a `Hit` knows its
+Gaussians.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Bool, Float, Float32, Int64, UInt8
+from jaxtyping import Bool, Float32, Int64, UInt8
 
+from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.device import ComputeDevice, compute_device
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.images import to_uint8
@@ -28,23 +24,19 @@ from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.field.autoencoder import Code, autoencoder_file, load_code
 from hilsplat.field.field import LanguageField
 from hilsplat.query.field_colours import field_colours
-from hilsplat.query.hits import Hit
+from hilsplat.query.hits import Hit, hits_of
 from hilsplat.query.latent_relevancy import LatentRelevancy
-from hilsplat.query.node_search import NodeHits, ancestor_margins, automatic_level, best_nodes, search_path
-from hilsplat.query.relevancy import relevancy
+from hilsplat.query.node_search import NodeHits, search
+from hilsplat.query.relevancy import margins, relevancy_of_margins
 from hilsplat.query.view_nodes import ViewNodes
 from hilsplat.query.view_store import ViewStore
-from hilsplat.scene.finished import FinishedScene, require_same
+from hilsplat.scene.cameras import Camera
+from hilsplat.scene.finished import FinishedScene, SceneParts, require_made_for
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.nodes import node_means
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings
 from hilsplat.splat.gaussians import Gaussians
-
-CANONICAL: tuple[str, ...] = EvaluateSettings().canonical
-RELEVANCY_SCALE: float = EvaluateSettings().relevancy_scale
-NODE_SELECT: float = EvaluateSettings().node_select
-ANCESTORS: float = EvaluateSettings().ancestors
 
 PATH_SEPARATOR = ">"
 
@@ -52,10 +44,24 @@ MIN_SHOWN_SHARE = 1e-4
 """Of a view: 14 px at 384 x 384 px show nothing."""
 
 MIN_LATENT_SHARE = 0.5
-"""A pixel has a latent at a level where Gaussians with one make up more than this share of it."""
+"""A pixel has a latent at a level if Gaussians with one make up more than this share of it."""
 
 TextEncoder = Callable[[list[str]], np.ndarray]
 Answerer = Literal["tree", "field"]
+
+
+class Opened:
+    """Artifacts by path: variants of a scene share most of theirs, and each is opened and hashed once."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[Hashable, ...], Any] = {}
+
+    def get(self, how: Callable[..., Any], path: Path, *more: Hashable) -> Any:
+        """`how(path, *more)`, or what it returned before."""
+        key = (how, Path(path).resolve(), *more)
+        if key not in self._kept:
+            self._kept[key] = how(path, *more)
+        return self._kept[key]
 
 
 @dataclass(frozen=True)
@@ -70,10 +76,7 @@ class LanguageScene:
         autoencoder: its decoder.
         encode_texts: unit CLIP vectors of texts.
         pixel_weights: compositing weights of a view (pixels x Gaussians).
-        canonical: phrases that a text must beat.
-        relevancy_scale: scale of the cosines.
-        node_select: threshold of `query` where none is given.
-        ancestors: share of the mean margin of a node's ancestors that is added to its own.
+        settings: canonical phrases, scale of the relevancy, and how nodes are selected.
         threads: for look-ups.
         device: "cpu" or "cuda", for look-ups of the field.
     """
@@ -85,20 +88,17 @@ class LanguageScene:
     autoencoder: Code
     encode_texts: TextEncoder
     pixel_weights: Callable[[str], sp.csr_matrix]
-    canonical: tuple[str, ...] = CANONICAL
-    relevancy_scale: float = RELEVANCY_SCALE
+    settings: EvaluateSettings = field(default_factory=EvaluateSettings)
     threads: int = 1
-    node_select: float = NODE_SELECT
-    ancestors: float = ANCESTORS
     device: ComputeDevice = "cpu"
     _views: ViewStore = field(default_factory=ViewStore, repr=False)
     _texts: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
 
     @staticmethod
     def open(
-        folder: Path | str, variant: str = "default", *, threads: int = 1, device: ComputeDevice = "cpu"
+        folder: Path | str, variant: str = "default", *, threads: int = 1, device: str = "cpu"
     ) -> "LanguageScene":
-        """Open `results/<dataset>/<scene>` with the settings that made it.
+        """Open `results/<dataset>/<scene>` with the settings that made it, wherever that folder is now.
 
         Canonical phrases, template, scale and what selects nodes are those that the variant was evaluated
         with, read from its provenance; of a scene without labels those that its panel was drawn with.
@@ -112,79 +112,70 @@ class LanguageScene:
         Raises:
             ArtifactError: the scene is not finished.
             MisalignedArtifactError: its parts do not belong together.
+            ModelError: the CLIP that embedded its masks is not found.
             DeviceError: cuda was asked for and torch finds no device.
         """
-        parts = FinishedScene.locate(Path(folder), variant)
-        settings = parts.evaluate_settings()
-        return LanguageScene.from_parts(
-            parts.scene,
-            parts.gaussians,
-            parts.semantic_tree,
-            parts.field,
-            parts.autoencoder,
-            parts.clip_model,
-            canonical=settings.canonical,
-            template=settings.template,
-            relevancy_scale=settings.relevancy_scale,
-            node_select=settings.node_select,
-            ancestors=settings.ancestors,
-            threads=threads,
-            device=device,
-        )
+        found = FinishedScene.locate(Path(folder), variant)
+        settings = found.evaluate_settings()
+        return LanguageScene.from_parts(found.parts, settings, threads=threads, device=device)
 
     @staticmethod
     def from_parts(
-        scene_folder: Path,
-        gaussians_ply: Path,
-        semantic_tree: Path,
-        language: Path,
-        autoencoder: Path,
-        clip_model_folder: Path,
+        parts: SceneParts,
+        settings: EvaluateSettings,
         *,
-        canonical: Sequence[str] = CANONICAL,
-        template: str = "{}",
-        relevancy_scale: float = RELEVANCY_SCALE,
-        node_select: float = NODE_SELECT,
-        ancestors: float = ANCESTORS,
         threads: int = 1,
-        device: ComputeDevice = "cpu",
+        device: str = "cpu",
+        opened: Opened | None = None,
     ) -> "LanguageScene":
-        """Read a scene's artifacts one by one and check that they belong together.
+        """Read a scene's artifacts, each once, and check that they belong together.
+
+        Args:
+            parts: where they are.
+            settings: how it answers; all of it.
+            threads: as in `open`.
+            device: as in `open`.
+            opened: what other variants of the scene opened before.
 
         Raises:
             MisalignedArtifactError: tree or field were made for other Gaussians, or the field for
                 another autoencoder.
+            ModelError: the CLIP that embedded the masks is not found.
         """
-        from hilsplat.embed.clip import ClipModel
+        from hilsplat.embed.clip import open_clip_of
         from hilsplat.splat.ply import load_ply
         from hilsplat.splat.rasterise.api import pixel_weights
 
-        scene = Scene.load(scene_folder)
-        gaussians = load_ply(gaussians_ply)
-        tree = SemanticTree.load(semantic_tree)
-        features = LanguageField.load(language)
-        require_same("semantic tree", scene.name, gaussians_ply, tree.gaussians_sha256)
-        require_same("language field", scene.name, gaussians_ply, features.gaussians_sha256)
-        require_same("language field", scene.name, autoencoder_file(autoencoder), features.autoencoder_sha256)
-        clip = ClipModel.load(clip_model_folder, threads, template)
-        code = load_code(autoencoder)
-        clip.require_width(code.channels, f"autoencoder {autoencoder}")
+        if device not in get_args(ComputeDevice):
+            raise SettingsError(
+                f"device {device!r} is unknown", expected=" or ".join(get_args(ComputeDevice)), found=device
+            )
+        opened = opened or Opened()
+        scene = opened.get(Scene.load, parts.scene)
+        gaussians = opened.get(load_ply, parts.gaussians)
+        tree = opened.get(SemanticTree.load, parts.semantic_tree)
+        language = opened.get(LanguageField.load, parts.field)
+        made_for = {"semantic tree": tree.gaussians_sha256, "language field": language.gaussians_sha256}
+        require_made_for(parts.gaussians, opened.get(sha256_of_file, parts.gaussians), scene.name, made_for)
+        code_file = autoencoder_file(parts.autoencoder)
+        made_for = {"language field": language.autoencoder_sha256}
+        require_made_for(code_file, opened.get(sha256_of_file, code_file), scene.name, made_for)
+        code = opened.get(load_code, parts.autoencoder)
+        clip = opened.get(open_clip_of, parts.clip, threads, settings.template)
+        clip.require_width(code.channels, f"autoencoder {parts.autoencoder}")
         return LanguageScene(
             scene,
             gaussians,
             tree,
-            features,
+            language,
             code,
             clip.embed_texts,
             lambda view: pixel_weights(
                 gaussians, scene.cameras[view], min_weight=tree.min_weight, threads=threads
             ),
-            tuple(canonical),
-            relevancy_scale,
+            settings,
             threads,
-            node_select,
-            ancestors,
-            compute_device(device),
+            compute_device(cast(ComputeDevice, device)),
         )
 
     # -- answers ----------------------------------------------------------------------------------
@@ -207,7 +198,7 @@ class LanguageScene:
             answerer: "tree": nodes answer with their averaged CLIP vectors; "field": with what the
                 paper's field holds for their Gaussians, decoded.
             view: name of a view, to ask only for what it shows; None: the whole scene.
-            threshold: hits lie at most 1 - threshold of the range of the level's margins below the best
+            threshold: hits are at most 1 - threshold of the range of the level's margins below the best
                 one (that the view shows), and three times as far if they look like it; None: the scene's
                 own (`node_select`).
             limit: answers at most.
@@ -216,113 +207,87 @@ class LanguageScene:
             SettingsError: the text is empty, level, answerer or view are unknown, or a path has more texts
                 than levels.
         """
-        hits = self.find(text, level, threshold, answerer, view)
-        return [
-            Hit.of(self.tree, int(node), float(score), hits.route)
-            for node, score in zip(hits.ids[:limit], hits.scores[:limit], strict=True)
-        ]
+        found = self.find(text, level, answerer=answerer, view=view, threshold=threshold)
+        return hits_of(self, found, limit)
 
     def find(
         self,
         text: str,
         level: str = "auto",
-        threshold: float | None = None,
+        *,
         answerer: str = "tree",
         view: str | None = None,
+        threshold: float | None = None,
     ) -> NodeHits:
         """Like `query`, as rows of the tree."""
-        path = tuple(part.strip() for part in text.split(PATH_SEPARATOR))
-        if not all(path):
-            raise SettingsError(
-                f"the query {text!r} holds no text", fix='write words, or "bear > head > nose"'
-            )
+        path = path_of(text)
         if answerer not in get_args(Answerer):
             raise SettingsError(
-                f"nothing answers as {answerer!r}", expected=" or ".join(get_args(Answerer)), found=answerer
+                f"answerer {answerer!r} is unknown",
+                expected=" or ".join(get_args(Answerer)),
+                found=answerer,
             )
         names = {each.label: each for each in LEVELS}
         if level != "auto" and level not in names:
             raise SettingsError(
                 f"level {level!r} is unknown", expected=f"auto, {', '.join(names)}", found=level
             )
-        if view is not None and view not in self.scene.cameras.names:
-            raise SettingsError(
-                f"{self.scene.name} has no view {view!r}",
-                expected=f"one of {', '.join(self.scene.views()[:3])}, ... ({len(self.scene.views())} views)",
-                found=view,
-            )
-        given = names.get(level)
-        if len(path) > 1:
-            return self.select_path(path, level=given, threshold=threshold, answerer=answerer, view=view)
-        return self.select_nodes(path[0], level=given, threshold=threshold, answerer=answerer, view=view)
+        chosen = cast(Answerer, answerer)
+        return self.select(path, level=names.get(level), answerer=chosen, view=view, threshold=threshold)
 
-    def select_nodes(
+    def select(
         self,
-        text: str,
+        path: Sequence[str],
         *,
-        level: Level | None,
-        threshold: float | None = None,
+        level: Level | None = None,
         answerer: Answerer = "tree",
         view: str | None = None,
+        threshold: float | None = None,
     ) -> NodeHits:
-        """Nodes whose margin is near that of the best, and those a little further that look like it.
-
-        To a node's margin a share (`ancestors`) of the mean of its ancestors' is added; see `best_nodes`.
+        """The search behind every answer: `query` and `find` of texts that are already apart.
 
         Args:
-            text: the query.
-            level: which nodes compete; None chooses it (see `automatic_level`).
-            threshold: as in `query`.
+            path: one text, or several from coarse to fine.
+            level: of the last text; None: chosen by the search.
             answerer: as in `query`.
             view: as in `query`.
-        """
-        scores = self.node_relevancy([text], answerer)[0]
-        shown = None if view is None else self.nodes_shown(view)
-        if level is None:
-            level = automatic_level(self.tree, scores, shown)
-        threshold = self.node_select if threshold is None else threshold
-        added = self.ancestors * ancestor_margins(self.tree, scores)
-        nodes = self.tree.nodes_of(level)
-        return best_nodes(scores, self.node_vectors(answerer), nodes, level, threshold, shown, added)
-
-    def select_path(
-        self,
-        path: tuple[str, ...],
-        *,
-        level: Level | None,
-        threshold: float | None = None,
-        answerer: Answerer = "tree",
-        view: str | None = None,
-    ) -> NodeHits:
-        """Search what answers the last text and lies in what answers those before; see `search_path`.
+            threshold: as in `query`.
 
         Raises:
-            SettingsError: the path is empty or longer than the levels down to the last text's.
+            SettingsError: the view is unknown, or the path is empty or longer than there are levels.
         """
-        scores = self.node_relevancy(list(path), answerer) if path else np.zeros((0, len(self.tree)))
-        threshold = self.node_select if threshold is None else threshold
-        shown = None if view is None else self.nodes_shown(view)
-        return search_path(self.tree, scores, self.node_vectors(answerer), path, threshold, level, shown)
+        return search(
+            self.tree,
+            self.node_margins(path, answerer),
+            self.node_vectors(answerer),
+            tuple(path),
+            threshold=self.settings.node_select if threshold is None else threshold,
+            ancestors=self.settings.ancestors,
+            level=level,
+            shown=None if view is None else self.nodes_shown(view),
+        )
 
     def nodes_shown(self, view: str) -> Bool[np.ndarray, " n"]:
         """Which nodes have a mask of at least `MIN_SHOWN_SHARE` of a view."""
+        height, width = self._camera(view).size_hw
 
         def measure() -> np.ndarray:
             num = len(self.tree)
-            height, width = self.scene.cameras[view].size_hw
             area_px = sum(self._view_nodes(view, level).area_px(num) for level in LEVELS)
             return area_px >= MIN_SHOWN_SHARE * height * width
 
         return self._views.get(("shown", view), measure, lambda kept: kept.nbytes)
 
     def gaussians_of(self, ids: Sequence[int] | Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " g"]:
-        """Gaussians of any of the nodes."""
+        """Rows of `gaussians.ply` that belong to any of the nodes."""
         return np.flatnonzero(np.isin(self.tree.node_of_gaussian, np.asarray(ids)).any(axis=1))
 
     def node_masks(self, view: str, ids: Sequence[int] | Int64[np.ndarray, " n"]) -> Bool[np.ndarray, "H W"]:
-        """Pixels where Gaussians of the nodes make up more than half of what is seen."""
+        """Pixels of which Gaussians of the nodes make up more than half; none for no nodes."""
         ids = np.asarray(ids, np.int64)
-        height, width = self.scene.cameras[view].size_hw
+        height, width = self._camera(view).size_hw
+        if not len(ids):
+            return np.zeros((height, width), np.bool_)
         chosen = np.zeros(len(self.tree), np.bool_)
         chosen[ids] = True
         levels = np.unique(self.tree.level[ids])
@@ -331,6 +296,38 @@ class LanguageScene:
         member = np.zeros(len(self.tree.node_of_gaussian), np.float32)
         member[self.gaussians_of(ids)] = 1
         return (self.view_weights(view) @ member > 0.5).reshape(height, width)
+
+    # -- views ------------------------------------------------------------------------------------
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Names of all views, in camera order."""
+        return self.scene.cameras.names
+
+    def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
+        """The undistorted photograph of a view; read-only, as it is kept: copy it to draw on it."""
+        self._camera(view)
+
+        def read() -> np.ndarray:
+            pixels = self.scene.image(view)
+            pixels.setflags(write=False)
+            return pixels
+
+        return self._views.get(("image", view), read, lambda kept: kept.nbytes)
+
+    def _camera(self, view: str) -> Camera:
+        """Camera of a view.
+
+        Raises:
+            SettingsError: the scene has no such view.
+        """
+        if view not in self.views:
+            raise SettingsError(
+                f"{self.scene.name} has no view {view!r}",
+                expected=f"one of {', '.join(self.views[:3])}, ... ({len(self.views)} views)",
+                found=view,
+            )
+        return self.scene.cameras[view]
 
     # -- relevancy --------------------------------------------------------------------------------
 
@@ -341,17 +338,20 @@ class LanguageScene:
             self._texts.update(zip(new, np.asarray(self.encode_texts(new), np.float32), strict=True))
         return np.stack([self._texts[text] for text in texts])
 
-    def relevancy(
-        self, embeddings: Float[np.ndarray, "B C"], texts: Sequence[str]
-    ) -> Float32[np.ndarray, "T B"]:
-        """Relevancy of embeddings to texts against this scene's canonical phrases."""
-        return relevancy(
-            embeddings, self.text_vectors(texts), self.text_vectors(self.canonical), self.relevancy_scale
-        )
+    def node_margins(self, texts: Sequence[str], answerer: Answerer = "tree") -> Float32[np.ndarray, "T n"]:
+        """Cosine margin of every node for every text, against this scene's canonical phrases."""
+        if not len(texts):
+            return np.zeros((0, len(self.tree)), np.float32)
+        canonical = self.text_vectors(self.settings.canonical)
+        return margins(self.node_vectors(answerer), self.text_vectors(texts), canonical)
 
     def node_relevancy(self, texts: Sequence[str], answerer: Answerer = "tree") -> Float32[np.ndarray, "T n"]:
         """Relevancy of every node to every text."""
-        return self.relevancy(self.node_vectors(answerer), texts)
+        return relevancy_of_margins(self.node_margins(texts, answerer), self.settings.relevancy_scale)
+
+    def score(self, margin: float) -> float:
+        """The relevancy of one margin."""
+        return float(relevancy_of_margins(np.array([margin]), self.settings.relevancy_scale)[0])
 
     def node_vectors(self, answerer: Answerer = "tree") -> Float32[np.ndarray, "n C"]:
         """Unit vectors by which nodes answer: their own, or what the field holds for their Gaussians."""
@@ -365,7 +365,7 @@ class LanguageScene:
         not stretch the range.
         """
         scores = self.node_relevancy(texts)
-        height, width = self.scene.cameras[view].size_hw
+        height, width = self._camera(view).size_hw
         maps = np.zeros((len(texts), len(LEVELS), height * width), np.float32)
         for level in LEVELS:
             nodes = self.tree.nodes_of(level)
@@ -394,7 +394,7 @@ class LanguageScene:
         shown, placed = self._view_latents(view), self._placed_latents(view) if by_look_up else None
         vectors = self.text_vectors(texts)
         answer = self._latent_relevancy
-        height, width = self.scene.cameras[view].size_hw
+        height, width = self._camera(view).size_hw
         maps = np.zeros((len(texts), len(LEVELS), height * width), np.float32)
         for index, (pixels, latents) in enumerate(shown):
             if not len(pixels):
@@ -412,7 +412,7 @@ class LanguageScene:
         """The field of a level as colours (see `field_colours`); uncovered pixels are black."""
         weights = self.view_weights(view)
         colours = field_colours(self.language.features[:, level.index])
-        return to_uint8((weights @ colours).reshape(*self.scene.cameras[view].size_hw, 3))
+        return to_uint8((weights @ colours).reshape(*self._camera(view).size_hw, 3))
 
     # -- what is kept of a view -------------------------------------------------------------------
 
@@ -462,8 +462,8 @@ class LanguageScene:
     def _latent_relevancy(self) -> LatentRelevancy:
         return LatentRelevancy(
             self.autoencoder,
-            self.text_vectors(self.canonical),
-            self.relevancy_scale,
+            self.text_vectors(self.settings.canonical),
+            self.settings.relevancy_scale,
             self.threads,
             self.device,
         )
@@ -473,3 +473,17 @@ class LanguageScene:
         """Decoded mean latent of each node's Gaussians at its level."""
         means = node_means(self.tree.node_of_gaussian, self.tree.level, self.language.features)
         return self.autoencoder.decode_array(means)
+
+
+def path_of(text: str) -> tuple[str, ...]:
+    """The texts of a query, coarse to fine: one, or those of a path such as "bear > head > nose".
+
+    Raises:
+        SettingsError: one of them is empty.
+    """
+    path = tuple(part.strip() for part in text.split(PATH_SEPARATOR))
+    if not all(path):
+        raise SettingsError(
+            f"the query {text!r} has an empty text", fix='write words, or a path such as "bear > head > nose"'
+        )
+    return path

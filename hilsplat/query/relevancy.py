@@ -1,10 +1,41 @@
-"""How much an embedding answers a text: LERF's relevancy."""
+"""How much an embedding answers a text: its cosine margin, and LERF's relevancy made of it."""
 
 import numpy as np
 from jaxtyping import Float, Float32
 
 CHUNK_ROWS = 65_536
 """Embeddings compared at once, so that products with many texts stay small."""
+
+
+def margins(
+    embeddings: Float[np.ndarray, "B C"],
+    texts: Float[np.ndarray, "T C"],
+    canonical: Float[np.ndarray, "K C"],
+) -> Float32[np.ndarray, "T B"]:
+    """Cosine with each text less the cosine with the nearest canonical phrase, in [-2, 2].
+
+    0 is an embedding as close to the text as to the nearest generic phrase. Whatever ranks or compares
+    embeddings reads margins: relevancies saturate, margins do not.
+
+    Args:
+        embeddings: unit vectors.
+        texts: unit vectors of the queries.
+        canonical: unit vectors of the generic phrases, at least one.
+
+    Example:
+        cosines 0.30 with the text and 0.25, 0.28, 0.20, 0.22 with the phrases: 0.02.
+    """
+    found = np.empty((len(texts), len(embeddings)), np.float32)
+    for start in range(0, len(embeddings), CHUNK_ROWS):
+        part = embeddings[start : start + CHUNK_ROWS]
+        generic = (part @ canonical.T).max(axis=1)
+        found[:, start : start + CHUNK_ROWS] = (part @ texts.T - generic[:, None]).T
+    return found
+
+
+def relevancy_of_margins(margin: Float[np.ndarray, "*n"], scale: float) -> Float[np.ndarray, "*n"]:
+    """The score that people and protocols read: 1 / (1 + exp(-scale * margin)); 0.5 at margin 0."""
+    return 1 / (1 + np.exp(-scale * margin))
 
 
 def relevancy(
@@ -15,8 +46,8 @@ def relevancy(
 ) -> Float32[np.ndarray, "T B"]:
     """Least softmax score of a text against each canonical phrase, in (0, 1).
 
-    rel = min over k of exp(s e.q) / (exp(s e.q) + exp(s e.c_k)). An embedding as close to the text
-    as to the nearest canonical phrase scores exactly 0.5: no better than generic.
+    rel = min over k of exp(s e.q) / (exp(s e.q) + exp(s e.c_k)), which is the logistic function of the
+    scaled margin: an embedding at margin 0 scores exactly 0.5, no better than generic.
 
     Source: LERF; LangSplat, `eval/openclip_encoder.py`.
 
@@ -30,10 +61,4 @@ def relevancy(
         cosines 0.30 with the text and 0.25, 0.28, 0.20, 0.22 with the phrases: the nearest phrase
         decides, 1 / (1 + exp(-10 * 0.02)) = 0.549834.
     """
-    scores = np.empty((len(texts), len(embeddings)), np.float32)
-    for start in range(0, len(embeddings), CHUNK_ROWS):
-        part = embeddings[start : start + CHUNK_ROWS]
-        generic = (part @ canonical.T).max(axis=1)
-        margin = scale * (part @ texts.T - generic[:, None])
-        scores[:, start : start + CHUNK_ROWS] = (1 / (1 + np.exp(-margin))).T
-    return scores
+    return relevancy_of_margins(margins(embeddings, texts, canonical), scale)

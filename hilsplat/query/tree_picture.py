@@ -30,16 +30,23 @@ FONT = 0  # cv2.FONT_HERSHEY_SIMPLEX
 FONT_SCALE = 0.5
 
 
-def export_tree(folder: Path, variant: str, out: Path, threads: int) -> str:
+def export_tree(folder: Path, variant: str, out: Path | None, threads: int) -> str:
     """Write `tree.json`, `tree.ply` (a node per Gaussian and level) and `tree.png` of a finished scene.
+
+    Args:
+        folder: `results/<dataset>/<scene>`, or wherever that folder is now.
+        variant: whose tree is written.
+        out: folder to write; None: `export/<variant>` in the scene's folder.
+        threads: threads for rendering.
 
     Returns:
         what was written, for people.
     """
-    parts = FinishedScene.locate(folder, variant)
-    scene = LanguageScene.open(folder, variant, threads=threads)
+    found = FinishedScene.locate(folder, variant)
+    out = out or found.folder / "export" / variant
+    scene = LanguageScene.from_parts(found.parts, found.evaluate_settings(), threads=threads)
     write_json(out / "tree.json", {"scene": scene.scene.name, "nodes": readable_nodes(scene.tree)})
-    write_tree_ply(parts.gaussians, scene.tree, out / "tree.ply")
+    write_tree_ply(found.parts.gaussians, scene.tree, out / "tree.ply")
     write_png(out / "tree.png", tree_picture(scene))
     counts = ", ".join(f"{len(scene.tree.nodes_of(level))} {level.label}" for level in LEVELS)
     return f"wrote tree.json, tree.ply and tree.png to {out} ({counts})"
@@ -117,7 +124,7 @@ def _crop(scene: LanguageScene, node: int) -> UInt8[np.ndarray, "84 84 3"]:
     import cv2
 
     view = scene.tree.view_names[int(scene.tree.view_area_px[node].argmax())]
-    image = scene.scene.image(view)
+    image = scene.image(view)
     mask = scene.node_masks(view, [node])
     if not mask.any():
         return np.full((CELL_PX, CELL_PX, 3), 225, np.uint8)

@@ -1,26 +1,32 @@
-"""Where the parts of a finished scene lie, and which settings made them."""
+"""Where the parts of a finished scene are, and which settings made them."""
 
-from dataclasses import dataclass
+import logging
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from hilsplat.base.artifacts import read_index, read_json, sha256_of_file
+from hilsplat.base.artifacts import read_json, sha256_of_file
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.provenance import provenance_path
 from hilsplat.settings import EvaluateSettings, Section
 
+logger = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
-class FinishedScene:
-    """The parts of one variant of a scene, some of which it may share with another variant.
+class SceneParts:
+    """Paths of the artifacts that together answer texts: one variant of one scene.
 
     Attributes:
-        folder: `results/<dataset>/<scene>`.
-        scene, gaussians, semantic_tree, field, autoencoder, clip, masks: its artifacts.
-        scores, panel: where these are, or would be; nothing is asked of them but settings.
+        scene: cameras, photographs, split.
+        gaussians: 3DGS PLY.
+        semantic_tree: nodes.
+        field: language field.
+        autoencoder: its code.
+        clip: CLIP vectors of the masks; its index names the model, which also embeds the texts.
+        masks: masks of the train views.
     """
 
-    folder: Path
     scene: Path
     gaussians: Path
     semantic_tree: Path
@@ -28,21 +34,44 @@ class FinishedScene:
     autoencoder: Path
     clip: Path
     masks: Path
-    scores: Path
-    panel: Path
+
+    def as_inputs(self) -> dict[str, Path]:
+        """The parts by name, as provenance lists what a stage read."""
+        return {part.name: getattr(self, part.name) for part in fields(self)}
+
+
+@dataclass(frozen=True)
+class FinishedScene:
+    """One variant of a finished scene; it may share some of its parts with another variant.
+
+    Attributes:
+        folder: `results/<dataset>/<scene>`, or wherever that folder is now.
+        variant: named set of settings.
+        parts: its artifacts.
+    """
+
+    folder: Path
+    variant: str
+    parts: SceneParts
 
     @staticmethod
     def locate(folder: Path, variant: str = "default") -> "FinishedScene":
-        """Find the parts of a variant.
+        """Find the parts of a variant, all within the scene's folder.
 
-        What a stage read is written in its provenance; without one, the parts are expected beside it. A
-        variant without a field of its own was scored with another's, which its scores' provenance names.
+        Provenance names what a stage read; without it, the parts are expected beside what was made of them.
+        A variant without a field of its own was scored with another's, which its scores' provenance names.
 
         Raises:
-            ArtifactError: a part is missing, or there is no such variant.
+            ArtifactError: the folder, the variant or a part is missing.
         """
         folder = Path(folder)
-        scores = folder / variant / "scores.csv"
+        if not folder.is_dir():
+            raise ArtifactError(
+                f"scene folder {folder} is missing",
+                expected="results/<dataset>/<scene> of a finished run, or a copy of it",
+                found=f"no such folder in {Path.cwd()}",
+                fix="correct the path, or name the results folder",
+            )
         if not (folder / variant).exists():
             raise ArtifactError(
                 f"{folder} has no variant {variant!r}",
@@ -51,54 +80,54 @@ class FinishedScene:
             )
         field = folder / variant / "field.safetensors"
         if not field.exists():
-            field = _recorded_input(scores, "field", folder) or field
+            field = _recorded_input(folder / variant / "scores.csv", "field", folder) or field
         if not field.exists():
             raise _unfinished(folder, field)
         autoencoder = _input_of(field, "autoencoder", folder)
         clip = _input_of(autoencoder, "clip", folder)
-        parts = {
-            "scene": folder / "scene",
-            "gaussians": folder / "gaussians.ply",
-            "semantic_tree": _input_of(autoencoder, "semantic_tree", folder),
-            "field": field,
-            "autoencoder": autoencoder,
-            "clip": clip,
-            "masks": _input_of(clip, "masks", folder),
-        }
-        for path in parts.values():
+        parts = SceneParts(
+            scene=folder / "scene",
+            gaussians=folder / "gaussians.ply",
+            semantic_tree=_input_of(autoencoder, "semantic_tree", folder),
+            field=field,
+            autoencoder=autoencoder,
+            clip=clip,
+            masks=_input_of(clip, "masks", folder),
+        )
+        for path in parts.as_inputs().values():
             if not path.exists():
                 raise _unfinished(folder, path)
-        place = folder.resolve()
-        return FinishedScene(
-            folder,
-            **parts,
-            scores=scores,
-            panel=place.parents[1] / "figures" / place.parent.name / place.name / "panel.png",
-        )
-
-    @property
-    def clip_model(self) -> Path:
-        """Folder of the CLIP that embedded the masks, and must embed the texts."""
-        return Path(read_index(self.clip)["model"])
+        return FinishedScene(folder, variant, parts)
 
     def evaluate_settings(self) -> EvaluateSettings:
-        """Canonical phrases, template, scale and selection of the run that made the scene; else the defaults.
+        """Canonical phrases, template, scale and selection of the run that made the scene.
 
-        A scene without labels has no scores; its panel was drawn with the same settings.
+        They are in the provenance of its scores. A scene without labels has no scores; its panel was drawn
+        with the same settings.
         """
-        if provenance_path(self.scores).is_file():
-            return _section(EvaluateSettings, _recorded_settings(self.scores))
-        return _section(EvaluateSettings, _recorded_settings(self.panel).get("evaluate", {}))
+        scores = self.folder / self.variant / "scores.csv"
+        if provenance_path(scores).is_file():
+            return _section(EvaluateSettings, _recorded_settings(scores))
+        place = self.folder.resolve()
+        panel = place.parent.parent / "figures" / place.parent.name / place.name / "panel.png"
+        if not provenance_path(panel).is_file():
+            logger.warning(
+                "%s: neither %s nor %s tells how texts were asked; the default settings answer",
+                self.folder,
+                provenance_path(scores),
+                provenance_path(panel),
+            )
+        return _section(EvaluateSettings, _recorded_settings(panel).get("evaluate", {}))
 
 
 def _recorded_settings(artifact: Path) -> dict[str, Any]:
-    """Settings in an artifact's provenance; none where it has none."""
+    """Settings in an artifact's provenance; none if it has no provenance."""
     record = provenance_path(artifact)
     return read_json(record)["settings"] if record.is_file() else {}
 
 
 def _section(section: type[Section], found: dict[str, Any]) -> Any:
-    """A section from recorded settings; knobs that they do not know take their defaults."""
+    """A section from recorded settings; knobs that the record does not know take their defaults."""
     return section(**{name: value for name, value in found.items() if name in section.model_fields})
 
 
@@ -113,12 +142,12 @@ def _unfinished(folder: Path, missing: Path) -> ArtifactError:
 
 
 def _input_of(artifact: Path, name: str, folder: Path) -> Path:
-    """Where an artifact's input lies: as its provenance says, else beside it."""
+    """Path of an artifact's input: as its provenance says, else beside it."""
     return _recorded_input(artifact, name, folder) or artifact.parent / name
 
 
 def _recorded_input(artifact: Path, name: str, folder: Path) -> Path | None:
-    """Where an artifact's input lies by its provenance, within the scene's folder wherever that is now."""
+    """Path of an artifact's input by its provenance, within the scene's folder wherever that is now."""
     record = provenance_path(artifact)
     if record.is_file():
         path = Path(read_json(record)["inputs"].get(name, {}).get("path", ""))
@@ -129,16 +158,31 @@ def _recorded_input(artifact: Path, name: str, folder: Path) -> Path | None:
 
 
 def require_same(what: str, scene: str, path: Path, expected_sha256: str) -> None:
-    """Refuse artifacts that were made for another file.
+    """Refuse an artifact that was made for another file.
 
     Raises:
         MisalignedArtifactError: the file's digest is another one.
     """
-    found = sha256_of_file(path)
-    if found != expected_sha256:
-        raise MisalignedArtifactError(
-            f"the {what} of {scene} was made for another {Path(path).name}",
-            expected=f"sha256 {expected_sha256[:12]}",
-            found=f"sha256 {found[:12]} in {path}",
-            fix=f"rerun the stage that writes the {what}",
-        )
+    require_made_for(path, sha256_of_file(path), scene, {what: expected_sha256})
+
+
+def require_made_for(path: Path, found_sha256: str, scene: str, made_for: dict[str, str]) -> None:
+    """Refuse artifacts that were made for another file.
+
+    Args:
+        path: the file.
+        found_sha256: its digest.
+        scene: for the message.
+        made_for: name of each artifact -> digest of the file that it was made for.
+
+    Raises:
+        MisalignedArtifactError: the file's digest is another one.
+    """
+    for what, expected in made_for.items():
+        if found_sha256 != expected:
+            raise MisalignedArtifactError(
+                f"the {what} of {scene} was made for another {Path(path).name}",
+                expected=f"sha256 {expected[:12]}",
+                found=f"sha256 {found_sha256[:12]} in {path}",
+                fix=f"rerun the stage that writes the {what}",
+            )

@@ -1,6 +1,7 @@
 """What made the masks of a scene, as rows and titles name it."""
 
 from pathlib import Path
+from typing import Any
 
 from hilsplat.base.artifacts import read_index
 
@@ -11,7 +12,11 @@ def masks_label(masks_folder: Path) -> str:
     The model folder's name, or the segmenter without one; masks made from true labels bring a label that
     also tells their faults.
     """
-    index = read_index(masks_folder)
+    return label_of_index(read_index(masks_folder))
+
+
+def label_of_index(index: dict[str, Any]) -> str:
+    """The same, from the index of a masks artifact."""
     if "label" in index:
         return str(index["label"])
     return Path(index["model"]).name if index["model"] else index["segmenter"]

@@ -17,6 +17,7 @@ from jaxtyping import Float, Float32, Int32, Int64, UInt8
 from hilsplat.base.artifacts import (
     INDEX,
     atomic_folder,
+    read_full_index,
     read_index,
     read_into,
     sha256_of_file,
@@ -27,7 +28,7 @@ from hilsplat.base.artifacts import (
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log
-from hilsplat.contributions.rows import Contributions, mask_embeddings, read_full_index
+from hilsplat.contributions.rows import Contributions, mask_embeddings
 from hilsplat.semantic_tree.boxes import node_boxes
 from hilsplat.semantic_tree.export import readable_nodes
 from hilsplat.semantic_tree.level_nodes import MIN_FIT, level_nodes

@@ -101,7 +101,7 @@ def answers_of(
     def mask_of(method: str, view: str, query: Query) -> Bool[np.ndarray, "H W"]:
         if method == "tree":
             size_hw = answers.scene.cameras[view].size_hw
-            return selections.mask(view, selections.text(query.text, query.level, view), size_hw)
+            return selections.mask(view, selections.nodes((query.text,), query.level, view), size_hw)
         if is_kept(view, query):
             return answered[view].get(given_key(method, query, settings))
         smoothed = SmoothedRelevancy.of(maps[view][query.text], rule)

@@ -12,15 +12,15 @@ from matplotlib.figure import Figure
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import stage_log, track
-from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.evaluate.figures.panel import Shown, annotated_rows, free_rows, truths_of
 from hilsplat.evaluate.metrics.masks import iou
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import rule_of
 from hilsplat.evaluate.tables.measured import row_name
-from hilsplat.query.language_scene import LanguageScene
+from hilsplat.query.language_scene import LanguageScene, Opened
 from hilsplat.query.pictures import label_left, paint_answer, save_png_and_pdf, show
+from hilsplat.scene.finished import FinishedScene
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 
@@ -46,20 +46,9 @@ class Answerer:
     scene: LanguageScene
 
     def mask(self, shown: Shown, evaluate: EvaluateSettings) -> Bool[np.ndarray, "H W"]:
-        """Answer to a query in its view, at its level where it has one."""
+        """Answer to a query in its view, at its level if it has one."""
         if self.method == "tree":
-            size_hw = self.scene.scene.cameras[shown.view].size_hw
-            if len(shown.path) > 1 and shown.level is None:  # a path that a person asks
-                hits = self.scene.select_path(
-                    shown.path, level=None, threshold=evaluate.node_select, view=shown.view
-                )
-            else:
-                hits = self.scene.select_nodes(
-                    shown.path[-1], level=shown.level, threshold=evaluate.node_select, view=shown.view
-                )
-            if not len(hits.ids):
-                return np.zeros(size_hw, dtype=bool)
-            return np.asarray(self.scene.node_masks(shown.view, hits.ids))
+            return shown.tree_mask(self.scene)
         rule = rule_of(evaluate)
         relevancy = np.asarray(self.scene.field_relevancy([shown.path[-1]], shown.view))[0]
         return relevancy_mask(SmoothedRelevancy.of(relevancy, rule), shown.level, rule)[0]
@@ -72,8 +61,10 @@ def run_comparison(
     out: Path,
     settings: FiguresSettings,
     evaluate: EvaluateSettings,
+    *,
     truth: Path | None = None,
-    labels: LabelledScene | None = None,
+    labels: str = "",
+    data_root: Path = Path(),
     queries: Sequence[str] = (),
     threads: int = 1,
 ) -> None:
@@ -81,14 +72,16 @@ def run_comparison(
 
     Args:
         folder: `results/<dataset>/<scene>`, finished under every variant.
-        variants: compared; "default" answers by its tree and its field, others by their field.
+        variants: compared, each with the settings it was evaluated with; "default" answers by its tree and
+            its field, others by their field.
         names: variant -> how tables name it.
         out: PNG of the comparison; `views.png` and `features.png` are written beside it.
         settings: how much is shown.
-        evaluate: how answers are made.
+        evaluate: which regions count as true, and how maps become masks.
         truth: truth folder of a synthetic scene.
-        labels: labels of a published data set, in its place.
-        queries: texts to show where there is neither.
+        labels: labels of a published data set in its place, such as "lerf_ovs/figurines".
+        data_root: folder of the data sets' folders.
+        queries: texts to show if there are neither.
         threads: threads for rendering.
 
     Raises:
@@ -97,24 +90,33 @@ def run_comparison(
     """
     if not variants:
         raise SettingsError("nothing is compared", expected="one variant or more", fix="name main_variants")
-    scene = Scene.load(Path(folder) / "scene")
+    scenes = open_variants(folder, variants, threads)
+    scene = scenes[variants[0]].scene
     with stage_log("comparison", scene.name) as counts:
-        methods: list[Answerer] = []
-        for variant in variants:
-            answers = LanguageScene.open(folder, variant, threads=threads)
-            for method in ("tree", "field") if variant == "default" else ("field",):
-                methods.append(Answerer(row_name(variant, method, names), method, answers))
-        truths = truths_of(scene, truth, labels, evaluate)
-        if truths:
-            rows = annotated_rows(truths, settings)
-        else:
-            rows = free_rows(methods[0].scene, queries, settings, evaluate)
+        methods = [
+            Answerer(row_name(variant, method, names), method, scenes[variant])
+            for variant in variants
+            for method in (("tree", "field") if variant == "default" else ("field",))
+        ]
+        truths = truths_of(scene, truth, labels, data_root, evaluate)
+        own = () if truths else queries
+        rows = [*annotated_rows(truths, settings), *free_rows(methods[0].scene, own, settings)]
         save_png_and_pdf(draw_methods(methods, rows, evaluate), out)
         several = over_views(scene, rows, truths)
         save_png_and_pdf(draw_views(methods, several, evaluate), Path(out).with_name("views.png"))
         view = several[0].view if several else (scene.views("test") or scene.views("train"))[0]
         save_png_and_pdf(draw_features(methods, view), Path(out).with_name("features.png"))
         counts |= {"methods": len(methods), "queries": len(rows), "views": len(several)}
+
+
+def open_variants(folder: Path, variants: Sequence[str], threads: int) -> dict[str, LanguageScene]:
+    """Open variants of a scene with the settings each was evaluated with; what they share is opened once."""
+    opened, scenes = Opened(), {}
+    for variant in variants:
+        found = FinishedScene.locate(folder, variant)
+        settings = found.evaluate_settings()
+        scenes[variant] = LanguageScene.from_parts(found.parts, settings, threads=threads, opened=opened)
+    return scenes
 
 
 def over_views(
@@ -146,10 +148,11 @@ def over_views(
 
 def draw_methods(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: EvaluateSettings) -> Figure:
     """One row per query, one column per method; the truth is outlined, IoU in the title."""
-    scene = methods[0].scene.scene
+    first = methods[0].scene
+    scene = first.scene
     figure, grid = _grid(scene, max(len(rows), 1), len(methods) + 1, f"{scene.name}: queries by method")
     for axes, row in zip(grid, track(list(rows), "queries compared"), strict=False):
-        image = scene.image(row.view)
+        image = first.image(row.view)
         title = f"truth, {row.view}" if row.truth is not None else row.view
         show(axes[0], paint_answer(image, None, row.truth), title)
         label_left(axes[0], row.text, row.level)
@@ -162,11 +165,12 @@ def draw_methods(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: E
 
 def draw_views(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: EvaluateSettings) -> Figure:
     """One row per method, one column per view: does a method answer alike from everywhere?"""
-    scene = methods[0].scene.scene
+    first = methods[0].scene
+    scene = first.scene
     asked = f"“{rows[0].text}” over {len(rows)} views" if rows else "no query"
     figure, grid = _grid(scene, len(methods) + 1, max(len(rows), 1), f"{scene.name}: {asked}")
     for column, row in enumerate(rows):
-        image = scene.image(row.view)
+        image = first.image(row.view)
         show(grid[0][column], paint_answer(image, None, row.truth), row.view)
         for place, method in enumerate(methods, start=1):
             mask = method.mask(row, evaluate)
@@ -183,7 +187,7 @@ def draw_features(methods: Sequence[Answerer], view: str) -> Figure:
     scene = methods[0].scene.scene
     figure, grid = _grid(scene, len(methods), len(LEVELS) + 1, f"{scene.name}: features at three levels")
     for axes, method in zip(grid, methods, strict=True):
-        show(axes[0], scene.image(view), view)
+        show(axes[0], methods[0].scene.image(view), view)
         label_left(axes[0], method.title)
         for level in LEVELS:
             picture = (

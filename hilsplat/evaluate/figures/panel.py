@@ -1,6 +1,8 @@
 """The panel of a scene: photograph, masks, field, and what queries answer."""
 
 import logging
+import shutil
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,16 +11,16 @@ import numpy as np
 from jaxtyping import Bool
 from matplotlib.figure import Figure, FigureBase
 
-from hilsplat.base.artifacts import read_index
+from hilsplat.base.artifacts import atomic_path, read_index
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import stage_log, track
-from hilsplat.datasets.labelled import LabelledScene
+from hilsplat.datasets.registry import open_labelled
 from hilsplat.evaluate.metrics.masks import iou
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import rule_of
 from hilsplat.evaluate.truths import annotated_truths, labelled_truths
-from hilsplat.query.language_scene import PATH_SEPARATOR, LanguageScene
+from hilsplat.query.language_scene import LanguageScene, path_of
 from hilsplat.query.node_search import NodeHits
 from hilsplat.query.pictures import (
     label_left,
@@ -27,9 +29,10 @@ from hilsplat.query.pictures import (
     save_png_and_pdf,
     show,
 )
+from hilsplat.scene.finished import SceneParts
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.segment.origin import made_from_truth, masks_label
+from hilsplat.segment.origin import label_of_index, made_from_truth
 from hilsplat.segment.pictures import paint_level
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 
@@ -44,10 +47,10 @@ class Shown:
 
     Attributes:
         text: what is asked; words separated by ">" are a path.
-        path: chain of texts from the whole down; the text alone where there are no annotations.
-        level: the annotation's level; None where there is none.
+        path: chain of texts from the whole down; without annotations the query's own.
+        level: the annotation's level; None if there is none.
         view: view name.
-        truth: true region; None where there is none.
+        truth: true region; None if it is not known.
     """
 
     text: str
@@ -56,73 +59,69 @@ class Shown:
     view: str
     truth: Bool[np.ndarray, "H W"] | None
 
+    def hits(self, answers: LanguageScene, *, by_path: bool = False) -> NodeHits:
+        """What the tree answers: to the text alone, or to the whole chain.
+
+        A query without an annotated level is somebody's own and is asked as it was written.
+        """
+        own = self.level is None or by_path
+        return answers.select(self.path if own else self.path[-1:], level=self.level, view=self.view)
+
+    def tree_mask(self, answers: LanguageScene, *, by_path: bool = False) -> Bool[np.ndarray, "H W"]:
+        """Its mask in the view."""
+        return answers.node_masks(self.view, self.hits(answers, by_path=by_path).ids)
+
 
 def run_figures(
-    scene_folder: Path,
-    truth: Path | None,
-    masks_folder: Path,
-    gaussians: Path,
-    semantic_tree: Path,
-    field: Path,
-    autoencoder: Path,
-    clip_folder: Path,
+    parts: SceneParts,
     out: Path,
     settings: FiguresSettings,
     evaluate: EvaluateSettings,
-    queries: Sequence[str] | None,
-    threads: int,
-    labels: LabelledScene | None = None,
+    *,
+    fit: Path | None = None,
+    truth: Path | None = None,
+    labels: str = "",
+    data_root: Path = Path(),
+    queries: Sequence[str] = (),
+    threads: int = 1,
 ) -> None:
-    """Draw the panel.
+    """Draw the panel; copy the pictures of poses and fit beside it.
 
     Args:
-        scene_folder: scene artifact.
-        truth: annotations, where the scene has them; then they name the queries.
-        masks_folder: masks artifact (training views).
-        gaussians: 3DGS PLY.
-        semantic_tree: semantic tree artifact.
-        field: language field.
-        autoencoder: autoencoder artifact.
-        clip_folder: mask embeddings; their index names the CLIP model.
-        out: PNG to write.
+        parts: the finished scene.
+        out: PNG to write; `registration.png` and `fit.png` are copied into its folder.
         settings: how much is shown.
         evaluate: how answers are made.
-        queries: texts to show where there are no annotations.
+        fit: report folder of the fit; None: nothing is copied.
+        truth: annotations of a synthetic scene; they name the queries.
+        labels: labels of a published data set in their place, such as "lerf_ovs/figurines".
+        data_root: folder of the data sets' folders.
+        queries: texts to show if there are neither.
         threads: threads for rendering.
-        labels: labels of a published data set, in place of annotations.
     """
-    scene = Scene.load(scene_folder)
-    with stage_log("figures", scene.name) as counts:
-        answers = LanguageScene.from_parts(
-            scene_folder,
-            gaussians,
-            semantic_tree,
-            field,
-            autoencoder,
-            Path(read_index(clip_folder)["model"]),
-            canonical=evaluate.canonical,
-            template=evaluate.template,
-            relevancy_scale=evaluate.relevancy_scale,
-            ancestors=evaluate.ancestors,
-            threads=threads,
-        )
-        truths = truths_of(scene, truth, labels, evaluate)
-        rows = (
-            annotated_rows(truths, settings)
-            if truths
-            else free_rows(answers, queries or (), settings, evaluate)
-        )
-        figure = draw_panel(answers, masks_folder, rows, evaluate)
-        save_png_and_pdf(figure, out)
+    if fit is not None:
+        copy_picture(parts.scene / "registration.png", out.with_name("registration.png"))
+        copy_picture(fit / "test_views.png", out.with_name("fit.png"))
+    answers = LanguageScene.from_parts(parts, evaluate, threads=threads)
+    with stage_log("figures", answers.scene.name) as counts:
+        truths = truths_of(answers.scene, truth, labels, data_root, evaluate)
+        rows = annotated_rows(truths, settings) if truths else free_rows(answers, queries, settings)
+        save_png_and_pdf(draw_panel(answers, parts.masks, rows, evaluate), out)
         counts["queries"] = len(rows)
 
 
+def copy_picture(source: Path, out: Path) -> None:
+    """Copy a file; the copy is whole or absent."""
+    with atomic_path(out) as temporary:
+        shutil.copyfile(source, temporary)
+
+
 def truths_of(
-    scene: Scene, truth: Path | None, labels: LabelledScene | None, evaluate: EvaluateSettings
+    scene: Scene, truth: Path | None, labels: str, data_root: Path, evaluate: EvaluateSettings
 ) -> Mapping[str, Callable[[], ViewTruth]]:
-    """What is true in the views of a scene; nothing where it has neither annotations nor labels."""
-    if labels is not None:
-        return labelled_truths(labels, scene)
+    """What is true in the views of a scene; nothing if it has neither annotations nor labels."""
+    if labels:
+        return labelled_truths(open_labelled(labels, data_root), scene)
     return annotated_truths(truth, scene, evaluate) if truth is not None else {}
 
 
@@ -152,17 +151,14 @@ def annotated_rows(truths: Mapping[str, Callable[[], ViewTruth]], settings: Figu
     return rows
 
 
-def free_rows(
-    answers: LanguageScene, queries: Sequence[str], settings: FiguresSettings, evaluate: EvaluateSettings
-) -> list[Shown]:
+def free_rows(answers: LanguageScene, queries: Sequence[str], settings: FiguresSettings) -> list[Shown]:
     """Given texts, each in the views that show its best node largest."""
     rows = []
     for text in queries:
-        hits = answers.query(text, threshold=evaluate.node_select, limit=1)
+        hits = answers.query(text, limit=1)
         fallback = [*answers.scene.views("test"), *answers.scene.views("train")]
         views = (list(hits[0].best_views) if hits else []) or fallback
-        path = tuple(part.strip() for part in text.split(PATH_SEPARATOR))
-        rows += [Shown(text, path, None, view, None) for view in views[: settings.views]]
+        rows += [Shown(text, path_of(text), None, view, None) for view in views[: settings.views]]
     return rows
 
 
@@ -171,7 +167,8 @@ def draw_panel(
 ) -> Figure:
     """Masks of a training view, the field in a held-out view, then one row per query."""
     scene = answers.scene
-    masked = next(iter(read_index(masks_folder)["views"]))
+    index = read_index(masks_folder)
+    masked = next(iter(index["views"]))
     held_out = rows[0].view if rows else (scene.views("test") or scene.views("train"))[0]
     height, width = scene.cameras[held_out].size_hw
     aspect = height / width
@@ -180,16 +177,16 @@ def draw_panel(
     row_in = WIDTH_IN / columns * aspect + 0.1
     queries_in = len(rows) * row_in + (0.2 if rows else 0)
     figure = Figure(figsize=(WIDTH_IN, overview_in + queries_in + 0.45), layout="constrained")
-    label = masks_label(masks_folder)
+    label = label_of_index(index)
     warning = ": a diagnostic, masks made from the true labels" if made_from_truth(label) else ""
     figure.suptitle(scene.name + warning, fontsize=12, fontweight="bold")
     parts = figure.subfigures(2, 1, height_ratios=[overview_in, queries_in]) if rows else [figure]
     grid = parts[0].subplots(2, 4, squeeze=False)
-    image = scene.image(masked)
+    image = answers.image(masked)
     masks = HierarchicalMasks.load(Path(masks_folder) / f"{masked}.npz")
     show(grid[0, 0], image, f"photograph {masked} (training view)")
     label_left(grid[0, 0], f"masks: {label}")
-    show(grid[1, 0], scene.image(held_out), f"photograph {held_out} ({scene.split[held_out]} view)")
+    show(grid[1, 0], answers.image(held_out), f"photograph {held_out} ({scene.split[held_out]} view)")
     label_left(grid[1, 0], "language field")
     for level in LEVELS:
         count = len(masks.rows_of(level))
@@ -220,18 +217,15 @@ def draw_queries(
     grid = figure.subplots(len(rows), columns, squeeze=False)
     rule = rule_of(evaluate)
     for axes, row in zip(grid, track(rows, "queries drawn"), strict=True):
-        image = answers.scene.image(row.view)
+        image = answers.image(row.view)
         last = row.path[-1]
         relevancy = np.asarray(answers.field_relevancy([last], row.view))[0]
-        hits = _hits(answers, row, evaluate)
+        hits = row.hits(answers)
         level = row.level or hits.level
         field_mask, _ = relevancy_mask(SmoothedRelevancy.of(relevancy, rule), level, rule)
-        pictures = [("tree", _node_mask(answers, row.view, hits))]
+        pictures = [("tree", answers.node_masks(row.view, hits.ids))]
         if columns == 7:
-            path = answers.select_path(
-                row.path, level=row.level, threshold=evaluate.node_select, view=row.view
-            )
-            pictures.append(("tree, path", _node_mask(answers, row.view, path)))
+            pictures.append(("tree, path", row.tree_mask(answers, by_path=True)))
         pictures.append(("field", field_mask))
         title = f"truth, {row.view}" if row.truth is not None else row.view
         show(axes[0], paint_answer(image, None, row.truth), title)
@@ -251,19 +245,5 @@ def draw_queries(
             )
 
 
-def _hits(answers: LanguageScene, row: Shown, evaluate: EvaluateSettings) -> NodeHits:
-    if row.level is None:
-        return answers.find(row.text, threshold=evaluate.node_select, view=row.view)
-    return answers.select_nodes(row.text, level=row.level, threshold=evaluate.node_select, view=row.view)
-
-
-def _node_mask(answers: LanguageScene, view: str, hits: NodeHits) -> Bool[np.ndarray, "H W"]:
-    if len(hits.ids) == 0:
-        return np.zeros(answers.scene.cameras[view].size_hw, dtype=bool)
-    return np.asarray(answers.node_masks(view, hits.ids))
-
-
 def _wrapped(text: str, width: int = 20) -> str:
-    import textwrap
-
     return "\n".join(textwrap.wrap(text, width))

@@ -17,11 +17,9 @@ class QueryableScene(Protocol):
     def node_relevancy_map(self, texts, view):
         """Relevancy of the node at each pixel, (T, 3, H, W)."""
 
-    def select_nodes(self, text, level=None, threshold=0.95, view=None):
-        """Nodes that answer a text, and their level. With a view only nodes that it shows compete."""
-
-    def select_path(self, texts, level=None, threshold=0.95, view=None):
-        """Nodes that answer the last of a chain of texts, at a level or at the one chosen; view as above."""
+    def select(self, path, *, level=None, view=None):
+        """Nodes that answer the last of one or more texts, at a level or at the one that is chosen. With a
+        view only nodes that it shows compete."""
 
     def node_masks(self, view, ids):
         """Union of the rendered nodes in a view, (H, W)."""
@@ -50,31 +48,25 @@ class PackedMasks:
 class Selections:
     """Nodes chosen for texts and paths, once for a view or for the whole scene."""
 
-    def __init__(self, scene: QueryableScene, threshold: float) -> None:
-        self.scene, self.threshold = scene, threshold
+    def __init__(self, scene: QueryableScene) -> None:
+        self.scene = scene
         self._of: dict[tuple, np.ndarray] = {}
 
-    def text(self, text: str, level: Level | None, view: str | None) -> np.ndarray:
-        """Ids of the nodes that answer a text at a level, or at the level the tree chooses.
+    def nodes(self, path: tuple[str, ...], level: Level | None, view: str | None) -> np.ndarray:
+        """Ids of the nodes that answer a text, or the last text of a path.
 
-        Nodes that the view shows compete, as maps do; without a view those of the whole scene.
+        Args:
+            path: one text, or several from coarse to fine.
+            level: of the last text; None: the one that the tree chooses.
+            view: nodes that it shows compete, as in maps; None: those of the whole scene.
         """
-        key = (text, level, view)
+        key = (path, level, view)
         if key not in self._of:
-            hits = self.scene.select_nodes(text, level=level, threshold=self.threshold, view=view)
-            self._of[key] = np.asarray(hits.ids)
-        return self._of[key]
-
-    def path(self, texts: tuple[str, ...], level: Level | None, view: str) -> np.ndarray:
-        """Ids of the nodes that answer the last of a chain of texts, at a level or at the one chosen."""
-        key = (texts, level, view)
-        if key not in self._of:
-            hits = self.scene.select_path(texts, level=level, threshold=self.threshold, view=view)
-            self._of[key] = np.asarray(hits.ids)
+            self._of[key] = np.asarray(self.scene.select(path, level=level, view=view).ids)
         return self._of[key]
 
     def mask(self, view: str, ids: np.ndarray, size_hw: tuple[int, int]) -> np.ndarray:
-        """Union of some nodes in a view; no node gives an empty mask."""
+        """Union of some nodes in a view; no nodes give an empty mask."""
         if len(ids) == 0:
             return np.zeros(size_hw, dtype=bool)
         return np.asarray(self.scene.node_masks(view, ids)).astype(bool)

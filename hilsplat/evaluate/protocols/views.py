@@ -131,7 +131,7 @@ def measure_view(
     rule = rule_of(settings)
 
     def select(text: str, level: Level | None) -> np.ndarray:
-        return selections.mask(view, selections.text(text, level, view), size_hw)
+        return selections.mask(view, selections.nodes((text,), level, view), size_hw)
 
     texts = [query.text for query in truth.categories]
     per_chunk = max(1, int(RELEVANCY_CHUNK_MIB * 2**20 / (2 * 3 * 4 * size_hw[0] * size_hw[1])))
@@ -229,7 +229,7 @@ def _scene_wide_rows(
     """The tree's answer in 3D, which knows of no view; maps, and so localization, are as with a view."""
     protocol = label_of(SCENE_WIDE, "tree", settings)
     for query in queries:
-        mask = selections.mask(view, selections.text(query.text, query.level, None), masks.size_hw)
+        mask = selections.mask(view, selections.nodes((query.text,), query.level, None), masks.size_hw)
         yield from mask_rows("tree", query, protocol, mask, NO_POINTS, MASK)
         masks.put(("tree", protocol, query.text, query.level), mask)
 
@@ -251,13 +251,13 @@ def _path_rows(
         mask = np.zeros(size_hw, dtype=bool)
         inside = np.zeros(size_hw, dtype=bool)
         for path in query.paths:
-            path_mask = selections.mask(view, selections.path(path, query.level, view), size_hw)
+            path_mask = selections.mask(view, selections.nodes(path, query.level, view), size_hw)
             masks.put(("tree-path", protocol, path), path_mask)
             mask |= path_mask
             if len(path) > 1:
                 is_full = len(path) == int(query.level)  # labels may lack a level in between
                 parent_level = Level(len(path) - 1) if is_full else None
-                inside |= selections.mask(view, selections.path(path[:-1], parent_level, view), size_hw)
+                inside |= selections.mask(view, selections.nodes(path[:-1], parent_level, view), size_hw)
         level_map = relevancy[query.level.index]
         filtered = mean_filter(np.where(inside, level_map, 0) if inside.any() else level_map, side_px)
         points, _ = peak_points(np.stack([filtered] * len(LEVELS)), query.level)

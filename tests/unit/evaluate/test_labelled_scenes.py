@@ -13,6 +13,7 @@ from hilsplat.evaluate import stage
 from hilsplat.evaluate.asked import Asked
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.scores import read_scores
+from hilsplat.scene.finished import SceneParts
 from hilsplat.settings import EvaluateSettings
 
 
@@ -43,24 +44,19 @@ def rows(block_world, monkeypatch, tmp_path):
         stage, "LanguageScene", SimpleNamespace(from_parts=lambda *_, **__: block_world.answers)
     )
     folder = block_world.folder
+    names = ("scene", "gaussians", "semantic_tree", "field", "autoencoder", "clip", "masks")
+    parts = SceneParts(**{name: folder / name for name in names})
 
     def evaluate(truth=None, labels=None):
+        monkeypatch.setattr(Asked, "open", staticmethod(lambda name, data_root: (name, labels, Asked())))
         stage.run_evaluate(
-            scene_folder=folder / "scene",
-            truth=truth,
-            gaussians=folder / "gaussians.ply",
-            semantic_tree=folder / "semantic_tree",
-            language=folder / "field.safetensors",
-            autoencoder=folder / "autoencoder",
-            clip_folder=folder / "clip",
-            masks_folder=folder / "masks",
-            out=tmp_path / "scores.csv",
-            settings=EvaluateSettings(),
+            parts,
+            tmp_path / "scores.csv",
+            EvaluateSettings(),
             dataset="lerf",
             scene="blocks",
-            variant="default",
-            threads=1,
-            labels=[("lerf", labels, Asked())] if labels else (),
+            truth=truth,
+            labels=["lerf"] if labels else [],
         )
         scores = read_scores([tmp_path / "scores.csv"])
         keys = ["view", "method", "query", "level", "metric", "protocol"]

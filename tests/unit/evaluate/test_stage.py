@@ -8,38 +8,31 @@ from PIL import Image
 from hilsplat.evaluate import stage
 from hilsplat.evaluate.figures import panel
 from hilsplat.evaluate.scores import read_scores
+from hilsplat.scene.finished import SceneParts
 from hilsplat.settings import EvaluateSettings, FiguresSettings
+
+PARTS = ("scene", "gaussians", "semantic_tree", "field", "autoencoder", "clip", "masks")
 
 
 @pytest.fixture
 def opened(block_world, monkeypatch):
-    """Arguments of a stage; the scene that they open is the block world."""
+    """Parts of a scene, and what a stage asks for when it opens them; what opens is the block world."""
     asked = {}
 
-    def open_scene(*paths, **options):
-        asked.update(options, model=paths[-1].as_posix())
+    def open_scene(parts, settings, **options):
+        asked.update(options, parts=parts, settings=settings)
         return block_world.answers
 
     for module in (stage, panel):
         monkeypatch.setattr(module, "LanguageScene", SimpleNamespace(from_parts=open_scene))
     folder = block_world.folder
-    arguments = {
-        "scene_folder": folder / "scene",
-        "truth": folder / "truth",
-        "masks_folder": folder / "masks",
-        "gaussians": folder / "gaussians.ply",
-        "semantic_tree": folder / "semantic_tree",
-        "language": folder / "field.safetensors",
-        "autoencoder": folder / "autoencoder",
-        "clip_folder": folder / "clip",
-        "threads": 1,
-    }
-    return SimpleNamespace(arguments=arguments, asked=asked)
+    parts = SceneParts(**{name: folder / name for name in PARTS})
+    return SimpleNamespace(parts=parts, truth=folder / "truth", asked=asked)
 
 
-def evaluate(opened, out, **changes):
-    names = {"dataset": "synthetic", "scene": "blocks", "variant": "default", "settings": EvaluateSettings()}
-    stage.run_evaluate(**{**opened.arguments, **names, "out": out, **changes})
+def evaluate(opened, out, settings=None, **changes):
+    names = {"dataset": "synthetic", "scene": "blocks", "variant": "default", "truth": opened.truth}
+    stage.run_evaluate(opened.parts, out, settings or EvaluateSettings(), **{**names, **changes})
 
 
 def test_only_test_views_are_scored_and_rows_say_where_they_come_from(opened, tmp_path):
@@ -48,8 +41,15 @@ def test_only_test_views_are_scored_and_rows_say_where_they_come_from(opened, tm
     assert set(scores["view"]) == {"001.png"}
     assert set(scores["masks"]) == {"sam-tiny"}
     assert set(scores["method"]) == {"field", "tree", "tree-path", "truth"}
-    assert opened.asked["model"] == "models/clip-tiny"
-    assert opened.asked["canonical"] == ("object", "things", "stuff", "texture")
+
+
+def test_a_scene_is_opened_with_all_that_the_settings_say(opened, tmp_path):
+    settings = EvaluateSettings(node_select=0.5, template="a photo of a {}", methods=("tree",))
+    evaluate(opened, tmp_path / "scores.csv", settings)
+    assert opened.asked["settings"] is settings
+    panel.run_figures(opened.parts, tmp_path / "panel.png", FiguresSettings(), settings, queries=["bear"])
+    assert opened.asked["settings"] is settings
+    assert opened.asked["parts"] is opened.parts
 
 
 def test_evaluating_twice_gives_the_same_bytes(opened, tmp_path):
@@ -63,13 +63,19 @@ def test_scene_without_annotations_gives_a_header_only(opened, tmp_path):
     assert len(read_scores([tmp_path / "scores.csv"])) == 0
 
 
-def test_panel_is_written(opened, tmp_path):
+def test_the_panel_is_written_with_the_pictures_of_poses_and_fit_beside_it(opened, tmp_path):
+    (opened.parts.scene / "registration.png").write_bytes(b"cameras")
+    (tmp_path / "fit").mkdir()
+    (tmp_path / "fit/test_views.png").write_bytes(b"renders")
     panel.run_figures(
-        **opened.arguments,
-        out=tmp_path / "panel.png",
-        settings=FiguresSettings(queries_per_level=1),
-        evaluate=EvaluateSettings(),
-        queries=None,
+        opened.parts,
+        tmp_path / "panel.png",
+        FiguresSettings(queries_per_level=1),
+        EvaluateSettings(),
+        fit=tmp_path / "fit",
+        truth=opened.truth,
     )
     with Image.open(tmp_path / "panel.png") as picture:
         assert picture.width == 1430
+    assert (tmp_path / "registration.png").read_bytes() == b"cameras"
+    assert (tmp_path / "fit.png").read_bytes() == b"renders"

@@ -13,7 +13,7 @@ from hilsplat.base.provenance import provenance_path
 from hilsplat.field.autoencoder import load_code, run_autoencoder
 from hilsplat.field.field import LanguageField, run_field
 from hilsplat.query.language_scene import LanguageScene
-from hilsplat.query.node_search import ancestor_margins, automatic_level, best_nodes, search_path
+from hilsplat.query.node_search import ancestor_margins, automatic_level, best_nodes, search
 from hilsplat.query.view_nodes import ViewNodes
 from hilsplat.query.view_store import ViewStore
 from hilsplat.scene.finished import FinishedScene, require_same
@@ -34,11 +34,6 @@ from tests.unit.two_boxes_world import (
 
 NAMES = ("A", "B", "A top", "B top", "A bottom", "A top left", "B corner")
 NODE = {name: node for node, name in enumerate(NAMES)}
-
-
-def logistic(margin: np.ndarray) -> np.ndarray:
-    """Relevancies behind which the margins lie."""
-    return (1 / (1 + np.exp(-margin))).astype(np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -76,89 +71,98 @@ def scene(tmp_path_factory) -> LanguageScene:
 @pytest.mark.parametrize("name", NODE)
 def test_every_region_is_found_at_its_level(scene, name):
     level = Level(int(scene.tree.level[NODE[name]]))
-    hits = scene.select_nodes(name, level=level, threshold=0.85)
+    hits = scene.select((name,), level=level, threshold=0.85)
     assert hits.ids.tolist() == [NODE[name]]
-    assert hits.scores[0] > 0.9
+    assert scene.score(hits.margins[0]) > 0.9
     assert scene.query(name, level.label)[0].node == NODE[name]
 
 
 @pytest.mark.parametrize("name", NODE)
 def test_automatic_level_is_the_region_s_own(scene, name):
-    assert scene.select_nodes(name, level=None, threshold=0.85).ids.tolist() == [NODE[name]]
+    assert scene.select((name,), threshold=0.85).ids.tolist() == [NODE[name]]
 
 
 def test_automatic_level_is_that_of_the_best_node_and_of_equals_the_coarsest(scene):
-    scores = np.full(7, 0.2, np.float32)
-    scores[[NODE["A top left"], NODE["A top"], NODE["A"]]] = 0.9, 0.8, 0.7
-    assert automatic_level(scene.tree, scores) == Level.SUBPART
+    margin = np.full(7, -0.1)
+    margin[[NODE["A top left"], NODE["A top"], NODE["A"]]] = 0.3, 0.2, 0.1
+    assert automatic_level(scene.tree, margin) == Level.SUBPART
     shown = np.arange(7) != NODE["A top left"]
-    assert automatic_level(scene.tree, scores, shown) == Level.PART
-    scores[NODE["A top"]] = 0.9
-    assert automatic_level(scene.tree, scores) == Level.PART
-    assert automatic_level(scene.tree, scores, np.zeros(7, bool)) == Level.WHOLE
+    assert automatic_level(scene.tree, margin, shown) == Level.PART
+    margin[NODE["A top"]] = 0.3
+    assert automatic_level(scene.tree, margin) == Level.PART
+    assert automatic_level(scene.tree, margin, np.zeros(7, bool)) == Level.WHOLE
 
 
-def test_selection_is_by_margins_which_do_not_saturate():
+def test_answers_are_near_the_best_in_the_range_of_their_level():
     every, apart = np.arange(4), np.eye(4, dtype=np.float32)
-    scores = np.array([0.1, 0.95, 0.98, 0.999])
-    # the relevancies 0.95 to 0.999 all lie above 0.94 of their range; of the margins (-2.2, 2.9, 3.9,
-    # 6.9) only the last lies above 0.85 of theirs
-    assert best_nodes(scores, apart, every, Level.PART, 0.85).ids.tolist() == [3]
-    assert best_nodes(scores, apart, every, Level.PART, 0.5).ids.tolist() == [3, 2, 1]
-    equal = best_nodes(np.array([0.4, 0.9, 0.9]), apart[:3], np.arange(3), Level.PART, 0.95)
-    assert equal.ids.tolist() == [1, 2]
+    margin = np.array([-0.22, 0.29, 0.39, 0.69])  # a range of 0.91: 0.15 of it is 0.14, a half 0.46
+    assert best_nodes(margin, apart, every, 0.85).tolist() == [3]
+    assert best_nodes(margin, apart, every, 0.5).tolist() == [3, 2, 1]
+    assert best_nodes(np.array([-0.1, 0.2, 0.2]), apart[:3], np.arange(3), 0.95).tolist() == [1, 2]
 
 
 @pytest.mark.parametrize(("cosine", "found"), [(0.91, [3, 2]), (0.89, [3])])
-def test_what_looks_like_the_best_answer_may_lie_three_times_as_far_below(cosine, found):
+def test_what_looks_like_the_best_answer_may_be_three_times_as_far_below(cosine, found):
     margin = np.array([0.0, 7.0, 8.6, 10.0])  # of a range of 10: 0.05 is 0.5, three times that 1.5
     vectors = np.eye(5, dtype=np.float32)[:4]
     for node in (1, 2):
         vectors[node] = cosine * vectors[3] + np.sqrt(1 - cosine**2) * np.eye(5)[4]
-    assert best_nodes(logistic(margin), vectors, np.arange(4), Level.PART, 0.95).ids.tolist() == found
+    assert best_nodes(margin, vectors, np.arange(4), 0.95).tolist() == found
 
 
 def test_only_what_is_shown_answers_in_the_range_of_all():
-    scores, apart = logistic(np.array([0.0, 9.4, 9.7, 10.0])), np.eye(4, dtype=np.float32)
+    margin, apart = np.array([0.0, 9.4, 9.7, 10.0]), np.eye(4, dtype=np.float32)
     shown = np.array([True, True, True, False])
-    hits = best_nodes(scores, apart, np.arange(4), Level.PART, 0.95, shown)
-    assert hits.ids.tolist() == [2, 1]  # within 0.05 of the range of all four, 10
-    assert not len(best_nodes(scores, apart, np.arange(4), Level.PART, 0.95, np.zeros(4, bool)).ids)
+    # within 0.05 of the range of all four, 10
+    assert best_nodes(margin, apart, np.arange(4), 0.95, shown).tolist() == [2, 1]
+    assert not len(best_nodes(margin, apart, np.arange(4), 0.95, np.zeros(4, bool)))
 
 
-def test_what_lies_in_a_likely_thing_is_ahead(scene):
+def test_what_is_part_of_a_likely_thing_is_ahead(scene):
     margin = np.full(7, -1.0)
     margin[[NODE["A"], NODE["A top"], NODE["A top left"]]] = 3.0, 1.0, 1.0
     margin[[NODE["B"], NODE["B corner"]]] = 0.0, 1.1
-    scores = logistic(margin)
-    added = ancestor_margins(scene.tree, scores)
-    # A top left lies in A top and A, B corner in B alone; wholes lie in nothing and add nothing
-    assert added[NODE["A top left"]] == pytest.approx(2.0, abs=1e-5)
-    assert added[NODE["B corner"]] == pytest.approx(0.0, abs=1e-5)
+    added = ancestor_margins(scene.tree, margin)
+    # A top left is part of A top and A, B corner of B alone; wholes are part of nothing and add nothing
+    assert added[NODE["A top left"]] == pytest.approx(2.0)
+    assert added[NODE["B corner"]] == pytest.approx(0.0)
     assert added[[NODE["A"], NODE["B"]]].tolist() == [0, 0]
-    subparts = scene.tree.nodes_of(Level.SUBPART)
-    vectors = scene.tree.clip
-    assert best_nodes(scores, vectors, subparts, Level.SUBPART, 0.9).ids[0] == NODE["B corner"]
-    hits = best_nodes(scores, vectors, subparts, Level.SUBPART, 0.9, added=0.2 * added)
-    assert hits.ids.tolist() == [NODE["A top left"]]
-    assert hits.scores == pytest.approx(scores[[NODE["A top left"]]])  # told as it is
+
+    def found(ancestors):
+        return search(
+            scene.tree,
+            margin[None].astype(np.float32),
+            scene.tree.clip,
+            ("x",),
+            threshold=0.9,
+            ancestors=ancestors,
+            level=Level.SUBPART,
+        )
+
+    assert found(0.0).ids[0] == NODE["B corner"]
+    assert found(0.2).ids.tolist() == [NODE["A top left"]]
+    assert found(0.2).margins.tolist() == [1.0]  # its own, with nothing added
     orphans = replace(scene.tree, parent=np.full(7, -1, np.int32))
-    least = ancestor_margins(orphans, scores)
-    assert least[scene.tree.level > 1] == pytest.approx(-1.0, abs=1e-5)
+    assert (ancestor_margins(orphans, margin)[scene.tree.level > 1] == -1.0).all()
 
 
-def of_path(scene, *margins):
-    """Relevancies of a path's texts: -1 but for the nodes that are named."""
-    every = np.full((len(margins), len(NAMES)), -1.0)
-    for row, named in zip(every, margins, strict=True):
-        for name, value in named.items():
+def of_path(*named):
+    """Margins of a path's texts: -1 but for the nodes that are named."""
+    every = np.full((len(named), len(NAMES)), -1.0, np.float32)
+    for row, values in zip(every, named, strict=True):
+        for name, value in values.items():
             row[NODE[name]] = value
-    return logistic(every)
+    return every
+
+
+def search_path(tree, margin, path, threshold, level=None, shown=None):
+    """Search a path of several texts."""
+    return search(tree, margin, tree.clip, path, threshold=threshold, ancestors=0.2, level=level, shown=shown)
 
 
 def test_a_path_stays_inside_its_first_thing(scene):
-    scores = of_path(scene, {"A": 3.0}, {"A bottom": 2.0}, {"A top left": 0.4, "B corner": 2.2})
-    hits = search_path(scene.tree, scores, scene.tree.clip, ("A", "A bottom", "x"), 0.95)
+    margin = of_path({"A": 3.0}, {"A bottom": 2.0}, {"A top left": 0.4, "B corner": 2.2})
+    hits = search_path(scene.tree, margin, ("A", "A bottom", "x"), 0.95)
     # the one subpart of A hangs under its top; that of B answers better, but is no part of A
     assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "child")
 
@@ -174,23 +178,23 @@ def three_wholes(scene) -> SemanticTree:
 @pytest.mark.parametrize(("b_corner", "found"), [(2.4, "A top left"), (2.6, "B corner")])
 def test_a_node_competes_together_with_what_holds_it(scene, three_wholes, b_corner, found):
     # A is best, B 1 below it, which counts half: 2.0 against b_corner - 0.5
-    scores = of_path(scene, {"A": 4.0, "B": 3.0}, {"A top left": 2.0, "B corner": b_corner})
-    hits = search_path(three_wholes, scores, scene.tree.clip, ("x", "y"), 0.99, Level.SUBPART)
+    margin = of_path({"A": 4.0, "B": 3.0}, {"A top left": 2.0, "B corner": b_corner})
+    hits = search_path(three_wholes, margin, ("x", "y"), 0.99, Level.SUBPART)
     assert hits.ids.tolist() == [NODE[found]]
 
 
 @pytest.mark.parametrize(("b", "found"), [(2.7, "A top left"), (2.8, "B corner")])
 def test_what_holds_no_likely_first_thing_does_not_compete(scene, three_wholes, b, found):
     # a quarter of the range of 5 is 1.25
-    scores = of_path(scene, {"A": 4.0, "B": b}, {"A top left": 0.0, "B corner": 9.0})
-    hits = search_path(three_wholes, scores, scene.tree.clip, ("x", "y"), 0.99, Level.SUBPART)
+    margin = of_path({"A": 4.0, "B": b}, {"A top left": 0.0, "B corner": 9.0})
+    hits = search_path(three_wholes, margin, ("x", "y"), 0.99, Level.SUBPART)
     assert hits.ids.tolist() == [NODE[found]]
 
 
 def test_where_nothing_likely_holds_an_answer_everything_is_searched_and_told(scene, three_wholes):
     # B top, the best whole, holds nothing, and all else is further below it than a quarter of the range
-    scores = of_path(scene, {"A": 1.0, "B": 0.0, "B top": 4.0}, {"A top left": 1.0, "B corner": 1.2})
-    hits = search_path(three_wholes, scores, scene.tree.clip, ("x", "y"), 0.99, Level.SUBPART)
+    margin = of_path({"A": 1.0, "B": 0.0, "B top": 4.0}, {"A top left": 1.0, "B corner": 1.2})
+    hits = search_path(three_wholes, margin, ("x", "y"), 0.99, Level.SUBPART)
     assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "fallback")
 
 
@@ -199,10 +203,10 @@ def test_what_a_view_does_not_show_is_no_rival_of_what_it_shows(scene, three_who
     parent[NODE["B corner"]] = -1
     tree = replace(three_wholes, parent=parent)
     # B top would leave A unlikely, and B corner, which nothing holds, the answer
-    scores = of_path(scene, {"A": 1.0, "B top": 4.0}, {}, {"A top left": 2.0, "B corner": 0.0})
+    margin = of_path({"A": 1.0, "B top": 4.0}, {}, {"A top left": 2.0, "B corner": 0.0})
     for hidden, found in (("B", "B corner"), ("B top", "A top left")):
         shown = np.arange(7) != NODE[hidden]
-        hits = search_path(tree, scores, tree.clip, ("x", "y", "z"), 0.99, shown=shown)
+        hits = search_path(tree, margin, ("x", "y", "z"), 0.99, shown=shown)
         assert hits.ids.tolist() == [NODE[found]]
 
 
@@ -211,9 +215,9 @@ def test_a_missing_ancestor_counts_a_tenth_of_the_range(scene, three_wholes):
     parent[NODE["B corner"]] = -1
     tree = replace(three_wholes, parent=parent)
     # of the range of 5 half a tenth, 0.25
-    for margin, found in ((2.2, "A top left"), (2.3, "B corner")):
-        scores = of_path(scene, {"A": 4.0}, {"A top left": 2.0, "B corner": margin})
-        hits = search_path(tree, scores, tree.clip, ("x", "y"), 0.99, Level.SUBPART)
+    for b_corner, found in ((2.2, "A top left"), (2.3, "B corner")):
+        margin = of_path({"A": 4.0}, {"A top left": 2.0, "B corner": b_corner})
+        hits = search_path(tree, margin, ("x", "y"), 0.99, Level.SUBPART)
         assert hits.ids.tolist() == [NODE[found]]
     assert hits.route == "fallback"
 
@@ -248,7 +252,7 @@ def test_a_variant_answers_with_the_field_it_was_scored_with_and_never_with_anot
     (folder / "theta").mkdir()
     (folder / "theta/scores.csv").touch()
     write_json(provenance_path(folder / "theta/scores.csv"), {"settings": {}, "inputs": inputs})
-    found = FinishedScene.locate(folder, "theta")
+    found = FinishedScene.locate(folder, "theta").parts
     assert found.field == folder / "default/field.safetensors"
     assert found.semantic_tree == folder / "default/semantic_tree"
     with pytest.raises(ArtifactError, match="no variant 'x'"):
@@ -290,7 +294,7 @@ def test_hits_tell_gaussians_and_an_oriented_box(scene):
 
 
 def test_path_goes_from_child_to_child(scene):
-    hits = scene.select_path(("A", "A top", "A top left"), level=None, threshold=0.85)
+    hits = scene.select(("A", "A top", "A top left"), threshold=0.85)
     assert hits.ids.tolist() == [NODE["A top left"]]
     assert hits.route == "child"
     assert hits.level == Level.SUBPART
@@ -298,7 +302,7 @@ def test_path_goes_from_child_to_child(scene):
 
 def test_path_restricts_a_part_to_its_object(scene):
     # "A top" asked inside B can only be a part of B
-    assert scene.select_path(("B", "A top"), level=None, threshold=0.85).ids.tolist() == [NODE["B top"]]
+    assert scene.select(("B", "A top"), threshold=0.85).ids.tolist() == [NODE["B top"]]
 
 
 @pytest.mark.parametrize(
@@ -313,16 +317,15 @@ def test_path_restricts_a_part_to_its_object(scene):
     ],
 )
 def test_a_short_path_finds_its_levels_unless_one_is_given(scene, path, level, found):
-    hits = scene.select_path(path, level=level, threshold=0.85)
+    hits = scene.select(path, level=level, threshold=0.85)
     assert hits.ids.tolist() == [NODE[found]]
     assert hits.level == Level(int(scene.tree.level[NODE[found]]))
 
 
 def test_a_way_through_the_levels_with_every_ancestor_goes_before_one_without(scene):
-    scores = np.full((2, 7), 0.1, np.float32)
-    scores[0, NODE["A"]], scores[0, NODE["B top"]] = 0.8, 0.9  # B top holds no subpart
-    scores[1, NODE["A top left"]], scores[1, NODE["B corner"]] = 0.6, 0.9
-    hits = search_path(scene.tree, scores, scene.tree.clip, ("x", "y"), 0.95)
+    # B top has no subpart
+    margin = of_path({"A": 0.8, "B top": 0.9}, {"A top left": 0.6, "B corner": 0.9})
+    hits = search_path(scene.tree, margin, ("x", "y"), 0.95)
     assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "descendant")
 
 
@@ -360,7 +363,7 @@ def test_a_view_shows_what_has_a_mask_there(scene, monkeypatch):
 
 def test_path_falls_back_to_any_descendant_of_the_object(scene):
     # "B top" has no subpart; "B corner" hangs directly under B
-    hits = scene.select_path(("B", "B top", "B corner"), level=None, threshold=0.85)
+    hits = scene.select(("B", "B top", "B corner"), threshold=0.85)
     assert hits.ids.tolist() == [NODE["B corner"]]
     assert hits.route == "descendant"
 
@@ -368,7 +371,7 @@ def test_path_falls_back_to_any_descendant_of_the_object(scene):
 def test_path_falls_back_to_the_whole_level(scene):
     parent = np.where(scene.tree.level == Level.SUBPART, -1, scene.tree.parent).astype(np.int32)
     orphaned = replace(scene, tree=replace(scene.tree, parent=parent))
-    hits = orphaned.select_path(("A", "A top", "B corner"), level=None, threshold=0.85)
+    hits = orphaned.select(("A", "A top", "B corner"), threshold=0.85)
     assert hits.ids.tolist() == [NODE["B corner"]]
     assert hits.route == "fallback"
 
@@ -386,7 +389,7 @@ def test_query_parses_paths_and_describes_hits(scene):
     [
         ("a > b > c > d", "auto", "1 to 3 texts"),
         ("a > b > c", "part", "cannot be searched at level part"),
-        (" ", "auto", "holds no text"),
+        (" ", "auto", "has an empty text"),
         ("A", "hole", "unknown"),
         ("A > A top", "hole", "unknown"),
     ],
@@ -397,7 +400,7 @@ def test_impossible_queries_say_why(scene, text, level, words):
 
 
 def test_an_unknown_answerer_is_named(scene):
-    with pytest.raises(SettingsError, match="nothing answers as 'tre'"):
+    with pytest.raises(SettingsError, match="answerer 'tre' is unknown"):
         scene.query("A", answerer="tre")
 
 

@@ -1,6 +1,6 @@
 """Figures of the paper: which methods and queries are shown, and that answers are drawn where they are."""
 
-from types import SimpleNamespace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ EVALUATE = EvaluateSettings()
 
 @pytest.fixture
 def rows(block_world):
-    truths = truths_of(block_world.scene, block_world.folder / "truth", None, EVALUATE)
+    truths = truths_of(block_world.scene, block_world.folder / "truth", "", Path(), EVALUATE)
     return truths, annotated_rows(truths, FiguresSettings(queries_per_level=1))
 
 
@@ -62,7 +62,7 @@ def test_equal_nodes_have_equal_colours_and_what_has_none_is_black(block_world):
 
 def test_all_figures_are_written_as_png_and_pdf_twice_the_same(block_world, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        comparison, "LanguageScene", SimpleNamespace(open=lambda *_, **__: block_world.answers)
+        comparison, "open_variants", lambda _, variants, __: dict.fromkeys(variants, block_world.answers)
     )
     for name in ("one", "two"):
         run_comparison(
@@ -86,7 +86,7 @@ def test_all_figures_are_written_as_png_and_pdf_twice_the_same(block_world, tmp_
 def test_scenes_without_labels_show_the_queries_of_the_configuration(block_world, tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(
-        comparison, "LanguageScene", SimpleNamespace(open=lambda *_, **__: block_world.answers)
+        comparison, "open_variants", lambda _, variants, __: dict.fromkeys(variants, block_world.answers)
     )
     monkeypatch.setattr(comparison, "draw_methods", lambda methods, rows, _: drawn.append(rows) or None)
     monkeypatch.setattr(comparison, "save_png_and_pdf", lambda figure, out: None)

@@ -1,6 +1,7 @@
 """Pictures are drawn for scenes with and without annotations, and show what they say."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.base.provenance import provenance_path
 from hilsplat.evaluate.figures.panel import annotated_rows, draw_panel, free_rows, truths_of
-from hilsplat.query.answer import file_name, query_panel, told, views_of
+from hilsplat.query.answer import file_name, query_panel, report, views_of
+from hilsplat.query.hits import hits_of
 from hilsplat.query.pictures import ANSWER_RGB, TRUTH_RGB, outline, paint_answer, save_figure
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.settings import EvaluateSettings, FiguresSettings
@@ -37,7 +39,7 @@ def test_outline_runs_inside_the_mask_but_not_along_the_image_border():
 
 
 def truths_of_blocks(block_world):
-    return truths_of(block_world.scene, block_world.folder / "truth", None, EVALUATE)
+    return truths_of(block_world.scene, block_world.folder / "truth", "", Path(), EVALUATE)
 
 
 def test_largest_text_of_each_level_is_shown_first(block_world):
@@ -61,7 +63,7 @@ def test_panel_with_annotations_is_drawn(block_world, tmp_path):
 
 
 def test_panel_without_annotations_takes_given_texts(block_world, tmp_path):
-    rows = free_rows(block_world.answers, ["bear", "bear > head"], FiguresSettings(), EVALUATE)
+    rows = free_rows(block_world.answers, ["bear", "bear > head"], FiguresSettings())
     assert [(row.path, row.view) for row in rows] == [(("bear",), "000.png"), (("bear", "head"), "000.png")]
     figure = draw_panel(block_world.answers, block_world.folder / "masks", rows, EVALUATE)
     save_figure(figure, tmp_path / "panel.png", dpi=60)
@@ -73,26 +75,41 @@ def test_panel_without_queries_shows_the_overview(block_world, tmp_path):
     save_figure(figure, tmp_path / "panel.png", dpi=60)
 
 
-def test_query_is_told_and_drawn(block_world, tmp_path):
-    hits = block_world.answers.query("bear > head")
-    assert views_of(block_world.answers, hits, 2) == ["000.png", "001.png"]
-    lines = told("bear > head", hits, "metre").splitlines()
-    assert lines[0].startswith("1 answer to 'bear > head'")
-    assert lines[2].split()[:3] == ["2", "part", "1.00"]
+def test_a_query_is_reported_and_drawn(block_world, tmp_path):
     answers, text = block_world.answers, "bear > head"
-    query_panel(answers, text, answers.find(text), ["000.png", "001.png"], tmp_path / "panel.png")
+    found = answers.find(text)
+    assert views_of(answers, hits_of(answers, found, 10), 2) == ["000.png", "001.png"]
+    lines = report(answers, text, found).splitlines()
+    assert lines[0] == "1 answer to 'bear > head' in synthetic/blocks; lengths in metres"
+    assert lines[2].split()[:3] == ["2", "part", "1.00"]
+    assert "doubtful" not in lines[-1]
+    query_panel(answers, text, found, ["000.png", "001.png"], tmp_path / "panel.png")
     assert (tmp_path / "panel.png").stat().st_size > 10_000
 
 
-def test_no_answer_is_said():
-    assert told("unicorn", [], "metre").startswith("no node of the scene answers 'unicorn'")
-    assert told("unicorn", [], "metre", "000.png").startswith("no node that 000.png shows answers 'unicorn'")
+def test_no_answer_is_said(block_world):
+    empty = replace(block_world.answers.find("bear"), ids=np.zeros(0, np.int64), margins=np.zeros(0))
+    words = report(block_world.answers, "unicorn", empty)
+    assert words.startswith(
+        "nothing in synthetic/blocks answers to 'unicorn' at level whole; try --level part"
+    )
+    words = report(block_world.answers, "unicorn", empty, "000.png")
+    assert words.startswith("nothing in what 000.png shows of synthetic/blocks answers to 'unicorn'")
 
 
 def test_a_path_that_ended_outside_its_first_thing_says_so(block_world):
-    (hit,) = block_world.answers.query("bear > head")
-    assert "everything else was searched" not in told("bear > head", [hit], "metre")
-    assert "everything else was searched" in told("bear > head", [replace(hit, route="fallback")], "metre")
+    found = block_world.answers.find("bear > head")
+    assert "the whole scene was searched" not in report(block_world.answers, "bear > head", found)
+    outside = report(block_world.answers, "bear > head", replace(found, route="fallback"))
+    assert "no answer is part of anything that answers to 'bear'" in outside
+
+
+def test_what_nothing_answers_is_reported_as_doubtful(block_world):
+    text = "unicorn > head"
+    found = block_world.answers.find(text)
+    assert found.route == "child"
+    last = report(block_world.answers, text, found).splitlines()[-1]
+    assert last.startswith("doubtful: nothing here answers to 'unicorn' better than to a generic word")
 
 
 def test_file_names_hold_no_separators():
@@ -116,7 +133,7 @@ def test_parts_of_a_variant_are_found_through_provenance(tmp_path):
     field.touch()
     path = "results/photos/bear/default/autoencoder"
     write_json(provenance_path(field), {"inputs": {"autoencoder": {"path": path, "sha256": ""}}})
-    parts = FinishedScene.locate(folder, "omega-2")
+    parts = FinishedScene.locate(folder, "omega-2").parts
     assert parts.field == field
     assert parts.autoencoder == folder / "default" / "autoencoder"
     assert parts.semantic_tree == folder / "default" / "semantic_tree"
@@ -133,3 +150,8 @@ def test_unknown_variant_names_those_there_are(tmp_path):
     folder = finished_scene(tmp_path)
     with pytest.raises(ArtifactError, match="one of default"):
         FinishedScene.locate(folder, "leftover")
+
+
+def test_a_missing_scene_folder_is_named(tmp_path):
+    with pytest.raises(ArtifactError, match=r"scene folder .*photos/desk is missing"):
+        FinishedScene.locate(tmp_path / "photos/desk")

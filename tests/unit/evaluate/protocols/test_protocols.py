@@ -51,13 +51,10 @@ class HandMade:
 
     node_relevancy_map = field_relevancy
 
-    def select_nodes(self, text, *, level=None, threshold=0.85, view=None):
+    def select(self, path, *, level=None, view=None):
         answers = self.answers if view == "v.png" else self.answers | self.scene_wide
-        return SimpleNamespace(ids=np.array(answers.get((text, level), []), dtype=np.int64), level=level)
-
-    def select_path(self, path, *, level=None, threshold=0.85, view=None):
-        answers = self.answers if view == "v.png" else self.answers | self.scene_wide
-        return SimpleNamespace(ids=np.array(answers.get(path, []), dtype=np.int64))
+        found = answers.get(path, answers.get((path[0], level), []) if len(path) == 1 else [])
+        return SimpleNamespace(ids=np.array(found, dtype=np.int64), level=level)
 
     def node_masks(self, view, ids):
         return np.any([self.masks[node] for node in ids], axis=0)
@@ -66,7 +63,7 @@ class HandMade:
 def measured(scene, truth, **settings):
     """{(method, protocol, query, level, metric): value} of one view."""
     section = EvaluateSettings(min_region_px=1, **settings)
-    rows = measure_view(scene, Selections(scene, 0.85), truth, "v.png", SIZE, section)
+    rows = measure_view(scene, Selections(scene), truth, "v.png", SIZE, section)
     return {(row.method, row.protocol, row.query, row.level, row.metric): row.value for row in rows}
 
 
@@ -222,7 +219,7 @@ def test_other_protocols_are_measured_with_their_own_rules():
     rows = list(
         measure_view(
             scene,
-            Selections(scene, 0.85),
+            Selections(scene),
             truth,
             "v.png",
             SIZE,
@@ -258,7 +255,7 @@ def test_perfect_tree_of_the_block_world_scores_one(block_world):
     view, size_hw = "001.png", (64, 64)
     settings = EvaluateSettings()
     truth = ViewTruth.of(block_world.annotations, view, size_hw, settings.min_region_px)
-    selections = Selections(block_world.answers, settings.node_select)
+    selections = Selections(block_world.answers)
     rows = list(measure_view(block_world.answers, selections, truth, view, size_hw, settings))
     given = [row for row in rows if row.method == "tree" and row.protocol == "hierarchy/level-given@4"]
     ious = {row.query: row.value for row in given if row.metric == "iou"}

@@ -1,0 +1,179 @@
+"""A finished scene in half a minute: coloured plates, a CLIP of colours, and every stage by its own command.
+
+The desk has a red mug with a green handle with a yellow rim, and a blue book with a green label. The CLIP
+embeds an image as its mean colour and a text as the colours of its words; words that it does not know are
+grey.
+"""
+
+import json
+import logging
+import os
+from pathlib import Path
+
+import numpy as np
+import onnx
+import torch
+from onnx import TensorProto, helper, numpy_helper
+from tokenizers import Tokenizer, models, pre_tokenizers
+
+from hilsplat.base.artifacts import write_index
+from hilsplat.base.images import write_png
+from hilsplat.base.provenance import write_provenance
+from hilsplat.cli.main import app
+from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.ply import save_ply
+
+HEIGHT, WIDTH = 24, 36
+NUM_VIEWS = 6
+GENERIC = (1, 1, 1)
+WORDS = {"mug": (1, 0, 0), "handle": (0, 1, 0), "book": (0, 0, 1), "rim": (1, 1, 0)}
+REGIONS = (
+    # name, level, rows, columns, colour; a region is painted over those before it
+    ("mug", 1, (0, 24), (0, 16), (250, 0, 0)),
+    ("book", 1, (0, 24), (16, 36), (0, 0, 250)),
+    ("handle", 2, (4, 16), (2, 12), (40, 220, 0)),
+    ("label", 2, (4, 14), (20, 28), (0, 250, 0)),
+    ("rim", 3, (4, 8), (2, 12), (250, 250, 0)),
+)
+SCENE = Path("results/photos/desk")
+
+
+def region_mask(name: str, shift: int = 0) -> np.ndarray:
+    """Pixels of a region in view number `shift`, (24, 42) bool."""
+    _, _, rows, columns, _ = next(region for region in REGIONS if region[0] == name)
+    mask = np.zeros((HEIGHT, WIDTH + NUM_VIEWS), bool)
+    mask[slice(*rows), columns[0] + shift : columns[1] + shift] = True
+    return mask
+
+
+def write_colour_clip(folder: Path) -> None:
+    """A CLIP of 4-px crops whose vectors are colours."""
+    value = helper.make_tensor_value_info
+    table = np.array([GENERIC, *WORDS.values()], np.float32)
+    table /= np.linalg.norm(table, axis=1, keepdims=True)
+    vision = [helper.make_node("ReduceMean", ["pixel_values"], ["image_embeds"], axes=[2, 3], keepdims=0)]
+    text = [
+        helper.make_node("Gather", ["table", "input_ids"], ["words"]),
+        helper.make_node("ReduceSum", ["words", "one"], ["text_embeds"], keepdims=0),
+    ]
+    image = value("pixel_values", TensorProto.FLOAT, ["batch", 3, 4, 4])
+    ids = value("input_ids", TensorProto.INT64, ["batch", "words_of_text"])
+    constants = {"table": table, "one": np.array([1])}
+    folder.mkdir(parents=True)
+    for name, nodes, given, made, held in (
+        ("vision_model", vision, image, "image_embeds", {}),
+        ("text_model", text, ids, "text_embeds", constants),
+    ):
+        initialisers = [numpy_helper.from_array(array, key) for key, array in held.items()]
+        output = value(made, TensorProto.FLOAT, ["batch", 3])
+        graph = helper.make_graph(nodes, "colours", [given], [output], initialisers)
+        opsets = [helper.make_opsetid("", 17)]
+        onnx.save(helper.make_model(graph, opset_imports=opsets, ir_version=9), folder / f"{name}.onnx")
+    described = {"size": {"shortest_edge": 4}, "crop_size": {"height": 4, "width": 4}}
+    described |= {"image_mean": [0, 0, 0], "image_std": [1, 1, 1]}
+    (folder / "config.json").write_text(json.dumps({"model_type": "clip"}))
+    (folder / "preprocessor_config.json").write_text(json.dumps(described))
+    tokenizer = Tokenizer(models.WordLevel({"[UNK]": 0} | {w: 1 + n for n, w in enumerate(WORDS)}, "[UNK]"))
+    tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
+    tokenizer.save(str(folder / "tokenizer.json"))
+
+
+def build_finished_desk(project: Path) -> Path:
+    """Write `models/colours` and `results/photos/desk` into a folder; returns the folder."""
+    before, handlers = Path.cwd(), list(logging.getLogger().handlers)
+    write_colour_clip(project / "models/colours")
+    os.chdir(project)  # paths in provenance are relative, as the workflow writes them
+    try:
+        _write_scene()
+        _run_stages()
+    finally:
+        os.chdir(before)
+        logging.getLogger().handlers[:] = handlers
+    return project
+
+
+def _write_scene() -> None:
+    """Photographs, cameras and Gaussians; a Gaussian at (column, row, 0) is a pixel of every view."""
+    canvas = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    for _, _, rows, columns, colour in REGIONS:
+        canvas[slice(*rows), slice(*columns)] = colour
+    names = tuple(f"{view:03d}.png" for view in range(NUM_VIEWS))
+    distance = 30.0
+    poses = np.tile(np.eye(4), (NUM_VIEWS, 1, 1))
+    poses[:, 2, 3] = distance
+    poses[:, 0, 3] = np.arange(NUM_VIEWS)  # one unit is one pixel
+    K = np.array([[distance, 0, 0.5], [0, distance, 0.5], [0, 0, 1]])
+    for shift, name in enumerate(names):
+        photograph = np.zeros((HEIGHT, WIDTH + NUM_VIEWS, 3), np.uint8)
+        photograph[:, shift : shift + WIDTH] = canvas
+        write_png(SCENE / "scene/images" / name, photograph)
+    sizes = np.full((NUM_VIEWS, 2), (HEIGHT, WIDTH + NUM_VIEWS), np.int32)
+    cameras = Cameras(names, poses, np.tile(K, (NUM_VIEWS, 1, 1)), sizes)
+    split = {name: "test" if name == names[-1] else "train" for name in names}
+    points = np.zeros((0, 3), np.float32)
+    Scene(
+        SCENE / "scene",
+        "photos/desk",
+        "arbitrary",
+        cameras,
+        split,
+        points,
+        points.astype(np.uint8),
+        np.eye(4),
+    ).save()
+    rows, columns = np.divmod(np.arange(HEIGHT * WIDTH), WIDTH)
+    count = len(rows)
+    colours = (canvas.reshape(-1, 3) / 255 - 0.5) / 0.28209479177387814
+    gaussians = Gaussians(
+        torch.from_numpy(np.stack([columns, rows, np.zeros(count)], axis=1).astype(np.float32)),
+        torch.full((count, 3), float(np.log(0.25))),
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        torch.full((count,), 5.0),
+        torch.from_numpy(colours.astype(np.float32))[:, None],
+    )
+    save_ply(SCENE / "gaussians.ply", gaussians)
+    masks = SCENE / "default/masks"
+    for shift, name in enumerate(names[:-1]):
+        dense = np.stack([region_mask(region[0], shift) for region in REGIONS])
+        levels, ones = (
+            np.array([region[1] for region in REGIONS], np.uint8),
+            np.ones(len(REGIONS), np.float32),
+        )
+        HierarchicalMasks.from_dense(dense, levels, ones, ones).save(masks / f"{name}.npz")
+    identity = {"segmenter": "graph", "model": None, "model_sha256": None}
+    write_index(masks, {name: {} for name in names[:-1]}, scene="photos/desk", **identity)
+    inputs = {"scene": SCENE / "scene"}
+    record = {"code": "", "command": (), "settings": {}, "seed": None, "inputs": inputs}
+    write_provenance(masks, stage="masks", **record)
+
+
+def _run_stages() -> None:
+    """From masks to scores, each stage by its command."""
+    places = {
+        name: SCENE / "default" / name
+        for name in ("masks", "coverage_tree", "clip", "contributions", "semantic_tree", "autoencoder")
+    }
+    places |= {"scene": SCENE / "scene", "gaussians": SCENE / "gaussians.ply"}
+    places |= {"field": SCENE / "default/field.safetensors"}
+
+    def run(command: str, out: Path, *inputs: str, settings: dict | None = None, more: tuple = ()) -> None:
+        options = [word for name in inputs for word in (f"--{name.replace('_', '-')}", str(places[name]))]
+        words = [command, *options, "--out", str(out), "--settings", json.dumps(settings or {}), *more]
+        app(words, standalone_mode=False)
+
+    cache = ("--cache", "results/.cache")
+    model = {"model": "models/colours"}
+    run("coverage-tree", places["coverage_tree"], "masks")
+    run("clip", places["clip"], "scene", "masks", settings=model, more=cache)
+    run("contributions", places["contributions"], "scene", "gaussians", "masks", more=cache)
+    run("semantic-tree", places["semantic_tree"], "contributions", "masks", "clip")
+    code = {"code": "pca", "latent": 2}
+    inputs = ("clip", "semantic_tree", "contributions")
+    run("autoencoder", places["autoencoder"], *inputs, settings=code)
+    run("field", places["field"], "contributions", "coverage_tree", "autoencoder")
+    parts = ("scene", "gaussians", "semantic_tree", "field", "autoencoder", "clip", "masks")
+    rows = ("--dataset", "photos", "--name", "desk")
+    run("evaluate", SCENE / "default/scores.csv", *parts, more=rows)

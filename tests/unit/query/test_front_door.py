@@ -1,0 +1,270 @@
+"""`hilsplat.open` and the commands that ask a finished scene, from other folders and after a move."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hilsplat
+from hilsplat.base.artifacts import read_npy
+from hilsplat.base.errors import ArtifactError, ModelError, SettingsError
+from hilsplat.evaluate.figures.comparison import open_variants
+from hilsplat.evaluate.figures.panel import run_figures
+from hilsplat.field.autoencoder import autoencoder_file
+from hilsplat.scene.finished import FinishedScene
+from hilsplat.settings import EvaluateSettings, FiguresSettings
+from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, build_finished_desk, region_mask
+
+pytestmark = pytest.mark.xdist_group("front door")
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory) -> Path:
+    """A project folder with models/colours and the finished results/photos/desk."""
+    return build_finished_desk(tmp_path_factory.mktemp("project"))
+
+
+@pytest.fixture
+def elsewhere(tmp_path, monkeypatch) -> Path:
+    """Another working directory."""
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def run_command(project: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run the real `hilsplat` of this checkout in the present working directory."""
+    command = [sys.executable, "-c", "from hilsplat.cli.main import main; main()", *words]
+    environment = {**os.environ, "PYTHONPATH": str(project)}
+    return subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=300)
+
+
+def test_importing_the_package_loads_nothing_heavy(project):
+    code = "import hilsplat, sys; hilsplat.Level; hilsplat.HilsplatError; print(sorted(sys.modules))"
+    environment = {**os.environ, "PYTHONPATH": str(project)}
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, env=environment)
+    loaded = set(re.findall(r"'(\w+)'", shown.stdout.decode()))
+    assert "hilsplat" in loaded
+    assert not loaded & {"torch", "numba", "numpy", "snakemake", "onnxruntime", "matplotlib"}
+
+
+def test_public_names_are_the_types_that_open_returns(desk):
+    scene = hilsplat.open(desk / SCENE)
+    (hit,) = scene.query("mug")
+    assert isinstance(scene, hilsplat.LanguageScene)
+    assert isinstance(hit, hilsplat.Hit)
+    assert isinstance(hit.level, hilsplat.Level)
+    assert isinstance(scene.query("unicorn")[0].doubts[0], hilsplat.Doubt)
+    assert set(hilsplat.__all__) == {"open", "LanguageScene", "Hit", "Doubt", "Level", "HilsplatError"}
+    with pytest.raises(AttributeError, match="no attribute 'shut'"):
+        hilsplat.shut  # noqa: B018
+
+
+def test_a_hit_knows_its_gaussians_and_its_pixels(desk):
+    scene = hilsplat.open(desk / SCENE)
+    (hit,) = scene.query("mug > handle > rim")
+    true = np.flatnonzero(region_mask("rim")[:, :WIDTH])
+    # a pixel's blur reaches the Gaussians next to the border
+    assert set(true) <= set(hit.gaussians)
+    assert len(hit.gaussians) <= 1.4 * len(true)
+    view = scene.views[-1]
+    shown = hit.mask(view)
+    expected = region_mask("rim", NUM_VIEWS - 1)
+    assert shown.shape == expected.shape == (HEIGHT, WIDTH + NUM_VIEWS)
+    assert (shown & expected).sum() / (shown | expected).sum() > 0.7
+    with pytest.raises(SettingsError, match=r"photos/desk has no view 'x\.png'"):
+        hit.mask("x.png")
+
+
+def test_a_path_chooses_among_handles_and_a_flat_text_does_not(desk):
+    scene = hilsplat.open(desk / SCENE)
+    (flat,), (of_mug,), (of_book,) = map(scene.query, ("handle", "mug > handle", "book > handle"))
+    assert flat.node == of_book.node != of_mug.node
+    assert set(of_mug.gaussians) < set(scene.query("mug")[0].gaussians)
+
+
+def test_a_scene_opens_from_another_folder(desk, elsewhere):
+    hits = hilsplat.open(desk / SCENE).query("mug > handle")
+    shutil.copytree(desk, elsewhere / "copy")
+    copied = hilsplat.open(Path("copy") / SCENE).query("mug > handle")
+    assert copied == hits
+
+
+def test_a_moved_results_folder_finds_its_clip_by_digest(desk, elsewhere):
+    shutil.copytree(desk / "results", elsewhere / "archive/outcomes")
+    shutil.copytree(desk / "models/colours", elsewhere / "archive/models/renamed")
+    hits = hilsplat.open("archive/outcomes/photos/desk").query("mug")
+    assert hits == hilsplat.open(desk / SCENE).query("mug")
+    shutil.rmtree("archive/models")
+    shutil.copytree(desk / "models/colours", elsewhere / "models/group/renamed")  # of the working directory
+    assert hilsplat.open("archive/outcomes/photos/desk").query("mug") == hits
+
+
+def test_another_clip_is_refused(desk, elsewhere):
+    shutil.copytree(desk, elsewhere / "copy")
+    described = elsewhere / "copy/models/colours/preprocessor_config.json"
+    described.write_text(described.read_text().replace('"image_std": [1, 1, 1]', '"image_std": [2, 1, 1]'))
+    recorded = json.loads((desk / SCENE / "default/clip/index.json").read_text())
+    with pytest.raises(ModelError, match="the CLIP that embedded the masks in") as caught:
+        hilsplat.open(Path("copy") / SCENE)
+    message = str(caught.value)
+    assert recorded["model_sha256"][:12] in message
+    assert re.search(r"copy/models/colours with digest [0-9a-f]{12}", message)
+    assert "models/clip-tiny with digest" in message  # what the checkout has
+    assert "run the clip stage again" in message
+
+
+def test_a_copy_without_any_clip_names_the_places(desk, elsewhere, monkeypatch):
+    monkeypatch.setattr("hilsplat.embed.clip.INSTALLED", elsewhere)
+    shutil.copytree(desk / SCENE, elsewhere / "desk")
+    (elsewhere / "models").mkdir()
+    with pytest.raises(ModelError, match=rf"no CLIP at models/colours or in {elsewhere}/models"):
+        hilsplat.open("desk")
+
+
+def test_a_scene_that_is_not_there_is_named(elsewhere):
+    with pytest.raises(ArtifactError, match="scene folder results/photos/desk is missing"):
+        hilsplat.open("results/photos/desk")
+    with pytest.raises(hilsplat.HilsplatError):
+        hilsplat.open("results/photos/desk")
+
+
+def test_a_copy_that_lost_its_settings_says_so(desk, elsewhere, caplog):
+    shutil.copytree(desk / SCENE, elsewhere / "desk")
+    shutil.copytree(desk / "models", elsewhere / "models")
+    hilsplat.open("desk")
+    assert "the default settings answer" not in caplog.text
+    (elsewhere / "desk/default/scores.csv.provenance.json").unlink()
+    hilsplat.open("desk")
+    assert "the default settings answer" in caplog.text
+
+
+def test_an_unknown_device_is_named(desk):
+    with pytest.raises(SettingsError, match="device 'tpu' is unknown"):
+        hilsplat.open(desk / SCENE, device="tpu")
+
+
+def test_the_example_of_the_docs_runs(desk, project, monkeypatch, capsys):
+    monkeypatch.chdir(desk)
+    blocks = re.findall(r"```python\n(.*?)```", (project / "docs/python.md").read_text(), re.DOTALL)
+    assert len(blocks) == 2
+    names: dict = {}
+    for block in blocks:
+        exec(compile(block, "docs/python.md", "exec"), names)
+    assert names["mask"].shape == names["photograph"].shape[:2]
+    assert names["best"].keys() == {"desk"}
+    printed = capsys.readouterr().out
+    assert "nothing here answers to 'unicorn' better than to a generic word" in printed
+    assert "has no view 'no such view'" in printed
+
+
+# -- commands, as a person types them ----------------------------------------------------------------
+
+
+def test_query_takes_a_path_from_any_folder(desk, elsewhere, project):
+    asked = run_command(project, "query", str(desk / SCENE), "mug > handle", "--out", "answer")
+    assert asked.returncode == 0, asked.stderr
+    lines = asked.stdout.splitlines()
+    assert lines[0] == "1 answer to 'mug > handle' in photos/desk; lengths in scene units"
+    assert lines[2].split()[1] == "part"
+    assert "doubtful" not in asked.stdout
+    assert lines[-1] == "wrote answer/panel.png and selection.ply"
+    for name in ("panel.png", "selection.ply"):
+        assert (elsewhere / "answer" / name).stat().st_size > 1000
+
+
+def test_query_takes_data_set_and_scene_with_the_results_folder(desk, elsewhere, project):
+    shutil.copytree(desk, elsewhere / "copy")
+    asked = run_command(project, "query", "photos/desk", "unicorn > handle", "--results", "copy/results")
+    assert asked.returncode == 0, asked.stderr
+    assert "doubtful: nothing here answers to 'unicorn' better than to a generic word" in asked.stdout
+    assert (elsewhere / "copy" / SCENE / "queries/unicorn--handle/panel.png").is_file()
+
+
+def test_query_says_what_is_missing(elsewhere, project):
+    asked = run_command(project, "query", "photos/desk", "mug")
+    assert asked.returncode == 1
+    assert "scene folder results/photos/desk is missing" in asked.stderr
+    assert "Traceback" not in asked.stderr
+
+
+def test_export_writes_the_tree_from_any_folder(desk, elsewhere, project):
+    done = run_command(project, "export", str(desk / SCENE), "--out", "tree")
+    assert done.returncode == 0, done.stderr
+    assert "2 whole, 2 part, 1 subpart" in done.stdout
+    nodes = json.loads((elsewhere / "tree/tree.json").read_text())["nodes"]
+    assert [node["level"] for node in nodes] == ["whole", "whole", "part", "part", "subpart"]
+    assert (elsewhere / "tree/tree.png").is_file()
+    assert (elsewhere / "tree/tree.ply").stat().st_size > (desk / SCENE / "gaussians.ply").stat().st_size
+
+
+def test_langsplat_files_go_out_and_come_back(desk, elsewhere, project):
+    default = desk / SCENE / "default"
+    places = ["--masks", str(default / "masks"), "--clip", str(default / "clip")]
+    written = run_command(project, "langsplat", "write", *places, "--out", "language_features")
+    assert written.returncode == 0, written.stderr
+    maps = read_npy(elsewhere / "language_features/000_s.npy")
+    assert maps.shape == (4, HEIGHT, WIDTH + NUM_VIEWS)
+    assert np.array_equal(maps[3] >= 0, region_mask("mug") | region_mask("book"))  # the fourth map: wholes
+    model = json.dumps({"model": str(desk / "models/colours")})
+    read = run_command(
+        project,
+        *("langsplat", "read", "--scene", str(desk / SCENE / "scene"), "--files", "language_features"),
+        *("--masks", "masks", "--clip", "clip", "--settings", model),
+    )
+    assert read.returncode == 0, read.stderr
+    for view in ("000.png", "004.png"):
+        back, before = read_npy(Path(f"clip/{view}.npy")), read_npy(default / f"clip/{view}.npy")
+        rows = [np.abs(before.astype(float) - vector).max(axis=1).argmin() for vector in back.astype(float)]
+        assert sorted(rows) == list(range(len(before)))
+        assert before[rows] == pytest.approx(back, abs=1e-3)
+
+
+# -- from a stage to a picture -----------------------------------------------------------------------
+
+opened_files: Counter[str] | None = None
+
+
+def count_opened(event: str, arguments: tuple) -> None:
+    """Count files that Python opens, while somebody counts; an audit hook cannot be taken out again."""
+    if opened_files is not None and event == "open" and isinstance(arguments[0], str):
+        opened_files[arguments[0]] += 1
+
+
+sys.addaudithook(count_opened)
+
+
+def test_the_panel_opens_no_artifact_twice(desk, tmp_path, monkeypatch):
+    parts = FinishedScene.locate(desk / SCENE).parts
+    monkeypatch.setattr(sys.modules[__name__], "opened_files", Counter())
+    queries = ["mug", "handle"]
+    run_figures(parts, tmp_path / "panel.png", FiguresSettings(), EvaluateSettings(), queries=queries)
+    counted = {path: count for path, count in opened_files.items() if path.startswith(str(desk))}
+    hashed = {str(parts.gaussians), str(autoencoder_file(parts.autoencoder))}  # hashed once, and read once
+    hashed |= {str(path) for path in (desk / "models/colours").iterdir()}
+    twice = {path: count for path, count in counted.items() if count > 1 + (path in hashed)}
+    assert {str(parts.gaussians), str(parts.semantic_tree / "tree.npz")} <= counted.keys()
+    assert twice == {}
+
+
+def test_variants_share_what_they_share(desk, tmp_path):
+    shutil.copytree(desk, tmp_path / "copy")
+    scene = tmp_path / "copy" / SCENE
+    (scene / "omega-2").mkdir()
+    shutil.copy(scene / "default/field.safetensors", scene / "omega-2")
+    record = json.loads((scene / "default/field.safetensors.provenance.json").read_text())
+    (scene / "omega-2/field.safetensors.provenance.json").write_text(json.dumps(record))
+    scenes = open_variants(scene, ["default", "omega-2"], 1)
+    first, second = scenes["default"], scenes["omega-2"]
+    assert first.gaussians is second.gaussians
+    assert first.tree is second.tree
+    assert first.scene is second.scene
+    assert first.language is not second.language

@@ -1,0 +1,173 @@
+"""Searches whose scales could vanish: a single thing, saturated relevancies, texts that nothing answers."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import torch
+
+from hilsplat.base.levels import Level
+from hilsplat.field.autoencoder import Autoencoder
+from hilsplat.field.field import LanguageField
+from hilsplat.query.hits import doubts_of
+from hilsplat.query.language_scene import LanguageScene
+from hilsplat.query.node_search import margin_range, search
+from hilsplat.query.relevancy import margins, relevancy
+from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.scene import Scene
+from hilsplat.semantic_tree.tree import SemanticTree
+from hilsplat.settings import EvaluateSettings
+from hilsplat.splat.gaussians import Gaussians
+
+
+def tree_of(levels: list[int], parents: list[int]) -> SemanticTree:
+    """A tree of nodes that look like nothing but themselves."""
+    n = len(levels)
+    return SemanticTree(
+        level=np.array(levels, np.uint8),
+        parent=np.array(parents, np.int32),
+        clip=np.eye(n, dtype=np.float32),
+        centroid=np.zeros((n, 3), np.float32),
+        box=np.zeros((n, 2, 3), np.float32),
+        oriented_box=np.zeros((n, 5, 3), np.float32),
+        quality=np.ones(n, np.float32),
+        views=np.ones(n, np.int32),
+        node_of_gaussian=np.full((1, 3), -1, np.int32),
+        membership=np.zeros((1, 3), np.float32),
+        node_of_mask=np.zeros(0, np.int32),
+        view_area_px=np.ones((n, 1), np.float32),
+        view_names=("a.png",),
+        gaussians_sha256="",
+        min_weight=0.1,
+    )
+
+
+def searched(tree: SemanticTree, margin: list[list[float]], *path: str, **options):
+    """Search with the default settings."""
+    found = np.array(margin, np.float32)
+    return search(tree, found, tree.clip, path, **{"threshold": 0.95, "ancestors": 0.2, **options})
+
+
+@pytest.mark.parametrize("heads_as_bear", [3.0, 0.0, -1.0])
+def test_in_a_scene_of_one_thing_its_part_is_ahead_of_an_orphan(heads_as_bear):
+    # one whole, its head and an orphan: the range of the wholes alone is 0. With the generic phrase it is 3,
+    # and half a tenth of that, 0.15, is taken off the orphan's 2.01
+    tree = tree_of([1, 2, 2], [-1, 0, -1])
+    bear, head = [3.0, heads_as_bear, heads_as_bear], [0.0, 2.00, 2.01]
+    hits = searched(tree, [bear, head], "bear", "head")
+    assert (hits.ids.tolist(), hits.route) == ([1], "child")
+    assert searched(tree, [bear, [0.0, 2.00, 2.16]], "bear", "head").ids.tolist() == [2]
+
+
+def test_twins_do_not_make_the_penalty_vanish():
+    tree = tree_of([1, 1, 2, 2], [-1, -1, 0, -1])
+    hits = searched(tree, [[3.0, 2.9, 0, 0], [0, 0, 2.00, 2.01]], "bear", "head")
+    assert (hits.ids.tolist(), hits.route) == ([2], "child")
+
+
+def test_the_range_is_the_nodes_own_if_a_generic_phrase_is_among_them():
+    assert margin_range(np.array([-1.0, 4.0])) == 5.0
+    assert margin_range(np.array([2.0, 4.0])) == 4.0
+    assert margin_range(np.array([-2.0, -1.0])) == 2.0
+    assert margin_range(np.zeros(0)) == 0.0
+
+
+COSINES = (0.30, 0.35, 0.28)
+GENERIC = 0.10
+
+
+@pytest.fixture
+def three_mugs() -> LanguageScene:
+    """Three wholes at known cosines with "mug", all at 0.10 with every generic phrase."""
+    tree = tree_of([1, 1, 1], [-1, -1, -1])
+    vectors = np.zeros((3, 6), np.float32)
+    for row, cosine in enumerate(COSINES):
+        vectors[row, :2] = cosine, GENERIC
+        vectors[row, 2 + row] = np.sqrt(1 - cosine**2 - GENERIC**2)
+    axes = {"mug": 0, "unicorn": 5}
+
+    def encode(texts: list[str]) -> np.ndarray:
+        return np.eye(6, dtype=np.float32)[[axes.get(text, 1) for text in texts]]
+
+    settings = EvaluateSettings(relevancy_scale=100)
+    camera = Cameras(("a.png",), np.eye(4)[None], np.eye(3)[None], np.array([[2, 2]], np.int32))
+    no_points = np.zeros((0, 3), np.float32)
+    zeros = torch.zeros(1, 3)
+    return LanguageScene(
+        Scene(
+            Path(),
+            "toy/mugs",
+            "metre",
+            camera,
+            {"a.png": "train"},
+            no_points,
+            no_points.astype(np.uint8),
+            np.eye(4),
+        ),
+        Gaussians(zeros, zeros, torch.zeros(1, 4), torch.zeros(1), zeros[:, None]),
+        replace(tree, clip=vectors),
+        LanguageField(np.zeros((1, 3, 2), np.float32), "", ""),
+        Autoencoder(6, 2),
+        encode,
+        lambda view: sp.csr_matrix((4, 1), dtype=np.float32),
+        settings,
+    )
+
+
+def test_a_large_scale_saturates_scores_but_not_the_ranking(three_mugs):
+    scores = three_mugs.node_relevancy(["mug"])[0]
+    assert scores.tolist() == [1.0, 1.0, 1.0]  # 1 / (1 + exp(-18)) in float32
+    assert three_mugs.select(["mug"], threshold=0.0).ids.tolist() == [1, 0, 2]
+    assert three_mugs.select(["mug"]).ids.tolist() == [1]
+    assert three_mugs.query("mug")[0].score == pytest.approx(1.0)
+
+
+def test_the_scale_of_relevancies_changes_no_answer(three_mugs):
+    small = replace(three_mugs, settings=EvaluateSettings(relevancy_scale=0.1))
+    for threshold in (0.0, 0.3, 0.95):
+        found = three_mugs.select(["mug"], threshold=threshold)
+        assert small.select(["mug"], threshold=threshold).ids.tolist() == found.ids.tolist()
+
+
+def test_margins_are_cosines_and_relevancies_their_logistic():
+    embeddings, text, generic = np.eye(5)[:1] * 0, np.eye(5)[:1], np.eye(5)[1:]
+    embeddings[0] = 0.30, 0.25, 0.28, 0.20, 0.22
+    assert margins(embeddings, text, generic) == pytest.approx(np.array([[0.02]]), abs=1e-6)
+    assert relevancy(embeddings, text, generic, 10.0) == pytest.approx(np.array([[0.549834]]), abs=1e-6)
+
+
+def test_a_text_that_nothing_answers_is_doubtful(three_mugs):
+    (doubt,) = three_mugs.query("unicorn", "whole")[0].doubts
+    # cosine 0 with the text and 0.1 with the nearest phrase, at scale 100: 1 / (1 + exp(10))
+    assert (doubt.text, doubt.level) == ("unicorn", None)
+    assert doubt.score == pytest.approx(4.54e-5, rel=1e-2)
+    assert str(doubt) == (
+        "nothing here answers to 'unicorn' better than to a generic word (the best score is 0.00)"
+    )
+    assert three_mugs.query("mug")[0].doubts == ()
+
+
+def test_the_first_text_of_a_path_is_doubted_though_the_last_is_answered_well(three_mugs):
+    tree = tree_of([1, 1, 2], [-1, -1, 0])
+    hits = searched(tree, [[-0.1, -0.2, 0.3], [-0.5, -0.5, 0.3]], "unicorn", "head")
+    assert (hits.ids.tolist(), hits.route) == ([2], "child")
+    assert [(each.text, each.level, each.is_doubtful) for each in hits.texts] == [
+        ("unicorn", Level.WHOLE, True),
+        ("head", Level.PART, False),
+    ]
+    # a part does answer to "unicorn", but it was searched among wholes
+    (doubt,) = doubts_of(three_mugs, hits)
+    assert (doubt.text, doubt.level) == ("unicorn", Level.WHOLE)
+    assert str(doubt).startswith("no whole here answers to 'unicorn' better than to a generic word")
+
+
+def test_doubts_are_about_what_competes_in_the_view():
+    tree = tree_of([1, 1, 2, 2], [-1, -1, 0, 1])
+    margin = [[0.4, -0.1, 0, 0], [0, 0, 0.3, 0.3]]
+    assert not searched(tree, margin, "mug", "handle").texts[0].is_doubtful
+    shown = np.array([False, True, False, True])
+    hits = searched(tree, margin, "mug", "handle", shown=shown)
+    assert hits.texts[0].margin == pytest.approx(-0.1)
+    assert hits.texts[0].is_doubtful
