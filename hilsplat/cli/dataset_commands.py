@@ -52,7 +52,9 @@ def datasets_export(
     log: Log = None,
 ) -> None:
     """Write images and poses of such a scene as a folder that `poses` imports."""
-    with stage("source", out, log):
+    from hilsplat.datasets.registry import readers_of
+
+    with stage("source", out, log, plugins=readers_of([name])):
         from hilsplat.datasets.sources import export_images
 
         export_images(name, data_root, out)

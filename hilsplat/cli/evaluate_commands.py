@@ -1,5 +1,6 @@
 """Scores, tables and figures."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -51,7 +52,8 @@ def evaluate(
     section = section_of("evaluate", settings)
     parts = _parts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
     inputs = {**parts.as_inputs(), **({"truth": truth} if truth else {})}
-    with stage("evaluate", out, log, settings=section, threads=threads, inputs=inputs):
+    more = {"inputs": inputs, "plugins": _readers(labels or ())}
+    with stage("evaluate", out, log, settings=section, threads=threads, **more):
         from hilsplat.evaluate.stage import run_evaluate
 
         run_evaluate(
@@ -67,6 +69,12 @@ def evaluate(
             data_root=data_root,
             threads=threads,
         )
+
+
+def _readers(labels: Sequence[str]) -> tuple[str, ...]:
+    from hilsplat.datasets.registry import readers_of
+
+    return readers_of(labels)
 
 
 def _parts(*paths: Path) -> "SceneParts":
@@ -126,7 +134,8 @@ def figures(
     parts = _parts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
     inputs = {**parts.as_inputs(), "fit": fit, **({"truth": truth} if truth else {})}
     recorded = {"figures": section, "evaluate": protocol}
-    with stage("figures", out, log, settings=recorded, threads=threads, inputs=inputs):
+    more = {"inputs": inputs, "plugins": _readers([labels])}
+    with stage("figures", out, log, settings=recorded, threads=threads, **more):
         from hilsplat.evaluate.figures.panel import run_figures
 
         run_figures(
@@ -164,7 +173,8 @@ def comparison(
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
     recorded, compared = {"figures": section, "evaluate": protocol}, json.loads(variants)
     inputs = {f"scores of {variant}": folder / variant / "scores.csv" for variant in compared}
-    with stage("comparison", out, log, settings=recorded, threads=threads, inputs=inputs):
+    more = {"inputs": inputs, "plugins": _readers([labels])}
+    with stage("comparison", out, log, settings=recorded, threads=threads, **more):
         from hilsplat.evaluate.figures.comparison import run_comparison
 
         run_comparison(

@@ -144,13 +144,13 @@ def method(
     section = section_of("method", settings)
     inputs = {"scene": scene, "gaussians": gaussians, "masks": masks}
     inputs |= {"contributions": contributions, "autoencoder": autoencoder}
+    from hilsplat.methods.method import MethodInputs
     from hilsplat.methods.registry import METHODS
 
+    parts = MethodInputs(scene, gaussians, masks, contributions, autoencoder, threads)
     plugins = (METHODS.places[section.name],) if section.name in METHODS else ()
     more = {"settings": section, "seed": seed, "threads": threads, "inputs": inputs, "plugins": plugins}
     with stage("method", out, log, **more):
-        from hilsplat.methods.method import MethodInputs
         from hilsplat.methods.stage import run_method
 
-        parts = MethodInputs(scene, gaussians, masks, contributions, autoencoder, threads)
         run_method(parts, out, section, seed)

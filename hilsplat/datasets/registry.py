@@ -3,6 +3,7 @@
 A reader's module describes its data set in a constant (see `dataset.Dataset`); one line here adds it.
 """
 
+from collections.abc import Collection
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
@@ -25,6 +26,12 @@ DATASETS: Plugins[Dataset] = Plugins(
     }
 )
 """In the order of the paper's tables."""
+
+
+def readers_of(labels: Collection[str]) -> tuple[str, ...]:
+    """Places of the readers of some labels, named as in "lerf_ovs/figurines" (see `base.plugins`)."""
+    names = {name.partition("/")[0] for name in labels}
+    return tuple(DATASETS.places[name] for name in sorted(names) if name in DATASETS)
 
 
 def open_labelled(name: str, data_root: Path) -> LabelledScene:

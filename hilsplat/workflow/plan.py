@@ -15,7 +15,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.configuration import UPSTREAM, StageSettings, parse_run
-from hilsplat.datasets.registry import DATASETS
+from hilsplat.datasets.registry import readers_of
 from hilsplat.datasets.sources import (
     DATA_PREFIX,
     absence,
@@ -214,7 +214,7 @@ class Plan:
 
     def source_reader(self, job: Job) -> tuple[str, ...]:
         """The reader of the data set that a scene's images are exported from."""
-        return (DATASETS.places[self.source_name(job).partition("/")[0]],)
+        return readers_of([self.source_name(job)])
 
     def brought(self, job: Job) -> list[str]:
         """Input: a PLY that replaces the fit, with the JSON beside it; usually nothing."""
@@ -273,8 +273,7 @@ class Plan:
 
     def label_readers(self, job: Job) -> tuple[str, ...]:
         """The readers of a scene's labels."""
-        datasets = {labels.partition("/")[0] for labels in self.labels(self.row(job))}
-        return tuple(DATASETS.places[name] for name in sorted(datasets))
+        return readers_of(self.labels(self.row(job)))
 
     def _label_files(self, row: SceneRow) -> list[str]:
         """Files that only evaluation reads: an edited one reruns nothing before it."""
