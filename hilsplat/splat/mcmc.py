@@ -163,6 +163,15 @@ def opacities(adam: Adam) -> Float[np.ndarray, " N"]:
     return expit(adam.parameters["opacity_logits"].astype(np.float64))
 
 
+def least_alive_logit(min_opacity: float) -> np.float32:
+    """A float32 logit whose opacity is just above the threshold of the dead.
+
+    The float32 nearest to the threshold's logit may lie below it: that of 0.005 has opacity 0.0049999995.
+    """
+    exact = float(logit(min_opacity))
+    return np.float32(exact + 1e-6 * max(abs(exact), 1.0))  # rounding moves it by 6e-8 of its size at most
+
+
 def _relocate(
     adam: Adam, dead: Bool[np.ndarray, " N"], settings: GaussiansSettings, generator: np.random.Generator
 ) -> None:
@@ -192,8 +201,9 @@ def _share(
     old = np.minimum(expit(p["opacity_logits"][rows].astype(np.float64)), MAX_OPACITY)
     new = shared_opacity(old, number)
     p["log_scales"][rows] += np.log(scale_factor(old, new, number)).astype(np.float32)[:, None]
-    # not below the threshold of the dead: they would be moved again at once
-    p["opacity_logits"][rows] = logit(np.maximum(new, settings.min_opacity)).astype(np.float32)
+    # at or below the threshold they would be relocated again at once
+    alive = least_alive_logit(settings.min_opacity)
+    p["opacity_logits"][rows] = np.maximum(logit(new).astype(np.float32), alive)
     for name in FIELDS:
         adam.first[name][rows] = 0
         adam.second[name][rows] = 0

@@ -115,6 +115,20 @@ def test_the_dead_move_onto_the_living_and_moments_begin_anew():
         assert (adam.first["means"][members] == (0 if touched else 1)).all()
 
 
+@pytest.mark.parametrize(("min_opacity", "opacity"), [(0.005, 0.1), (0.003, 0.1), (0.1, 0.6), (0.5, 0.9)])
+def test_gaussians_that_share_a_place_stay_alive(min_opacity, opacity):
+    # an equal share for 51 would be 0.002, 0.002, 0.018 or 0.044: below each threshold
+    adam = Adam.start(some_gaussians([opacity] + [min_opacity / 2] * 200))
+    settings = SETTINGS.model_copy(update={"mcmc_growth": 0.0, "min_opacity": min_opacity})
+    relocate_and_grow(adam, settings, np.random.default_rng(0))
+    assert (opacities(adam) > min_opacity).all()
+    np.testing.assert_allclose(opacities(adam), min_opacity, rtol=1e-5)
+    before = {name: values.copy() for name, values in adam.parameters.items()}
+    relocate_and_grow(adam, settings, np.random.default_rng(1))
+    for name, values in before.items():
+        np.testing.assert_array_equal(adam.parameters[name], values)
+
+
 def test_growth_is_a_share_and_stops_at_the_cap():
     adam = Adam.start(some_gaussians([0.5] * 40))
     settings = SETTINGS.model_copy(update={"mcmc_growth": 0.05, "max_gaussians": 43})
