@@ -119,6 +119,8 @@ def render(
     - a Gaussian is projected by the perspective Jacobian at its centre, with the ray clamped to 30 %
       beyond the image, and 0.3 px^2 are added to its variance (`eps2d`), whatever its size;
     - Gaussians nearer than depth 0.01 are not drawn; no Gaussian is too small (`radius_clip` 0);
+    - scales are cut at exp(20) scene units, where a Gaussian covers any view evenly (CPU; gsplat
+      overflows);
     - alpha below 1/255 is not drawn, alpha above 0.999 is cut there;
     - blending goes front to back by the depth of the centres and stops before the Gaussian that
       would leave less than 1e-4 of the light;

@@ -202,15 +202,34 @@ def test_a_gaussian_of_no_width_is_as_wide_as_the_low_pass(device):
     assert all(torch.isfinite(leaf.grad).all() for leaf in parameters if leaf.grad is not None)
 
 
-def test_a_gaussian_of_exp_20_covers_the_view_evenly():
-    # s = exp(20) is 7e9 px wide here: alpha = o at every pixel. gsplat overflows in float32
-    parameters = leaves(round_gaussian(0.8, math.exp(20), 2.0))
+@pytest.mark.parametrize("log_scale", [20.0, 39.0, 40.0, 90.0, 1e6])
+def test_a_gaussian_far_wider_than_the_view_covers_it_evenly(log_scale):
+    # s = exp(20) is 7e9 px wide here: alpha = o at every pixel, and wider ones cover no more. gsplat
+    # overflows in float32
+    parameters = leaves(round_gaussian(0.8, 1.0, 2.0))
+    parameters[1].data[:] = log_scale
     out = render(Gaussians(*parameters), straight_camera())
     np.testing.assert_allclose(out.alpha.detach().numpy(), 0.8, rtol=1e-6)
+    if log_scale <= 40:  # the reference's covariance is finite
+        _, alpha, _ = render_reference(Gaussians(*(leaf.detach() for leaf in parameters)), straight_camera(), 0)
+        np.testing.assert_allclose(out.alpha.detach().numpy(), alpha.numpy(), rtol=1e-6)
     out.alpha.sum().backward()
     assert all(torch.isfinite(leaf.grad).all() for leaf in parameters if leaf.grad is not None)
     # d alpha / d logit = o (1 - o) at each of 24 x 32 pixels
     np.testing.assert_allclose(parameters[3].grad.item(), 24 * 32 * 0.8 * 0.2, rtol=1e-5)
+    # nothing changes as the scale does
+    np.testing.assert_allclose(parameters[1].grad.numpy(), 0, atol=1e-12)
+
+
+def test_a_wide_wall_aside_of_the_axis_covers_the_view_evenly():
+    # exp(60) along two axes and 0.01 across, 1000 units off the axis: 15000 px, much less than its width
+    parameters = leaves(round_gaussian(0.8, 0.01, 2.0))
+    parameters[0].data[0, 0] = 1000.0
+    parameters[1].data[0, :2] = 60.0
+    out = render(Gaussians(*parameters), straight_camera())
+    np.testing.assert_allclose(out.alpha.detach().numpy(), 0.8, rtol=1e-6)
+    out.alpha.sum().backward()
+    assert all(torch.isfinite(leaf.grad).all() for leaf in parameters if leaf.grad is not None)
 
 
 def test_a_needle_has_finite_gradients_that_agree_with_the_reference():
