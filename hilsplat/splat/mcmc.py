@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from scipy.special import comb, expit, logit
 
 from hilsplat.base.compiled import compiled
+from hilsplat.base.rotations import matrix_entries
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.optimise import FIELDS, Adam
 from hilsplat.splat.rasterise.cpu import Gradients, over_ranges
@@ -74,16 +75,11 @@ def _noise_rows(begin, end, means, log_scales, quats, logits, normal, dead_below
             continue
         w, x = np.float64(quats[row, 0]), np.float64(quats[row, 1])
         y, z = np.float64(quats[row, 2]), np.float64(quats[row, 3])
-        two = 2.0 / (w * w + x * x + y * y + z * z)
-        turn[0, 0] = 1 - two * (y * y + z * z)
-        turn[0, 1] = two * (x * y - w * z)
-        turn[0, 2] = two * (x * z + w * y)
-        turn[1, 0] = two * (x * y + w * z)
-        turn[1, 1] = 1 - two * (x * x + z * z)
-        turn[1, 2] = two * (y * z - w * x)
-        turn[2, 0] = two * (x * z - w * y)
-        turn[2, 1] = two * (y * z + w * x)
-        turn[2, 2] = 1 - two * (x * x + y * y)
+        norm = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
+        entries = matrix_entries(w * norm, x * norm, y * norm, z * norm)
+        for axis in range(3):
+            for k in range(3):
+                turn[axis, k] = entries[3 * axis + k]
         for axis in range(3):
             along = 0.0
             for k in range(3):

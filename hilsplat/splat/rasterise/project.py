@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hilsplat.base.compiled import compiled
+from hilsplat.base.rotations import matrix_entries
 from hilsplat.scene.cameras import Camera
 
 NEAR = 0.01
@@ -25,8 +26,8 @@ LOW_PASS_PX2 = 0.3
 MIN_ALPHA = 1.0 / 255.0
 """Contributions below are not drawn (3DGS, gsplat: 1 / 255)."""
 MAX_LOG_SCALE = 20.0
-"""Scales are cut at exp(20), 5e8 scene units, and get no gradient beyond. A Gaussian that wide covers any view
-evenly along that axis; at exp(40) the columns of its pixel box would overflow 64-bit integers."""
+"""Scales are cut at exp(20), 5e8 scene units, and get no gradient beyond. A Gaussian that wide covers any
+view evenly along that axis; at exp(40) the columns of its pixel box would overflow 64-bit integers."""
 LOG2_E = 1.4426950408889634
 
 GEOMETRY = 8
@@ -129,9 +130,7 @@ def _cam_from_gaussian(camera, quats, scales, i, axes, factor):
     w, x, y, z = float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3])
     norm = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * norm, x * norm, y * norm, z * norm
-    r00, r01, r02 = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)
-    r10, r11, r12 = 2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)
-    r20, r21, r22 = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = matrix_entries(w, x, y, z)
     for row in range(3):
         a, b, c = camera[3 * row], camera[3 * row + 1], camera[3 * row + 2]
         axes[row, 0] = a * r00 + b * r10 + c * r20

@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.special import expit, logit
 
+from hilsplat.base.rotations import rotation_matrices
 from hilsplat.scene.cameras import Camera
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.gaussians import Gaussians
@@ -173,6 +174,22 @@ def test_noise_vanishes_for_opaque_gaussians_and_follows_the_covariance():
     expected = 5e5 * 1e-4 * gate * np.array([0.01, 0.02, 0.005]) ** 2 / 2
     spread = adam.parameters["means"][10:, 1:].std(axis=0)
     np.testing.assert_allclose(spread, expected[1:], rtol=0.05)  # standard error 1.1 %
+
+
+def test_noise_is_normal_numbers_times_the_covariance():
+    parameters = some_gaussians([0.004] * 30)
+    generator = np.random.default_rng(2)
+    parameters["log_scales"] = np.log(generator.uniform(0.001, 0.02, (30, 3))).astype(np.float32)
+    parameters["quats"] = (3 * generator.normal(size=(30, 4))).astype(np.float32)
+    adam = Adam.start({name: values.copy() for name, values in parameters.items()})
+    add_noise(adam, SETTINGS, 1e-4, 2.0, np.random.default_rng(0))
+    normal = np.random.default_rng(0).standard_normal((30, 3), dtype=np.float32)
+    root = rotation_matrices(parameters["quats"]) * np.exp(parameters["log_scales"].astype(float))[:, None]
+    gate = expit(-100 * (0.004 - 0.005))
+    # lengths in units of the extent 2, and back
+    expected = 5e5 * 1e-4 * gate * np.einsum("nij,nkj,nk->ni", root, root, normal) / 2
+    # means lie up to 30 from 0, where float32 steps by 2e-6
+    np.testing.assert_allclose(adam.parameters["means"] - parameters["means"], expected, atol=2e-6)
 
 
 def test_noise_moves_a_scene_in_other_units_alike():

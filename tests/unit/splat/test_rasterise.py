@@ -11,7 +11,6 @@ from hilsplat.base.errors import HilsplatError
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.rasterise.api import draw, pixel_weights, render, render_features, to_parameters
 from hilsplat.splat.rasterise.device import DEVICES, cuda_problem
-from hilsplat.splat.rasterise.reference import render_reference
 from tests.unit.splat.rasterise_scenes import (
     FIELDS,
     camera,
@@ -21,6 +20,7 @@ from tests.unit.splat.rasterise_scenes import (
     rows,
     straight_camera,
 )
+from tests.unit.splat.reference import render_reference
 
 
 @pytest.fixture(params=DEVICES)
@@ -211,7 +211,9 @@ def test_a_gaussian_far_wider_than_the_view_covers_it_evenly(log_scale):
     out = render(Gaussians(*parameters), straight_camera())
     np.testing.assert_allclose(out.alpha.detach().numpy(), 0.8, rtol=1e-6)
     if log_scale <= 40:  # the reference's covariance is finite
-        _, alpha, _ = render_reference(Gaussians(*(leaf.detach() for leaf in parameters)), straight_camera(), 0)
+        _, alpha, _ = render_reference(
+            Gaussians(*(leaf.detach() for leaf in parameters)), straight_camera(), 0
+        )
         np.testing.assert_allclose(out.alpha.detach().numpy(), alpha.numpy(), rtol=1e-6)
     out.alpha.sum().backward()
     assert all(torch.isfinite(leaf.grad).all() for leaf in parameters if leaf.grad is not None)
