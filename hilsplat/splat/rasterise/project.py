@@ -25,9 +25,10 @@ LOW_PASS_PX2 = 0.3
 """Added to the projected variance, px^2 (3DGS, gsplat: 0.3)."""
 MIN_ALPHA = 1.0 / 255.0
 """Contributions below are not drawn (3DGS, gsplat: 1 / 255)."""
-MAX_LOG_SCALE = 20.0
+MAX_LOG_SCALE = np.float32(20.0)
 """Scales are cut at exp(20), 5e8 scene units, and get no gradient beyond. A Gaussian that wide covers any
-view evenly along that axis; at exp(40) the columns of its pixel box would overflow 64-bit integers."""
+view evenly along that axis; at exp(40) the columns of its pixel box would overflow 64-bit integers. float32
+as the scales: with a float64 they would all be computed in float64, and change in their last bits."""
 LOG2_E = 1.4426950408889634
 
 GEOMETRY = 8
