@@ -5,6 +5,7 @@ import os
 import re
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
 
 from snakemake.exceptions import WorkflowError
 from snakemake.logging import logger
@@ -172,6 +173,17 @@ def shared(stage, path):
     return (
         lambda wildcards: f"results/{wildcards.dataset}/{wildcards.scene}/{shared_variant(stage, wildcards)}/{path}"
     )
+
+
+def compared(stage, path):
+    """Input function: a stage's output for every variant that is compared, wherever it is shared."""
+
+    def paths(wildcards):
+        scene = {"dataset": wildcards.dataset, "scene": wildcards.scene}
+        jobs = [SimpleNamespace(**scene, variant=name) for name in RUN.main_variants]
+        return list(dict.fromkeys(shared(stage, path)(job) for job in jobs))
+
+    return paths
 
 
 def photos_of(wildcards):

@@ -87,8 +87,15 @@ rule mask_truth:
 
 rule comparison:
     input:
+        scene="results/{dataset}/{scene}/scene",
         truth=truth_or_labels_of,
-        scores=lambda wildcards: [
+        gaussians="results/{dataset}/{scene}/gaussians.ply",
+        masks=compared("masks", "masks"),
+        clip=compared("clip", "clip"),
+        semantic_tree=compared("semantic_tree", "semantic_tree"),
+        field=compared("field", "field.safetensors"),
+        autoencoder=compared("autoencoder", "autoencoder"),
+        scores=lambda wildcards: [  # their provenance holds the settings of the answers
             f"results/{wildcards.dataset}/{wildcards.scene}/{variant}/scores.csv"
             for variant in RUN.main_variants
         ],
@@ -124,7 +131,7 @@ rule comparison:
     resources:
         mem_mb=6000,
     params:
-        folder="results/{dataset}/{scene}",
+        folder=lambda wildcards, input: str(Path(input.gaussians).parent),
         variants=json.dumps(RUN.main_variants),
         names=json.dumps(dict(RUN.labels)),
         settings=settings_of("figures"),
