@@ -91,10 +91,10 @@ def read_transforms(
 ) -> tuple[list[KnownView], tuple[np.ndarray, np.ndarray] | None]:
     """Read transforms files: camera-to-world in OpenGL axes, intrinsics for all or per frame.
 
-    Returns the views and, where the file names a `ply_file_path`, its points.
+    Returns the views and, if the file names a `ply_file_path`, its points.
 
     Raises:
-        SceneError: a file is no JSON, or a key is missing or unusable.
+        SceneError: a file is not JSON, or a key is missing or unusable.
     """
     views: list[KnownView] = []
     points = None
@@ -142,7 +142,7 @@ def _read_frame(known: KnownPoses, file: Path, number: int, frame: Mapping[str, 
 
 
 def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> pycolmap.Camera:
-    """The lens of a frame: PINHOLE, or OPENCV where it has distortion (k1, k2, p1, p2)."""
+    """The lens of a frame: PINHOLE, or OPENCV if it has distortion (k1, k2, p1, p2)."""
     try:
         width, height = frame.get("w"), frame.get("h")
         if width is None or height is None:
@@ -187,7 +187,7 @@ def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> p
 
 
 def _read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Points and colours of a PLY file (grey where it has no colours)."""
+    """Points and colours of a PLY file (grey if it has no colours)."""
     from plyfile import PlyData, PlyParseError
 
     try:

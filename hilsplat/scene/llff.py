@@ -73,7 +73,7 @@ def llff_views(
             f"{path} has {len(poses)} poses for {len(images)} images",
             expected="one row per image, in the order of their names",
             found=f"{images[0].name} to {images[-1].name}" if images else "no image",
-            fix="unpack the images again, and remove what is no photograph of the scene",
+            fix="unpack the images again, and remove what is not a photograph of the scene",
         )
     views = []
     for image, pose, (_, width_px, focal_px) in zip(images, poses, sizes, strict=True):

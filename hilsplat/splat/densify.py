@@ -48,7 +48,7 @@ class ScreenGradients:
         self.seen += drawn
 
     def mean(self) -> Float64[np.ndarray, " N"]:
-        """Average length; 0 where never drawn."""
+        """Average length; 0 for a Gaussian that was never drawn."""
         return self.total / np.maximum(self.seen, 1)
 
 

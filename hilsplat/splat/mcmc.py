@@ -1,4 +1,4 @@
-"""3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024): the other strategy.
+"""3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024): `strategy: mcmc`.
 
 Nothing is cloned, split, pruned or reset. Gaussians that became transparent move onto opaque ones,
 the number grows by a fixed share up to the cap, noise lets transparent Gaussians explore, and two
@@ -18,13 +18,13 @@ from hilsplat.splat.optimise import FIELDS, Adam
 from hilsplat.splat.rasterise.cpu import Gradients, over_ranges
 
 MAX_TOGETHER = 51
-"""So many Gaussians at most are taken to share one place (paper's code); more would change little."""
+"""At most this many Gaussians count as sharing one place (paper's code); more would change little."""
 MAX_OPACITY = 1 - 1e-6
 """Opacity 1 has no logit."""
 NOISE_SHARPNESS = 100.0
 """How fast noise falls with opacity (paper: k = 100): at opacity 0.1 it is down to e^-9.5."""
 LEAST_GATE = 1e-6
-"""Less noise than this share is none."""
+"""Smaller shares of the noise are not drawn."""
 
 
 def shared_opacity(opacity: Float[np.ndarray, " N"], number: Int[np.ndarray, " N"]) -> np.ndarray:
@@ -60,7 +60,7 @@ def scale_factor(
 @compiled(error_model="numpy")
 @no_type_check
 def noise_gate(opacity, dead_below):
-    """Share of the noise that a Gaussian gets: 1/2 at the opacity of the dead, 0 for the opaque (Eq. 8)."""
+    """Share of the noise that a Gaussian gets: 1/2 at the threshold of the dead, 0 for the opaque (Eq. 8)."""
     return 1.0 / (1.0 + np.exp(NOISE_SHARPNESS * (opacity - dead_below)))
 
 
@@ -140,8 +140,8 @@ def add_regularisers(adam: Adam, gradients: Gradients, settings: GaussiansSettin
 def relocate_and_grow(adam: Adam, settings: GaussiansSettings, generator: np.random.Generator) -> None:
     """Move the dead onto the living, then add Gaussians on the living up to the cap.
 
-    A place is drawn with a probability proportional to its opacity. Those that share it from then on
-    cover together what the one covered before.
+    A place is drawn with a probability proportional to its opacity. Together,
+    those that share it cover what the one Gaussian covered before.
     """
     dead = opacities(adam) <= settings.min_opacity
     if dead.any() and not dead.all():
@@ -190,7 +190,7 @@ def _draw(weights: Float[np.ndarray, " N"], number: int, generator: np.random.Ge
 def _share(
     adam: Adam, source: Int[np.ndarray, " M"], settings: GaussiansSettings
 ) -> dict[str, Float32[np.ndarray, "M ..."]]:
-    """Give the drawn rows what is their part of the place; return the copies that join them there."""
+    """Reduce the drawn rows to their share of the place; return the copies that join them there."""
     p = adam.parameters
     rows, drawn = np.unique(source, return_counts=True)
     number = np.minimum(drawn + 1, MAX_TOGETHER)

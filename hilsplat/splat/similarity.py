@@ -40,7 +40,7 @@ def move_gaussians(gaussians: Gaussians, similarity: Float[np.ndarray, "4 4"]) -
     band, because they are functions of the direction in the world. Opacities stay.
 
     Args:
-        similarity: b_from_a, where the Gaussians are given in a.
+        similarity: b_from_a, for Gaussians given in a.
 
     Raises:
         HilsplatError: `similarity` is not one.

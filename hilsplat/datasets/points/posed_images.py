@@ -25,7 +25,7 @@ class PosedImage:
 
     Attributes:
         name: file name in the folder that is imported.
-        image: the file, or its encoded bytes where the data set keeps images inside other files.
+        image: the file, or its encoded bytes if the data set keeps images inside other files.
         cam_from_world: world-to-camera transform, OpenCV axes, metres.
         K: intrinsics, px; the centre of the first pixel is (0.5, 0.5).
         size_hw: height and width, px.
@@ -67,7 +67,7 @@ def write_posed_images(
 ) -> None:
     """Write `images/` and `transforms.json` (OpenGL axes, intrinsics per frame): a source for `poses`.
 
-    Images are copied byte by byte; lenses stay as they are, `poses` undistorts. Points, where there are
+    Images are copied byte by byte; lenses stay as they are, `poses` undistorts. Points, if there are
     any, go to `points.ply`: the sparse points of the scene, in their order.
 
     Args:

@@ -117,7 +117,7 @@ def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> Mapping[str
 
 
 def against_default(scores: "pd.DataFrame", part: "pd.DataFrame") -> Cell:
-    """How far a row's mIoU lies above that of the default field, paired by scene.
+    """How far a row's mIoU is above that of the default field, paired by scene.
 
     Scenes differ by more than rows do; the spread of the differences tells whether one is better in general.
 

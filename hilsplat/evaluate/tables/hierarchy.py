@@ -87,6 +87,6 @@ def hierarchy_table(sources: Sources) -> Table:
 
 
 def view_consistency(scores: "pd.DataFrame", part: "pd.DataFrame") -> Cell:
-    """Consistency between views of the same row's answers; a dash where it was not measured."""
+    """Consistency between views of the same row's answers; a dash if it was not measured."""
     same = same_row(scores, part, (VIEW_CONSISTENCY.full_name,))
     return level_cells(same, "view_consistency")["Avg"]

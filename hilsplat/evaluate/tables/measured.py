@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SYNTHETIC = "synthetic"
-"""Data sets whose name begins so are stand-ins."""
+"""Data sets whose names begin with this are stand-ins."""
 
 SEED = re.compile(r"(?P<variant>.+)\.seed(?P<seed>[0-9]+)")
 """A variant's name with another seed; rows of all seeds of a variant are one row."""
@@ -133,7 +133,7 @@ def mean_over_seeds(seeds: Sequence[Mapping[str, Cell]]) -> dict[str, Cell]:
 
 
 def without_repeats(rows: Sequence[Row]) -> tuple[Row, ...]:
-    """Rows that show the same are one: the annotations' own row is the same for every variant."""
+    """Keep one of the rows that show the same: the annotations' row is the same for every variant."""
     seen: dict[tuple, Row] = {}
     for row in rows:
         key = (*row.names.values(), *(cell.text for cell in row.cells.values()))

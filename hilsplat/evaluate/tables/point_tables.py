@@ -126,7 +126,7 @@ def semantic_cells(part: "pd.DataFrame") -> dict[str, Cell]:
 
 
 def instance_cells(sources: Sources, part: "pd.DataFrame") -> dict[str, Cell]:
-    """AP of all scans of a row together; dashes where the method has no instances."""
+    """AP of all scans of a row together; dashes if the method has no instances."""
     first = part.iloc[0]
     variant = first["variant"] if first["seed"] == "0" else f"{first['variant']}.seed{first['seed']}"
     key = (first["dataset"], variant, first["masks"], first["method"])

@@ -40,7 +40,7 @@ class Rendering:
 
 
 def to_parameters(gaussians: Gaussians) -> Parameters:
-    """Gaussians as contiguous float32 arrays (shared memory where they are so already)."""
+    """Gaussians as contiguous float32 arrays (shared memory if they are so already)."""
     tensors = (gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh)
     return Parameters(*(_to_array(tensor) for tensor in tensors))
 
@@ -55,7 +55,7 @@ def _checked_degree(gaussians: Gaussians, sh_degree: int | None) -> int:
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     if not 0 <= degree <= min(gaussians.sh_degree, 3):
         raise HilsplatError(
-            f"spherical harmonics of degree {degree} were asked for",
+            f"spherical harmonics of degree {degree} cannot be used",
             expected=f"0 to {gaussians.sh_degree}, the degree of these Gaussians, and at most 3",
         )
     return degree
@@ -118,7 +118,7 @@ def render(
     So one round Gaussian of scale s and opacity o on the optical axis at depth z has, r px from the
     principal point, under a camera of focal length f px,
 
-        alpha = o exp(-r^2 / (2 ((f s / z)^2 + 0.3))), where that is at least 1/255.
+        alpha = o exp(-r^2 / (2 ((f s / z)^2 + 0.3))), if that is at least 1/255.
 
     Gaussians behind the camera get zero gradient; without any Gaussian the background shows.
     Gradients are first-order only and do not reach the camera.
@@ -130,7 +130,7 @@ def render(
         device: backend; see `device.choose_device`.
 
     Returns:
-        Images where `gaussians` are.
+        Images on the device of `gaussians`.
 
     Raises:
         HilsplatError: parameters that are not finite, zero quaternions, or features of other rows.

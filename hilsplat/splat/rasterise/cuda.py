@@ -1,7 +1,7 @@
 """The CUDA backend: gsplat (extra `gpu`) behind the functions and conventions of the CPU backend.
 
 Written against the public interface of gsplat 1.5 and its CUDA sources. It has not been run on a
-device yet: the tests of the rasteriser cover it where torch finds one. Sums on CUDA are atomic, so
+device yet: the tests of the rasteriser cover it if torch finds one. Sums on CUDA are atomic, so
 gradients repeat to rounding, not to the bit.
 
 gsplat works in float32 throughout: a Gaussian wider than about 1e9 px overflows there.
@@ -80,7 +80,7 @@ def colours(gaussians: Gaussians, camera: Camera, degree: int) -> Float[Tensor, 
 def render_channels(
     gaussians: Gaussians, camera: Camera, degree: int, features: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Premultiplied RGB (+ features) and alpha, where the Gaussians are."""
+    """Premultiplied RGB (+ features) and alpha, on the device of the Gaussians."""
     home = gaussians.means.device
     if len(gaussians) == 0:
         width = 3 + (features.shape[1] if features is not None else 0)
