@@ -87,11 +87,15 @@ rule mask_truth:
 
 rule comparison:
     input:
+        scene="results/{dataset}/{scene}/scene",
         truth=PLAN.truth_or_labels,
-        scores=lambda wildcards: [
-            f"results/{wildcards.dataset}/{wildcards.scene}/{variant}/scores.csv"
-            for variant in PLAN.run.main_variants
-        ],
+        gaussians="results/{dataset}/{scene}/gaussians.ply",
+        masks=PLAN.compared("masks", "masks"),
+        clip=PLAN.compared("clip", "clip"),
+        semantic_tree=PLAN.compared("semantic_tree", "semantic_tree"),
+        field=PLAN.compared("field", "field.safetensors"),
+        autoencoder=PLAN.compared("autoencoder", "autoencoder"),
+        scores=PLAN.compared_scores,  # their provenance holds the settings of the answers
     output:
         methods=report(
             "results/figures/{dataset}/{scene}/comparison.png",
@@ -124,7 +128,7 @@ rule comparison:
     resources:
         mem_mb=6000,
     params:
-        folder="results/{dataset}/{scene}",
+        folder=lambda wildcards, input: str(Path(input.gaussians).parent),
         variants=json.dumps(PLAN.run.main_variants),
         names=json.dumps(dict(PLAN.run.labels)),
         settings=PLAN.settings("figures"),

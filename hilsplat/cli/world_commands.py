@@ -109,7 +109,8 @@ def world_masks(
     folder = results / scene
     truth, masks_folder = folder / "world" / "truth", folder / variant / "masks"
     target = out or masks_folder.with_name("masks_truth.png")
-    with stage("mask_truth", target, log, inputs={"truth": truth, "masks": masks_folder}):
+    inputs = {"scene": folder / "scene", "truth": truth, "masks": masks_folder}
+    with stage("mask_truth", target, log, inputs=inputs):
         from hilsplat.evaluate.diagnostics.mask_truth import run_mask_truth
 
         table = run_mask_truth(folder / "scene", truth, masks_folder, target)
@@ -128,10 +129,14 @@ def world_tree(
     folder = results / scene
     semantic_tree, truth = folder / variant / "semantic_tree", folder / "world" / "truth"
     target = out or semantic_tree.with_name("tree_truth.csv")
-    with stage("tree_truth", target, None, inputs={"truth": truth, "semantic_tree": semantic_tree}):
+    inputs = {
+        "scene": folder / "scene",
+        "gaussians": folder / "gaussians.ply",
+        "truth": truth,
+        "semantic_tree": semantic_tree,
+    }
+    with stage("tree_truth", target, None, inputs=inputs):
         from hilsplat.evaluate.diagnostics.tree_truth import run_tree_truth
 
-        table = run_tree_truth(
-            folder / "scene", folder / "gaussians.ply", semantic_tree, truth, target, threads
-        )
+        table = run_tree_truth(inputs["scene"], inputs["gaussians"], semantic_tree, truth, target, threads)
     typer.echo(table)

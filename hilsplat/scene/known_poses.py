@@ -36,7 +36,7 @@ class KnownView:
 
     Attributes:
         name: name in the source.
-        image: its file; None where it is missing.
+        image: its file; None if it is missing.
         camera: its lens, for the size that the source states.
         cam_from_source: world-to-camera transform, OpenCV axes.
         is_test: the source holds it out for testing.
@@ -50,7 +50,7 @@ class KnownView:
 
 
 def find_known_poses(folder: Path) -> KnownPoses | None:
-    """Look for a COLMAP model, transforms files, LLFF's file, in this order; None where there is none.
+    """Look for a COLMAP model, transforms files, LLFF's file, in this order; None if there is none.
 
     Raises:
         SceneError: there is a `sparse/` folder without a complete model in it.

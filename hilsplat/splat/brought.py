@@ -21,9 +21,9 @@ FIX = "export it again as an uncompressed 3DGS PLY, or correct column gaussians 
 
 
 def bring_gaussians(ply: Path, scene: Scene) -> tuple[Gaussians, dict[str, Any]]:
-    """Read a 3DGS PLY that stands in the coordinates of the scene's source poses.
+    """Read a 3DGS PLY given in the coordinates of the scene's source poses.
 
-    A PLY of this package stands in the coordinates of its scene instead; the JSON file beside it
+    A PLY of this package is in the coordinates of its scene instead; the JSON file beside it
     leads back to the source's first.
 
     Returns:
@@ -50,7 +50,7 @@ def bring_gaussians(ply: Path, scene: Scene) -> tuple[Gaussians, dict[str, Any]]
     logger.info("%s: %d Gaussians of %s, %s", scene.name, len(gaussians), ply, moved)
     origin = {
         "kind": "brought along",
-        "file": ply.name,  # where it lies is in the provenance
+        "file": ply.name,  # its folder is in the provenance
         "sha256": sha256_of_file(ply),
         "taken_as": moved,
         "scene_from_ply": np.asarray(transform).tolist(),

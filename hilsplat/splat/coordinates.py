@@ -21,14 +21,14 @@ def coordinates_path(ply: Path) -> Path:
 
 
 def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dict[str, Any]) -> None:
-    """Write the coordinates of a PLY that stands in the scene's coordinates.
+    """Describe the coordinates of a PLY that is in the scene's own.
 
     The source is what the poses came from: an imported COLMAP model or transforms.json, or our own
     structure from motion, whose coordinates nothing but this file knows.
 
     Args:
         ply: the written file, whose digest is kept: the JSON says nothing of any other.
-        origin: where the Gaussians come from, as the report says it.
+        origin: origin of the Gaussians, as in the report.
     """
     scale, rotation, translation = decompose(scene.scene_from_source)
     registration = read_json(scene.folder / "registration.json")
@@ -55,7 +55,7 @@ def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dic
 
 
 def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
-    """The way to the source's coordinates of a PLY that this package wrote; None where no JSON says one.
+    """The way to the source's coordinates of a PLY that this package wrote; None if no JSON gives it.
 
     Raises:
         ArtifactError: the JSON belongs to another PLY, or its transform cannot be used.
@@ -76,5 +76,5 @@ def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
         )
     matrix = np.array(content["source_from_scene"], dtype=np.float64)
     if matrix.shape != (4, 4):
-        raise ArtifactError(f"{path}: source_from_scene is no 4 x 4 matrix", found=f"shape {matrix.shape}")
+        raise ArtifactError(f"{path}: source_from_scene is not a 4 x 4 matrix", found=f"shape {matrix.shape}")
     return matrix

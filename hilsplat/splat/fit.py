@@ -39,7 +39,7 @@ CURVE_EVERY = 20
 def fit_step(
     state: FitState, views: list[TrainingView], settings: GaussiansSettings, extent: float, threads: int
 ) -> None:
-    """One view: render, compare, step; then density control where it is due."""
+    """One view: render, compare, step; then density control when it is due."""
     if not state.order:
         state.order = state.generator.permutation(len(views)).tolist()
     view = views[state.order.pop()]

@@ -39,10 +39,10 @@ def write_report(
     """Write the report folder and return report.json's content.
 
     It holds `report.json`, `test_views.png` (photograph, rendering, error), `flyaround.png`,
-    `flyaround.mp4` where ffmpeg is on PATH, `curves.png` where there was a fit, and the index.
+    `flyaround.mp4` if ffmpeg is on PATH, `curves.png` if there was a fit, and the index.
 
     Args:
-        scene: the held-out views are scored; where there is none, the training views.
+        scene: its held-out views are scored, or its training views if it has none.
         curve: rows of (step, loss, training PSNR in dB, number of Gaussians); None without a fit.
         origin: where the Gaussians come from.
     """

@@ -93,7 +93,7 @@ def short_round(distances: Float64[np.ndarray, "S S"]) -> list[int]:
 def write_flyaround(
     folder: Path, cameras: list[Camera], picture: Callable[[Camera], UInt8[np.ndarray, "H W 3"]]
 ) -> str:
-    """Write `flyaround.png` and, where ffmpeg is on PATH, `flyaround.mp4`.
+    """Write `flyaround.png` and, if ffmpeg is on PATH, `flyaround.mp4`.
 
     Args:
         cameras: training cameras, which the path is led through.

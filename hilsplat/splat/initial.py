@@ -21,7 +21,7 @@ MIN_POINTS = 200
 ADDED_POINTS = 2_000
 """Random points beside too few sparse ones."""
 RANDOM_POINTS = 10_000
-"""Random points where they are asked for."""
+"""Number of points of a random start."""
 
 
 def first_gaussians(

@@ -1,4 +1,4 @@
-"""3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024): the other strategy.
+"""3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024): `strategy: mcmc`.
 
 Nothing is cloned, split, pruned or reset. Gaussians that became transparent move onto opaque ones,
 the number grows by a fixed share up to the cap, noise lets transparent Gaussians explore, and two
@@ -12,18 +12,19 @@ from jaxtyping import Bool, Float, Float32, Int
 from scipy.special import comb, expit, logit
 
 from hilsplat.base.compiled import compiled
+from hilsplat.base.rotations import matrix_entries
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.optimise import FIELDS, Adam
 from hilsplat.splat.rasterise.cpu import Gradients, over_ranges
 
 MAX_TOGETHER = 51
-"""So many Gaussians at most are taken to share one place (paper's code); more would change little."""
+"""At most this many Gaussians count as sharing one place (paper's code); more would change little."""
 MAX_OPACITY = 1 - 1e-6
 """Opacity 1 has no logit."""
 NOISE_SHARPNESS = 100.0
 """How fast noise falls with opacity (paper: k = 100): at opacity 0.1 it is down to e^-9.5."""
 LEAST_GATE = 1e-6
-"""Less noise than this share is none."""
+"""Smaller shares of the noise are not drawn."""
 
 
 def shared_opacity(opacity: Float[np.ndarray, " N"], number: Int[np.ndarray, " N"]) -> np.ndarray:
@@ -59,7 +60,7 @@ def scale_factor(
 @compiled(error_model="numpy")
 @no_type_check
 def noise_gate(opacity, dead_below):
-    """Share of the noise that a Gaussian gets: 1/2 at the opacity of the dead, 0 for the opaque (Eq. 8)."""
+    """Share of the noise that a Gaussian gets: 1/2 at the threshold of the dead, 0 for the opaque (Eq. 8)."""
     return 1.0 / (1.0 + np.exp(NOISE_SHARPNESS * (opacity - dead_below)))
 
 
@@ -74,16 +75,11 @@ def _noise_rows(begin, end, means, log_scales, quats, logits, normal, dead_below
             continue
         w, x = np.float64(quats[row, 0]), np.float64(quats[row, 1])
         y, z = np.float64(quats[row, 2]), np.float64(quats[row, 3])
-        two = 2.0 / (w * w + x * x + y * y + z * z)
-        turn[0, 0] = 1 - two * (y * y + z * z)
-        turn[0, 1] = two * (x * y - w * z)
-        turn[0, 2] = two * (x * z + w * y)
-        turn[1, 0] = two * (x * y + w * z)
-        turn[1, 1] = 1 - two * (x * x + z * z)
-        turn[1, 2] = two * (y * z - w * x)
-        turn[2, 0] = two * (x * z - w * y)
-        turn[2, 1] = two * (y * z + w * x)
-        turn[2, 2] = 1 - two * (x * x + y * y)
+        norm = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
+        entries = matrix_entries(w * norm, x * norm, y * norm, z * norm)
+        for axis in range(3):
+            for k in range(3):
+                turn[axis, k] = entries[3 * axis + k]
         for axis in range(3):
             along = 0.0
             for k in range(3):
@@ -144,8 +140,8 @@ def add_regularisers(adam: Adam, gradients: Gradients, settings: GaussiansSettin
 def relocate_and_grow(adam: Adam, settings: GaussiansSettings, generator: np.random.Generator) -> None:
     """Move the dead onto the living, then add Gaussians on the living up to the cap.
 
-    A place is drawn with a probability proportional to its opacity. Those that share it from then on
-    cover together what the one covered before.
+    A place is drawn with a probability proportional to its opacity. Together,
+    those that share it cover what the one Gaussian covered before.
     """
     dead = opacities(adam) <= settings.min_opacity
     if dead.any() and not dead.all():
@@ -161,6 +157,15 @@ def relocate_and_grow(adam: Adam, settings: GaussiansSettings, generator: np.ran
 def opacities(adam: Adam) -> Float[np.ndarray, " N"]:
     """Peak alphas."""
     return expit(adam.parameters["opacity_logits"].astype(np.float64))
+
+
+def least_alive_logit(min_opacity: float) -> np.float32:
+    """A float32 logit whose opacity is just above the threshold of the dead.
+
+    The float32 nearest to the threshold's logit may lie below it: that of 0.005 has opacity 0.0049999995.
+    """
+    exact = float(logit(min_opacity))
+    return np.float32(exact + 1e-6 * max(abs(exact), 1.0))  # rounding moves it by 6e-8 of its size at most
 
 
 def _relocate(
@@ -185,15 +190,16 @@ def _draw(weights: Float[np.ndarray, " N"], number: int, generator: np.random.Ge
 def _share(
     adam: Adam, source: Int[np.ndarray, " M"], settings: GaussiansSettings
 ) -> dict[str, Float32[np.ndarray, "M ..."]]:
-    """Give the drawn rows what is their part of the place; return the copies that join them there."""
+    """Reduce the drawn rows to their share of the place; return the copies that join them there."""
     p = adam.parameters
     rows, drawn = np.unique(source, return_counts=True)
     number = np.minimum(drawn + 1, MAX_TOGETHER)
     old = np.minimum(expit(p["opacity_logits"][rows].astype(np.float64)), MAX_OPACITY)
     new = shared_opacity(old, number)
     p["log_scales"][rows] += np.log(scale_factor(old, new, number)).astype(np.float32)[:, None]
-    # not below the threshold of the dead: they would be moved again at once
-    p["opacity_logits"][rows] = logit(np.maximum(new, settings.min_opacity)).astype(np.float32)
+    # at or below the threshold they would be relocated again at once
+    alive = least_alive_logit(settings.min_opacity)
+    p["opacity_logits"][rows] = np.maximum(logit(new).astype(np.float32), alive)
     for name in FIELDS:
         adam.first[name][rows] = 0
         adam.second[name][rows] = 0

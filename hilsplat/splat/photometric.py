@@ -194,6 +194,6 @@ def ssim(image: Float32[np.ndarray, "H W 3"], target: Float32[np.ndarray, "H W 3
 
 
 def psnr(image: Float32[np.ndarray, "H W 3"], target: Float32[np.ndarray, "H W 3"]) -> float:
-    """Peak signal-to-noise ratio in dB of two RGB images in [0, 1]; infinite where they are equal."""
+    """Peak signal-to-noise ratio in dB of two RGB images in [0, 1]; infinite if they are equal."""
     error = np.square(image.astype(np.float64) - target).mean()
     return float("inf") if error == 0 else float(-10 * np.log10(error))

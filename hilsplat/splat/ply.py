@@ -65,7 +65,7 @@ def load_ply(path: Path, fix: str = "delete it and run the gaussians stage again
     except FileNotFoundError as error:
         raise ArtifactError(f"{path} is missing", fix="run the gaussians stage") from error
     except (PlyParseError, KeyError, ValueError, EOFError) as error:
-        raise ArtifactError(f"{path} is no readable PLY: {error}", fix=fix) from error
+        raise ArtifactError(f"{path} cannot be read as a PLY: {error}", fix=fix) from error
     found = {prop.name for prop in vertex.properties}
     if "packed_position" in found:
         raise ArtifactError(f"{path} is a compressed PLY", expected="a plain 3DGS PLY", fix=fix)
@@ -74,7 +74,7 @@ def load_ply(path: Path, fix: str = "delete it and run the gaussians stage again
     missing = [name for name in _names(num_bases) if name not in found and name not in ("nx", "ny", "nz")]
     if missing or num_rest not in (0, 9, 24, 45):
         raise ArtifactError(
-            f"{path} is no 3DGS PLY",
+            f"{path} is not a 3DGS PLY",
             expected="x y z, f_dc_0..2, 0, 9, 24 or 45 f_rest_*, opacity, scale_0..2, rot_0..3",
             found=f"{num_rest} f_rest columns" + (f"; without {', '.join(missing[:5])}" if missing else ""),
             fix=fix,

@@ -56,7 +56,7 @@ class FitState:
 
     @staticmethod
     def load(path: Path, key: str) -> "FitState | None":
-        """Read a checkpoint of this very fit; None where there is none, or only another fit's."""
+        """Read a checkpoint of this very fit; None if there is none, or only one of another fit."""
         if not path.is_file():
             return None
         try:

@@ -11,6 +11,7 @@ import re
 import shlex
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Protocol, runtime_checkable
 
 from hilsplat.base.errors import SettingsError
@@ -157,6 +158,18 @@ class Plan:
         A sweep over Omega thus retrains fields and shares masks, trees and embeddings with `default`.
         """
         return lambda job: self.output(job, self.shared_variant(stage, job), path)
+
+    def compared(self, stage: str, path: str) -> Callable[[Job], list[str]]:
+        """Input: a stage's output for every variant of the main tables, wherever it is shared."""
+        return lambda job: list(dict.fromkeys(map(self.shared(stage, path), self._main_jobs(job))))
+
+    def compared_scores(self, job: Job) -> list[str]:
+        """Input: the scores of every variant of the main tables."""
+        return [self.output(each, each.variant, "scores.csv") for each in self._main_jobs(job)]
+
+    def _main_jobs(self, job: Job) -> list[SimpleNamespace]:
+        scene = {"dataset": job.dataset, "scene": job.scene}
+        return [SimpleNamespace(**scene, variant=name) for name in self.run.main_variants]
 
     def output(self, job: Job, *parts: str) -> str:
         """A path in a scene's folder."""

@@ -1,4 +1,4 @@
-"""The diagnostic segmenter sees the truth where it is asked for, and nobody else does."""
+"""The diagnostic segmenter sees the truth when it is asked for, and no other segmenter does."""
 
 from pathlib import Path
 

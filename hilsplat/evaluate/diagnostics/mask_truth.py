@@ -1,4 +1,4 @@
-"""How well the masks of a synthetic scene's views fit the true regions: a diagnostic, no table reads it."""
+"""How well the masks of a synthetic scene's views fit the true regions: a diagnostic that no table reads."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from hilsplat.segment.overlaps import region_ious
 from hilsplat.segment.pictures import paint_level
 
 LEAST_PX = 100
-"""Smaller regions are not asked for."""
+"""Smaller true regions are not scored."""
 FIT_IOU = 0.5
 COLUMNS = ("scene", "masks", "level", "views", "regions", "best_iou", "recall", "masks_a_view", "precision")
 COLOURS = "RdYlGn"
@@ -36,7 +36,7 @@ class ViewFit:
 
     Attributes:
         ids: true nodes with a region of at least `LEAST_PX`.
-        best: IoU of the best mask of each, 0 where there is no mask.
+        best: IoU of the best mask of each, 0 if there is no mask.
         masks: number of masks.
         fitting: masks with an IoU of at least 0.5 with some region, however small.
     """
@@ -129,7 +129,7 @@ def table_row(scene: str, masks: str, level: Level, fits: Mapping[str, dict[Leve
 
 
 def middling_and_worst(fits: Mapping[str, dict[Level, ViewFit]]) -> list[str]:
-    """The view whose mean over all regions is the median, and the one where it is lowest."""
+    """The view whose mean over all regions is the median, and the one whose mean is lowest."""
 
     def mean_of(view: str) -> float:
         best = np.concatenate([fit.best for fit in fits[view].values()])
@@ -184,7 +184,7 @@ def draw_fits(
 
 
 def paint_fits(image: np.ndarray, labels: np.ndarray, fit: ViewFit) -> np.ndarray:
-    """True regions coloured by the IoU of the best mask, outlined; what is not asked for stays grey."""
+    """True regions coloured by the IoU of the best mask, outlined; what is not scored stays grey."""
     painted = 0.5 * grey(image)
     for node, value in zip(fit.ids, fit.best, strict=True):
         colour = np.array(colormaps[COLOURS](float(value))[:3]) * 255

@@ -7,8 +7,8 @@
 | `vote` | the vote of the k nearest within a radius, weighted by opacity; nothing beyond the radius |
 | `density` | the mean of the k nearest, weighted by opacity times Gaussian falloff at the point |
 
-The numbers differ by mode, so the mode stands in every row. Of Gaussians at equal distances the search tree
-decides, always alike for the same input, whatever the number of threads.
+The numbers differ by mode, so every row names its mode. Of Gaussians at equal distances the search tree
+decides, always alike for the same input and any number of threads.
 """
 
 from dataclasses import dataclass
@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from scipy.spatial import cKDTree
 
 from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.rotations import rotation_matrices
 
 Mode = Literal["frozen", "nearest", "vote", "density"]
 
@@ -35,8 +36,8 @@ class CarriedPoints:
 
     Attributes:
         mode: as rows name it, with what departs from the defaults.
-        index: Gaussians per point; where the weight is 0 the index means nothing.
-        weight: of each, not negative, summing to 1; all 0 where no Gaussian speaks for the point.
+        index: Gaussians per point; it means nothing if the weight is 0.
+        weight: of each, not negative, summing to 1; all 0 if no Gaussian speaks for the point.
         is_scored: False for points that the mode takes out of the evaluation.
     """
 
@@ -64,7 +65,7 @@ class CarriedPoints:
         return result
 
     def features(self, of_gaussian: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "P D"]:
-        """Weighted mean of the Gaussians' features; zeros where no Gaussian speaks for the point."""
+        """Weighted mean of the Gaussians' features; zeros if no Gaussian speaks for the point."""
         result = np.zeros((len(self.index), of_gaussian.shape[1]), dtype=of_gaussian.dtype)
         for rows in _chunks(len(self.index)):
             result[rows] = np.einsum("pk,pkd->pd", self.weight[rows], of_gaussian[self.index[rows]])
@@ -126,7 +127,7 @@ def vote(
         points: what is labelled, scene units.
         means: centres of the Gaussians, scene units.
         opacities: peak alphas.
-        radius: scene units; 0.1 is 10 cm where the unit is a metre.
+        radius: scene units; 0.1 is 10 cm if the unit is a metre.
         k: neighbours.
         threads: threads of the search; they change nothing but the time.
 
@@ -158,7 +159,7 @@ def density(
     Args:
         points: what is labelled, scene units.
         means: centres of the Gaussians, scene units.
-        opacities: peak alphas; below 0.1 a Gaussian is no candidate.
+        opacities: peak alphas; below 0.1 a Gaussian is not a candidate.
         scales: standard deviations along the axes, scene units.
         quats: world-from-Gaussian rotation, wxyz, any non-zero length.
         k: neighbours.
@@ -204,7 +205,7 @@ def classify(features: Float[np.ndarray, "P D"], texts: Float[np.ndarray, "K D"]
 def _neighbours(
     points: np.ndarray, means: np.ndarray, opacities: np.ndarray, k: int, radius: float, threads: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Index (P, k) and distance (P, k) of the nearest opaque Gaussians; infinite where there is none."""
+    """Index (P, k) and distance (P, k) of the nearest opaque Gaussians; infinite if missing."""
     opaque = np.flatnonzero(opacities >= OPACITY_MIN)
     if not opaque.size:
         raise MisalignedArtifactError(
@@ -225,16 +226,7 @@ def _neighbours(
 
 def _gaussian_from_world(scales: np.ndarray, quats: np.ndarray) -> np.ndarray:
     """Matrices (N, 3, 3) that turn an offset from the centre into standard deviations."""
-    w, x, y, z = (quats.astype(float) / np.linalg.norm(quats, axis=1, keepdims=True)).T
-    world_from_gaussian = np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=-1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=-1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1),
-        ],
-        axis=-2,
-    )
-    return world_from_gaussian.transpose(0, 2, 1) / scales.astype(float)[:, :, None]
+    return rotation_matrices(quats).transpose(0, 2, 1) / scales.astype(float)[:, :, None]
 
 
 def _normalised(weight: np.ndarray) -> np.ndarray:

@@ -62,10 +62,10 @@ class Projected:
         size_hw: image size, px.
         degree: spherical-harmonics degree that was used.
         geometry: see `project.GEOMETRY`.
-        box: pixel box of each Gaussian; last < first where it is not drawn.
+        box: pixel box of each Gaussian; last < first if it is not drawn.
         colours: RGB in this view.
         tiles: depth order and sizes of the tile lists; `tile_lists` fills them band by band.
-        only_band: the filled lists, where one band holds them all and was filled already.
+        only_band: the filled lists, once filled, if one band holds them all.
     """
 
     camera: Float64[np.ndarray, " 25"]
@@ -109,7 +109,7 @@ class Drawn:
 
 
 def refuse_broken(broken: int, total: int) -> None:
-    """Raise where parameters are not finite or quaternions have length zero."""
+    """Raise if parameters are not finite or quaternions have length zero."""
     if broken:
         raise HilsplatError(
             f"{broken} of {total} Gaussians cannot be drawn: not finite, or a zero quaternion",

@@ -11,12 +11,11 @@ from hilsplat.base.errors import DeviceError
 logger = logging.getLogger(__name__)
 
 Device = Literal["cpu", "cuda"]
-DEVICES: tuple[Device, ...] = ("cpu", "cuda")
 
 
 @cache
 def cuda_problem() -> str | None:
-    """Why the CUDA backend cannot be used here; None where it can."""
+    """Why the CUDA backend cannot be used here; None if it can."""
     if not torch.cuda.is_available():
         return f"torch {torch.__version__} finds no CUDA device"
     try:
@@ -28,13 +27,13 @@ def cuda_problem() -> str | None:
 
 @cache
 def choose_device(wanted: Literal["auto", "cpu", "cuda"]) -> Device:
-    """The backend for a stage, told in the log the first time.
+    """The backend for a stage; the log names it the first time.
 
     Args:
-        wanted: `auto` takes CUDA where torch finds a device and gsplat can be imported.
+        wanted: `auto` takes CUDA if torch finds a device and gsplat can be imported.
 
     Raises:
-        DeviceError: `cuda` was asked for and cannot be used. There is no falling back.
+        DeviceError: `cuda` was asked for and cannot be used; the CPU never replaces it.
     """
     problem = cuda_problem()
     if wanted == "cuda" and problem:

@@ -91,6 +91,17 @@ def test_an_override_of_one_scene_changes_what_it_shares(tmp_path):
     assert json.loads(found.settings("coverage_tree")(Job("synthetic", "two")))["theta"] == 0.6
 
 
+def test_a_comparison_reads_each_shared_artifact_once(tmp_path):
+    found, job = plan(tmp_path, main_variants=["default", "theta", "network"]), Job("synthetic", "one")
+    assert found.compared("masks", "masks")(job) == ["results/synthetic/one/default/masks"]
+    assert [path.split("/")[3] for path in found.compared("field", "f")(job)] == [
+        "default",
+        "theta",
+        "network",
+    ]
+    assert [path.split("/")[3] for path in found.compared_scores(job)] == ["default", "theta", "network"]
+
+
 def test_fields_are_ours_or_a_baseline_s(tmp_path):
     found = plan(tmp_path)
     assert found.variants(by_baseline=True) == "lifted"

@@ -1,0 +1,41 @@
+"""What counts as a difference from the recorded run."""
+
+from dataclasses import replace
+
+from tests.reference import tiny
+
+NAME = "iou/default/tree/hierarchy/level-given/whole"
+
+
+def changed(by: float, name: str = NAME, **more: str) -> list[str]:
+    """Differences of a run whose number moved."""
+    known = tiny.recorded()
+    return list(
+        tiny.differences(
+            replace(known, numbers={**known.numbers, name: known.numbers[name] + by}, **more), known
+        )
+    )
+
+
+def test_a_point_of_iou_counts_if_the_gaussians_are_the_recorded_ones():
+    assert changed(0.0) == changed(0.009) == changed(-0.009) == []
+    assert len(changed(0.011)) == len(changed(-0.011)) == 1
+    assert changed(float("nan")) != []
+
+
+def test_other_gaussians_may_move_it_further():
+    assert changed(-0.1, gaussians_sha256="other") == []
+    [sentence] = changed(-0.13, gaussians_sha256="other")
+    assert sentence.startswith(f"{NAME} is ") and sentence.endswith("tolerance 0.12")
+
+
+def test_every_recorded_number_has_a_tolerance():
+    for name in tiny.recorded().numbers:
+        assert changed(0.0, name) == [] and len(changed(1e4, name)) == 1, name
+
+
+def test_numbers_that_come_or_go_are_named():
+    known = tiny.recorded()
+    without = replace(known, numbers={name: v for name, v in known.numbers.items() if name != NAME})
+    assert list(tiny.differences(without, known)) == [f"{NAME} is missing"]
+    assert list(tiny.differences(known, without)) == [f"{NAME} is new"]
