@@ -1,5 +1,6 @@
 """Whole runs in copies of the project: edits there never touch the checkout."""
 
+import fcntl
 import os
 import shutil
 import subprocess
@@ -18,10 +19,10 @@ UNFINISHED = shutil.ignore_patterns("*.pyc", "*.pyc.*", "*.tmp.*")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """One process runs all tests of this folder, so that the finished run is made once."""
+    """One process runs the tests of a module here, so that what its fixtures make is made once."""
     for item in items:
         if item.path.is_relative_to(Path(__file__).parent):
-            item.add_marker(pytest.mark.xdist_group("workflow"))
+            item.add_marker(pytest.mark.xdist_group(item.path.stem))
 
 
 @dataclass(frozen=True)
@@ -110,9 +111,17 @@ def copy_project(source: Path, target: Path, *, results: bool) -> Project:
 
 @pytest.fixture(scope="session")
 def finished(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Project:
-    """A copy in which the CI configuration ran to its end."""
-    copy = copy_project(project, tmp_path_factory.mktemp("finished") / "project", results=False)
-    copy.snakemake()
+    """A copy in which the CI configuration ran to its end; the processes of a test run share it."""
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    with (folder / "finished.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # the others wait: the run takes every core
+        copy = Project(folder / "finished")
+        if not (folder / "finished.done").exists():
+            shutil.rmtree(copy.root, ignore_errors=True)
+            copy_project(project, copy.root, results=False).snakemake()
+            (folder / "finished.done").touch()
     return copy
 
 

@@ -66,11 +66,11 @@ def test_the_tiny_scene_reaches_what_was_recorded(finished: Project) -> None:
     assert not moved, "\n".join([f"{tiny.__name__} says how to record anew", *moved])
 
 
-def test_a_second_run_does_nothing(finished: Project) -> None:
-    before = times_of(finished)
-    again = finished.snakemake()
+def test_a_second_run_does_nothing(copy_of_finished: Project) -> None:
+    before = times_of(copy_of_finished)
+    again = copy_of_finished.snakemake()
     assert "Nothing to be done" in again.stderr
-    assert times_of(finished) == before
+    assert times_of(copy_of_finished) == before
 
 
 def times_of(project: Project) -> dict[str, int]:
@@ -102,9 +102,9 @@ def test_one_core_gives_the_same_bytes_as_two(finished: Project, fresh: Callable
     ).read_bytes()
 
 
-def test_the_report_holds_tables_and_panels(finished: Project) -> None:
-    finished.snakemake("--report", "report.html")
-    text = (finished.root / "report.html").read_text()
+def test_the_report_holds_tables_and_panels(copy_of_finished: Project) -> None:
+    copy_of_finished.snakemake("--report", "report.html")
+    text = (copy_of_finished.root / "report.html").read_text()
     names = ("hierarchy.html", "waymo.html", "panel.png", "registration.png", "fit.png", "comparison.png")
     for name in (*names, "views.png", "features.png", "sweep-theta.png"):
         assert name in text, name
