@@ -11,6 +11,7 @@ from PIL import Image
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, list_images
+from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.known_poses import KnownPoses, KnownView
 from hilsplat.scene.llff import llff_views
@@ -121,12 +122,15 @@ def _read_frame(known: KnownPoses, file: Path, number: int, frame: Mapping[str, 
         raise SceneError(
             f"{where}: file_path or transform_matrix cannot be used: {error!r}", fix="export it again"
         ) from error
-    rotation = source_from_cam[:3, :3] if source_from_cam.shape in ((4, 4), (3, 4)) else np.zeros((3, 3))
-    if not np.isfinite(source_from_cam).all() or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
+    if (
+        source_from_cam.shape not in ((4, 4), (3, 4))
+        or not np.isfinite(source_from_cam).all()
+        or not are_rotations(source_from_cam[:3, :3], RIGID_TOLERANCE)
+    ):
         raise SceneError(
-            f"{where} ({name}): transform_matrix is no rigid pose",
-            expected="a 4 x 4 camera-to-world matrix with a rotation in it",
-            found=f"shape {source_from_cam.shape}",
+            f"{where} ({name}): transform_matrix is not a rigid pose",
+            expected="a 4 x 4 camera-to-world matrix with a rotation in it, which neither scales nor mirrors",
+            found=np.array2string(source_from_cam, precision=4, suppress_small=True).replace("\n", ""),
             fix="export it again without scaling the cameras",
         )
     pose = np.eye(4)

@@ -8,6 +8,7 @@ from jaxtyping import Float64
 from PIL import Image
 
 from hilsplat.base.errors import SceneError
+from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.colmap import pycolmap
 
 POSES_BOUNDS = "poses_bounds.npy"
@@ -26,7 +27,7 @@ def read_poses_bounds(
         World-to-camera transforms (OpenCV axes), rows (height, width, focal) in px, rows (near, far).
 
     Raises:
-        SceneError: it is no such array, or a rotation is none.
+        SceneError: the file does not hold such an array, or a matrix is not a rotation.
     """
     try:
         rows = np.load(path, allow_pickle=False)
@@ -45,12 +46,10 @@ def read_poses_bounds(
     down, right, back = (matrices[:, :, column] for column in range(3))
     world_from_cam[:, :3, :3] = np.stack([right, down, -back], axis=2)
     world_from_cam[:, :3, 3] = matrices[:, :, 3]
-    rotations = world_from_cam[:, :3, :3]
-    products = rotations @ rotations.transpose(0, 2, 1)
-    proper = np.isclose(products, np.eye(3), atol=1e-3).all(axis=(1, 2)) & (np.linalg.det(rotations) > 0)
-    if not proper.all() or (matrices[:, :, 4] <= 0).any():
+    proper = are_rotations(world_from_cam[:, :3, :3], RIGID_TOLERANCE) & (matrices[:, :, 4] > 0).all(axis=1)
+    if not proper.all():
         raise SceneError(
-            f"{path}, row {int(np.argmin(proper))}: no rigid pose with size and focal length",
+            f"{path}, row {int(np.argmin(proper))}: not a rigid pose with size and focal length",
             expected="rotation columns down, right, back, then translation, then height, width, focal",
             fix="write it again with LLFF's axes",
         )

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
+from hilsplat.base.rotations import rotate, unit_quaternions
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.optimise import FIELDS, Adam
-from hilsplat.splat.rotations import rotate
 
 SMALL = 0.01
 """Largest axis, in units of the extent, up to which a Gaussian is cloned; larger ones are split (3DGS)."""
@@ -83,9 +83,7 @@ def _offsets(
 ) -> Float32[np.ndarray, "N 3"]:
     """One random draw from each Gaussian, about its mean."""
     local = generator.normal(size=log_scales.shape) * np.exp(log_scales.astype(np.float64))
-    q = quats.astype(np.float64)
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
-    return rotate(q, local).astype(np.float32)
+    return rotate(unit_quaternions(quats), local).astype(np.float32)
 
 
 def prune(adam: Adam, settings: GaussiansSettings, extent: float) -> None:

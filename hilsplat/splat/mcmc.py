@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from scipy.special import comb, expit, logit
 
 from hilsplat.base.compiled import compiled
+from hilsplat.base.rotations import matrix_entries
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.optimise import FIELDS, Adam
 from hilsplat.splat.rasterise.cpu import Gradients, over_ranges
@@ -74,16 +75,11 @@ def _noise_rows(begin, end, means, log_scales, quats, logits, normal, dead_below
             continue
         w, x = np.float64(quats[row, 0]), np.float64(quats[row, 1])
         y, z = np.float64(quats[row, 2]), np.float64(quats[row, 3])
-        two = 2.0 / (w * w + x * x + y * y + z * z)
-        turn[0, 0] = 1 - two * (y * y + z * z)
-        turn[0, 1] = two * (x * y - w * z)
-        turn[0, 2] = two * (x * z + w * y)
-        turn[1, 0] = two * (x * y + w * z)
-        turn[1, 1] = 1 - two * (x * x + z * z)
-        turn[1, 2] = two * (y * z - w * x)
-        turn[2, 0] = two * (x * z - w * y)
-        turn[2, 1] = two * (y * z + w * x)
-        turn[2, 2] = 1 - two * (x * x + y * y)
+        norm = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
+        entries = matrix_entries(w * norm, x * norm, y * norm, z * norm)
+        for axis in range(3):
+            for k in range(3):
+                turn[axis, k] = entries[3 * axis + k]
         for axis in range(3):
             along = 0.0
             for k in range(3):
@@ -163,6 +159,15 @@ def opacities(adam: Adam) -> Float[np.ndarray, " N"]:
     return expit(adam.parameters["opacity_logits"].astype(np.float64))
 
 
+def least_alive_logit(min_opacity: float) -> np.float32:
+    """A float32 logit whose opacity is just above the threshold of the dead.
+
+    The float32 nearest to the threshold's logit may lie below it: that of 0.005 has opacity 0.0049999995.
+    """
+    exact = float(logit(min_opacity))
+    return np.float32(exact + 1e-6 * max(abs(exact), 1.0))  # rounding moves it by 6e-8 of its size at most
+
+
 def _relocate(
     adam: Adam, dead: Bool[np.ndarray, " N"], settings: GaussiansSettings, generator: np.random.Generator
 ) -> None:
@@ -192,8 +197,9 @@ def _share(
     old = np.minimum(expit(p["opacity_logits"][rows].astype(np.float64)), MAX_OPACITY)
     new = shared_opacity(old, number)
     p["log_scales"][rows] += np.log(scale_factor(old, new, number)).astype(np.float32)[:, None]
-    # not below the threshold of the dead: they would be moved again at once
-    p["opacity_logits"][rows] = logit(np.maximum(new, settings.min_opacity)).astype(np.float32)
+    # at or below the threshold they would be relocated again at once
+    alive = least_alive_logit(settings.min_opacity)
+    p["opacity_logits"][rows] = np.maximum(logit(new).astype(np.float32), alive)
     for name in FIELDS:
         adam.first[name][rows] = 0
         adam.second[name][rows] = 0

@@ -5,8 +5,9 @@ import torch
 from jaxtyping import Float, Float64
 
 from hilsplat.base.errors import HilsplatError
+from hilsplat.base.rotations import are_rotations, multiply, quaternion_of
 from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.rotations import multiply, sh_rotation
+from hilsplat.splat.harmonics import sh_rotation
 
 TOLERANCE = 1e-5
 """How far from a rotation times a scale a matrix may be, relative to the scale."""
@@ -23,11 +24,9 @@ def decompose(similarity: Float[np.ndarray, "4 4"]) -> tuple[float, Float64[np.n
     determinant = np.linalg.det(linear) if np.isfinite(matrix).all() else 0.0
     scale = float(np.cbrt(determinant))
     rotation = linear / scale if scale > 0 else np.zeros((3, 3))
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=TOLERANCE) or not np.allclose(
-        matrix[3], [0, 0, 0, 1]
-    ):
+    if not are_rotations(rotation, TOLERANCE) or not np.allclose(matrix[3], [0, 0, 0, 1]):
         raise HilsplatError(
-            "a transform of coordinates is no similarity",
+            "a transform of coordinates is not a similarity",
             expected="a 4 x 4 matrix of scale times rotation, with a translation and the last row 0 0 0 1",
             found=str(matrix.tolist()),
         )
@@ -44,20 +43,17 @@ def move_gaussians(gaussians: Gaussians, similarity: Float[np.ndarray, "4 4"]) -
         similarity: b_from_a, where the Gaussians are given in a.
 
     Raises:
-        HilsplatError: `similarity` is none.
+        HilsplatError: `similarity` is not one.
     """
-    from scipy.spatial.transform import Rotation
-
     scale, rotation, translation = decompose(similarity)
     means = gaussians.means.detach().cpu().double().numpy()
     quats = gaussians.quats.detach().cpu().double().numpy()
     by_band = sh_rotation(rotation, gaussians.sh_degree)
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
     sh = np.einsum("kj,njc->nkc", by_band, gaussians.sh.detach().cpu().double().numpy())
     return Gaussians(
         means=_float32(scale * np.einsum("ij,nj->ni", rotation, means) + translation),
         log_scales=_float32(gaussians.log_scales.detach().cpu().double().numpy() + np.log(scale)),
-        quats=_float32(multiply(np.array([w, x, y, z]), quats)),
+        quats=_float32(multiply(quaternion_of(rotation), quats)),
         opacity_logits=gaussians.opacity_logits.detach().cpu().clone(),
         sh=_float32(sh),
     )

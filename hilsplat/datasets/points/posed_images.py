@@ -12,12 +12,11 @@ from plyfile import PlyData, PlyElement
 
 from hilsplat.base.artifacts import atomic_folder, write_text
 from hilsplat.base.errors import SceneError
+from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 HALF_PIXEL = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
 """Added to a K whose pixel centres are whole numbers: here the first pixel's centre is (0.5, 0.5)."""
-
-RIGID_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,13 +49,12 @@ def cam_from_world_of(world_from_cam: Float[np.ndarray, "4 4"], where: str) -> F
     """Invert a camera-to-world matrix.
 
     Raises:
-        SceneError: it is no rotation and translation; `where` begins the message.
+        SceneError: the matrix is not a rotation and a translation; `where` begins the message.
     """
-    rotation = world_from_cam[:3, :3]
-    rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=RIGID_TOLERANCE)
-    if not rigid or np.linalg.det(rotation) < 0 or not np.allclose(world_from_cam[3], [0, 0, 0, 1]):
+    rigid = are_rotations(world_from_cam[:3, :3], RIGID_TOLERANCE)
+    if not rigid or not np.allclose(world_from_cam[3], [0, 0, 0, 1]):
         raise SceneError(
-            f"{where}: the pose is no rotation and translation",
+            f"{where}: the pose is not a rotation and a translation",
             expected="a 4 x 4 camera-to-world matrix, row by row, last row 0 0 0 1",
             found=np.array2string(world_from_cam, precision=4, suppress_small=True).replace("\n", ""),
             fix="export the poses again",

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 from scipy.spatial import cKDTree
 
 from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.rotations import rotation_matrices
 
 Mode = Literal["frozen", "nearest", "vote", "density"]
 
@@ -225,16 +226,7 @@ def _neighbours(
 
 def _gaussian_from_world(scales: np.ndarray, quats: np.ndarray) -> np.ndarray:
     """Matrices (N, 3, 3) that turn an offset from the centre into standard deviations."""
-    w, x, y, z = (quats.astype(float) / np.linalg.norm(quats, axis=1, keepdims=True)).T
-    world_from_gaussian = np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=-1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=-1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1),
-        ],
-        axis=-2,
-    )
-    return world_from_gaussian.transpose(0, 2, 1) / scales.astype(float)[:, :, None]
+    return rotation_matrices(quats).transpose(0, 2, 1) / scales.astype(float)[:, :, None]
 
 
 def _normalised(weight: np.ndarray) -> np.ndarray:

@@ -1,25 +1,72 @@
-"""From rows to the number in a table, in the averaging order that the protocol states."""
+"""From rows of scores to the number in a table, in the averaging order that their protocol states.
 
-from collections.abc import Mapping
+Rows are those of `scores.csv` as a frame (`evaluate.scores.read_scores`). A pair without a prediction has a
+row of value 0 unless its protocol leaves such pairs out.
+"""
 
-from hilsplat.evaluate.metrics.averages import (
-    Pairs,
-    mean_over_classes,
-    mean_over_pairs,
-    mean_over_scenes,
-)
-from hilsplat.evaluate.protocols.cards import ProtocolCard
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.evaluate.protocols.cards import card_of
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
-def scene_value(card: ProtocolCard, values: Pairs) -> float:
-    """One scene's number from its (view, query) values; nan where there is none.
+def scene_values(rows: "pd.DataFrame", metric: str, level: str | None = None) -> "pd.Series":
+    """One number per scene, by its name; scenes without a row are left out.
 
-    For `levels`, give the pairs of one level at a time.
+    It is the mean over the scene's rows; under a protocol of `classes`, the mean over the views of each
+    query, then over queries.
+
+    Args:
+        rows: of one table row, so of one averaging order.
+        metric: rows of other metrics are left out.
+        level: rows of other levels are left out; None keeps all.
     """
-    assert card.averaging != "pooled", f"{card.full_name} pools counts and has no number per scene"
-    return mean_over_classes(values) if card.averaging == "classes" else mean_over_pairs(values)
+    kept = rows[rows["metric"] == metric]
+    if level is not None:
+        kept = kept[kept["level"] == level]
+    orders = {card_of(label).averaging for label in kept["protocol"].unique()}
+    assert len(orders) <= 1, f"rows of several averaging orders: {sorted(orders)}"
+    assert "pooled" not in orders, "pooled protocols have no number per scene"
+    if "classes" in orders:
+        of_query = kept.groupby(["scene", "query"], sort=True)["value"].mean()
+        return of_query.groupby(level="scene", sort=True).mean()
+    return kept.groupby("scene", sort=True)["value"].mean()
 
 
-def table_value(card: ProtocolCard, scenes: Mapping[str, Pairs]) -> float:
-    """The mean of the scenes' numbers; every scene weighs the same."""
-    return mean_over_scenes(scene_value(card, values) for values in scenes.values())
+def table_value(rows: "pd.DataFrame", metric: str, level: str | None = None) -> float:
+    """Mean of the scenes' numbers, which weigh the same whatever their rows; nan without a row."""
+    return float(scene_values(rows, metric, level).mean())
+
+
+def share_above(rows: "pd.DataFrame", metric: str, threshold: float) -> float:
+    """Share of rows above a threshold, such as Acc@0.25, averaged as the values themselves are."""
+    return table_value(rows.assign(value=(rows["value"] > threshold).astype(float)), metric)
+
+
+def level_values(rows: "pd.DataFrame", metric: str) -> dict[Level, float]:
+    """The number of each level, L1 to L3; nan for a level without a row."""
+    return {level: table_value(rows, metric, level.label) for level in LEVELS}
+
+
+def mean_over_levels(values: Iterable[float]) -> float:
+    """Plain mean of the levels that have a number: the column Avg; nan where none has."""
+    present = [value for value in values if value == value]
+    return sum(present) / len(present) if present else float("nan")
+
+
+def level_averages_of_scenes(rows: "pd.DataFrame", metric: str) -> "pd.Series":
+    """One number per scene over all seeds: mean over the rows of a level, over levels, then over seeds.
+
+    Differences of two table rows are paired by it.
+
+    Args:
+        rows: with seeds in a column of their own (`tables.measured.with_seeds`).
+    """
+    kept = rows[rows["metric"] == metric]
+    of_level = kept.groupby(["scene", "seed", "level"], sort=True)["value"].mean()
+    of_seed = of_level.groupby(level=["scene", "seed"], sort=True).mean()
+    return of_seed.groupby(level="scene", sort=True).mean()

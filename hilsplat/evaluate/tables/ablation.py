@@ -7,7 +7,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN, PATH, card_of
-from hilsplat.evaluate.tables.measured import level_cells, measured_blocks, same_row, scene_mean, with_seeds
+from hilsplat.evaluate.protocols.totals import level_averages_of_scenes, table_value
+from hilsplat.evaluate.tables.measured import level_cells, measured_blocks, same_row, with_seeds
 from hilsplat.evaluate.tables.reported import reported_block
 from hilsplat.evaluate.tables.rows import Block, Cell, Table
 from hilsplat.evaluate.tables.sources import Sources
@@ -105,12 +106,12 @@ def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> Mapping[str
     flat, ovs = same_row(scores, part, FLAT), same_row(scores, part, OVS)
     levels = level_cells(part)
     return {
-        "LERF localization": Cell.percent(scene_mean(flat, "localization_box")),
-        "LERF mIoU": Cell.percent(scene_mean(flat, "iou")),
-        "3D-OVS mIoU": Cell.percent(scene_mean(ovs, "iou")),
+        "LERF localization": Cell.percent(table_value(flat, "localization_box")),
+        "LERF mIoU": Cell.percent(table_value(flat, "iou")),
+        "3D-OVS mIoU": Cell.percent(table_value(ovs, "iou")),
         **{name: cell for name, cell in levels.items() if name != "Avg"},
         "Hi-LERF mIoU": levels["Avg"],
-        "Hi-LERF HC": Cell.percent(scene_mean(part, "hc_containment")),
+        "Hi-LERF HC": Cell.percent(table_value(part, "hc_containment")),
         "Avg, best threshold": level_cells(part, "best_threshold_iou")["Avg"],
     }
 
@@ -130,7 +131,8 @@ def against_default(scores: "pd.DataFrame", part: "pd.DataFrame") -> Cell:
         default &= scores[key] == first[key]
     if (first["variant"], first["method"]) == ("default", "field"):
         return Cell()
-    differences = 100 * (scene_averages(part) - scene_averages(scores[default])).dropna()
+    ours, others = (level_averages_of_scenes(rows, "iou") for rows in (part, scores[default]))
+    differences = 100 * (ours - others).dropna()
     if not len(differences):
         return Cell()
     mean = statistics.fmean(differences)
@@ -138,14 +140,6 @@ def against_default(scores: "pd.DataFrame", part: "pd.DataFrame") -> Cell:
         return Cell(f"{mean:+.1f}", mean)
     error = statistics.stdev(differences) / math.sqrt(len(differences))
     return Cell(f"{mean:+.1f} ± {error:.1f}", mean, spread=error)
-
-
-def scene_averages(part: "pd.DataFrame") -> "pd.Series":
-    """Mean IoU of each scene: over the queries of a level, over levels, over seeds."""
-    rows = part[part["metric"] == "iou"]
-    of_level = rows.groupby(["scene", "seed", "level"], sort=True)["value"].mean()
-    of_seed = of_level.groupby(level=["scene", "seed"], sort=True).mean()
-    return of_seed.groupby(level="scene", sort=True).mean()
 
 
 def filled(block: Block, column: str) -> bool:

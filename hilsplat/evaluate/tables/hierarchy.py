@@ -3,12 +3,11 @@
 from typing import TYPE_CHECKING
 
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN, VIEW_CONSISTENCY
+from hilsplat.evaluate.protocols.totals import share_above, table_value
 from hilsplat.evaluate.tables.measured import (
     level_cells,
-    mean_of,
     measured_blocks,
     same_row,
-    scene_mean,
     with_seeds,
 )
 from hilsplat.evaluate.tables.reported import reported_block
@@ -48,13 +47,12 @@ def hierarchy_table(sources: Sources) -> Table:
 
     def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
         ious = part[part["metric"] == "iou"]
-        share = ious.assign(value=(ious["value"] > 0.25).astype(float))
         cells = {
             **level_cells(part),
-            "Acc@0.25": Cell.percent(scene_mean(share, "iou")),
-            "HC containment": Cell.percent(scene_mean(part, "hc_containment")),
-            "HC literal": Cell.percent(scene_mean(part, "hc_literal")),
-            "HC anchored": Cell.percent(scene_mean(part, "hc_anchored")),
+            "Acc@0.25": Cell.percent(share_above(part, "iou", 0.25)),
+            "HC containment": Cell.percent(table_value(part, "hc_containment")),
+            "HC literal": Cell.percent(table_value(part, "hc_literal")),
+            "HC anchored": Cell.percent(table_value(part, "hc_anchored")),
             "Avg, best threshold": level_cells(part, "best_threshold_iou")["Avg"],
             "Pairs": Cell(str(len(ious)), float(len(ious))) if len(ious) else Cell(),
         }
@@ -91,5 +89,4 @@ def hierarchy_table(sources: Sources) -> Table:
 def view_consistency(scores: "pd.DataFrame", part: "pd.DataFrame") -> Cell:
     """Consistency between views of the same row's answers; a dash where it was not measured."""
     same = same_row(scores, part, (VIEW_CONSISTENCY.full_name,))
-    levels = sorted(set(same["level"]))
-    return Cell.percent(mean_of([scene_mean(same, "view_consistency", level) for level in levels]))
+    return level_cells(same, "view_consistency")["Avg"]

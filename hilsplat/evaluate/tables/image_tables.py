@@ -2,8 +2,9 @@
 
 from typing import TYPE_CHECKING
 
-from hilsplat.evaluate.protocols.cards import LERF_MASK, card_of
-from hilsplat.evaluate.tables.measured import class_mean, measured_blocks, scene_mean
+from hilsplat.evaluate.protocols.cards import LERF_MASK
+from hilsplat.evaluate.protocols.totals import table_value
+from hilsplat.evaluate.tables.measured import measured_blocks, scene_cells
 from hilsplat.evaluate.tables.reported import reported_block
 from hilsplat.evaluate.tables.rows import Cell, Table
 from hilsplat.evaluate.tables.sources import Sources
@@ -55,7 +56,7 @@ def ovs_table(sources: Sources) -> Table:
     def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
         cells = scene_cells(part, {"mIoU": "iou"})
         overall = cells.pop("Average mIoU")
-        accuracy = Cell.percent(scene_mean(part, "pixel_accuracy"))
+        accuracy = Cell.percent(table_value(part, "pixel_accuracy"))
         return {**cells, "Overall mIoU": overall, "Overall accuracy": accuracy}
 
     blocks = [reported_block(sources.published, "3D-OVS", "Reported in the paper: 3D-OVS")]
@@ -78,15 +79,3 @@ def ovs_table(sources: Sources) -> Table:
         "*: reproduced by the paper's authors.",
     )
     return sources.finished("3dovs", "3D-OVS: segmentation", blocks, footnotes)
-
-
-def scene_cells(part: "pd.DataFrame", metrics: dict[str, str]) -> dict[str, Cell]:
-    """Columns `<scene> <name>` and `Average <name>`, in the averaging order of the protocol."""
-    by_class = card_of(part["protocol"].iloc[0]).averaging == "classes"
-    mean = class_mean if by_class else scene_mean
-    cells = {}
-    for name, metric in metrics.items():
-        for scene, of_scene in part.groupby("scene", sort=True):
-            cells[f"{scene} {name}"] = Cell.percent(mean(of_scene, metric))
-        cells[f"Average {name}"] = Cell.percent(mean(part, metric))
-    return cells

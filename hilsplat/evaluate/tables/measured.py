@@ -5,8 +5,8 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from hilsplat.base.levels import LEVELS
 from hilsplat.evaluate.protocols.cards import ANNOTATIONS, LEVEL_AUTO, LEVEL_GIVEN, PATH, SCENE_WIDE
+from hilsplat.evaluate.protocols.totals import level_values, mean_over_levels, scene_values, table_value
 from hilsplat.evaluate.tables.rows import Block, Cell, Row
 from hilsplat.segment.origin import made_from_truth
 
@@ -163,37 +163,30 @@ def kind_and_title(dataset: str) -> tuple[str, str, str]:
     return "measured", dataset, f"Measured on {dataset}"
 
 
-def scene_mean(part: "pd.DataFrame", metric: str, level: str | None = None) -> float:
-    """Mean over the rows of each scene, then over scenes; nan where there is none."""
-    rows = part[part["metric"] == metric]
-    if level is not None:
-        rows = rows[rows["level"] == level]
-    if rows.empty:
-        return float("nan")
-    return float(rows.groupby("scene", sort=True)["value"].mean().mean())
+def scene_cells(
+    part: "pd.DataFrame", metrics: Mapping[str, str], average: str = "Average"
+) -> dict[str, Cell]:
+    """Columns `<scene> <name>` of every scene, and the mean over scenes.
 
-
-def class_mean(part: "pd.DataFrame", metric: str) -> float:
-    """Mean over the views of each text, over the texts of a scene, then over scenes."""
-    rows = part[part["metric"] == metric]
-    if rows.empty:
-        return float("nan")
-    of_text = rows.groupby(["scene", "query"], sort=True)["value"].mean()
-    return float(of_text.groupby(level="scene", sort=True).mean().mean())
+    Args:
+        part: the scores of one row.
+        metrics: name in the column -> metric.
+        average: begins the name of the mean's column.
+    """
+    cells = {}
+    for name, metric in metrics.items():
+        values = scene_values(part, metric)
+        for scene in sorted(set(part["scene"])):
+            cells[f"{scene} {name}"] = Cell.percent(values.get(scene, float("nan")))
+        cells[f"{average} {name}"] = Cell.percent(table_value(part, metric))
+    return cells
 
 
 def level_cells(part: "pd.DataFrame", metric: str = "iou") -> dict[str, Cell]:
-    """L1, L2, L3 and Avg, the mean of the levels that have pairs."""
-    values = [scene_mean(part, metric, level.label) for level in LEVELS]
-    names = [f"L{int(level)}" for level in LEVELS]
-    average = Cell.percent(mean_of(values))
-    return {**dict(zip(names, map(Cell.percent, values), strict=True)), "Avg": average}
-
-
-def mean_of(values: Sequence[float]) -> float:
-    """Mean of what is there; nan where nothing is."""
-    present = [value for value in values if value == value]
-    return sum(present) / len(present) if present else float("nan")
+    """L1, L2, L3 and Avg, the mean of the levels that have rows."""
+    values = level_values(part, metric)
+    cells = {f"L{int(level)}": Cell.percent(value) for level, value in values.items()}
+    return {**cells, "Avg": Cell.percent(mean_over_levels(values.values()))}
 
 
 def same_row(scores: "pd.DataFrame", part: "pd.DataFrame", protocols: tuple[str, ...]) -> "pd.DataFrame":

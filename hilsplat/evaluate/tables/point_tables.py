@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from hilsplat.evaluate.protocols.cards import INSTANCES, card_of
 from hilsplat.evaluate.protocols.measured import Measured
+from hilsplat.evaluate.protocols.totals import table_value
 from hilsplat.evaluate.tables.measured import (
     ANSWERS,
     TRUE_MASKS,
@@ -12,7 +13,7 @@ from hilsplat.evaluate.tables.measured import (
     mean_over_seeds,
     measured_blocks,
     row_name,
-    scene_mean,
+    scene_cells,
     with_seeds,
 )
 from hilsplat.evaluate.tables.reported import reported_block
@@ -44,14 +45,6 @@ MODE_NOTE = (
 def replica_table(sources: Sources) -> Table:
     """mIoU and mAcc per scene (paper: Replica, semantic segmentation)."""
 
-    def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
-        cells = {}
-        for name, metric in (("mIoU", "miou_present"), ("mAcc", "macc_present")):
-            for scene, of_scene in part.groupby("scene", sort=True):
-                cells[f"{scene} {name}"] = Cell.percent(scene_mean(of_scene, metric))
-            cells[f"Mean {name}"] = Cell.percent(scene_mean(part, metric))
-        return cells
-
     def columns_of(of_data: "pd.DataFrame") -> list[str]:
         scenes = [*sorted(set(of_data["scene"])), "Mean"]
         return [f"{scene} {name}" for scene in scenes for name in ("mIoU", "mAcc")]
@@ -61,7 +54,7 @@ def replica_table(sources: Sources) -> Table:
         sources.scores,
         sources.labels,
         lambda protocol: protocol.startswith("replica/per-scene"),
-        cells_of,
+        lambda part: scene_cells(part, {"mIoU": "miou_present", "mAcc": "macc_present"}, "Mean"),
         columns_of,
     )
     footnotes = (
@@ -128,7 +121,7 @@ def semantic_cells(part: "pd.DataFrame") -> dict[str, Cell]:
     for protocol, name in SCANNET_COLUMNS.items():
         of_protocol = part[part["protocol"].str.startswith(protocol)]
         for metric, key in (("mIoU", "miou_present"), ("mAcc", "macc_present")):
-            cells[f"{name} {metric}"] = Cell.percent(scene_mean(of_protocol, key))
+            cells[f"{name} {metric}"] = Cell.percent(table_value(of_protocol, key))
     return cells
 
 

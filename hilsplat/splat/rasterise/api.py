@@ -16,16 +16,12 @@ from hilsplat.splat.rasterise import cpu, cuda
 from hilsplat.splat.rasterise.cpu import (
     Drawn,
     Parameters,
-    Projected,
     blend_forward,
     blend_gradients,
     project_gaussians,
     sparse_weights,
 )
 from hilsplat.splat.rasterise.device import Device
-
-CHANNELS_PER_PASS = 32
-"""Feature channels blended in one pass; more would leave the first-level cache."""
 
 
 @dataclass(frozen=True)
@@ -36,14 +32,11 @@ class Rendering:
         color: RGB over the background.
         alpha: coverage in [0, 1], the sum of the blending weights.
         features: blended features, premultiplied (divide by alpha for their average), or None.
-        depth: average depth of what is seen, scene units; 0 where alpha is 0. No gradient. None
-            unless asked for.
     """
 
     color: Float[Tensor, "H W 3"]
     alpha: Float[Tensor, "H W"]
     features: Float[Tensor, "H W D"] | None = None
-    depth: Float[Tensor, "H W"] | None = None
 
 
 def to_parameters(gaussians: Gaussians) -> Parameters:
@@ -69,11 +62,11 @@ def _checked_degree(gaussians: Gaussians, sh_degree: int | None) -> int:
 
 
 class _Render(torch.autograd.Function):
-    """Premultiplied RGB + feature channels, alpha and blended depth, with the CPU backend's own gradients."""
+    """Premultiplied RGB + feature channels and alpha, with the CPU backend's own gradients."""
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Any:
-        *tensors, features, camera, degree, depth, threads = arguments
+        *tensors, features, camera, degree, threads = arguments
         parameters = Parameters(*(_to_array(tensor) for tensor in tensors))
         view = project_gaussians(parameters, camera, degree, threads)
         channels = view.colours
@@ -83,21 +76,17 @@ class _Render(torch.autograd.Function):
         ctx.replay = (parameters, view, channels, image, alpha, threads)
         ctx.inputs = [(tensor.device, tensor.dtype) for tensor in tensors]
         ctx.features = (features.device, features.dtype) if features is not None else None
-        summed = torch.empty(0)
-        if depth:
-            summed = torch.from_numpy(blend_forward(view, view.geometry[:, 6:7].copy(), threads)[0][..., 0])
-        ctx.mark_non_differentiable(summed)
-        return torch.from_numpy(image), torch.from_numpy(alpha), summed
+        return torch.from_numpy(image), torch.from_numpy(alpha)
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
         parameters, view, channels, image, alpha, threads = ctx.replay
-        grad_image, grad_alpha = (_to_array(grad) for grad in grads[:2])
+        grad_image, grad_alpha = (_to_array(grad) for grad in grads)
         g = blend_gradients(parameters, view, channels, image, alpha, grad_image, grad_alpha, threads)
         arrays = (g.means, g.log_scales, g.quats, g.opacity_logits, g.sh)
         out = [torch.from_numpy(a).to(*place) for a, place in zip(arrays, ctx.inputs, strict=True)]
         by_features = torch.from_numpy(g.features).to(*ctx.features) if ctx.features else None
-        return *out, by_features, None, None, None, None
+        return *out, by_features, None, None, None
 
 
 def render(
@@ -108,7 +97,6 @@ def render(
     features: Float[Tensor, "N D"] | None = None,
     sh_degree: int | None = None,
     threads: int = 1,
-    depth: bool = False,
     device: Device = "cpu",
 ) -> Rendering:
     """Render a view; differentiable in all parameters of the Gaussians and in `features`.
@@ -119,6 +107,8 @@ def render(
     - a Gaussian is projected by the perspective Jacobian at its centre, with the ray clamped to 30 %
       beyond the image, and 0.3 px^2 are added to its variance (`eps2d`), whatever its size;
     - Gaussians nearer than depth 0.01 are not drawn; no Gaussian is too small (`radius_clip` 0);
+    - scales are cut at exp(20) scene units, where a Gaussian covers any view evenly (CPU; gsplat
+      overflows);
     - alpha below 1/255 is not drawn, alpha above 0.999 is cut there;
     - blending goes front to back by the depth of the centres and stops before the Gaussian that
       would leave less than 1e-4 of the light;
@@ -137,7 +127,6 @@ def render(
         features: further channels to blend in the same pass; any number.
         sh_degree: degree of the spherical harmonics to use; all of them by default.
         threads: CPU threads; the result is the same bytes for any number.
-        depth: also return the average depth.
         device: backend; see `device.choose_device`.
 
     Returns:
@@ -148,21 +137,21 @@ def render(
     """
     degree = _checked_degree(gaussians, sh_degree)
     g = gaussians
-    if features is not None:
-        _check_rows(features, g)
+    if features is not None and len(features) != len(g):
+        raise HilsplatError(
+            "features do not fit the Gaussians",
+            expected=f"{len(g)} rows",
+            found=f"{len(features)} rows",
+        )
     if device == "cuda":
-        image, alpha, summed = cuda.render_channels(g, camera, degree, features, depth)
+        image, alpha = cuda.render_channels(g, camera, degree, features)
     else:
-        image, alpha, summed = _Render.apply(
-            g.means, g.log_scales, g.quats, g.opacity_logits, g.sh, features, camera, degree, depth, threads
+        image, alpha = _Render.apply(
+            g.means, g.log_scales, g.quats, g.opacity_logits, g.sh, features, camera, degree, threads
         )
     behind = torch.tensor(background, dtype=image.dtype, device=image.device)
     color = image[..., :3] + (1.0 - alpha)[..., None] * behind
-    depth_map = None
-    if depth:
-        covered = alpha.detach()
-        depth_map = torch.where(covered > 0, summed / covered, torch.zeros_like(covered))
-    return Rendering(color, alpha, image[..., 3:] if features is not None else None, depth_map)
+    return Rendering(color, alpha, image[..., 3:] if features is not None else None)
 
 
 def draw(parameters: Parameters, camera: Camera, degree: int, *, threads: int, device: Device) -> Drawn:
@@ -174,36 +163,6 @@ def draw(parameters: Parameters, camera: Camera, degree: int, *, threads: int, d
     if device == "cuda":
         return cuda.draw(parameters, camera, degree)
     return cpu.draw(parameters, camera, degree, threads)
-
-
-def render_features(
-    gaussians: Gaussians,
-    camera: Camera,
-    features: Float[np.ndarray, "N D"] | Float[Tensor, "N D"],
-    *,
-    threads: int = 1,
-    device: Device = "cpu",
-) -> tuple[Float[np.ndarray, "H W D"], Float[np.ndarray, "H W"]]:
-    """Blend any number of feature channels into a view, without gradients.
-
-    Returns:
-        The premultiplied feature map and alpha; divide by alpha for the average feature.
-
-    Raises:
-        HilsplatError: rows of `features` do not fit, or parameters cannot be drawn.
-    """
-    _check_rows(features, gaussians)
-    values = _to_array(features)
-    if device == "cuda":
-        return cuda.blend_features(gaussians, camera, values)
-    view = _project(gaussians, camera, threads)
-    if values.shape[1] <= CHANNELS_PER_PASS:
-        return blend_forward(view, values, threads)
-    out = np.empty((*camera.size_hw, values.shape[1]), np.float32)
-    for begin in range(0, values.shape[1], CHANNELS_PER_PASS):
-        some = np.ascontiguousarray(values[:, begin : begin + CHANNELS_PER_PASS])
-        out[..., begin : begin + CHANNELS_PER_PASS], alpha = blend_forward(view, some, threads)
-    return out, alpha
 
 
 def pixel_weights(
@@ -220,7 +179,7 @@ def pixel_weights(
     """
     if device == "cuda":
         return cuda.pixel_weights(gaussians, camera, min_weight)
-    view = _project(gaussians, camera, threads)
+    view = project_gaussians(to_parameters(gaussians), camera, 0, threads)
     row_start, columns, weights = sparse_weights(view, min_weight, threads)
     if row_start[-1] < np.iinfo(np.int32).max:
         row_start = row_start.astype(np.int32)
@@ -228,16 +187,3 @@ def pixel_weights(
     matrix = csr_matrix((weights, columns, row_start), shape=shape, copy=False)
     matrix.has_sorted_indices = True
     return matrix
-
-
-def _check_rows(features: Tensor | np.ndarray, gaussians: Gaussians) -> None:
-    if len(features) != len(gaussians):
-        raise HilsplatError(
-            "features do not fit the Gaussians",
-            expected=f"{len(gaussians)} rows",
-            found=f"{len(features)} rows",
-        )
-
-
-def _project(gaussians: Gaussians, camera: Camera, threads: int) -> Projected:
-    return project_gaussians(to_parameters(gaussians), camera, 0, threads)

@@ -31,11 +31,6 @@ class Tiles:
     order: Int32[np.ndarray, " M"]
     tile_start: Int64[np.ndarray, " num_tiles_plus_1"]
 
-    @property
-    def num_entries(self) -> int:
-        """Entries of all lists together."""
-        return int(self.tile_start[-1])
-
     def bands(self, max_entries: int = MAX_ENTRIES) -> list[tuple[int, int]]:
         """Ranges of tiles that cover all tiles, each with at most `max_entries` entries or one tile."""
         start, out, begin = self.tile_start, [], 0

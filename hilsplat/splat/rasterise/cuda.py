@@ -41,12 +41,9 @@ def _on_device(gaussians: Gaussians) -> Gaussians:
 
 
 def blend(
-    gaussians: Gaussians, camera: Camera, channels: Float[Tensor, "N C"], *, depth: bool = False
+    gaussians: Gaussians, camera: Camera, channels: Float[Tensor, "N C"]
 ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"], dict[str, Any]]:
-    """Blend channels of Gaussians that are on the device: premultiplied image, alpha, gsplat's notes.
-
-    With `depth` the blended depth is one more channel.
-    """
+    """Blend channels of Gaussians that are on the device: premultiplied image, alpha, gsplat's notes."""
     import gsplat
 
     height, width = camera.size_hw
@@ -66,7 +63,7 @@ def blend(
         sh_degree=None,
         packed=False,
         tile_size=TILE,
-        render_mode="RGB+D" if depth else "RGB",
+        render_mode="RGB",
         rasterize_mode="classic",
     )
     return image[0], alpha[0, ..., 0], notes
@@ -81,37 +78,20 @@ def colours(gaussians: Gaussians, camera: Camera, degree: int) -> Float[Tensor, 
 
 
 def render_channels(
-    gaussians: Gaussians, camera: Camera, degree: int, features: Tensor | None, depth: bool
-) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Premultiplied RGB (+ features), alpha and blended depth, where the Gaussians are."""
-    home, size_hw = gaussians.means.device, camera.size_hw
-    width = 3 + (features.shape[1] if features is not None else 0)
+    gaussians: Gaussians, camera: Camera, degree: int, features: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Premultiplied RGB (+ features) and alpha, where the Gaussians are."""
+    home = gaussians.means.device
     if len(gaussians) == 0:
-        nothing = torch.zeros(*size_hw, width + 1, device=home)
-        return nothing[..., :-1], nothing[..., -1], nothing[..., -1] if depth else None
+        width = 3 + (features.shape[1] if features is not None else 0)
+        nothing = torch.zeros(*camera.size_hw, width + 1, device=home)
+        return nothing[..., :-1], nothing[..., -1]
     g = _on_device(gaussians)
     channels = colours(g, camera, degree)
     if features is not None:
         channels = torch.cat([channels, features.to("cuda", torch.float32)], dim=1)
-    image, alpha, _ = blend(g, camera, channels, depth=depth)
-    summed_depth = image[..., -1].detach().to(home) if depth else None
-    return image[..., :width].to(home), alpha.to(home), summed_depth
-
-
-def blend_features(
-    gaussians: Gaussians, camera: Camera, features: Float[np.ndarray, "N D"]
-) -> tuple[Float[np.ndarray, "H W D"], Float[np.ndarray, "H W"]]:
-    """Premultiplied feature map and alpha, without gradients."""
-    if len(gaussians) == 0:
-        return np.zeros((*camera.size_hw, features.shape[1]), np.float32), np.zeros(
-            camera.size_hw, np.float32
-        )
-    with torch.no_grad():
-        g = _on_device(gaussians)
-        # gsplat blends no empty feature
-        one_at_least = features if features.shape[1] else np.zeros((len(features), 1), np.float32)
-        image, alpha, _ = blend(g, camera, torch.from_numpy(one_at_least).cuda())
-    return image[..., : features.shape[1]].cpu().numpy(), alpha.cpu().numpy()
+    image, alpha, _ = blend(g, camera, channels)
+    return image.to(home), alpha.to(home)
 
 
 def pixel_weights(gaussians: Gaussians, camera: Camera, min_weight: float) -> csr_matrix:

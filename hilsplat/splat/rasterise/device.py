@@ -11,7 +11,6 @@ from hilsplat.base.errors import DeviceError
 logger = logging.getLogger(__name__)
 
 Device = Literal["cpu", "cuda"]
-DEVICES: tuple[Device, ...] = ("cpu", "cuda")
 
 
 @cache

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hilsplat.base.compiled import compiled
+from hilsplat.base.rotations import matrix_entries
 from hilsplat.scene.cameras import Camera
 
 NEAR = 0.01
@@ -24,6 +25,9 @@ LOW_PASS_PX2 = 0.3
 """Added to the projected variance, px^2 (3DGS, gsplat: 0.3)."""
 MIN_ALPHA = 1.0 / 255.0
 """Contributions below are not drawn (3DGS, gsplat: 1 / 255)."""
+MAX_LOG_SCALE = 20.0
+"""Scales are cut at exp(20), 5e8 scene units, and get no gradient beyond. A Gaussian that wide covers any
+view evenly along that axis; at exp(40) the columns of its pixel box would overflow 64-bit integers."""
 LOG2_E = 1.4426950408889634
 
 GEOMETRY = 8
@@ -126,9 +130,7 @@ def _cam_from_gaussian(camera, quats, scales, i, axes, factor):
     w, x, y, z = float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3])
     norm = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * norm, x * norm, y * norm, z * norm
-    r00, r01, r02 = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)
-    r10, r11, r12 = 2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)
-    r20, r21, r22 = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = matrix_entries(w, x, y, z)
     for row in range(3):
         a, b, c = camera[3 * row], camera[3 * row + 1], camera[3 * row + 2]
         axes[row, 0] = a * r00 + b * r10 + c * r20
@@ -179,7 +181,7 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
         if opacity < MIN_ALPHA:
             continue
         for k in range(3):
-            scales[k] = math.exp(float(log_scales[i, k]))
+            scales[k] = math.exp(min(float(log_scales[i, k]), MAX_LOG_SCALE))
         _cam_from_gaussian(camera, quats, scales, i, axes, factor)
         inverse_z = 1.0 / z
         ray_x = min(max(x * inverse_z, camera[19]), camera[20])
@@ -282,7 +284,7 @@ def project_backward(
         y = camera[3] * mx + camera[4] * my + camera[5] * mz + camera[10]
         z = camera[6] * mx + camera[7] * my + camera[8] * mz + camera[11]
         for k in range(3):
-            scales[k] = math.exp(float(log_scales[i, k]))
+            scales[k] = math.exp(min(float(log_scales[i, k]), MAX_LOG_SCALE))
         qw, qx, qy, qz, norm = _cam_from_gaussian(camera, quats, scales, i, axes, factor)
         inverse_z = 1.0 / z
         ray_x, ray_y = x * inverse_z, y * inverse_z
@@ -308,7 +310,7 @@ def project_backward(
             for row in range(3):
                 grad_factor[row, k] = jacobian[0, row] * du + jacobian[1, row] * dv
                 along += grad_factor[row, k] * factor[row, k]
-            grad_log_scales[i, k] = along
+            grad_log_scales[i, k] = along if log_scales[i, k] <= MAX_LOG_SCALE else 0.0
         gx, gy = gpx * jx, gpy * jy
         gz = -(gpx * jx * x + gpy * jy * y) * inverse_z
         # J = (fx/z, 0, -fx/z ray_x; 0, fy/z, -fy/z ray_y); the ray is constant where it is clamped

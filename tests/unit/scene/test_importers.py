@@ -136,3 +136,16 @@ def test_unusable_transforms_are_refused(tmp_path, more, message):
     write_transforms(tmp_path / "in", **more)
     with pytest.raises(SceneError, match=message):
         import_scene(tmp_path / "in", tmp_path / "scene")
+
+
+@pytest.mark.parametrize("factors", [(1, 1, -1), (1.01, 1, 1), (np.nan, 1, 1)])
+def test_poses_that_mirror_or_scale_are_refused(tmp_path, factors):
+    write_transforms(tmp_path / "in", fl_x=40)
+    path = tmp_path / "in" / "transforms.json"
+    content = json.loads(path.read_text())
+    pose = np.array(content["frames"][1]["transform_matrix"])
+    pose[:3, :3] *= factors
+    content["frames"][1]["transform_matrix"] = pose.tolist()
+    path.write_text(json.dumps(content))
+    with pytest.raises(SceneError, match=r"frame 1 \(images/b\): transform_matrix is not a rigid pose"):
+        import_scene(tmp_path / "in", tmp_path / "scene")

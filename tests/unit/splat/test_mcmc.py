@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.special import expit, logit
 
+from hilsplat.base.rotations import rotation_matrices
 from hilsplat.scene.cameras import Camera
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.gaussians import Gaussians
@@ -115,6 +116,20 @@ def test_the_dead_move_onto_the_living_and_moments_begin_anew():
         assert (adam.first["means"][members] == (0 if touched else 1)).all()
 
 
+@pytest.mark.parametrize(("min_opacity", "opacity"), [(0.005, 0.1), (0.003, 0.1), (0.1, 0.6), (0.5, 0.9)])
+def test_gaussians_that_share_a_place_stay_alive(min_opacity, opacity):
+    # an equal share for 51 would be 0.002, 0.002, 0.018 or 0.044: below each threshold
+    adam = Adam.start(some_gaussians([opacity] + [min_opacity / 2] * 200))
+    settings = SETTINGS.model_copy(update={"mcmc_growth": 0.0, "min_opacity": min_opacity})
+    relocate_and_grow(adam, settings, np.random.default_rng(0))
+    assert (opacities(adam) > min_opacity).all()
+    np.testing.assert_allclose(opacities(adam), min_opacity, rtol=1e-5)
+    before = {name: values.copy() for name, values in adam.parameters.items()}
+    relocate_and_grow(adam, settings, np.random.default_rng(1))
+    for name, values in before.items():
+        np.testing.assert_array_equal(adam.parameters[name], values)
+
+
 def test_growth_is_a_share_and_stops_at_the_cap():
     adam = Adam.start(some_gaussians([0.5] * 40))
     settings = SETTINGS.model_copy(update={"mcmc_growth": 0.05, "max_gaussians": 43})
@@ -159,6 +174,22 @@ def test_noise_vanishes_for_opaque_gaussians_and_follows_the_covariance():
     expected = 5e5 * 1e-4 * gate * np.array([0.01, 0.02, 0.005]) ** 2 / 2
     spread = adam.parameters["means"][10:, 1:].std(axis=0)
     np.testing.assert_allclose(spread, expected[1:], rtol=0.05)  # standard error 1.1 %
+
+
+def test_noise_is_normal_numbers_times_the_covariance():
+    parameters = some_gaussians([0.004] * 30)
+    generator = np.random.default_rng(2)
+    parameters["log_scales"] = np.log(generator.uniform(0.001, 0.02, (30, 3))).astype(np.float32)
+    parameters["quats"] = (3 * generator.normal(size=(30, 4))).astype(np.float32)
+    adam = Adam.start({name: values.copy() for name, values in parameters.items()})
+    add_noise(adam, SETTINGS, 1e-4, 2.0, np.random.default_rng(0))
+    normal = np.random.default_rng(0).standard_normal((30, 3), dtype=np.float32)
+    root = rotation_matrices(parameters["quats"]) * np.exp(parameters["log_scales"].astype(float))[:, None]
+    gate = expit(-100 * (0.004 - 0.005))
+    # lengths in units of the extent 2, and back
+    expected = 5e5 * 1e-4 * gate * np.einsum("nij,nkj,nk->ni", root, root, normal) / 2
+    # means lie up to 30 from 0, where float32 steps by 2e-6
+    np.testing.assert_allclose(adam.parameters["means"] - parameters["means"], expected, atol=2e-6)
 
 
 def test_noise_moves_a_scene_in_other_units_alike():

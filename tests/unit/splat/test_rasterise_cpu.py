@@ -22,11 +22,11 @@ def everything(threads: int) -> list[torch.Tensor]:
     base, view = random_gaussians(300, seed=5), camera(70, 90)
     parameters = leaves(base)
     features = torch.linspace(-1, 1, 1800).reshape(300, 6).requires_grad_()
-    out = render(Gaussians(*parameters), view, features=features, threads=threads, depth=True)
+    out = render(Gaussians(*parameters), view, features=features, threads=threads)
     (out.color.square().sum() + out.features.square().sum() + out.alpha.sum()).backward()
     matrix = pixel_weights(base, view, min_weight=1e-3, threads=threads)
     sparse = [torch.from_numpy(values) for values in (matrix.data, matrix.indices, matrix.indptr)]
-    images = [out.color.detach(), out.features.detach(), out.alpha.detach(), out.depth]
+    images = [out.color.detach(), out.features.detach(), out.alpha.detach()]
     return [*images, *(leaf.grad for leaf in [*parameters, features]), *sparse]
 
 
@@ -61,7 +61,7 @@ def test_tiles_list_the_boxes_that_touch_them_front_to_back():
     depths[10:20] = depths[10]  # equal depths stay in the order of the rows
     tiles = bin_gaussians(box, depths, (35, 50))
     order = np.argsort(depths, kind="stable")
-    gaussian = np.empty(tiles.num_entries, np.int32)
+    gaussian = np.empty(tiles.tile_start[-1], np.int32)
     for begin, end in ((0, 5), (5, 6), (6, 12)):  # in pieces: as threads and bands fill them
         fill_lists(begin, end, 0, tiles.tiles_x, tiles.order, tiles.tile_start, box, gaussian)
     for tile in range(4 * 3):

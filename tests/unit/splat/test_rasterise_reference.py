@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.rasterise.reference import render_reference
 from tests.unit.splat.rasterise_scenes import (
     FIELDS,
     camera,
@@ -14,6 +13,7 @@ from tests.unit.splat.rasterise_scenes import (
     round_gaussian,
     straight_camera,
 )
+from tests.unit.splat.reference import render_reference
 
 
 @pytest.mark.parametrize(("opacity", "scale", "depth"), [(0.8, 0.2, 2.0), (0.3, 0.05, 1.0), (0.99, 1.0, 5.0)])

@@ -249,7 +249,7 @@ def break_sens(folder: Path) -> None:
         (break_group, r"group 0: cannot be read: KeyError\('objectId'\)"),
         (break_archive, r"scene0000_00 of ScanNet v2 is incomplete(.|\n)*labels\.ply(.|\n)*unpack"),
         (break_name, r"first\.jpg is not named as a frame\n  expected  <number>\.jpg"),
-        (break_pose, r"0\.txt: the pose is no rotation"),
+        (break_pose, r"0\.txt: the pose is not a rotation"),
         (break_pose_shape, r"0\.txt, line 1: cannot be read\n  expected  4 numbers\n  found     1 0 0"),
         (break_table, r"is no table of ScanNet's labels(.|\n)*found     id,raw_category,nyu40id"),
         (break_depth_of_folder, r"wrong place(.|\n)*fix       move .*scene0000_00/scene0000_00 to"),

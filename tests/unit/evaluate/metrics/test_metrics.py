@@ -7,13 +7,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilsplat.base.levels import Level
-from hilsplat.evaluate.metrics.averages import (
-    accuracy_at,
-    mean_over_classes,
-    mean_over_levels,
-    mean_over_pairs,
-    mean_over_scenes,
-)
 from hilsplat.evaluate.metrics.hierarchy import Family, hierarchical_consistency
 from hilsplat.evaluate.metrics.localization import box_of, hits_a_box, hits_the_mask, peak_points
 from hilsplat.evaluate.metrics.masks import (
@@ -296,44 +289,6 @@ def test_mask_hit_is_stricter_than_box_hit():
     assert box_of(truth).tolist() == [0, 0, 4, 4]
     assert hits_a_box(point, box_of(truth)[None])
     assert not hits_the_mask(point, truth)
-
-
-def test_localization_accuracy_is_the_share_of_pairs():
-    hits = {("f1", "apple"): 1.0, ("f1", "egg"): 1.0, ("f2", "apple"): 0.0}
-    assert mean_over_pairs(hits) == pytest.approx(0.666667, abs=1e-6)
-
-
-# --- averages -------------------------------------------------------------------------------------
-
-
-def test_pooled_and_class_averages_differ():
-    values = {("f1", "apple"): 0.8, ("f1", "egg"): 0.3, ("f2", "apple"): 0.6}
-    assert mean_over_pairs(values) == pytest.approx(1.7 / 3)
-    assert mean_over_classes(values) == pytest.approx((0.7 + 0.3) / 2)
-
-
-def test_scenes_weigh_equally_whatever_their_pairs():
-    assert mean_over_scenes([0.5, 0.7, float("nan")]) == pytest.approx(0.6)
-    assert np.isnan(mean_over_scenes([]))
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.permutations([("f1", "a"), ("f1", "b"), ("f2", "a"), ("f3", "b"), ("f3", "c")]))
-def test_averages_do_not_depend_on_the_order_of_views_and_queries(pairs):
-    value = {("f1", "a"): 0.1, ("f1", "b"): 0.7, ("f2", "a"): 0.2, ("f3", "b"): 0.3, ("f3", "c"): 0.9}
-    shuffled = {pair: value[pair] for pair in pairs}
-    assert mean_over_pairs(shuffled) == mean_over_pairs(value)
-    assert mean_over_classes(shuffled) == mean_over_classes(value)
-
-
-def test_level_averages_weigh_levels_equally():
-    levels, average = mean_over_levels([[0.8, 0.6], [0.5], [0.2, 0.0, 0.1]])
-    assert levels == pytest.approx([0.7, 0.5, 0.1])
-    assert average == pytest.approx(0.433333, abs=1e-6)
-
-
-def test_accuracy_counts_only_ious_above_the_threshold():
-    assert accuracy_at([0.25, 0.26, 0.9, 0.0], 0.25) == pytest.approx(0.5)
 
 
 # --- hierarchical consistency ---------------------------------------------------------------------

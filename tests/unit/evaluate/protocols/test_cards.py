@@ -19,7 +19,6 @@ from hilsplat.evaluate.protocols.cards import (
     TREE_NODES,
     card_of,
 )
-from hilsplat.evaluate.protocols.totals import scene_value, table_value
 from hilsplat.evaluate.protocols.views import label_of
 from hilsplat.settings import EvaluateSettings
 
@@ -115,17 +114,6 @@ def test_rows_lead_back_to_their_protocol():
     assert card_of("lerf/langsplat@1 (filter 20, raw)") is LERF_LANGSPLAT
     with pytest.raises(ArtifactError, match=r"no protocol 'lerf/langsplat@9'"):
         card_of("lerf/langsplat@9")
-
-
-def test_averaging_order_belongs_to_the_protocol():
-    values = {("f1", "apple"): 0.8, ("f1", "egg"): 0.3, ("f2", "apple"): 0.6}
-    assert scene_value(LERF_LANGSPLAT, values) == pytest.approx(1.7 / 3)
-    assert scene_value(LERF_MASK, values) == pytest.approx((0.7 + 0.3) / 2)
-
-
-def test_scenes_of_a_table_weigh_equally():
-    scenes = {"one": {("f", "a"): 0.9, ("f", "b"): 0.5}, "two": {("f", "a"): 0.1}}
-    assert table_value(LERF_LANGSPLAT, scenes) == pytest.approx((0.7 + 0.1) / 2)
 
 
 def test_published_rules_differ_as_stated():

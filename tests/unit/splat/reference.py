@@ -1,7 +1,7 @@
 """Slow, obvious rendering in float64 torch: what the fast backends are tested against.
 
-Every Gaussian is evaluated at every pixel, gradients are torch's own. Used by tests only, and shares
-no code with the backends: the constants stand here again.
+Every Gaussian is evaluated at every pixel, and gradients are torch's own. It shares no code with the
+backends, and repeats their constants and formulas on purpose.
 """
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import Gaussians
 
-_SH = (
+SH = (
     lambda x, y, z: 0.28209479177387814 + 0 * x,
     lambda x, y, z: -0.4886025119029199 * y,
     lambda x, y, z: 0.4886025119029199 * z,
@@ -73,7 +73,7 @@ def render_reference(
     centre = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=1)
 
     direction = torch.nn.functional.normalize(g.means - torch.from_numpy(camera.centre), dim=1)
-    basis = torch.stack([f(*direction.unbind(1)) for f in _SH[: (sh_degree + 1) ** 2]], dim=1)
+    basis = torch.stack([f(*direction.unbind(1)) for f in SH[: (sh_degree + 1) ** 2]], dim=1)
     colours = (torch.einsum("nk,nkc->nc", basis, g.sh[:, : basis.shape[1]]) + 0.5).clamp(min=0)
     if features is not None:
         colours = torch.cat([colours, features.double()], dim=1)

@@ -1,28 +1,8 @@
-"""Turning vectors, quaternions and spherical harmonics."""
+"""Spherical harmonics of 3DGS, and how they turn."""
 
 import numpy as np
 from jaxtyping import Float64
 from scipy.special import sph_harm_y
-
-
-def rotate(
-    quats: Float64[np.ndarray, "N 4"], vectors: Float64[np.ndarray, "N 3"]
-) -> Float64[np.ndarray, "N 3"]:
-    """Turn each vector by its unit quaternion (wxyz)."""
-    # v + 2 w (u x v) + 2 u x (u x v)
-    u = quats[:, 1:]
-    turned = np.cross(u, vectors)
-    return vectors + 2 * (quats[:, :1] * turned + np.cross(u, turned))
-
-
-def multiply(
-    left: Float64[np.ndarray, " 4"], right: Float64[np.ndarray, "N 4"]
-) -> Float64[np.ndarray, "N 4"]:
-    """Quaternion (wxyz) of: first turn by `right`, then by `left`."""
-    w, u = left[0], left[1:]
-    scalar = w * right[:, 0] - right[:, 1:] @ u
-    vector = w * right[:, 1:] + right[:, :1] * u + np.cross(u, right[:, 1:])
-    return np.concatenate([scalar[:, None], vector], axis=1)
 
 
 def sh_basis(directions: Float64[np.ndarray, "P 3"], degree: int) -> Float64[np.ndarray, "P K"]:

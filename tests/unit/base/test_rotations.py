@@ -1,0 +1,95 @@
+"""Quaternions and rotation matrices, against scipy and by hand."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hilsplat.base.compiled import compiled
+from hilsplat.base.rotations import (
+    are_rotations,
+    matrix_entries,
+    multiply,
+    quaternion_of,
+    rotate,
+    rotation_matrices,
+    unit_quaternions,
+)
+
+GENERATOR = np.random.default_rng(3)
+RANDOM = GENERATOR.normal(size=(50, 4)) * GENERATOR.uniform(0.01, 100, (50, 1))
+"""Quaternions wxyz of any length."""
+
+
+def by_scipy(quats: np.ndarray) -> np.ndarray:
+    return Rotation.from_quat(np.roll(quats, -1, axis=1)).as_matrix()
+
+
+@compiled
+def in_a_loop(quats, out):
+    for i in range(len(quats)):
+        entries = matrix_entries(quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3])
+        for k in range(9):
+            out[i, k // 3, k % 3] = entries[k]
+
+
+def test_a_quarter_turn_about_z_by_hand():
+    quarter = np.array([[np.sqrt(0.5), 0, 0, np.sqrt(0.5)]])
+    expected = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    np.testing.assert_allclose(rotation_matrices(7 * quarter)[0], expected, atol=1e-15)
+    np.testing.assert_allclose(rotate(quarter, np.array([[1.0, 0, 0]]))[0], [0, 1, 0], atol=1e-15)
+
+
+def test_no_turn_is_exactly_the_identity():
+    assert (rotation_matrices(np.float32([[3, 0, 0, 0]])) == np.eye(3)).all()
+
+
+def test_matrices_are_scipys():
+    np.testing.assert_allclose(rotation_matrices(RANDOM), by_scipy(RANDOM), atol=1e-14)
+    single = RANDOM.astype(np.float32)
+    np.testing.assert_allclose(rotation_matrices(single), by_scipy(single.astype(float)), atol=1e-14)
+
+
+def test_compiled_loops_have_the_same_matrices_to_the_bit():
+    out = np.empty((len(RANDOM), 3, 3))
+    in_a_loop(unit_quaternions(RANDOM), out)
+    np.testing.assert_array_equal(out, rotation_matrices(RANDOM))
+
+
+def test_a_matrix_has_its_quaternion_back_but_for_its_sign():
+    for matrix, quat in zip(by_scipy(RANDOM), unit_quaternions(RANDOM), strict=True):
+        found = quaternion_of(matrix)
+        np.testing.assert_allclose(found * np.sign(found @ quat), quat, atol=1e-12)
+
+
+def test_turning_by_a_quaternion_is_turning_by_its_matrix():
+    vectors = np.random.default_rng(4).normal(size=(50, 3))
+    turned = np.einsum("nij,nj->ni", rotation_matrices(RANDOM), vectors)
+    np.testing.assert_allclose(rotate(unit_quaternions(RANDOM), vectors), turned, atol=1e-12)
+
+
+def test_a_product_turns_first_by_the_right_and_keeps_its_length():
+    left = np.array([0.5, -0.5, 0.1, 2.0])
+    both = multiply(left, RANDOM)
+    expected = rotation_matrices(left[None]) @ rotation_matrices(RANDOM)
+    np.testing.assert_allclose(rotation_matrices(both), expected, atol=1e-12)
+    lengths = np.linalg.norm(left) * np.linalg.norm(RANDOM, axis=1)
+    np.testing.assert_allclose(np.linalg.norm(both, axis=1), lengths)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda matrix: matrix * [1, 1, -1],  # a mirror
+        lambda matrix: matrix * 1.01,
+        lambda matrix: matrix + np.diag([0.01, 0], k=1),  # a shear
+        lambda matrix: np.where(np.eye(3) > 0, np.nan, matrix),
+        lambda matrix: np.where(np.eye(3) > 0, np.inf, matrix),
+        np.zeros_like,
+    ],
+)
+def test_what_is_not_a_rotation_is_found_among_rotations(spoil):
+    matrices = by_scipy(RANDOM[:5])
+    assert are_rotations(matrices, 1e-12).all()
+    matrices[2] = spoil(matrices[2])
+    assert are_rotations(matrices, 1e-3).tolist() == [True, True, False, True, True]
+    assert not are_rotations(matrices[2], 1e-3)

@@ -1,0 +1,148 @@
+"""From rows to a table's number: every averaging order by hand."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hilsplat.base.errors import ArtifactError
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.evaluate.protocols.cards import (
+    CARDS,
+    LERF_LANGSPLAT,
+    LERF_MASK,
+    LERF_OPENGAUSSIAN,
+    LEVEL_GIVEN,
+    OVS_ARGMAX,
+    ProtocolCard,
+)
+from hilsplat.evaluate.protocols.totals import (
+    level_averages_of_scenes,
+    level_values,
+    mean_over_levels,
+    scene_values,
+    share_above,
+    table_value,
+)
+
+
+def rows_of(
+    card: ProtocolCard,
+    values: Sequence[tuple[str, str, str, float]] | Mapping[tuple[str, str], float],
+    metric: str = "iou",
+    **more: object,
+) -> pd.DataFrame:
+    """Rows of scores from (scene, view, query, value), or of one scene from (view, query) -> value."""
+    if isinstance(values, Mapping):
+        values = [("one", view, query, value) for (view, query), value in values.items()]
+    frame = pd.DataFrame(values, columns=["scene", "view", "query", "value"])
+    return frame.assign(**{"metric": metric, "protocol": card.full_name, "level": "", **more})
+
+
+PAIRS = {("f1", "apple"): 0.8, ("f1", "egg"): 0.3, ("f2", "apple"): 0.6}
+
+
+def test_pairs_of_a_scene_weigh_equally():
+    assert table_value(rows_of(LERF_LANGSPLAT, PAIRS), "iou") == pytest.approx(1.7 / 3)
+
+
+def test_classes_are_averaged_over_views_first():
+    assert table_value(rows_of(LERF_MASK, PAIRS), "iou") == pytest.approx((0.7 + 0.3) / 2)
+
+
+@pytest.mark.parametrize(("card", "first"), [(LERF_LANGSPLAT, 0.4), (LERF_MASK, (0.3 + 0.6) / 2)])
+def test_scenes_weigh_equally_whatever_their_rows(card, first):
+    several = [
+        ("one", "f1", "a", 0.2),
+        ("one", "f2", "a", 0.4),
+        ("one", "f1", "b", 0.6),
+        ("two", "f", "a", 0.1),
+    ]
+    rows = rows_of(card, several)
+    assert scene_values(rows, "iou").to_dict() == pytest.approx({"one": first, "two": 0.1})
+    assert table_value(rows, "iou") == pytest.approx((first + 0.1) / 2)
+
+
+def test_other_metrics_and_levels_stay_out():
+    rows = pd.concat(
+        [
+            rows_of(LEVEL_GIVEN, PAIRS, level="whole"),
+            rows_of(LEVEL_GIVEN, {("f1", "lid"): 0.1}, level="part"),
+            rows_of(LEVEL_GIVEN, {("f1", "apple"): 0.9}, "boundary_iou", level="whole"),
+        ]
+    )
+    assert table_value(rows, "iou") == pytest.approx(1.8 / 4)
+    assert table_value(rows, "iou", "part") == pytest.approx(0.1)
+    assert math.isnan(table_value(rows, "iou", "subpart"))
+    assert math.isnan(table_value(rows, "localization_box"))
+    assert math.isnan(table_value(rows[:0], "iou"))
+
+
+@given(st.permutations(range(5)), st.sampled_from([LERF_LANGSPLAT, LERF_MASK]))
+def test_the_order_of_rows_does_not_matter(order, card):
+    values = {("f1", "a"): 0.1, ("f1", "b"): 0.7, ("f2", "a"): 0.2, ("f3", "b"): 0.3, ("f3", "c"): 0.9}
+    rows = rows_of(card, values)
+    # a sum in another order may differ in its last bit
+    assert table_value(rows.iloc[order], "iou") == pytest.approx(table_value(rows, "iou"), rel=1e-14)
+
+
+def test_levels_weigh_equally_and_those_without_rows_are_left_out():
+    of_level = {Level.WHOLE: [0.8, 0.6], Level.PART: [0.5], Level.SUBPART: [0.2, 0.0, 0.1]}
+    rows = pd.concat(
+        rows_of(LEVEL_GIVEN, {("f", str(n)): v for n, v in enumerate(values)}, level=level.label)
+        for level, values in of_level.items()
+    )
+    found = level_values(rows, "iou")
+    assert [found[level] for level in LEVELS] == pytest.approx([0.7, 0.5, 0.1])
+    assert mean_over_levels(found.values()) == pytest.approx(1.3 / 3)
+    without = level_values(rows[rows["level"] != "part"], "iou")
+    assert math.isnan(without[Level.PART])
+    assert mean_over_levels(without.values()) == pytest.approx(0.4)
+    assert math.isnan(mean_over_levels([math.nan] * 3))
+
+
+def test_only_values_above_the_threshold_count():
+    rows = rows_of(LERF_LANGSPLAT, {("f", str(n)): v for n, v in enumerate((0.25, 0.26, 0.9, 0.0))})
+    assert share_above(rows, "iou", 0.25) == pytest.approx(0.5)
+
+
+def test_scenes_are_paired_by_their_levels_over_all_seeds():
+    # seed 0: whole 0.4 and 0.6, part 0.1; seed 1: whole 0.9 alone
+    rows = pd.concat(
+        [
+            rows_of(LEVEL_GIVEN, {("f", "a"): 0.4, ("f", "b"): 0.6}, level="whole", seed="0"),
+            rows_of(LEVEL_GIVEN, {("f", "c"): 0.1}, level="part", seed="0"),
+            rows_of(LEVEL_GIVEN, {("f", "a"): 0.9}, level="whole", seed="1"),
+        ]
+    )
+    expected = ((0.5 + 0.1) / 2 + 0.9) / 2
+    assert level_averages_of_scenes(rows, "iou").to_dict() == pytest.approx({"one": expected})
+
+
+def test_settings_that_depart_from_a_protocol_keep_its_order():
+    rows = rows_of(LERF_MASK, PAIRS, protocol=f"{LERF_MASK.full_name} (filter 20)")
+    assert table_value(rows, "iou") == pytest.approx(0.5)
+
+
+def test_orders_are_not_mixed_and_pooled_protocols_have_no_number_per_scene():
+    both = pd.concat([rows_of(LERF_MASK, PAIRS), rows_of(OVS_ARGMAX, PAIRS)])
+    with pytest.raises(AssertionError, match="several averaging orders"):
+        table_value(both, "iou")
+    for card in CARDS:
+        if card.averaging == "pooled":
+            with pytest.raises(AssertionError, match="pooled"):
+                table_value(rows_of(card, PAIRS), "iou")
+
+
+def test_rows_of_a_protocol_that_is_no_more_are_refused():
+    stale = rows_of(LERF_LANGSPLAT, PAIRS, protocol="lerf/langsplat@0")
+    with pytest.raises(ArtifactError, match="there is no protocol 'lerf/langsplat@0'"):
+        table_value(stale, "iou")
+
+
+def test_localization_accuracy_is_the_share_of_pairs():
+    hits = {("f1", "apple"): 1.0, ("f1", "egg"): 1.0, ("f2", "apple"): 0.0}
+    assert table_value(rows_of(LERF_OPENGAUSSIAN, hits), "iou") == pytest.approx(2 / 3)
