@@ -215,6 +215,15 @@ def match_features(database: Path, num_views: int, settings: PosesSettings, seed
     return matcher
 
 
+def incremental_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
+    """Options of COLMAP's incremental mapper and triangulator, on one thread with fixed seeds."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+    options.min_num_matches = MIN_INLIERS
+    return options
+
+
 @dataclass(frozen=True)
 class MatchCounts:
     """What matching found for one view.

@@ -9,8 +9,8 @@ from jaxtyping import Float64, UInt8
 from hilsplat.scene.assemble import PosedView
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.features import (
-    MIN_INLIERS,
     extract_features,
+    incremental_options,
     match_features,
 )
 from hilsplat.scene.model import sparse_points
@@ -41,16 +41,13 @@ def triangulate(
     with pycolmap.Database.open(database) as opened:
         for view in views:
             entry = opened.read_image_with_name(view.view)
+            assert entry is not None  # imported above
             model.add_camera_with_trivial_rig(opened.read_camera(entry.camera_id))
             image = pycolmap.Image(name=view.view, camera_id=entry.camera_id, image_id=entry.image_id)
             model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.cam_from_source[:3]))
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = options.mapper.num_threads = 1
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
-    options.min_num_matches = MIN_INLIERS
     target = work / "triangulated"
     target.mkdir()
-    model = pycolmap.triangulate_points(model, database, folder, target, options=options)
+    model = pycolmap.triangulate_points(model, database, folder, target, options=incremental_options(seed))
     return sparse_points(model)
 
 

@@ -15,7 +15,7 @@ from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.known_poses import KnownPoses, KnownView
 from hilsplat.scene.llff import llff_views
-from hilsplat.scene.model import pose_matrix, reprojection_errors, sparse_points
+from hilsplat.scene.model import camera_of, pose_matrix, reprojection_errors, sparse_points
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -60,7 +60,7 @@ def read_colmap(
             KnownView(
                 image.name,
                 _find_image(known.root, image.name),
-                pycolmap.Camera(image.camera.todict()),
+                pycolmap.Camera(camera_of(image).todict()),
                 pose_matrix(image.cam_from_world()),
             )
         )

@@ -21,13 +21,14 @@ from hilsplat.scene.features import (
     WorkImage,
     count_matches,
     extract_features,
+    incremental_options,
     match_features,
     prepare_images,
     register_images,
 )
 from hilsplat.scene.importers import import_poses
 from hilsplat.scene.known_poses import find_known_poses
-from hilsplat.scene.model import pose_matrix, reprojection_errors, sparse_points
+from hilsplat.scene.model import camera_of, pose_matrix, reprojection_errors, sparse_points
 from hilsplat.scene.sheet import MIN_PHOTOS, photo_folder
 from hilsplat.settings import PosesSettings
 
@@ -146,7 +147,9 @@ def _reconstruct(
     check_registration(images, name, report, settings)
     assert model is not None
     views = [
-        PosedView(image.name, work / "images" / image.name, image.camera, pose_matrix(image.cam_from_world()))
+        PosedView(
+            image.name, work / "images" / image.name, camera_of(image), pose_matrix(image.cam_from_world())
+        )
         for image in (model.images[image_id] for image_id in model.reg_image_ids())
     ]
     xyz, rgb = sparse_points(model)
@@ -164,36 +167,33 @@ def map_views(
     """
     folder.mkdir(parents=True, exist_ok=True)
     if mapper == "incremental":
-        options = pycolmap.IncrementalPipelineOptions()
-        options.num_threads = options.mapper.num_threads = 1
-        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
-        options.min_num_matches = MIN_INLIERS
+        options = incremental_options(seed)
         options.min_model_size = MIN_PHOTOS
         options.mapper.init_min_num_inliers = INIT_MIN_INLIERS
         options.mapper.abs_pose_min_num_inliers = POSE_MIN_INLIERS
         models = pycolmap.incremental_mapping(database, images, folder, options)
     else:
-        options = pycolmap.GlobalPipelineOptions()
-        options.num_threads = options.mapper.num_threads = 1
-        options.mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
-        options.min_num_matches = MIN_INLIERS
-        options.min_model_size = MIN_PHOTOS
-        for part in (
-            options,
-            options.mapper,
-            options.mapper.rotation_averaging,
-            options.mapper.global_positioning,
-            options.mapper.retriangulation,
-        ):
-            part.random_seed = seed
-        options.mapper.global_positioning.use_gpu = False
-        options.mapper.bundle_adjustment.ceres.use_gpu = False
-        models = pycolmap.global_mapping(database, images, folder, options)
+        models = pycolmap.global_mapping(database, images, folder, _global_options(seed))
     large_enough = [
         (number, model) for number, model in models.items() if model.num_reg_images() >= MIN_PHOTOS
     ]
     large_enough.sort(key=lambda item: (-item[1].num_reg_images(), -item[1].num_points3D(), item[0]))
     return [model for _, model in large_enough]
+
+
+def _global_options(seed: int) -> pycolmap.GlobalPipelineOptions:
+    """Options of COLMAP's global mapper, on one thread with fixed seeds."""
+    options = pycolmap.GlobalPipelineOptions()
+    mapper = options.mapper
+    options.num_threads = mapper.num_threads = 1
+    mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
+    options.min_num_matches = MIN_INLIERS
+    options.min_model_size = MIN_PHOTOS
+    options.random_seed = mapper.random_seed = mapper.rotation_averaging.random_seed = seed
+    mapper.global_positioning.random_seed = mapper.retriangulation.random_seed = seed
+    mapper.global_positioning.use_gpu = False
+    mapper.bundle_adjustment.ceres.use_gpu = False
+    return options
 
 
 def registration_report(

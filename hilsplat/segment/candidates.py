@@ -8,6 +8,7 @@ from jaxtyping import Float32, Int8, Int32, Int64, UInt8
 from hilsplat.base.artifacts import sha256_of_json
 from hilsplat.base.identity import code_digest
 from hilsplat.segment.logit_kernels import edge_windows
+from hilsplat.segment.masks import join_rows
 from hilsplat.segment.sam import HEADS, Frame, SamModel, point_grid, read_logits
 from hilsplat.settings import MasksSettings
 
@@ -60,16 +61,8 @@ class Candidates:
     @staticmethod
     def concatenate(parts: "list[Candidates]") -> "Candidates":
         """Rows of all parts, at least one, one after the other."""
-        starts = np.cumsum([0, *(len(part.logits) for part in parts)])
-        offsets = [part.offsets[1:] + start for part, start in zip(parts, starts[:-1], strict=True)]
-        return Candidates(
-            offsets=np.concatenate([np.zeros(1, np.int64), *offsets]),
-            low_hw=parts[0].low_hw,
-            **{
-                name: np.concatenate([getattr(part, name) for part in parts])
-                for name in ("logits", "window_xyxy", "head", "predicted_iou", "stability", "crop")
-            },
-        )
+        names = ("window_xyxy", "head", "predicted_iou", "stability", "crop")
+        return Candidates(low_hw=parts[0].low_hw, **join_rows(parts, "logits", names))
 
 
 def crop_boxes(

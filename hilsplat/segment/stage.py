@@ -56,7 +56,11 @@ def run_masks(scene_folder: Path, out: Path, cache: Path, settings: MasksSetting
     with stage_log("masks", scene.name) as counts:
         if settings.segmenter == "sam":
             model = SamModel.load(Path(settings.model))
-            identity = {"segmenter": "sam", "model": settings.model, "model_sha256": model.digest}
+            identity: dict[str, str | None] = {
+                "segmenter": "sam",
+                "model": settings.model,
+                "model_sha256": model.digest,
+            }
 
             def segment(view: str) -> HierarchicalMasks:
                 return sam_masks(scene, view, model, view_cache, settings)

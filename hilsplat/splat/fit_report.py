@@ -55,7 +55,9 @@ def write_report(
     views, split = load_views(scene, "test", settings.image_scale), "test"
     if not views:
         views, split = load_views(scene, "train", settings.image_scale), "train"
-    scores, flat, cells = {}, [], []
+    scores: dict[str, dict[str, float]] = {}
+    flat: list[float] = []
+    cells: list[UInt8[np.ndarray, "_ _ 3"]] = []
     for view in views:
         shown = picture(view.camera)  # scored as the 8-bit image one would save
         drawn, truth = to_float(shown), to_float(view.image)
@@ -64,7 +66,7 @@ def write_report(
         if len(cells) < 3 * MAX_SHOWN:
             error = np.abs(view.image.astype(np.int32) - shown) * ERROR_GAIN
             cells += [view.image, shown, np.minimum(error, 255).astype(np.uint8)]
-    report = {
+    report: dict[str, Any] = {
         "split": split,
         "psnr_db": float(np.mean([score["psnr_db"] for score in scores.values()])),
         "ssim": float(np.mean([score["ssim"] for score in scores.values()])),

@@ -70,7 +70,7 @@ def first_gaussians(
     return {
         "means": xyz.astype(np.float32),
         "log_scales": np.repeat(np.log(spacing)[:, None], 3, axis=1).astype(np.float32),
-        "quats": np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        "quats": np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
         "opacity_logits": np.full(n, np.log(FIRST_OPACITY / (1 - FIRST_OPACITY)), np.float32),
         "sh": sh,
     }

@@ -115,13 +115,8 @@ def add_noise(
     p = adam.parameters
     normal = generator.standard_normal(p["means"].shape, dtype=np.float32)
     arrays = (p["means"], p["log_scales"], p["quats"], p["opacity_logits"], normal)
-    over_ranges(
-        lambda begin, end: _noise_rows(
-            begin, end, *arrays, settings.min_opacity, settings.mcmc_noise * rate_of_means, extent
-        ),
-        len(adam),
-        threads,
-    )
+    weight = settings.mcmc_noise * rate_of_means
+    over_ranges(_noise_rows, len(adam), threads, *arrays, settings.min_opacity, weight, extent)
 
 
 def add_regularisers(adam: Adam, gradients: Gradients, settings: GaussiansSettings, extent: float) -> None:

@@ -166,19 +166,11 @@ def photometric_loss(
     t, _ = _padded(target)
     slopes = np.zeros(3 * len(x), np.float32)
     ssim_sums, l1_sums = np.empty(height), np.empty(height)
-    over_ranges(
-        lambda begin, end: _ssim_rows(begin, end, num, stride, x, t, slopes, ssim_sums, l1_sums),
-        height,
-        threads,
-    )
+    over_ranges(_ssim_rows, height, threads, num, stride, x, t, slopes, ssim_sums, l1_sums)
     gradient = np.empty((height, num), np.float32)
     count = height * num
     weights = np.float32((1 - ssim_weight) / count), np.float32(ssim_weight / count)
-    over_ranges(
-        lambda begin, end: _gradient_rows(begin, end, num, stride, x, t, slopes, *weights, gradient),
-        height,
-        threads,
-    )
+    over_ranges(_gradient_rows, height, threads, num, stride, x, t, slopes, *weights, gradient)
     loss = (1 - ssim_weight) * l1_sums.sum() / count + ssim_weight * (1 - ssim_sums.sum() / count)
     return float(loss), gradient.reshape(height, width, 3)
 

@@ -67,15 +67,15 @@ class FitState:
         if arrays["key"].item() != key:
             logger.info("checkpoint %s belongs to other inputs; the fit starts anew", path)
             return None
-        tables = [
+        parameters, first, second = (
             {name: arrays[f"{table}_{name}"] for name in FIELDS}
             for table in ("parameters", "first", "second")
-        ]
+        )
         generator = np.random.default_rng()
         generator.bit_generator.state = json.loads(arrays["generator"].item())
         step, adam_steps = (int(count) for count in arrays["counts"])
         return FitState(
-            Adam(*tables, steps=adam_steps),
+            Adam(parameters, first, second, adam_steps),
             ScreenGradients(arrays["gradient_total"], arrays["gradient_seen"]),
             generator,
             arrays["order"].tolist(),

@@ -165,7 +165,11 @@ def draw(parameters: Parameters, camera: Camera, degree: int) -> Drawn:
             [torch.from_numpy(np.ascontiguousarray(grad)).cuda() for grad in (grad_image, grad_alpha)],
         )
         *by_field, by_mean_px = (grad.cpu().numpy() for grad in grads)
-        return Gradients(*by_field, np.zeros((len(leaves[0]), 0), np.float32), by_mean_px[0])
+        return Gradients(
+            **dict(zip(fields, by_field, strict=True)),
+            features=np.zeros((len(leaves[0]), 0), np.float32),
+            means_px=by_mean_px[0],
+        )
 
     drawn = (notes["radii"][0] > 0).all(dim=-1).cpu().numpy()
     return Drawn(image.detach().cpu().numpy(), alpha.detach().cpu().numpy(), drawn, gradients)
