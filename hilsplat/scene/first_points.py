@@ -1,4 +1,4 @@
-"""Sparse points of views whose poses are known: triangulated, or random where that fails."""
+"""Sparse points of views whose poses are known: triangulated, or random if that fails."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,7 +25,7 @@ NUM_RANDOM_POINTS = 20_000
 def triangulate(
     views: Sequence[PosedView], work: Path, settings: PosesSettings, seed: int, threads: int
 ) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
-    """Sparse points of pinhole views with known poses: features, matches, triangulation; poses stay."""
+    """Sparse points of pinhole views with known poses: features, matches, triangulation at fixed poses."""
     if len(views) < 2:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)
     folder, database = views[0].image.parent, work / "triangulation.db"
@@ -54,7 +54,7 @@ def triangulate(
 def random_points(
     views: Sequence[PosedView], seed: int
 ) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
-    """Random points that cameras see, to start a fit where triangulation found none.
+    """Random points that cameras see, to start a fit if triangulation found too few.
 
     Each lies on the ray of a random pixel of a random view, at a depth between 0.3 and 2 times the
     distance from the camera to the point nearest to all optical axes; grey.
@@ -62,7 +62,7 @@ def random_points(
     generator = np.random.default_rng(seed)
     centres = np.stack([view.centre for view in views])
     looks = np.stack([view.cam_from_source[2, :3] for view in views])
-    # Least squares for the point nearest to all axes, with a weak pull to one camera spread ahead.
+    # Least squares for the point nearest to all axes, weakly drawn to one camera spread ahead.
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()) or 1.0
     across = np.eye(3)[None] - looks[:, :, None] * looks[:, None, :]
     prior = 1e-3

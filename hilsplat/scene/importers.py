@@ -1,4 +1,4 @@
-"""Make a scene of images whose poses are known."""
+"""Make a scene from images with known poses."""
 
 import logging
 from collections.abc import Collection, Sequence
@@ -42,9 +42,9 @@ def import_poses(
 ) -> dict[str, Any]:
     """Write the Scene artifact of a folder with known poses; returns the registration report.
 
-    Images are matched to poses by name; poses without an image and images without a pose are named
-    in the report. The pixels are taken as stored, since COLMAP pays no heed to the EXIF orientation.
-    Coordinates keep the source's axes.
+    Images are matched to poses by name; poses without an image and images without a pose are listed
+    in the report. Pixels are used as stored, because COLMAP ignores the EXIF orientation. Coordinates
+    keep the source's axes.
 
     Raises:
         SceneError: the model or transforms file cannot be used.
@@ -114,7 +114,7 @@ def import_poses(
         "views": entries,
     }
     names = [view.view for view in views]
-    if any(view.is_test for view in present):  # the source has a split of its own
+    if any(view.is_test for view in present):  # the source brings its own split
         split = {name: "test" if view.is_test else "train" for name, view in zip(names, present, strict=True)}
     else:
         split = split_views(names, settings.test_every)
@@ -129,10 +129,10 @@ def _check_present(
     missing: Sequence[str],
     settings: PosesSettings,
 ) -> None:
-    """Refuse a source most of whose images are not there."""
+    """Refuse a source with too few of its images."""
     total = len(present) + len(missing)
     if total == 0:
-        raise SceneError(f"{known.files[0]} of {name} poses no view", fix="export it again")
+        raise SceneError(f"{known.files[0]} of {name} does not pose any view", fix="export it again")
     if not present or len(present) < settings.min_registered_share * total:
         listed = ", ".join(missing[:20]) + (f" and {len(missing) - 20} more" if len(missing) > 20 else "")
         raise RegistrationError(
@@ -163,10 +163,10 @@ def _with_pixels(view: KnownView, file: Path, view_name: str, folder: Path, max_
 
 
 def _read_as_described(path: Path, camera: pycolmap.Camera) -> UInt8[np.ndarray, "H W 3"]:
-    """Pixels of an image in the orientation whose shape fits the camera; as stored where both do.
+    """Pixels of an image in the orientation whose shape fits the camera; as stored if both fit.
 
     Raises:
-        ImageError: unreadable, or of another shape than the camera says.
+        ImageError: the image cannot be read, or no orientation fits the camera.
     """
     upright = read_image(path)
     candidates = [upright]

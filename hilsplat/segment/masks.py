@@ -189,7 +189,7 @@ class HierarchicalMasks:
 
     @staticmethod
     def concatenate(parts: "list[HierarchicalMasks]", size_hw: tuple[int, int]) -> "HierarchicalMasks":
-        """Rows of all parts, one after the other; `size_hw` is the view's where there is no part."""
+        """Rows of all parts, one after the other; `size_hw` is the view's size, px."""
         empty = HierarchicalMasks.from_dense(
             np.zeros((0, *size_hw), bool),
             np.zeros(0, np.uint8),
@@ -202,8 +202,8 @@ class HierarchicalMasks:
     def content_order(self) -> Int64[np.ndarray, " M"]:
         """Rows sorted by what they hold: level, large to small, box, predicted IoU, runs.
 
-        The order depends on no row numbers, so a segmenter that ends with it gives the same file
-        whatever order its prompts came in.
+        The order does not depend on row numbers, so a segmenter that ends with it writes the same file
+        whatever the order of its prompts.
         """
         keys = [
             (

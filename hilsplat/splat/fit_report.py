@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 MAX_SHOWN = 8
 """Views on the sheet of test views."""
 ERROR_GAIN = 4
-"""Errors are shown so many times as large."""
+"""Errors are shown magnified by this factor."""
 
 
 def write_report(
@@ -39,10 +39,10 @@ def write_report(
     """Write the report folder and return report.json's content.
 
     It holds `report.json`, `test_views.png` (photograph, rendering, error), `flyaround.png`,
-    `flyaround.mp4` where ffmpeg is on PATH, `curves.png` where there was a fit, and the index.
+    `flyaround.mp4` if ffmpeg is on PATH, `curves.png` after a fit, and the index.
 
     Args:
-        scene: the held-out views are scored; where there is none, the training views.
+        scene: its held-out views are scored, or its training views if none are held out.
         curve: rows of (step, loss, training PSNR in dB, number of Gaussians); None without a fit.
         origin: where the Gaussians come from.
     """

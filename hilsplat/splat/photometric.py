@@ -26,10 +26,10 @@ _ZERO, _TWO = np.float32(0.0), np.float32(2.0)
 @compiled
 @no_type_check
 def _ssim_rows(begin, end, num, stride, image, target, slopes, ssim_sums, l1_sums):
-    """SSIM of padded rows begin..end and, in `slopes`, its derivatives by mean, square and product.
+    """SSIM of padded rows begin..end and, in `slopes`, its derivatives.
 
     `slopes` (3 padded maps, flat) receives dSSIM/dE[x] (means' own part and that of the variances),
-    dSSIM/dE[x^2], dSSIM/dE[x y] of every pixel's window. Empty: values only.
+    dSSIM/dE[x^2], dSSIM/dE[x y] of every pixel's window. If it is empty, only values are computed.
     """
     groups = (num + _LANES - 1) // _LANES
     row_length = groups * _LANES + 2 * _SIDE
@@ -153,12 +153,12 @@ def photometric_loss(
     ssim_weight: float,
     threads: int = 1,
 ) -> tuple[float, Float32[np.ndarray, "H W 3"]]:
-    """(1 - w) mean |image - target| + w (1 - SSIM), and its gradient by `image` (3DGS, Eq. 7).
+    """(1 - w) mean |image - target| + w (1 - SSIM), and its gradient with respect to `image` (3DGS, Eq. 7).
 
     Args:
         image, target: RGB in [0, 1].
         ssim_weight: w; 3DGS takes 0.2.
-        threads: the result is the same bytes for any number.
+        threads: the result has the same bytes for any number.
     """
     height, width, _ = image.shape
     num = 3 * width
@@ -186,6 +186,6 @@ def ssim(image: Float32[np.ndarray, "H W 3"], target: Float32[np.ndarray, "H W 3
 
 
 def psnr(image: Float32[np.ndarray, "H W 3"], target: Float32[np.ndarray, "H W 3"]) -> float:
-    """Peak signal-to-noise ratio in dB of two RGB images in [0, 1]; infinite where they are equal."""
+    """Peak signal-to-noise ratio in dB of two RGB images in [0, 1]; infinite if they are equal."""
     error = np.square(image.astype(np.float64) - target).mean()
     return float("inf") if error == 0 else float(-10 * np.log10(error))

@@ -50,14 +50,14 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
 def load_ply(path: Path, fix: str = "delete it and run the gaussians stage again") -> Gaussians:
     """Read a 3DGS PLY, of this package or another; the number of f_rest columns gives the degree.
 
-    Binary or ASCII, properties in any order and of any number type; properties that 3DGS does not
-    know (colours, labels) and normals are passed over, present or not.
+    Binary or ASCII, properties in any order and of any number type; normals and properties unknown to
+    3DGS (colours, labels) are ignored.
 
     Args:
-        fix: what a person can do about a file that cannot be used.
+        fix: advice for a file that cannot be used.
 
     Raises:
-        ArtifactError: the file is missing, damaged, no 3DGS PLY or holds numbers that are not finite.
+        ArtifactError: the file is missing, damaged or not a 3DGS PLY, or holds numbers that are not finite.
     """
     path = Path(path)
     try:
@@ -65,7 +65,7 @@ def load_ply(path: Path, fix: str = "delete it and run the gaussians stage again
     except FileNotFoundError as error:
         raise ArtifactError(f"{path} is missing", fix="run the gaussians stage") from error
     except (PlyParseError, KeyError, ValueError, EOFError) as error:
-        raise ArtifactError(f"{path} is no readable PLY: {error}", fix=fix) from error
+        raise ArtifactError(f"{path} is not a readable PLY: {error}", fix=fix) from error
     found = {prop.name for prop in vertex.properties}
     if "packed_position" in found:
         raise ArtifactError(f"{path} is a compressed PLY", expected="a plain 3DGS PLY", fix=fix)
@@ -74,7 +74,7 @@ def load_ply(path: Path, fix: str = "delete it and run the gaussians stage again
     missing = [name for name in _names(num_bases) if name not in found and name not in ("nx", "ny", "nz")]
     if missing or num_rest not in (0, 9, 24, 45):
         raise ArtifactError(
-            f"{path} is no 3DGS PLY",
+            f"{path} is not a 3DGS PLY",
             expected="x y z, f_dc_0..2, 0, 9, 24 or 45 f_rest_*, opacity, scale_0..2, rot_0..3",
             found=f"{num_rest} f_rest columns" + (f"; without {', '.join(missing[:5])}" if missing else ""),
             fix=fix,

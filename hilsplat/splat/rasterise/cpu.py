@@ -1,6 +1,6 @@
 """The CPU backend: projection, tile lists and blending over threads, on plain arrays.
 
-Threads take ranges of Gaussians or tiles; nothing is summed across threads, so every result is the
+Threads take ranges of Gaussians or tiles; nothing is summed across threads, so every result has the
 same bytes for any number of them.
 """
 
@@ -21,7 +21,7 @@ from hilsplat.splat.rasterise.blend import add_slots, blend, blend_backward, ble
 from hilsplat.splat.rasterise.project import GEOMETRY, MOMENTS, pack_camera, project, project_backward
 
 RANGES_PER_THREAD = 4
-"""Ranges that work is cut into for each thread, so that threads end together."""
+"""Ranges of work per thread, so that threads finish together."""
 
 
 @cache
@@ -69,10 +69,10 @@ class Projected:
         size_hw: image size, px.
         degree: spherical-harmonics degree that was used.
         geometry: see `project.GEOMETRY`.
-        box: pixel box of each Gaussian; last < first where it is not drawn.
+        box: pixel box of each Gaussian; last < first if it is not drawn.
         colours: RGB in this view.
         tiles: depth order and sizes of the tile lists; `tile_lists` fills them band by band.
-        only_band: the filled lists, where one band holds them all and was filled already.
+        only_band: the filled lists, once filled, if one band holds them all.
     """
 
     camera: Float64[np.ndarray, " 25"]
@@ -106,7 +106,7 @@ class Drawn:
         image: premultiplied RGB, without background.
         alpha: coverage.
         drawn: whether a Gaussian reaches a pixel of the view.
-        gradients: of the parameters, from those of image and alpha.
+        gradients: function from the gradients of image and alpha to those of the parameters.
     """
 
     image: Float32[np.ndarray, "H W 3"]
@@ -116,7 +116,7 @@ class Drawn:
 
 
 def refuse_broken(broken: int, total: int) -> None:
-    """Raise where parameters are not finite or quaternions have length zero."""
+    """Raise if parameters are not finite or quaternions have length zero."""
     if broken:
         raise HilsplatError(
             f"{broken} of {total} Gaussians cannot be drawn: not finite, or a zero quaternion",
@@ -161,7 +161,7 @@ class Band:
 def tile_lists(view: Projected, threads: int) -> Iterator[Band]:
     """Fill the tile lists, a band of tiles at a time so that memory stays bounded.
 
-    Where one band holds all tiles it is kept for the next pass over the view.
+    If one band holds all tiles, it is kept for the next pass over the view.
     """
     if view.only_band:
         yield view.only_band[0]

@@ -1,7 +1,7 @@
 """The CUDA backend: gsplat (extra `gpu`) behind the functions and conventions of the CPU backend.
 
 Written against the public interface of gsplat 1.5 and its CUDA sources. It has not been run on a
-device yet: the tests of the rasteriser cover it where torch finds one. Sums on CUDA are atomic, so
+device yet: the tests of the rasteriser cover it if torch finds one. Sums on CUDA are atomic, so
 gradients repeat to rounding, not to the bit.
 
 gsplat works in float32 throughout: a Gaussian wider than about 1e9 px overflows there.
@@ -43,7 +43,7 @@ def _on_device(gaussians: Gaussians) -> Gaussians:
 def blend(
     gaussians: Gaussians, camera: Camera, channels: Float[Tensor, "N C"]
 ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"], dict[str, Any]]:
-    """Blend channels of Gaussians that are on the device: premultiplied image, alpha, gsplat's notes."""
+    """Blend channels of Gaussians on the device: premultiplied image, alpha, intermediate results."""
     import gsplat
 
     height, width = camera.size_hw
@@ -80,7 +80,7 @@ def colours(gaussians: Gaussians, camera: Camera, degree: int) -> Float[Tensor, 
 def render_channels(
     gaussians: Gaussians, camera: Camera, degree: int, features: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Premultiplied RGB (+ features) and alpha, where the Gaussians are."""
+    """Premultiplied RGB (+ features) and alpha, on the Gaussians' device."""
     home = gaussians.means.device
     if len(gaussians) == 0:
         width = 3 + (features.shape[1] if features is not None else 0)
@@ -95,10 +95,10 @@ def render_channels(
 
 
 def pixel_weights(gaussians: Gaussians, camera: Camera, min_weight: float) -> csr_matrix:
-    """Blending weights of each Gaussian at each pixel, as the CPU backend's `pixel_weights`.
+    """Blending weights of each Gaussian at each pixel, as `api.pixel_weights` returns them.
 
-    gsplat lists who is blended at each pixel; the weights follow from the projected Gaussians. The
-    list takes about 60 bytes a hit on the device (some 40 hits a pixel).
+    gsplat lists which Gaussians are blended at each pixel; the weights follow from the projected
+    Gaussians. The list takes about 60 bytes per entry on the device (some 40 entries per pixel).
     """
     import gsplat
 

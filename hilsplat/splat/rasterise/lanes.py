@@ -1,6 +1,6 @@
 """Sixteen float32 lanes as one numba value, so that a 4x4-pixel block is a single vector.
 
-numba turns a loop over 16 pixels into vector code only where it can prove that arrays do not
+numba turns a loop over 16 pixels into vector code only if it can prove that arrays do not
 overlap, and it spills every temporary to memory. A value of type `Lanes` is an LLVM `<16 x float>`:
 arithmetic on it is vector arithmetic and accumulators stay in registers. LLVM splits it into what
 the machine has (one register with AVX-512, two with AVX2, four with NEON).
@@ -120,7 +120,7 @@ def exp2_negative(typingctx, value):
     """2**x for x in [-126, 0], relative error below 3e-7.
 
     Truncation gives x = k + f with f in (-1, 0]; a degree-6 polynomial is 2**f and k goes into the
-    exponent bits. Lanes outside the range hold something finite or infinite, never a trap.
+    exponent bits. Lanes outside the range get some finite or infinite number; nothing traps.
     """
 
     def codegen(context, builder, sig, args):
