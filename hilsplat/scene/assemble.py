@@ -1,4 +1,4 @@
-"""From posed views to the scene artifact: pinhole images, sane coordinates, split, registration report."""
+"""From posed views to the scene artifact: pinhole images, normalised coordinates, split, report."""
 
 import logging
 import shutil
@@ -19,10 +19,10 @@ from hilsplat.scene.scene import Scene
 logger = logging.getLogger(__name__)
 
 MIN_VIEWS_FOR_TEST = 8
-"""With fewer views none is held out: each one is needed for the fit."""
+"""With fewer views none is held out: the fit needs every one."""
 
 MIN_LEVELNESS_GAP = 3.0
-"""How much better "up" must explain level cameras than the next direction, to be taken from them."""
+"""Up is taken from the cameras' x axes if it fits them this many times better than the next direction."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ def up_direction(cam_from_source: Float64[np.ndarray, "V 4 4"]) -> Float64[np.nd
     """Estimate which way is up from cameras that were mostly held level.
 
     Level cameras have their x axes in the horizontal plane, whatever their tilt, so up is the
-    direction most orthogonal to all of them. Where the x axes are nearly parallel (a camera that
-    only moved sideways) that is ambiguous, and the mean of the cameras' own up axes is taken.
+    direction most orthogonal to all of them. If the x axes are nearly parallel (a camera that only
+    moved sideways), that direction is ambiguous, and the mean of the cameras' own up axes is used.
     """
     right, up_of_camera = cam_from_source[:, 0, :3], -cam_from_source[:, 1, :3]
     mean_up = up_of_camera.mean(axis=0)
@@ -99,12 +99,12 @@ def normalising_similarity(
     metric: bool,
     turn: bool,
 ) -> Float64[np.ndarray, "4 4"]:
-    """The similarity `scene_from_source` that gives every scene sane coordinates.
+    """The similarity `scene_from_source` that normalises the coordinates of a scene.
 
-    The origin is the median of the sparse points (of the camera centres where there are none). One
+    The origin is the median of the sparse points (of the camera centres if there are none). One
     unit is the median distance of the cameras from it, so a scene fills a few units whatever its
-    size; metric sources keep their metre. With `turn`, +z is up as the cameras were held: structure
-    from motion leaves the rotation to chance, imported poses keep their own axes.
+    size; metric sources keep the metre. With `turn`, +z is up as the cameras were held: structure
+    from motion leaves the rotation arbitrary, whereas imported poses keep their axes.
     """
     rotations = cam_from_source[:, :3, :3]
     centres = -np.einsum("vji,vj->vi", rotations, cam_from_source[:, :3, 3])
@@ -133,7 +133,8 @@ def move_cameras(
 def split_views(names: Sequence[str], test_every: int) -> dict[str, str]:
     """Hold out every `test_every`-th view by sorted name, beginning with the first (3DGS: index % 8 == 0).
 
-    None is held out with `test_every` 0, 1 (nothing would be left), or fewer than eight views.
+    No view is held out if `test_every` is 0 or 1 (1 would leave none to train on), or with fewer than
+    eight views.
     """
     ordered = sorted(names)
     holds_out = test_every > 1 and len(ordered) >= MIN_VIEWS_FOR_TEST
@@ -160,12 +161,12 @@ def write_scene(
     Args:
         out: the scene folder.
         name: `<dataset>/<scene>`.
-        unit: "metre" keeps the source's scale; any other lets it be normalised.
+        unit: "metre" keeps the source's scale; any other unit is normalised.
         views: posed views, at least one.
         points_xyz: sparse points, source coordinates.
         points_rgb: their colours.
         split: "train" or "test" per view.
-        report: what registration found; split and size per view are added here.
+        report: what registration found; this function adds split and size per view.
         turn: turn the scene so that +z is up.
     """
     views = sorted(views, key=lambda view: view.view)

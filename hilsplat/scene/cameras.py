@@ -35,7 +35,7 @@ class Camera:
     def scaled(self, size_hw: tuple[int, int]) -> "Camera":
         """The same camera for a resized image: K scales with each side."""
         scale = np.array([size_hw[1] / self.size_hw[1], size_hw[0] / self.size_hw[0], 1.0])
-        return Camera(self.name, self.cam_from_world, scale[:, None] * self.K, tuple(size_hw))
+        return Camera(self.name, self.cam_from_world, scale[:, None] * self.K, size_hw)
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,8 @@ class Cameras:
                 f"view {name!r} has no camera",
                 expected=f"one of {len(self.names)} views: {', '.join(self.names[:5])}, ...",
             ) from error
-        return Camera(name, self.cam_from_world[row], self.K[row], tuple(int(n) for n in self.size_hw[row]))
+        height, width = self.size_hw[row].tolist()
+        return Camera(name, self.cam_from_world[row], self.K[row], (height, width))
 
     def save(self, path: Path) -> None:
         """Write `cameras.npz` atomically."""

@@ -44,7 +44,7 @@ class WorkImage:
         view: view name, which is the file name of the work image.
         source: the photograph it was made from.
         size_hw: height and width of the work image, px.
-        focal_px: focal length by EXIF, in px of the work image; None where EXIF has none.
+        focal_px: focal length from EXIF, in px of the work image; None if EXIF has none.
     """
 
     view: str
@@ -56,8 +56,8 @@ class WorkImage:
 def view_names(sources: Sequence[Path]) -> list[str]:
     """View names of image files: the file name with the suffix .png ("DSC_1.jpg" -> "DSC_1.png").
 
-    Files of one name in different folders ("train/r_0.png", "test/r_0.png") are told apart by
-    their folder: "train_r_0.png".
+    Files of the same name in different folders ("train/r_0.png", "test/r_0.png") get their folder
+    as a prefix: "train_r_0.png".
 
     Raises:
         SceneError: two files would get the same view name.
@@ -83,12 +83,12 @@ def view_names(sources: Sequence[Path]) -> list[str]:
 
 
 def exif_focal_px(path: Path, size_hw: tuple[int, int]) -> float | None:
-    """Focal length by EXIF (35 mm equivalent), in px of an image of the given size."""
+    """Focal length from EXIF (35 mm equivalent), in px of an image of the given size."""
     try:
         with Image.open(path) as image:
             focal_mm = image.getexif().get_ifd(EXIF_SUB_FOLDER).get(EXIF_35MM_FOCAL)
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
-        return None  # damaged EXIF only: whether the pixels can be read is checked elsewhere
+        return None  # EXIF may be damaged; whether the pixels can be read is checked elsewhere
     try:
         focal = float(focal_mm or 0)
     except (TypeError, ValueError):
@@ -97,7 +97,7 @@ def exif_focal_px(path: Path, size_hw: tuple[int, int]) -> float | None:
 
 
 def prepare_images(sources: Sequence[Path], folder: Path, max_side_px: int) -> list[WorkImage]:
-    """Write every photograph upright, at most `max_side_px` long, as PNG into a work folder.
+    """Write every photograph upright, its longer side at most `max_side_px`, as PNG into a work folder.
 
     Raises:
         ImageError: files cannot be read; all of them are named.
@@ -123,7 +123,7 @@ def prepare_images(sources: Sequence[Path], folder: Path, max_side_px: int) -> l
         raise ImageError(
             f"{len(damaged)} of {len(sources)} images in {damaged[0][0].parent} cannot be read",
             found=", ".join(f"{path.name} ({path.stat().st_size} bytes)" for path, _ in damaged),
-            fix="remove them from the folder or replace them by whole copies",
+            fix="remove them from the folder or replace them with intact copies",
         )
     return images
 
@@ -131,7 +131,7 @@ def prepare_images(sources: Sequence[Path], folder: Path, max_side_px: int) -> l
 def camera_groups(images: Sequence[WorkImage], single_camera: str) -> list[list[WorkImage]]:
     """Group the views that share one set of intrinsics, in order of their first view.
 
-    "auto" joins views of equal size and EXIF focal length, "yes" all, "no" none.
+    "auto" groups views of equal size and EXIF focal length, "yes" all views, "no" none.
 
     Raises:
         SceneError: "yes" with images of different sizes.
@@ -148,7 +148,7 @@ def camera_groups(images: Sequence[WorkImage], single_camera: str) -> list[list[
             "poses.single_camera is yes, but the images have several sizes",
             expected="one size (width x height) for all images",
             found=", ".join(sizes),
-            fix="set poses.single_camera to auto, or leave images of other sizes out",
+            fix="set poses.single_camera to auto, or remove the images of other sizes",
         )
     return list(groups.values())
 
@@ -191,7 +191,7 @@ def extract_features(
 
 
 def match_features(database: Path, num_views: int, settings: PosesSettings, seed: int, threads: int) -> str:
-    """Match pairs and verify them geometrically; returns the kind of matching."""
+    """Match pairs and verify them geometrically; returns which matching was used."""
     matcher = settings.matcher
     if matcher == "auto":
         matcher = "exhaustive" if num_views <= EXHAUSTIVE_UP_TO else "sequential"
@@ -213,6 +213,15 @@ def match_features(database: Path, num_views: int, settings: PosesSettings, seed
         pairing.num_threads = threads
         pycolmap.match_sequential(database, matching, pairing, verification, device=pycolmap.Device.cpu)
     return matcher
+
+
+def incremental_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
+    """Options of COLMAP's incremental mapper and triangulator, on one thread with fixed seeds."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+    options.min_num_matches = MIN_INLIERS
+    return options
 
 
 @dataclass(frozen=True)

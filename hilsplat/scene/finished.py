@@ -15,15 +15,15 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SceneParts:
-    """Paths of the artifacts that together answer texts: one variant of one scene.
+    """Paths of the artifacts that together answer queries: one variant of one scene.
 
     Attributes:
         scene: cameras, photographs, split.
         gaussians: 3DGS PLY.
         semantic_tree: nodes.
         field: language field.
-        autoencoder: its code.
-        clip: CLIP vectors of the masks; its index names the model, which also embeds the texts.
+        autoencoder: decodes the field's features to CLIP vectors.
+        clip: CLIP vectors of the masks; its index names the model, which also embeds the queries.
         masks: masks of the train views.
     """
 
@@ -58,8 +58,8 @@ class FinishedScene:
     def locate(folder: Path, variant: str = "default") -> "FinishedScene":
         """Find the parts of a variant, all within the scene's folder.
 
-        Provenance names what a stage read; without it, the parts are expected beside what was made of them.
-        A variant without a field of its own was scored with another's, which its scores' provenance names.
+        Provenance names what a stage read; without it, a part is expected beside the artifact made from it.
+        A variant that has no field was scored with another variant's, named in the provenance of its scores.
 
         Raises:
             ArtifactError: the folder, the variant or a part is missing.
@@ -102,8 +102,8 @@ class FinishedScene:
     def evaluate_settings(self) -> EvaluateSettings:
         """Canonical phrases, template, scale and selection of the run that made the scene.
 
-        They are in the provenance of its scores. A scene without labels has no scores; its panel was drawn
-        with the same settings.
+        They are in the provenance of its scores. A scene without labels has no scores, but its panel was
+        drawn with the same settings.
         """
         scores = self.folder / self.variant / "scores.csv"
         if provenance_path(scores).is_file():
@@ -112,7 +112,7 @@ class FinishedScene:
         panel = place.parent.parent / "figures" / place.parent.name / place.name / "panel.png"
         if not provenance_path(panel).is_file():
             logger.warning(
-                "%s: neither %s nor %s tells how texts were asked; the default settings answer",
+                "%s: neither %s nor %s records the settings of queries; using the default settings",
                 self.folder,
                 provenance_path(scores),
                 provenance_path(panel),
@@ -127,7 +127,7 @@ def _recorded_settings(artifact: Path) -> dict[str, Any]:
 
 
 def _section(section: type[Section], found: dict[str, Any]) -> Any:
-    """A section from recorded settings; knobs that the record does not know take their defaults."""
+    """A section from recorded settings; knobs missing from the record take their defaults."""
     return section(**{name: value for name, value in found.items() if name in section.model_fields})
 
 
@@ -142,12 +142,12 @@ def _unfinished(folder: Path, missing: Path) -> ArtifactError:
 
 
 def _input_of(artifact: Path, name: str, folder: Path) -> Path:
-    """Path of an artifact's input: as its provenance says, else beside it."""
+    """Path of an artifact's input: from its provenance, else beside the artifact."""
     return _recorded_input(artifact, name, folder) or artifact.parent / name
 
 
 def _recorded_input(artifact: Path, name: str, folder: Path) -> Path | None:
-    """Path of an artifact's input by its provenance, within the scene's folder wherever that is now."""
+    """Path of an artifact's input from its provenance, inside the scene's folder, which may have moved."""
     record = provenance_path(artifact)
     if record.is_file():
         path = Path(read_json(record)["inputs"].get(name, {}).get("path", ""))

@@ -1,4 +1,4 @@
-"""Sparse points of views whose poses are known: triangulated, or random where that fails."""
+"""Sparse points of views whose poses are known: triangulated, or random if that fails."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,8 +9,8 @@ from jaxtyping import Float64, UInt8
 from hilsplat.scene.assemble import PosedView
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.features import (
-    MIN_INLIERS,
     extract_features,
+    incremental_options,
     match_features,
 )
 from hilsplat.scene.model import sparse_points
@@ -25,7 +25,7 @@ NUM_RANDOM_POINTS = 20_000
 def triangulate(
     views: Sequence[PosedView], work: Path, settings: PosesSettings, seed: int, threads: int
 ) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
-    """Sparse points of pinhole views with known poses: features, matches, triangulation; poses stay."""
+    """Sparse points of pinhole views with known poses: features, matches, triangulation at fixed poses."""
     if len(views) < 2:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)
     folder, database = views[0].image.parent, work / "triangulation.db"
@@ -41,23 +41,20 @@ def triangulate(
     with pycolmap.Database.open(database) as opened:
         for view in views:
             entry = opened.read_image_with_name(view.view)
+            assert entry is not None  # imported above
             model.add_camera_with_trivial_rig(opened.read_camera(entry.camera_id))
             image = pycolmap.Image(name=view.view, camera_id=entry.camera_id, image_id=entry.image_id)
             model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.cam_from_source[:3]))
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = options.mapper.num_threads = 1
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
-    options.min_num_matches = MIN_INLIERS
     target = work / "triangulated"
     target.mkdir()
-    model = pycolmap.triangulate_points(model, database, folder, target, options=options)
+    model = pycolmap.triangulate_points(model, database, folder, target, options=incremental_options(seed))
     return sparse_points(model)
 
 
 def random_points(
     views: Sequence[PosedView], seed: int
 ) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
-    """Random points that cameras see, to start a fit where triangulation found none.
+    """Random points that cameras see, to start a fit if triangulation found too few.
 
     Each lies on the ray of a random pixel of a random view, at a depth between 0.3 and 2 times the
     distance from the camera to the point nearest to all optical axes; grey.
@@ -65,7 +62,7 @@ def random_points(
     generator = np.random.default_rng(seed)
     centres = np.stack([view.centre for view in views])
     looks = np.stack([view.cam_from_source[2, :3] for view in views])
-    # Least squares for the point nearest to all axes, with a weak pull to one camera spread ahead.
+    # Least squares for the point nearest to all axes, weakly drawn to one camera spread ahead.
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()) or 1.0
     across = np.eye(3)[None] - looks[:, :, None] * looks[:, None, :]
     prior = 1e-3

@@ -1,7 +1,7 @@
-"""Make a scene of images whose poses are known."""
+"""Make a scene from images with known poses."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,9 +42,9 @@ def import_poses(
 ) -> dict[str, Any]:
     """Write the Scene artifact of a folder with known poses; returns the registration report.
 
-    Images are matched to poses by name; poses without an image and images without a pose are named
-    in the report. The pixels are taken as stored, since COLMAP pays no heed to the EXIF orientation.
-    Coordinates keep the source's axes.
+    Images are matched to poses by name; poses without an image and images without a pose are listed
+    in the report. Pixels are used as stored, because COLMAP ignores the EXIF orientation. Coordinates
+    keep the source's axes.
 
     Raises:
         SceneError: the model or transforms file cannot be used.
@@ -59,12 +59,13 @@ def import_poses(
     else:
         described = known_views(known)
     present = [view for view in described if view.image is not None]
+    files = [view.image for view in described if view.image is not None]
     missing = sorted(view.name for view in described if view.image is None)
     _check_present(known, name, present, missing, settings)
     views = [
-        _with_pixels(view, view_name, work / "images", settings.max_side_px)
-        for view, view_name in track(
-            list(zip(present, view_names([view.image for view in present]), strict=True)), "images read"
+        _with_pixels(view, file, view_name, work / "images", settings.max_side_px)
+        for view, file, view_name in track(
+            list(zip(present, files, view_names(files), strict=True)), "images read"
         )
     ]
     origin_of_points = "source"
@@ -80,15 +81,14 @@ def import_poses(
             )
             points = random_points(views, seed)
             origin_of_points = "random"
-    unposed = _images_without_pose(known, present)
+    unposed = _images_without_pose(known, set(files))
     if unposed:
         warnings.append(f"{len(unposed)} images have no pose and are left out")
     for warning in warnings:
         logger.warning("%s: %s", name, warning)
     entries: dict[str, Any] = {}
-    for posed, view in zip(present, views, strict=True):
-        assert posed.image is not None
-        entries[view.view] = {"file": posed.image.name, "registered": True, **errors.get(posed.name, {})}
+    for posed, file, view in zip(present, files, views, strict=True):
+        entries[view.view] = {"file": file.name, "registered": True, **errors.get(posed.name, {})}
     for gone in missing:
         entries[gone] = {"file": gone, "registered": False, "why_not": "its image file is missing"}
     for path in unposed:
@@ -98,10 +98,10 @@ def import_poses(
     observed = [(entry["observations"], entry["reprojection_error_px"]) for entry in errors.values()]
     num_observations = sum(count for count, error in observed if error is not None)
     total_error = sum(count * error for count, error in observed if error is not None)
-    files = ", ".join(path.relative_to(known.root).as_posix() for path in known.files)
+    source = ", ".join(path.relative_to(known.root).as_posix() for path in known.files)
     report = {
         "scene": name,
-        "poses": f"imported from {files}",
+        "poses": f"imported from {source}",
         "seed": seed,
         "images": len(described) + len(unposed),
         "registered": len(views),
@@ -114,7 +114,7 @@ def import_poses(
         "views": entries,
     }
     names = [view.view for view in views]
-    if any(view.is_test for view in present):  # the source has a split of its own
+    if any(view.is_test for view in present):  # the source brings its own split
         split = {name: "test" if view.is_test else "train" for name, view in zip(names, present, strict=True)}
     else:
         split = split_views(names, settings.test_every)
@@ -129,10 +129,10 @@ def _check_present(
     missing: Sequence[str],
     settings: PosesSettings,
 ) -> None:
-    """Refuse a source most of whose images are not there."""
+    """Refuse a source with too few of its images."""
     total = len(present) + len(missing)
     if total == 0:
-        raise SceneError(f"{known.files[0]} of {name} poses no view", fix="export it again")
+        raise SceneError(f"{known.files[0]} of {name} does not pose any view", fix="export it again")
     if not present or len(present) < settings.min_registered_share * total:
         listed = ", ".join(missing[:20]) + (f" and {len(missing) - 20} more" if len(missing) > 20 else "")
         raise RegistrationError(
@@ -143,19 +143,17 @@ def _check_present(
         )
 
 
-def _images_without_pose(known: KnownPoses, present: Sequence[KnownView]) -> list[Path]:
+def _images_without_pose(known: KnownPoses, used: Collection[Path]) -> list[Path]:
     """Images in the folder of a COLMAP model that it does not pose."""
     if known.kind != "colmap" or not (known.root / "images").is_dir():
         return []
-    used = {view.image for view in present}
     return [path for path in list_images(known.root / "images") if path not in used]
 
 
-def _with_pixels(view: KnownView, view_name: str, folder: Path, max_side_px: int) -> PosedView:
+def _with_pixels(view: KnownView, file: Path, view_name: str, folder: Path, max_side_px: int) -> PosedView:
     """Read a view's image as its camera describes it, write the work image, and fit the lens to it."""
-    assert view.image is not None
     folder.mkdir(parents=True, exist_ok=True)
-    pixels = resize_to_fit(_read_as_described(view.image, view.camera), max_side_px)
+    pixels = resize_to_fit(_read_as_described(file, view.camera), max_side_px)
     height, width = pixels.shape[:2]
     camera = pycolmap.Camera(view.camera.todict())
     if (camera.width, camera.height) != (width, height):
@@ -165,10 +163,10 @@ def _with_pixels(view: KnownView, view_name: str, folder: Path, max_side_px: int
 
 
 def _read_as_described(path: Path, camera: pycolmap.Camera) -> UInt8[np.ndarray, "H W 3"]:
-    """Pixels of an image in the orientation whose shape fits the camera; as stored where both do.
+    """Pixels of an image in the orientation whose shape fits the camera; as stored if both fit.
 
     Raises:
-        ImageError: unreadable, or of another shape than the camera says.
+        ImageError: the image cannot be read, or no orientation fits the camera.
     """
     upright = read_image(path)
     candidates = [upright]

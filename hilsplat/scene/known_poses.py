@@ -1,4 +1,4 @@
-"""Where a folder keeps known poses, and what each view of it is."""
+"""Known poses in a folder: where they are, and the views that they describe."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +17,7 @@ TRANSFORMS = ("transforms.json", "transforms_train.json")
 
 @dataclass(frozen=True)
 class KnownPoses:
-    """Where a folder keeps its poses.
+    """Where a folder has its poses.
 
     Attributes:
         root: the folder.
@@ -50,7 +50,7 @@ class KnownView:
 
 
 def find_known_poses(folder: Path) -> KnownPoses | None:
-    """Look for a COLMAP model, transforms files, LLFF's file, in this order; None if there is none.
+    """Look for a COLMAP model, transforms files or LLFF's file, in this order; None if there is none.
 
     Raises:
         SceneError: there is a `sparse/` folder without a complete model in it.
@@ -69,7 +69,7 @@ def find_known_poses(folder: Path) -> KnownPoses | None:
         return KnownPoses(folder, "llff", (folder / POSES_BOUNDS,))
     if (folder / "sparse").is_dir():
         raise SceneError(
-            f"{folder / 'sparse'} holds no complete COLMAP model",
+            f"{folder / 'sparse'} does not hold a complete COLMAP model",
             expected="cameras, images and points3D, all .bin or all .txt, in sparse/0/ or sparse/",
             found=", ".join(sorted(path.name for path in (folder / "sparse").rglob("*"))) or "nothing",
             fix="complete the model, or rename sparse/ to have the poses computed",

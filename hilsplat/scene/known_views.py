@@ -15,13 +15,13 @@ from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.known_poses import KnownPoses, KnownView
 from hilsplat.scene.llff import llff_views
-from hilsplat.scene.model import pose_matrix, reprojection_errors, sparse_points
+from hilsplat.scene.model import camera_of, pose_matrix, reprojection_errors, sparse_points
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def known_views(known: KnownPoses) -> list[KnownView]:
-    """Posed views of a folder, whatever it keeps them in.
+    """Posed views of a folder, in whichever format it holds them.
 
     Raises:
         SceneError: they cannot be read.
@@ -60,7 +60,7 @@ def read_colmap(
             KnownView(
                 image.name,
                 _find_image(known.root, image.name),
-                pycolmap.Camera(image.camera.todict()),
+                pycolmap.Camera(camera_of(image).todict()),
                 pose_matrix(image.cam_from_world()),
             )
         )
@@ -75,7 +75,7 @@ def read_colmap(
 
 
 def _find_image(root: Path, name: str) -> Path | None:
-    """File of an image named in a source: as named, or with a suffix, in the folder or its images/."""
+    """File of an image named in a source: as named, or with a suffix added, in the folder or its images/."""
     for base in (root / "images", root):
         candidate = base / name
         if candidate.is_file():
@@ -91,10 +91,10 @@ def read_transforms(
 ) -> tuple[list[KnownView], tuple[np.ndarray, np.ndarray] | None]:
     """Read transforms files: camera-to-world in OpenGL axes, intrinsics for all or per frame.
 
-    Returns the views and, if the file names a `ply_file_path`, its points.
+    Returns the views and, if a file names a `ply_file_path`, its points.
 
     Raises:
-        SceneError: a file is not JSON, or a key is missing or unusable.
+        SceneError: a file is not valid JSON, or a key is missing or unusable.
     """
     views: list[KnownView] = []
     points = None
@@ -113,7 +113,7 @@ def read_transforms(
 
 
 def _read_frame(known: KnownPoses, file: Path, number: int, frame: Mapping[str, Any]) -> KnownView:
-    """One frame of a transforms file; its own keys come before those of the whole file."""
+    """One frame of a transforms file; its own keys override those of the whole file."""
     where = f"{file}, frame {number}"
     try:
         name = str(frame["file_path"]).removeprefix("./")
@@ -129,7 +129,7 @@ def _read_frame(known: KnownPoses, file: Path, number: int, frame: Mapping[str, 
     ):
         raise SceneError(
             f"{where} ({name}): transform_matrix is not a rigid pose",
-            expected="a 4 x 4 camera-to-world matrix with a rotation in it, which neither scales nor mirrors",
+            expected="a 4 x 4 camera-to-world matrix whose rotation part neither scales nor mirrors",
             found=np.array2string(source_from_cam, precision=4, suppress_small=True).replace("\n", ""),
             fix="export it again without scaling the cameras",
         )
@@ -163,7 +163,7 @@ def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> p
     except KeyError as error:
         raise SceneError(
             f"{where} has no focal length",
-            expected="fl_x (px) or camera_angle_x (radian)",
+            expected="fl_x (px) or camera_angle_x (radians)",
             fix="export it again",
         ) from error
     except (TypeError, ValueError, OSError) as error:

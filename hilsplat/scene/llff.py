@@ -1,4 +1,4 @@
-"""Poses of LLFF's `poses_bounds.npy`, which 3D-OVS and other forward-facing data sets bring."""
+"""Poses of LLFF's `poses_bounds.npy`, which 3D-OVS and other forward-facing data sets provide."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,7 +35,7 @@ def read_poses_bounds(
         raise SceneError(f"{path} cannot be read: {error}", fix="unpack it again") from error
     if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows).all():
         raise SceneError(
-            f"{path} holds no LLFF poses",
+            f"{path} does not hold LLFF poses",
             expected="finite numbers of shape (images, 17)",
             found=f"shape {rows.shape}",
             fix="unpack it again",
@@ -59,7 +59,7 @@ def read_poses_bounds(
 def llff_views(
     path: Path, images: Sequence[Path]
 ) -> list[tuple[Path, pycolmap.Camera, Float64[np.ndarray, "4 4"]]]:
-    """Image, lens and world-to-camera transform of every row; rows belong to the images by name.
+    """Image, lens and world-to-camera transform of every row; row i belongs to the i-th image by name.
 
     The lens is SIMPLE_PINHOLE with its centre in the middle, for the image as it is on disk.
 
@@ -72,8 +72,8 @@ def llff_views(
         raise SceneError(
             f"{path} has {len(poses)} poses for {len(images)} images",
             expected="one row per image, in the order of their names",
-            found=f"{images[0].name} to {images[-1].name}" if images else "no image",
-            fix="unpack the images again, and remove what is not a photograph of the scene",
+            found=f"{images[0].name} to {images[-1].name}" if images else "no images",
+            fix="unpack the images again, and remove files that are not photographs of the scene",
         )
     views = []
     for image, pose, (_, width_px, focal_px) in zip(images, poses, sizes, strict=True):

@@ -11,6 +11,12 @@ def pose_matrix(pose: pycolmap.Rigid3d) -> Float64[np.ndarray, "4 4"]:
     return np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]])
 
 
+def camera_of(image: pycolmap.Image) -> pycolmap.Camera:
+    """Camera of an image that is part of a model."""
+    assert image.camera is not None  # only images outside a model have none
+    return image.camera
+
+
 def sparse_points(
     model: pycolmap.Reconstruction,
 ) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
@@ -33,6 +39,6 @@ def reprojection_errors(model: pycolmap.Reconstruction) -> dict[str, Float64[np.
         measured = np.array([point.xy for point in seen])
         xyz = np.array([model.points3D[point.point3D_id].xyz for point in seen])
         pose = image.cam_from_world().matrix()
-        projected = image.camera.img_from_cam(xyz @ pose[:, :3].T + pose[:, 3], check_cheirality=False)
+        projected = camera_of(image).img_from_cam(xyz @ pose[:, :3].T + pose[:, 3], check_cheirality=False)
         errors[image.name] = np.linalg.norm(projected - measured, axis=1)
     return errors

@@ -1,4 +1,4 @@
-"""One's own photographs: what a folder holds, and adding it to the scene sheet."""
+"""Your own photographs: what a folder holds, and adding it to the scene sheet."""
 
 import hashlib
 from collections import Counter, defaultdict
@@ -25,7 +25,7 @@ from hilsplat.scene.sheet import (
 OTHER_PHOTO_SUFFIXES = frozenset(
     {".heic", ".heif", ".avif", ".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".gif"}
 )
-"""Photographs that we do not read; a folder of them deserves a better answer than "no images"."""
+"""Photographs in formats that are not read; a folder of them deserves a better message than "no images"."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class PhotoReport:
         unreadable: (file name, reason) of each image that cannot be read.
         num_rotated: photographs that an EXIF flag turns upright.
         duplicates: groups of file names with identical bytes.
-        passed_over: number of files per suffix that look like photographs but are not read.
+        passed_over: number of skipped files per suffix: photographs in formats that are not read.
     """
 
     folder: Path
@@ -67,7 +67,7 @@ class PhotoReport:
         for names in self.duplicates:
             lines.append(f"  {len(names):>5}  are the same file: {', '.join(names)}")
         for suffix, count in sorted(self.passed_over.items()):
-            lines.append(f"  {count:>5}  {suffix} passed over: convert them to JPEG or PNG to use them")
+            lines.append(f"  {count:>5}  {suffix} skipped: convert them to JPEG or PNG to use them")
         if self.unreadable:
             lines.append(f"  {len(self.unreadable):>5}  cannot be read:")
             lines += [f"           {name}: {reason}" for name, reason in self.unreadable]
@@ -135,20 +135,19 @@ def inspect_photos(folder: Path) -> PhotoReport:
 
 
 def add_scene(sheet: Path, name: str, photos: Path, unit: str = "arbitrary") -> PhotoReport:
-    """Append one's own photographs to the sheet as scene `photos/<name>`; an absent sheet is begun.
+    """Append your own photographs to the sheet as scene `photos/<name>`; a missing sheet is created.
 
-    The folder stays where it is: the sheet points at it, relative to the project where it lies
-    inside.
+    The folder stays where it is: the sheet points to it, by a relative path if it is inside the project.
 
     Args:
         sheet: the scene sheet.
         name: name of the new scene.
         photos: folder of photographs.
-        unit: unit of lengths where the folder brings metric poses.
+        unit: unit of lengths, for a folder with metric poses.
 
     Raises:
         SceneError: the name cannot be used or is taken, photographs cannot be read, or there are
-            fewer than three different ones and no known poses. The sheet is unchanged then.
+            fewer than three different ones and no known poses. The sheet is then unchanged.
     """
     from hilsplat.base.artifacts import write_text
 
@@ -175,13 +174,11 @@ def add_scene(sheet: Path, name: str, photos: Path, unit: str = "arbitrary") -> 
         raise SceneError(
             f"{len(report.unreadable)} photographs in {report.folder} cannot be read",
             found="; ".join(f"{file}: {reason}" for file, reason in report.unreadable),
-            fix="remove them from the folder or replace them by whole copies, then try again",
+            fix="remove them from the folder or replace them with intact copies, then try again",
         )
     if report.num_distinct < MIN_PHOTOS and not has_known_poses(photos):
-        found = [f"{report.num_distinct} different ones that can be read"]
-        found += [
-            f"{count} {suffix} files passed over" for suffix, count in sorted(report.passed_over.items())
-        ]
+        found = [f"{report.num_distinct} different readable ones"]
+        found += [f"{count} {suffix} files skipped" for suffix, count in sorted(report.passed_over.items())]
         raise SceneError(
             f"{report.folder} has too few photographs",
             expected=f"at least {MIN_PHOTOS} (20 or more are better)",
@@ -191,7 +188,7 @@ def add_scene(sheet: Path, name: str, photos: Path, unit: str = "arbitrary") -> 
     root = project_root(sheet)
     source = photos.relative_to(root).as_posix() if photos.is_relative_to(root) else str(photos)
     if not source.isprintable() or source.startswith("world:"):
-        raise SceneError(f"the path {source!r} cannot stand in the scene sheet", fix="rename the folder")
+        raise SceneError(f"the path {source!r} cannot be written in the scene sheet", fix="rename the folder")
     values = {"dataset": PHOTOS, "scene": name, "group": PHOTOS, "source": source, "unit": unit}
     if sheet.exists():
         text = sheet.read_text(encoding="utf-8-sig")

@@ -21,13 +21,14 @@ from hilsplat.scene.features import (
     WorkImage,
     count_matches,
     extract_features,
+    incremental_options,
     match_features,
     prepare_images,
     register_images,
 )
 from hilsplat.scene.importers import import_poses
 from hilsplat.scene.known_poses import find_known_poses
-from hilsplat.scene.model import pose_matrix, reprojection_errors, sparse_points
+from hilsplat.scene.model import camera_of, pose_matrix, reprojection_errors, sparse_points
 from hilsplat.scene.sheet import MIN_PHOTOS, photo_folder
 from hilsplat.settings import PosesSettings
 
@@ -37,10 +38,10 @@ INIT_MIN_INLIERS = 50
 """Matches the first pair of a model needs (reference block; COLMAP: 100)."""
 
 POSE_MIN_INLIERS = 15
-"""Points that a further view must see to be posed (reference block; COLMAP: 30)."""
+"""Points that each further view must see to be posed (reference block; COLMAP: 30)."""
 
 WEAK_POINTS_PER_VIEW = 13
-"""Good runs on renders had at least this many points per registered view; worthless ones had 4 to 18."""
+"""Good runs on renders had at least this many points per registered view; useless ones had 4 to 18."""
 
 
 def run_poses(
@@ -59,7 +60,8 @@ def run_poses(
     by structure from motion. The result depends on images, settings and seed, not on `threads`:
     features and matches are computed pair by pair, the mapping itself runs on one thread.
 
-    Structure from motion knows no metre, so its scenes have the unit "arbitrary" whatever `unit` says.
+    Structure from motion cannot recover the metre, so its scenes have the unit "arbitrary" whatever
+    `unit` says.
 
     Args:
         images: folder of photographs, or of images with known poses.
@@ -72,7 +74,7 @@ def run_poses(
         threads: for feature extraction and matching.
 
     Raises:
-        SceneError: fewer than three images, or an unusable folder.
+        SceneError: there are fewer than three images, or the folder cannot be used.
         ImageError: an image is empty, truncated or unreadable.
         RegistrationError: too few views were registered.
     """
@@ -113,7 +115,9 @@ def _reconstruct(
 ) -> dict[str, Any]:
     """Structure from motion on a folder of photographs; returns the registration report."""
     if not images.is_dir():
-        raise SceneError(f"image folder {images} of {name} is missing", fix="correct its source")
+        raise SceneError(
+            f"image folder {images} of {name} is missing", fix="correct its source in the scene sheet"
+        )
     sources = list_images(photo_folder(images))
     if len(sources) < MIN_PHOTOS:
         raise SceneError(
@@ -146,7 +150,9 @@ def _reconstruct(
     check_registration(images, name, report, settings)
     assert model is not None
     views = [
-        PosedView(image.name, work / "images" / image.name, image.camera, pose_matrix(image.cam_from_world()))
+        PosedView(
+            image.name, work / "images" / image.name, camera_of(image), pose_matrix(image.cam_from_world())
+        )
         for image in (model.images[image_id] for image_id in model.reg_image_ids())
     ]
     xyz, rgb = sparse_points(model)
@@ -160,40 +166,37 @@ def map_views(
 ) -> list[pycolmap.Reconstruction]:
     """Run the mapper on one thread with fixed seeds; returns its models, the largest first.
 
-    The mapper may leave a last model of two views whatever its least size; such are dropped.
+    The mapper may end with a model of two views despite `min_model_size`; such models are dropped.
     """
     folder.mkdir(parents=True, exist_ok=True)
     if mapper == "incremental":
-        options = pycolmap.IncrementalPipelineOptions()
-        options.num_threads = options.mapper.num_threads = 1
-        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
-        options.min_num_matches = MIN_INLIERS
+        options = incremental_options(seed)
         options.min_model_size = MIN_PHOTOS
         options.mapper.init_min_num_inliers = INIT_MIN_INLIERS
         options.mapper.abs_pose_min_num_inliers = POSE_MIN_INLIERS
         models = pycolmap.incremental_mapping(database, images, folder, options)
     else:
-        options = pycolmap.GlobalPipelineOptions()
-        options.num_threads = options.mapper.num_threads = 1
-        options.mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
-        options.min_num_matches = MIN_INLIERS
-        options.min_model_size = MIN_PHOTOS
-        for part in (
-            options,
-            options.mapper,
-            options.mapper.rotation_averaging,
-            options.mapper.global_positioning,
-            options.mapper.retriangulation,
-        ):
-            part.random_seed = seed
-        options.mapper.global_positioning.use_gpu = False
-        options.mapper.bundle_adjustment.ceres.use_gpu = False
-        models = pycolmap.global_mapping(database, images, folder, options)
+        models = pycolmap.global_mapping(database, images, folder, _global_options(seed))
     large_enough = [
         (number, model) for number, model in models.items() if model.num_reg_images() >= MIN_PHOTOS
     ]
     large_enough.sort(key=lambda item: (-item[1].num_reg_images(), -item[1].num_points3D(), item[0]))
     return [model for _, model in large_enough]
+
+
+def _global_options(seed: int) -> pycolmap.GlobalPipelineOptions:
+    """Options of COLMAP's global mapper, on one thread with fixed seeds."""
+    options = pycolmap.GlobalPipelineOptions()
+    mapper = options.mapper
+    options.num_threads = mapper.num_threads = 1
+    mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
+    options.min_num_matches = MIN_INLIERS
+    options.min_model_size = MIN_PHOTOS
+    options.random_seed = mapper.random_seed = mapper.rotation_averaging.random_seed = seed
+    mapper.global_positioning.random_seed = mapper.retriangulation.random_seed = seed
+    mapper.global_positioning.use_gpu = False
+    mapper.bundle_adjustment.ceres.use_gpu = False
+    return options
 
 
 def registration_report(
@@ -202,7 +205,7 @@ def registration_report(
     models: Sequence[pycolmap.Reconstruction],
     settings: PosesSettings,
 ) -> dict[str, Any]:
-    """What registration found: totals, models, and for each view whether it was posed and why not."""
+    """What registration found: totals, models and, for each view, whether it was posed or why not."""
     errors = reprojection_errors(models[0]) if models else {}
     members = [{model.images[i].name for i in model.reg_image_ids()} for model in models]
     views: dict[str, Any] = {}
@@ -286,17 +289,17 @@ def _warnings(report: Mapping[str, Any]) -> list[str]:
 
 
 def check_registration(images: Path, name: str, report: Mapping[str, Any], settings: PosesSettings) -> None:
-    """Refuse a reconstruction that holds too few views; log what is doubtful about one that passes.
+    """Refuse a reconstruction that holds too few views; log the doubts about one that passes.
 
     Raises:
-        RegistrationError: naming the lost photographs, the numbers and what to do.
+        RegistrationError: it holds too few; the message names the lost photographs and what to do.
     """
     total, registered = report["images"], report["registered"]
     lost = [entry for entry in report["views"].values() if not entry["registered"]]
     listing = "".join(f"\n            {entry['file']}: {entry['why_not']}" for entry in lost)
     advice = (
-        "add photographs between those that were lost and the others (neighbours less than about 10 degrees "
-        "apart, sharp, with texture in sight), or leave the lost ones out of the folder"
+        "add sharp photographs of textured surfaces between the lost ones and the others (neighbours less "
+        "than about 10 degrees apart), or remove the lost ones from the folder"
     )
     if not report["models"]:
         raise RegistrationError(
@@ -312,7 +315,7 @@ def check_registration(images: Path, name: str, report: Mapping[str, Any], setti
             f"too few photographs of {name} could be registered",
             expected=f"at least {settings.min_registered_share:.0%} of {total} (poses.min_registered_share)",
             found=f"{registered} ({share:.1%}); models of {sizes} views; not registered:{listing}",
-            fix=f"{advice}; to go on with {registered} views set poses.min_registered_share to "
+            fix=f"{advice}; to continue with {registered} views, set poses.min_registered_share to "
             f"{np.floor(share * 100) / 100:.2f} or less",
         )
     if settings.several_models == "stop" and len(report["models"]) > 1:
@@ -320,7 +323,7 @@ def check_registration(images: Path, name: str, report: Mapping[str, Any], setti
             f"the photographs of {name} fall into {len(report['models'])} separate models",
             expected="one model (poses.several_models is stop)",
             found=f"models of {sizes} views; not in the largest:{listing}",
-            fix=f"{advice}; to go on with the largest set poses.several_models to largest",
+            fix=f"{advice}; to continue with the largest, set poses.several_models to largest",
         )
     for warning in report["warnings"]:
         logger.warning("%s: %s", name, warning)

@@ -76,7 +76,7 @@ class Scene:
 
     @staticmethod
     def load(folder: Path) -> "Scene":
-        """Read a scene folder that the poses stage finished."""
+        """Read a scene folder written by the poses stage."""
         folder = Path(folder)
         index = read_index(folder)
         points = read_npz(folder / "points.npz")

@@ -1,4 +1,4 @@
-"""The scene sheet (config/scenes.tsv): which scenes there are.
+"""The scene sheet (config/scenes.tsv), which lists the scenes.
 
 The workflow imports this module at start-up, so nothing heavy is imported at its top.
 """
@@ -15,7 +15,7 @@ from hilsplat.base.files import IMAGE_SUFFIXES, list_images
 COLUMNS = ("dataset", "scene", "group", "source", "unit")
 OPTIONAL_COLUMNS = ("gaussians",)
 NOTHING = ("", "-")
-"""Values that leave an optional cell empty."""
+"""Contents of an optional cell that is left empty."""
 GROUPS = (
     "benchmark",
     "development",
@@ -30,7 +30,7 @@ GROUPS = (
 )
 UNITS = ("metre", "arbitrary")
 PHOTOS = "photos"
-"""Data set and group of one's own photographs."""
+"""Data set and group of your own photographs."""
 
 MIN_PHOTOS = 3
 """Structure from motion needs at least this many."""
@@ -50,14 +50,14 @@ class SceneRow:
     """One scene of the sheet.
 
     Attributes:
-        dataset: data set, first part of its place under `results/`.
+        dataset: data set, first part of the scene's path under `results/`.
         scene: scene name, second part.
         group: "benchmark", "development", "ci", "photos" or a real data set such as "lerf".
         source: `world:<kind>:<seed>`, `data:<folder below data_root>`, or a folder.
         unit: unit of the source's lengths, "metre" or "arbitrary".
         folder: the source folder, resolved; None for a world, and for `data:` without a data root.
-        gaussians: somebody's 3DGS PLY in the source's coordinates, which takes the place of a fit;
-            None where the Gaussians are fitted, and for `data:` without a data root.
+        gaussians: a ready-made 3DGS PLY in the source's coordinates, used instead of a fit; None if the
+            Gaussians are fitted, and for `data:` without a data root.
     """
 
     dataset: str
@@ -124,17 +124,17 @@ def read_sheet(
 ) -> list[SceneRow]:
     """Read and check the scene sheet: tab-separated, one header line, `#` begins a comment line.
 
-    The column `gaussians` may be left out; an empty cell or "-" in it has the Gaussians fitted.
+    The column `gaussians` may be left out; if its cell is empty or "-", the Gaussians are fitted.
 
     Args:
         path: the sheet; relative sources start from its project root.
         checked_groups: groups whose source folders must exist and hold images; None for all. A
-            run checks the groups it runs, so that a lost folder of another group does not stop it.
-        data_root: folder of the real data sets, which `data:` sources start from; where it is
-            empty such rows have no folder. Whether they are there is not checked here.
+            run checks the groups it runs, so that a missing folder of another group does not stop it.
+        data_root: folder of the real data sets, from which `data:` sources start; if it is empty,
+            such rows have no folder. This function does not check that they exist.
 
     Raises:
-        SceneError: naming sheet, line, column and the way out.
+        SceneError: the sheet cannot be used; the message names line, column and what to do.
     """
     path = Path(path)
     lines = content_lines(path)
@@ -152,10 +152,10 @@ def read_sheet(
                 f"{path}, line {line}: wrong number of columns",
                 expected=f"{len(header)} columns, separated by tabs ({_joined(header)})",
                 found=f"{len(cells)}: {text!r}",
-                fix="separate the columns by one tab each, and leave none out",
+                fix="separate the columns with one tab each, and leave none out",
             )
         row = _row(path, line, dict(zip(header, cells, strict=True)), checked_groups, data_root)
-        # Names that differ in case only would share a folder on some file systems.
+        # Names that differ only in case would share a folder on some file systems.
         if (key := row.name.casefold()) in line_of:
             raise SceneError(
                 f"{path}, line {line}, column scene: {row.name} is listed twice",
@@ -170,16 +170,16 @@ def read_sheet(
 def choose_scenes(
     rows: Sequence[SceneRow], groups: Collection[str], only: Sequence[str]
 ) -> tuple[SceneRow, ...]:
-    """Scenes of a run: those of the groups or, where some are named, those alone, in the sheet's order.
+    """Scenes of a run, in the sheet's order: all those of the groups, or the named ones alone.
 
     Args:
         rows: the sheet.
         groups: groups of the run.
-        only: names such as `table-1` or `synthetic/table-1`; none for all scenes of the groups. A
-            short name means scenes of the groups; only where these have none of that name, any.
+        only: names such as `table-1` or `synthetic/table-1`; empty for all scenes of the groups. A
+            short name means scenes of the groups or, if they have none of that name, of any group.
 
     Raises:
-        SceneError: a name is in no row.
+        SceneError: no row has a given name.
     """
     in_groups = [row for row in rows if row.group in groups]
     if not only:
@@ -190,7 +190,7 @@ def choose_scenes(
         found = found or [row.name for row in rows if name in (row.scene, row.name)]
         if not found:
             raise SceneError(
-                f"only names {name!r}, and no scene is called so",
+                f"only names {name!r}, but no scene has that name",
                 expected=", ".join(row.name for row in in_groups or rows),
                 fix="correct the name, or add a row to the scene sheet",
             )
@@ -236,7 +236,7 @@ def _check_header(path: Path, line: int, header: list[str]) -> None:
             f"{path}, line {line}: the header cannot be used",
             expected=f"the columns {_joined(COLUMNS)}, separated by tabs; also {_joined(OPTIONAL_COLUMNS)}",
             found="; ".join(problems),
-            fix="correct the header line; blanks or commas do not separate columns",
+            fix="correct the header line; spaces or commas do not separate columns",
         )
 
 
@@ -274,7 +274,7 @@ def _row(
         folder = None
     else:
         folder = _resolved(path, source, data_root)
-        # What is absent of a published data set is skipped by the workflow, which says so.
+        # The workflow skips the missing scenes of a published data set, and says so.
         if folder is not None and is_checked and not source.startswith(DATA_PREFIX):
             _check_source(where, folder)
     gaussians = None
@@ -284,7 +284,7 @@ def _row(
         if gaussians is None and folder is not None and is_checked:
             raise SceneError(
                 f"{where}: {cell!r} is relative to data_root, which is not set",
-                fix="set data_root, or give a path that starts from the project folder",
+                fix="set data_root, or give a path relative to the project folder",
             )
         if gaussians is not None and is_checked:
             _check_gaussians(where, gaussians)
@@ -294,7 +294,7 @@ def _row(
 
 
 def _resolved(sheet: Path, place: str, data_root: str) -> Path | None:
-    """A path of the sheet, from the project root or, with `data:`, the data root; None without that."""
+    """A path of the sheet, from the project root or, with `data:`, the data root; None if that is not set."""
     start = project_root(sheet)
     if place.startswith(DATA_PREFIX):
         if not data_root:
@@ -331,7 +331,7 @@ def _check_source(where: str, folder: Path) -> None:
     if not list_images(photo_folder(folder)) and not has_known_poses(folder):
         raise SceneError(
             f"{where}: folder {folder} has no images",
-            expected=f"files of the kinds {', '.join(sorted(IMAGE_SUFFIXES))} in it or in its images/ folder",
+            expected=f"files with suffix {', '.join(sorted(IMAGE_SUFFIXES))} in it or in its images/ folder",
             found=_what_else(folder),
             fix="correct the path, or convert the photographs to JPEG or PNG",
         )

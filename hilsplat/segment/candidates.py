@@ -1,4 +1,4 @@
-"""What the networks say about a view: the costly half of automatic mask generation, which is cached."""
+"""What the networks predict for a view: the costly, cached half of automatic mask generation."""
 
 from dataclasses import dataclass
 
@@ -8,6 +8,7 @@ from jaxtyping import Float32, Int8, Int32, Int64, UInt8
 from hilsplat.base.artifacts import sha256_of_json
 from hilsplat.base.identity import code_digest
 from hilsplat.segment.logit_kernels import edge_windows
+from hilsplat.segment.masks import join_rows
 from hilsplat.segment.sam import HEADS, Frame, SamModel, point_grid, read_logits
 from hilsplat.settings import MasksSettings
 
@@ -23,12 +24,12 @@ CROP_OVERLAP = 512 / 1500
 
 @dataclass(frozen=True)
 class Candidates:
-    """K masks as the decoder gave them, before any threshold that a user may want to turn.
+    """K masks as the decoder gave them, before any threshold that a user may change.
 
-    A mask's logits are kept inside a window round it, in steps of `sam.LOGIT_STEP`, and flat
-    (+-127) wherever no edge is within `BAND_PX`: the two bilinear resizings up to the view read logits
-    at most three pixels apart, so every pixel of every mask stays what it was, and what is left is
-    constant almost everywhere and packs small. Outside the window stands -127.
+    A mask's logits are kept inside a window around it, in steps of `sam.LOGIT_STEP`, and set to
+    +-127 wherever no edge is within `BAND_PX`: the two bilinear resizings up to the view read logits
+    at most three pixels apart, so no pixel of any mask changes, and the window is constant almost
+    everywhere and compresses well. Outside the window logits are -127.
 
     Attributes:
         logits: the windows one after the other, row by row.
@@ -60,16 +61,8 @@ class Candidates:
     @staticmethod
     def concatenate(parts: "list[Candidates]") -> "Candidates":
         """Rows of all parts, at least one, one after the other."""
-        starts = np.cumsum([0, *(len(part.logits) for part in parts)])
-        offsets = [part.offsets[1:] + start for part, start in zip(parts, starts[:-1], strict=True)]
-        return Candidates(
-            offsets=np.concatenate([np.zeros(1, np.int64), *offsets]),
-            low_hw=parts[0].low_hw,
-            **{
-                name: np.concatenate([getattr(part, name) for part in parts])
-                for name in ("logits", "window_xyxy", "head", "predicted_iou", "stability", "crop")
-            },
-        )
+        names = ("window_xyxy", "head", "predicted_iou", "stability", "crop")
+        return Candidates(low_hw=parts[0].low_hw, **join_rows(parts, "logits", names))
 
 
 def crop_boxes(
@@ -133,7 +126,7 @@ def decode_candidates(
         points = grid * (right - left, bottom - top)
         for start in range(0, len(points), batch):
             asked = points[start : start + batch]
-            # Every call has the same number of prompts: some networks fix it, and results then
+            # Every call has the same number of prompts: some networks fix it, and so results
             # cannot depend on how a batch was cut.
             padded = np.concatenate([asked, np.repeat(asked[-1:], batch - len(asked), axis=0)])
             scores, logits = model.decode(encoded, padded)

@@ -2,8 +2,8 @@
 
 Two halves. `candidates.decode_candidates` runs the networks and depends on few settings; what it
 returns is cached. `masks_from_candidates` filters, upscales and suppresses; changing its knobs costs
-no network call. The steps are SAM's automatic generator, kept apart for the three heads as LangSplat does,
-then LangSplat's mask suppression.
+no network call. The steps are SAM's automatic generator, run separately for the three heads as in
+LangSplat, then LangSplat's mask suppression.
 """
 
 import numpy as np
@@ -25,8 +25,8 @@ CROP_EDGE_PX = 20
 def masks_from_candidates(
     candidates: Candidates, size_hw: tuple[int, int], model: SamModel, settings: MasksSettings
 ) -> HierarchicalMasks:
-    """Thresholds, upscaling, and the four suppressions: boxes in a crop, boxes across crops, boxes again
-    after small islands and holes are gone, masks.
+    """Thresholds, upscaling and four suppressions: boxes in a crop, boxes across crops, boxes again after
+    small islands and holes are gone, masks.
 
     Returns:
         masks in `content_order`; a level may be empty.
@@ -50,7 +50,7 @@ def masks_from_candidates(
             masks = masks.take(
                 suppress_boxes(masks.box_xyxy, layer + masks.predicted_iou / 2, settings.box_nms_iou)
             )
-        # Mending costs most, so it comes after the boxes have thinned the masks out, as in SAM.
+        # Mending costs most, so it comes after suppression by boxes, as in SAM.
         masks, changed = mend_masks(masks, settings.min_area_px)
         if changed.any():  # mending moved boxes; masks that needed none are better (SAM)
             keep = suppress_boxes(masks.box_xyxy, ~changed + masks.predicted_iou / 2, settings.box_nms_iou)
@@ -66,7 +66,7 @@ def masks_from_candidates(
 
 
 def _frame(crop_box: Int32[np.ndarray, " 4"], model: SamModel) -> Frame:
-    """How a crop sat in the network's input."""
+    """Where a crop was in the network's input."""
     left, top, right, bottom = (int(number) for number in crop_box)
     original = (bottom - top, right - left)
     return Frame(original, sam.resized_size(original, model.longest_edge), model.padded_hw)
@@ -96,7 +96,7 @@ def _upscale(
         int(crop_box[0]),
         *size_hw,
     )
-    # a code of one run is a mask without pixels
+    # a single run is a mask without pixels
     keep = np.flatnonzero(np.diff(offsets) > 1)
     runs, offsets = take_runs(runs, offsets, keep)
     masks = HierarchicalMasks.from_runs(
@@ -131,7 +131,7 @@ def mend_masks(
 def cut_by_crop(
     boxes: Int32[np.ndarray, "M 4"], crop_box: Int32[np.ndarray, " 4"], size_hw: tuple[int, int]
 ) -> Bool[np.ndarray, " M"]:
-    """Which boxes touch an edge of their crop that is no edge of the image."""
+    """Which boxes touch an edge of their crop that is not an edge of the image."""
     image_box = np.array([0, 0, size_hw[1], size_hw[0]])
     near_crop = np.abs(boxes - crop_box) <= CROP_EDGE_PX
     near_image = np.abs(boxes - image_box) <= CROP_EDGE_PX

@@ -1,8 +1,8 @@
 """Masks without a model: OpenCV's graph segmentation, merged into three nested scales.
 
-For photographs where no SAM weights are at hand. It knows nothing of objects: its levels are coarse,
-middle and fine regions of even colour, nested by construction, and its scores say how clearly a
-region stands out. A region that one scale shares with the next appears at both levels.
+For photographs without SAM weights. It knows nothing about objects: its levels are coarse, middle and
+fine regions of even colour, nested by construction, and its scores say how clearly a region stands
+out. A region that two scales share appears at both levels.
 """
 
 import heapq
@@ -16,20 +16,20 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.segment.masks import HierarchicalMasks, runs_of_labels
 
 WORK_SIDE_PX = 640
-"""Images are segmented at this longer side; finer texture is no part of anything."""
+"""Images are segmented at this longer side; finer texture is not a part of anything."""
 
 BASE_SCALE = 80.0
 """Scale `k` of the base segmentation (Felzenszwalb and Huttenlocher), in its colour units."""
 
 CONTRAST = 6.0
-"""Colour difference (CIELAB units) that a region of exactly a level's least size must have to all
-its neighbours in order to stay; larger regions stay with less, in proportion to their area."""
+"""Colour difference (CIELAB units) from all its neighbours that keeps a region of exactly a level's
+least size; larger regions need less, in proportion to their area."""
 
 THIN_PX = 4.0
-"""A region of less width (at working size) is the seam that blur leaves along a strong edge."""
+"""A narrower region (at working size) is the seam that blur leaves along a strong edge."""
 
 THIN_HURRY = 0.01
-"""Factor on the cost of merging a seam: seams go first, into the more similar side."""
+"""Factor on the cost of merging a seam: seams merge first, into the more similar side."""
 
 LIGHTNESS = 0.6
 """Weight of lightness beside hue and chroma: shading changes lightness inside one thing."""
@@ -44,22 +44,22 @@ def segment_graph(
     """Segment a photograph into regions at three nested scales.
 
     A fine segmentation (`cv2.ximgproc.segmentation`) is merged pair by pair, the cheapest first. A
-    merge of regions with colour difference D, the smaller of area A and perimeter P, costs D times
-    that one's width, `min(sqrt(A), 4 A / P)`: small or thin regions go into their most similar
-    neighbour, large ones stay apart though they differ less. A level of least size s (a share of
-    the image side) is the state in which every merge left costs at least
+    merge across a colour difference D, the smaller region of area A and perimeter P, costs D times
+    that region's width, `min(sqrt(A), 4 A / P)`: small or thin regions join their most similar
+    neighbour, large ones stay apart even if they differ less. A level of least size s (a share of
+    the image side) is the state in which every remaining merge costs at least
     `CONTRAST * s * sqrt(image area)`.
 
     Args:
         image: the view.
         scales: least size at whole, part, subpart; each at most the one before.
-        min_area_px: smaller regions give no mask.
+        min_area_px: smaller regions become no mask.
 
     Returns:
         one mask per region and level. `predicted_iou` is the mean colour difference along the
         region's border over `CLEAR_EDGE`, clipped to 1; `stability` is the share of scales,
         on a logarithmic axis from the level's own to the one where everything is merged, over which
-        the region lives on unchanged.
+        the region persists unchanged.
     """
     height, width = image.shape[:2]
     small = resize_to_fit(image, WORK_SIDE_PX)
@@ -92,13 +92,13 @@ def segment_graph(
 
 Merge = tuple[float, int, int]
 """Cost at which a merge happens (never falling) and the two regions that merge; the result is a new
-region, numbered on from the base regions in the order of merges."""
+region, numbered after the base regions in the order of merges."""
 
 
 def to_lab(image: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
     """CIELAB of a slightly smoothed image, with lightness scaled by `LIGHTNESS`.
 
-    Smoothing takes out texture of a pixel or two.
+    Smoothing removes texture of a pixel or two.
     """
     smooth = cv2.bilateralFilter(image, d=7, sigmaColor=20, sigmaSpace=3)
     lab = cv2.cvtColor(smooth.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2LAB)
@@ -116,7 +116,7 @@ def base_regions(image: UInt8[np.ndarray, "H W 3"], finest: float) -> Int32[np.n
 def steps_along(
     axis: int, labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]
 ) -> tuple[Int32[np.ndarray, "n m"], Int32[np.ndarray, "n m"], Float[np.ndarray, "n m"]]:
-    """Labels of each pair of pixels next to each other along an axis, and the colour difference there.
+    """Labels of each pair of adjacent pixels along an axis, and the colour difference there.
 
     The difference is taken two pixels wider than the pair: a photograph's edge is never one pixel wide.
     """
@@ -147,7 +147,7 @@ def neighbours(
 
 
 def roughness(labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, " n"]:
-    """Mean colour difference between pixels next to each other inside each region: its texture."""
+    """Mean colour difference between adjacent pixels inside each region: its texture."""
     total, count = np.zeros(labels.max() + 1), np.zeros(labels.max() + 1)
     for axis in (0, 1):
         first, second, contrast = steps_along(axis, labels, lab)
@@ -161,8 +161,8 @@ def merge_regions(labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 
     """Merge until one region is left, the cheapest pair first (equal costs: lower numbers first).
 
     The colour difference of a pair is the mean of two: between mean colours, and across their
-    border beyond what their own texture shows anyway. It is halved where the smaller region is
-    enclosed by the larger one, and next to nothing where it is a seam (`THIN_PX`).
+    border in excess of their own texture. It is halved if the smaller region is enclosed by the
+    larger one, and nearly zero if it is a seam (`THIN_PX`).
     """
     flat = labels.reshape(-1)
     area = np.bincount(flat).astype(np.float64).tolist()
@@ -228,7 +228,7 @@ def cut(
     """Regions after all merges cheaper than `threshold`.
 
     Returns:
-        labels 0..n-1, and the cost at which each region merges on (infinity for the last one).
+        labels 0..n-1, and the cost at which each region merges further (infinity for the last one).
     """
     num_base = int(labels.max()) + 1
     owner = np.arange(num_base + len(merges))
@@ -247,7 +247,7 @@ def cut(
 def border_contrast(
     labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Mean colour difference along the whole border of each region; 0 where it has none."""
+    """Mean colour difference along the whole border of each region; 0 if it has none."""
     total, length = np.zeros(labels.max() + 1), np.zeros(labels.max() + 1)
     for (a, b), (contrast, count) in neighbours(labels, lab).items():
         total[[a, b]] += contrast

@@ -1,7 +1,7 @@
-"""Compiled loops over run lengths. One file: numba keeps them on disk until its bytes change.
+"""Compiled loops over run lengths.
 
-Masks are run lengths over the flattened image (see `masks.encode_runs`), so that nothing here holds a
-picture per mask. Every loop is sequential: results do not depend on threads.
+Masks are run lengths over the flattened image (see `masks.encode_runs`), so that nothing here holds an
+image per mask. Every loop is sequential: results do not depend on threads.
 """
 
 from typing import no_type_check
@@ -17,7 +17,7 @@ BAND_WORDS = 2**17
 @compiled
 @no_type_check
 def _push(out, count, length):
-    """Append a run; the buffer doubles where it is full."""
+    """Append a run; the buffer doubles when it is full."""
     if count == len(out):
         longer = np.empty(2 * len(out), np.uint32)
         longer[:count] = out
@@ -33,7 +33,7 @@ def upscaled_runs(
 ):
     """Run lengths of masks from windows of low-resolution logits, enlarged by weights along each axis.
 
-    Pixel (y, x) of a crop at (top, left) of the image lies in the mask where
+    Pixel (y, x) of a crop at (top, left) of the image is in the mask if
     `sum_ij weight_y[y, i] weight_x[x, j] low[first_y[y] + i, first_x[x] + j] > 0`; low is the lowest
     logit outside the window. The weights are convex, so a pixel whose logits have one sign has that
     sign, and only pixels near a change of sign are computed.
@@ -43,7 +43,7 @@ def upscaled_runs(
         rows: which of them.
         first_y, weight_y: first low-resolution row and weights of each row of the crop.
         first_x, weight_x: the same along x.
-        top, left, height, width: place of the crop in the image, and the image's size.
+        top, left, height, width: position of the crop in the image, and the image's size.
 
     Returns:
         runs and offsets (`masks.encode_runs`); a mask without pixels is one run.
@@ -312,7 +312,7 @@ def shared_pixels(runs, offsets, boxes, height, width):
                         _set_bits(bits[k, line - top], start - line * width, cut - line * width)
                         start = cut
                 if end > bottom * width:
-                    break  # goes on in the next band
+                    break  # continues in the next band
                 at[k] = end
                 place[k] += 1
         for first in range(num_active):
@@ -338,7 +338,7 @@ def shared_pixels(runs, offsets, boxes, height, width):
 @compiled
 @no_type_check
 def paint_runs(runs, offsets, order, canvas):
-    """Write each row number of `order` into the flat canvas where its mask lies; later ones win."""
+    """Write each row number of `order` into the flat canvas at the pixels of its mask; later ones win."""
     for row in order:
         at = np.int64(0)
         for place in range(offsets[row], offsets[row + 1]):

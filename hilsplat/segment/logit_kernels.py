@@ -10,7 +10,7 @@ from hilsplat.base.compiled import compiled
 @compiled
 @no_type_check
 def quantise_logits(logits, per_unit, upper, lower, valid_h, valid_w):
-    """Round logits to steps, and count what the tests of a mask need.
+    """Round logits to steps, and measure what stability and box of a mask need.
 
     Args:
         logits: float32 (K, h, w).
@@ -20,7 +20,7 @@ def quantise_logits(logits, per_unit, upper, lower, valid_h, valid_w):
 
     Returns:
         steps int8 (K, h, w) in -127..127; pixels of the image above `upper` and above `lower`;
-        box (xyxy, end exclusive) of all pixels above 0, empty where there is none.
+        box (xyxy, end exclusive) of all pixels above 0, empty if there are none.
     """
     number, height, width = logits.shape
     steps = np.empty((number, height, width), np.int8)

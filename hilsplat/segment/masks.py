@@ -1,7 +1,9 @@
 """Overlapping masks of one view at three levels, run-length coded."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32, Int64, UInt8, UInt32
@@ -64,6 +66,20 @@ def runs_of_labels(
         pieces.append(lengths if edges[-1] == flat.size else np.append(lengths, flat.size - edges[-1]))
     offsets = np.cumsum([0, *(len(piece) for piece in pieces)], dtype=np.int64)
     return np.concatenate([np.zeros(0, np.int64), *pieces]).astype(np.uint32), offsets
+
+
+def join_rows(parts: Sequence[Any], ragged: str, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Fields of several tables, at least one, with their rows one after the other.
+
+    Args:
+        parts: tables with `offsets` into the field `ragged`.
+        ragged: field whose values each row has its own number of.
+        names: the other fields to join, with one entry per row.
+    """
+    starts = np.cumsum([0, *(len(getattr(part, ragged)) for part in parts)])
+    offsets = [part.offsets[1:] + start for part, start in zip(parts, starts[:-1], strict=True)]
+    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in (ragged, *names)}
+    return {"offsets": np.concatenate([np.zeros(1, np.int64), *offsets]), **joined}
 
 
 @dataclass(frozen=True)
@@ -173,29 +189,21 @@ class HierarchicalMasks:
 
     @staticmethod
     def concatenate(parts: "list[HierarchicalMasks]", size_hw: tuple[int, int]) -> "HierarchicalMasks":
-        """Rows of all parts, one after the other; `size_hw` is the view's where there is no part."""
+        """Rows of all parts, one after the other; `size_hw` is the view's size, px."""
         empty = HierarchicalMasks.from_dense(
             np.zeros((0, *size_hw), bool),
             np.zeros(0, np.uint8),
             np.zeros(0, np.float32),
             np.zeros(0, np.float32),
         )
-        parts = [empty, *parts]
-        starts = np.cumsum([0, *(len(part.runs) for part in parts)])
-        offsets = [part.offsets[1:] + start for part, start in zip(parts, starts[:-1], strict=True)]
-        joined = {
-            name: np.concatenate([getattr(part, name) for part in parts])
-            for name in ("runs", "level", "predicted_iou", "stability", "area_px", "box_xyxy")
-        }
-        return HierarchicalMasks(
-            offsets=np.concatenate([np.zeros(1, np.int64), *offsets]), size_hw=size_hw, **joined
-        )
+        names = ("level", "predicted_iou", "stability", "area_px", "box_xyxy")
+        return HierarchicalMasks(size_hw=size_hw, **join_rows([empty, *parts], "runs", names))
 
     def content_order(self) -> Int64[np.ndarray, " M"]:
         """Rows sorted by what they hold: level, large to small, box, predicted IoU, runs.
 
-        The order depends on no row numbers, so a segmenter that ends with it gives the same file
-        whatever order its prompts came in.
+        The order does not depend on row numbers, so a segmenter that ends with it writes the same file
+        whatever the order of its prompts.
         """
         keys = [
             (

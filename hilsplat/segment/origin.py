@@ -1,4 +1,4 @@
-"""What made the masks of a scene, as rows and titles name it."""
+"""The name, in rows and titles, of what made the masks of a scene."""
 
 from pathlib import Path
 from typing import Any
@@ -9,8 +9,8 @@ from hilsplat.base.artifacts import read_index
 def masks_label(masks_folder: Path) -> str:
     """What made the masks, as rows name it.
 
-    The model folder's name, or the segmenter without one; masks made from true labels bring a label that
-    also tells their faults.
+    The model folder's name, or the segmenter's if it has no model; masks made from true labels have a
+    label that also names their faults.
     """
     return label_of_index(read_index(masks_folder))
 
@@ -23,5 +23,5 @@ def label_of_index(index: dict[str, Any]) -> str:
 
 
 def made_from_truth(masks: str) -> bool:
-    """Whether masks with this label were made from true labels: a diagnostic that is no result."""
+    """Whether masks with this label were made from true labels: a diagnostic, not a result."""
     return masks.startswith("truth-perturbed")

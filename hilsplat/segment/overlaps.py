@@ -21,9 +21,9 @@ def region_ious(
     first = int(np.searchsorted(ids, 0))
     areas = np.bincount(index, minlength=len(ids))
     guesses = masks.reshape(len(masks), flat.size)
-    shared = np.stack(
-        [np.bincount(index, weights=guess, minlength=len(ids)) for guess in guesses] or [np.zeros(len(ids))]
-    )[: len(masks)].T
+    shared = np.zeros((len(ids), len(masks)))
+    for row, guess in enumerate(guesses):
+        shared[:, row] = np.bincount(index, weights=guess, minlength=len(ids))
     union = areas[:, None] + guesses.sum(axis=1)[None] - shared
     found = (shared / np.maximum(union, 1)).astype(np.float32)
     return ids[first:].astype(np.int64), areas[first:].astype(np.int64), found[first:]

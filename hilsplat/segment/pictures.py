@@ -16,7 +16,7 @@ from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
 
 GOLDEN = 0.6180339887498949
-"""Step of the hue from one row to the next: neighbours in the table never look alike."""
+"""Step of the hue from one row to the next: neighbouring rows never look alike."""
 
 UNCOVERED = 0.35
 """Brightness of pixels without a mask."""
@@ -77,9 +77,9 @@ def tree_picture(
     parent: Int32[np.ndarray, " M"],
     max_leaves: int = 12,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The coverage trees of a view that hold most masks: roots at the left, children to the right.
+    """The coverage trees of a view that hold the most masks: roots at the left, children to the right.
 
-    A mask is shown as its crop, dimmed outside, framed in the colour that it has in `masks_picture`.
+    A mask is shown as its crop, dimmed outside and framed in its colour from `masks_picture`.
 
     Args:
         image: the view.
@@ -111,7 +111,7 @@ def tree_picture(
     palette = row_colours(len(masks))
 
     def draw(row: int, depth: int, top: int) -> int:
-        """Draw a subtree from the given leaf on; the height at which its root stands, px."""
+        """Draw a subtree from the given leaf on; returns the top of its root's crop, px."""
         below, at = [], top
         for child in children.get(row, []):
             below.append(draw(child, depth + 1, at))

@@ -1,7 +1,7 @@
-"""Segment Anything by onnxruntime: one image in, three masks per point prompt out.
+"""Segment Anything in onnxruntime: one image in, three masks per point prompt out.
 
-Preparation and restoring of sizes follow the SamProcessor of the transformers library, because its
-ONNX exports are what we read. The rounding of logits (`read_logits`) is ours.
+Images are resized and masks restored as by SamProcessor of the transformers library, whose ONNX
+exports are read here. The rounding of logits (`read_logits`) is ours.
 """
 
 import math
@@ -20,8 +20,8 @@ HEADS: tuple[Level, Level, Level] = (Level.SUBPART, Level.PART, Level.WHOLE)
 """What the decoder's three outputs mean, in its order: fine to coarse."""
 
 LOGIT_STEP = 1 / 8
-"""Logits are rounded to this step and clipped to +-127 steps, so that a view's survivors fit in a few MB
-of cache. A border moves by less than a hundredth of a low-resolution pixel where the logit changes by 5 per
+"""Logits are rounded to this step and clipped to +-127 steps, so that the candidates of a view fit in a few
+MB of cache. A border moves by less than a hundredth of a low-resolution pixel if the logit changes by 5 per
 pixel, as it does at SAM's borders."""
 
 
@@ -81,7 +81,7 @@ class SamModel:
         else:
             self.padded_hw = (side_px(padded, self.longest_edge),) * 2
         self.resample = Image.Resampling(preprocessing.get("resample", Image.Resampling.BILINEAR))
-        # transformers' defaults where a key is missing: ImageNet statistics, values in 0..1
+        # transformers' defaults if a key is missing: ImageNet statistics, values in 0..1
         self.mean = np.array(preprocessing.get("image_mean", (0.485, 0.456, 0.406)), dtype=np.float32)
         self.std = np.array(preprocessing.get("image_std", (0.229, 0.224, 0.225)), dtype=np.float32)
         self.rescale = np.float32(preprocessing.get("rescale_factor", 1 / 255))
@@ -91,7 +91,7 @@ class SamModel:
         """Open a model folder.
 
         Raises:
-            ModelError: it is missing, incomplete or no SAM.
+            ModelError: it is missing, incomplete or not a SAM.
         """
         return SamModel(
             open_model_folder(folder, "sam", fix="set masks.segmenter: graph, which needs no model")
@@ -116,7 +116,7 @@ class SamModel:
         return Encoded(embeddings, positional, frame)
 
     def prompts_per_call(self, wanted: int, asked: int) -> int:
-        """Prompts of one decoder call: the network's number where it fixes one, else at most those asked."""
+        """Prompts of one decoder call: the number the network fixes, if any, else at most `asked`."""
         return self.decoder.fixed_axis("input_points", 1) or min(wanted, asked)
 
     def decode(
@@ -155,22 +155,22 @@ def valid_low_resolution(low_hw: tuple[int, int], frame: Frame) -> tuple[int, in
 def read_logits(
     logits: Float32[np.ndarray, "K h w"], offset: float, frame: Frame
 ) -> tuple[Int8[np.ndarray, "K h w"], Float32[np.ndarray, " K"], Int32[np.ndarray, "K 4"]]:
-    """Round logits, and tell how stable each mask is and where it lies.
+    """Round logits, and measure the stability and the box of each mask.
 
-    Stability is the IoU of the masks at logit thresholds +offset and -offset; 0 where the larger one
+    Stability is the IoU of the masks at logit thresholds +offset and -offset; 0 if the larger one
     is empty. Departs: SAM counts pixels of the full-size mask; we count low-resolution ones, which
     saves the upscaling of masks that are dropped.
 
     Returns:
         logits in steps of `LOGIT_STEP`, clipped to +-127 steps; stability; box (xyxy, low-resolution
-        px, end exclusive) of what is above 0, all 0 where nothing is.
+        px, end exclusive) of what is above 0, all 0 if nothing is.
     """
     height, width = valid_low_resolution((logits.shape[1], logits.shape[2]), frame)
     steps = offset / LOGIT_STEP
     rounded, small, large, boxes = quantise_logits(
         np.ascontiguousarray(logits),
         np.float32(1 / LOGIT_STEP),
-        math.floor(steps),  # whole steps exceed a number where they exceed its floor
+        math.floor(steps),  # a whole number exceeds another number if it exceeds its floor
         math.floor(-steps),
         height,
         width,

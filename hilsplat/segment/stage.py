@@ -31,7 +31,7 @@ def train_views(scene: Scene) -> list[str]:
     """Training views of a scene.
 
     Raises:
-        SceneError: there is none.
+        SceneError: there are none.
     """
     views = scene.views("train")
     if not views:
@@ -56,7 +56,11 @@ def run_masks(scene_folder: Path, out: Path, cache: Path, settings: MasksSetting
     with stage_log("masks", scene.name) as counts:
         if settings.segmenter == "sam":
             model = SamModel.load(Path(settings.model))
-            identity = {"segmenter": "sam", "model": settings.model, "model_sha256": model.digest}
+            identity: dict[str, str | None] = {
+                "segmenter": "sam",
+                "model": settings.model,
+                "model_sha256": model.digest,
+            }
 
             def segment(view: str) -> HierarchicalMasks:
                 return sam_masks(scene, view, model, view_cache, settings)
@@ -85,7 +89,7 @@ def run_masks(scene_folder: Path, out: Path, cache: Path, settings: MasksSetting
 def sam_masks(
     scene: Scene, view: str, model: SamModel, cache: ViewCache, settings: MasksSettings
 ) -> HierarchicalMasks:
-    """One view's masks by SAM; the networks run only where the cache lacks the view."""
+    """One view's masks by SAM; the networks run only if the view is not in the cache."""
     key = candidates_key(sha256_of_file(scene.image_path(view)), model, settings)
     arrays = cache.get(key, lambda: decode_candidates(scene.image(view), model, settings).arrays())
     return masks_from_candidates(Candidates(**arrays), scene.cameras[view].size_hw, model, settings)

@@ -1,4 +1,4 @@
-"""Dropping masks that say the same as a better one: by boxes, then by pixels."""
+"""Dropping masks that repeat a better one: by boxes, then by pixels."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
@@ -7,17 +7,17 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.segment.masks import HierarchicalMasks
 
 BOXES_AT_ONCE = 256
-"""Boxes compared with all that follow at once."""
+"""Boxes that are compared with all following ones in one step."""
 
 INNER_COVERED = 0.85
-"""Share of a mask inside another one above which it counts as contained (LangSplat)."""
+"""Share of a mask inside another one from which on it counts as contained (LangSplat)."""
 
 INNER_COVERS = 0.5
 """Share of the container that the contained mask must stay below (LangSplat)."""
 
 
 def box_iou(boxes_a: Int[np.ndarray, "A 4"], boxes_b: Int[np.ndarray, "B 4"]) -> Float[np.ndarray, "A B"]:
-    """IoU of boxes (xyxy, px, end exclusive); 0 where both are empty."""
+    """IoU of boxes (xyxy, px, end exclusive); 0 if both are empty."""
     shared = np.ones((len(boxes_a), len(boxes_b)))
     for axis in (0, 1):
         low = np.maximum(boxes_a[:, None, axis], boxes_b[None, :, axis])
@@ -64,13 +64,13 @@ def keep_best_masks(
 ) -> Bool[np.ndarray, " M"]:
     """LangSplat's mask suppression inside one level, for rows that are already in a fixed order.
 
-    With I shared pixels and areas a, row j is dropped where any of these holds:
+    With I shared pixels and areas a, row j is dropped if any of these holds:
     - its score is below `score_min`;
     - a row of better score (of equal score: a lower row) has an IoU with it above `iou_max`;
     - it sits inside a row i: `I / a_j >= 0.85`, `I / a_i < 0.5` and
       `1 - (I / a_i) (I / a_j) > 1 - inner`. The left side exceeds 0.5, so `inner = 0.5` drops every
-      contained mask whichever score is higher, and `inner = 0` none: nesting then stands between
-      levels, or inside them too.
+      contained mask whichever score is higher (masks then nest between levels only), and
+      `inner = 0` drops none (masks nest inside levels too).
     As in LangSplat, a row that is dropped itself still drops others. The result follows from three
     comparisons of matrices, so it does not depend on the order in which rows are visited.
     """

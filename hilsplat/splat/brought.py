@@ -1,4 +1,4 @@
-"""Somebody's Gaussians for a scene of ours: read, checked, and moved into the scene's coordinates."""
+"""Ready-made Gaussians for a scene: read, checked and moved into the scene's coordinates."""
 
 import logging
 from pathlib import Path
@@ -21,10 +21,10 @@ FIX = "export it again as an uncompressed 3DGS PLY, or correct column gaussians 
 
 
 def bring_gaussians(ply: Path, scene: Scene) -> tuple[Gaussians, dict[str, Any]]:
-    """Read a 3DGS PLY given in the coordinates of the scene's source poses.
+    """Read a 3DGS PLY in the coordinates of the scene's source poses.
 
-    A PLY of this package is in the coordinates of its scene instead; the JSON file beside it
-    leads back to the source's first.
+    A PLY written by this package is in the coordinates of its scene instead; it is first moved to the
+    source's, as the JSON file beside it describes.
 
     Returns:
         The Gaussians in the scene's coordinates, and their origin for the report.
@@ -35,7 +35,7 @@ def bring_gaussians(ply: Path, scene: Scene) -> tuple[Gaussians, dict[str, Any]]
     ply = Path(ply)
     gaussians = load_ply(ply, fix=FIX)
     if len(gaussians) == 0:
-        raise ArtifactError(f"{ply} holds no Gaussian", fix=FIX)
+        raise ArtifactError(f"{ply} does not hold any Gaussians", fix=FIX)
     lengths = torch.linalg.vector_norm(gaussians.quats, dim=1)
     if (zero := int((lengths < 1e-12).sum())) > 0:
         raise ArtifactError(

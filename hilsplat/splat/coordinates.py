@@ -21,14 +21,14 @@ def coordinates_path(ply: Path) -> Path:
 
 
 def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dict[str, Any]) -> None:
-    """Describe the coordinates of a PLY that is in the scene's own.
+    """Write how the coordinates of a PLY, which are the scene's, relate to those of the scene's source.
 
     The source is what the poses came from: an imported COLMAP model or transforms.json, or our own
-    structure from motion, whose coordinates nothing but this file knows.
+    structure from motion, whose coordinates are recorded nowhere else.
 
     Args:
-        ply: the written file, whose digest is kept: the JSON says nothing of any other.
-        origin: origin of the Gaussians, as in the report.
+        ply: the written file, whose digest is recorded: the JSON applies to no other.
+        origin: where the Gaussians come from, as in the report.
     """
     scale, rotation, translation = decompose(scene.scene_from_source)
     registration = read_json(scene.folder / "registration.json")
@@ -55,7 +55,7 @@ def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dic
 
 
 def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
-    """The way to the source's coordinates of a PLY that this package wrote; None if no JSON gives it.
+    """Transform of a PLY that this package wrote to its source's coordinates; None without a JSON for it.
 
     Raises:
         ArtifactError: the JSON belongs to another PLY, or its transform cannot be used.
@@ -71,7 +71,7 @@ def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
             f"{path} belongs to another PLY than {Path(ply).name}",
             expected=f"sha256 {content.get('ply_sha256')}",
             found=f"sha256 {found}",
-            fix="put the PLY that it was written with beside it, or remove it if the PLY is in the "
+            fix="put it beside the PLY that it was written for, or remove it if the PLY is in the "
             "coordinates of the scene's source",
         )
     matrix = np.array(content["source_from_scene"], dtype=np.float64)

@@ -1,8 +1,8 @@
 """Adaptive density control of 3DGS: clone, split, prune, reset opacities.
 
-The gradient that decides is that of the loss by a Gaussian's projected mean, in the units of 3DGS:
-its x part times half the image width, its y part times half the height (as by normalised device
-coordinates), its length averaged over the steps in which the Gaussian was drawn.
+The gradient that decides is that of the loss with respect to a Gaussian's projected mean, in the units
+of 3DGS: its x part times half the image width, its y part times half the height (as with normalised
+device coordinates), its length averaged over the steps in which the Gaussian was drawn.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ SPLIT_FACTOR = 1.6
 """Halves of a split Gaussian are smaller by this factor (3DGS: 0.8 x 2)."""
 HUGE = 0.5
 """Gaussians with a larger axis, in units of the extent, are pruned (3DGS: 0.1, after the first
-opacity reset; we have rooms whose walls are flat, wide Gaussians)."""
+opacity reset; here the walls of rooms are flat, wide Gaussians)."""
 RESET_OPACITY = 0.01  # 3DGS
 
 
@@ -48,7 +48,7 @@ class ScreenGradients:
         self.seen += drawn
 
     def mean(self) -> Float64[np.ndarray, " N"]:
-        """Average length; 0 for a Gaussian that was never drawn."""
+        """Average length; 0 if never drawn."""
         return self.total / np.maximum(self.seen, 1)
 
 

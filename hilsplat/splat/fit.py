@@ -1,4 +1,4 @@
-"""Base 3D Gaussian Splatting fit (Kerbl et al. 2023) on the CPU; the geometry of everything after."""
+"""Base 3D Gaussian Splatting fit (Kerbl et al. 2023) on the CPU; the geometry of all later stages."""
 
 import logging
 from pathlib import Path
@@ -39,12 +39,12 @@ CURVE_EVERY = 20
 def fit_step(
     state: FitState, views: list[TrainingView], settings: GaussiansSettings, extent: float, threads: int
 ) -> None:
-    """One view: render, compare, step; then density control when it is due."""
+    """One view: render, compare, step; then density control if it is due."""
     if not state.order:
         state.order = state.generator.permutation(len(views)).tolist()
     view = views[state.order.pop()]
     progress = state.step / settings.iterations
-    # 3DGS adds a degree every 1000 of 30 000 steps; short fits get the whole colour by a third
+    # 3DGS adds a degree every 1000 of 30 000 steps; short fits reach degree 3 after 30 % of the steps
     degree = min(settings.sh_degree, int(progress * 10))
     behind = {"black": np.zeros(3), "white": np.ones(3)}.get(settings.background)
     if behind is None:
@@ -75,7 +75,7 @@ def fit_step(
 def control_density(
     state: FitState, settings: GaussiansSettings, progress: float, extent: float, threads: int
 ) -> None:
-    """What the strategy does to the set of Gaussians after a step."""
+    """Add, move and remove Gaussians after a step, as the strategy demands."""
     is_mcmc = settings.strategy == "mcmc"
     densify_until = int(settings.densify_until * settings.iterations)
     if settings.densify_from * settings.iterations <= state.step <= densify_until:
@@ -104,22 +104,22 @@ def fit_gaussians(
     """Fit Gaussians to the training views of a scene.
 
     Args:
-        seed: fixes the view order, splits, relocations, noise and random points; the result is the
-            same bytes for any number of threads, and for a fit that was stopped and went on.
-        checkpoint: file to keep the state in every `checkpoint_every` steps and to go on from;
-            removed at the end.
-        key: digest of everything the fit depends on; another fit's checkpoint is not used.
+        seed: fixes the view order, splits, relocations, noise and random points; the result has the
+            same bytes for any number of threads, and for a fit that was stopped and resumed.
+        checkpoint: file to which the state is written every `checkpoint_every` steps, and from which
+            a stopped fit resumes; removed at the end.
+        key: digest of everything the fit depends on; the checkpoint of another fit is not used.
 
     Returns:
         The Gaussians, along a Morton curve (frozen ones in the order of their points), and the
         training curve: rows of (step, loss, training PSNR, number of Gaussians).
 
     Raises:
-        SceneError: there is no training view, or nothing is left to draw.
+        SceneError: there are no training views, or no Gaussians are left.
     """
     views = load_views(scene, "train", settings.image_scale)
     if not views:
-        raise SceneError(f"{scene.name} has no training view", fix="hold fewer views out: poses.test_every")
+        raise SceneError(f"{scene.name} has no training view", fix="hold out fewer views (poses.test_every)")
     cameras = [view.camera for view in views]
     extent = camera_extent(cameras)
     state = FitState.load(checkpoint, key) if checkpoint else None
@@ -128,7 +128,7 @@ def fit_gaussians(
         adam = Adam.start(first_gaussians(scene, cameras, settings, generator))
         state = FitState(adam, ScreenGradients.start(len(adam)), generator)
     else:
-        logger.info("going on from the checkpoint at step %d", state.step)
+        logger.info("resuming from the checkpoint at step %d", state.step)
     for _ in track(range(state.step, settings.iterations), "fit steps"):
         fit_step(state, views, settings, extent, threads)
         if len(state.adam) == 0:
@@ -160,16 +160,16 @@ def run_gaussians(
     threads: int,
     brought: Path | None = None,
 ) -> None:
-    """Stage: fit, or take somebody's Gaussians; write them, their coordinates and the report.
+    """Stage: fit Gaussians or take ready-made ones; write them, their coordinates and the report.
 
-    Written are `out_ply` (standard 3DGS), a JSON file of the same name beside it (the way back to the
+    Writes `out_ply` (standard 3DGS), a JSON file of the same name beside it (the way back to the
     source's coordinates) and the report folder (test PSNR and SSIM, curves, pictures, fly-around).
 
     Args:
-        brought: a 3DGS PLY in the coordinates of the scene's source; it takes the place of a fit.
+        brought: a 3DGS PLY in the coordinates of the scene's source, used instead of a fit.
 
     Raises:
-        SceneError: there is no training view to fit.
+        SceneError: there are no training views to fit.
         ArtifactError: `brought` cannot be used.
     """
     scene = Scene.load(scene_folder)

@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 MAX_SHOWN = 8
 """Views on the sheet of test views."""
 ERROR_GAIN = 4
-"""Errors are shown so many times as large."""
+"""Errors are shown magnified by this factor."""
 
 
 def write_report(
@@ -39,10 +39,10 @@ def write_report(
     """Write the report folder and return report.json's content.
 
     It holds `report.json`, `test_views.png` (photograph, rendering, error), `flyaround.png`,
-    `flyaround.mp4` if ffmpeg is on PATH, `curves.png` if there was a fit, and the index.
+    `flyaround.mp4` if ffmpeg is on PATH, `curves.png` after a fit, and the index.
 
     Args:
-        scene: its held-out views are scored, or its training views if it has none.
+        scene: its held-out views are scored, or its training views if none are held out.
         curve: rows of (step, loss, training PSNR in dB, number of Gaussians); None without a fit.
         origin: where the Gaussians come from.
     """
@@ -55,7 +55,9 @@ def write_report(
     views, split = load_views(scene, "test", settings.image_scale), "test"
     if not views:
         views, split = load_views(scene, "train", settings.image_scale), "train"
-    scores, flat, cells = {}, [], []
+    scores: dict[str, dict[str, float]] = {}
+    flat: list[float] = []
+    cells: list[UInt8[np.ndarray, "_ _ 3"]] = []
     for view in views:
         shown = picture(view.camera)  # scored as the 8-bit image one would save
         drawn, truth = to_float(shown), to_float(view.image)
@@ -64,7 +66,7 @@ def write_report(
         if len(cells) < 3 * MAX_SHOWN:
             error = np.abs(view.image.astype(np.int32) - shown) * ERROR_GAIN
             cells += [view.image, shown, np.minimum(error, 255).astype(np.uint8)]
-    report = {
+    report: dict[str, Any] = {
         "split": split,
         "psnr_db": float(np.mean([score["psnr_db"] for score in scores.values()])),
         "ssim": float(np.mean([score["ssim"] for score in scores.values()])),

@@ -21,22 +21,22 @@ FRAMES = 120
 FRAMES_PER_S = 24
 SHEET_FRAMES = 12
 MAX_STOPS = 80
-"""Cameras that the path is led through; of more, every n-th."""
+"""Upper limit on the cameras that the path visits; of more, it visits every n-th."""
 SMOOTHING = 1 / 40
-"""Width of the smoothing, as a share of the round: it takes the shake out of hand-held photographs."""
+"""Width of the smoothing, as a share of the round: it removes the shake of hand-held photographs."""
 TIMEOUT_S = 600
 
 
 def closed_path(cameras: list[Camera], frames: int) -> list[Camera]:
     """Cameras along a closed tour of the given ones, evenly spaced and smoothed.
 
-    The tour visits the cameras in a short round (by position and viewing direction), is walked at
-    even speed, and position, viewing direction and up are smoothed along it. Lens and image size are
-    those of the first camera.
+    The tour visits the cameras in a short round (by position and viewing direction) at even speed;
+    position, viewing direction and up are smoothed along it. Lens and image size are those of the
+    first camera.
 
     Args:
-        cameras: at least one; a single one is returned as often as asked.
-        frames: number of cameras to return; the one after the last is the first.
+        cameras: at least one; a single one is repeated.
+        frames: number of cameras to return; after the last, the path returns to the first.
     """
     stops = cameras[:: -(-len(cameras) // MAX_STOPS)]
     centres = np.stack([camera.centre for camera in stops])
@@ -45,7 +45,7 @@ def closed_path(cameras: list[Camera], frames: int) -> list[Camera]:
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()) or 1.0
     order = short_round(cdist(*[np.concatenate([centres / spread, ahead], axis=1)] * 2))
     poses = np.concatenate([centres, spread * ahead, spread * down], axis=1)[order]
-    # walked at even speed, far more finely than the frames, smoothed round the ring, then picked
+    # walk at even speed, far more finely than the frames; smooth around the ring; then pick the frames
     steps = np.linalg.norm(np.diff(poses, axis=0, append=poses[:1]), axis=1) + 1e-9 * spread
     at = np.concatenate([[0], np.cumsum(steps)])
     fine = frames * 8
@@ -60,7 +60,7 @@ def _camera(row: Float64[np.ndarray, " 9"], like: Camera) -> Camera:
     """Camera from its centre, viewing direction and down direction, which need not be orthogonal."""
     forward = row[3:6] / max(np.linalg.norm(row[3:6]), 1e-12)
     down = row[6:] - forward * (row[6:] @ forward)
-    if np.linalg.norm(down) < 1e-9:  # opposite cameras that average to nothing: any upright will do
+    if np.linalg.norm(down) < 1e-9:  # opposite cameras average to nothing: any upright will do
         down = like.cam_from_world[1, :3] - forward * (like.cam_from_world[1, :3] @ forward)
     down = down / max(np.linalg.norm(down), 1e-12)
     pose = np.eye(4)
@@ -96,7 +96,7 @@ def write_flyaround(
     """Write `flyaround.png` and, if ffmpeg is on PATH, `flyaround.mp4`.
 
     Args:
-        cameras: training cameras, which the path is led through.
+        cameras: training cameras, which the path visits.
         picture: renders a camera.
 
     Returns:

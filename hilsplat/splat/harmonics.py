@@ -1,4 +1,4 @@
-"""Spherical harmonics of 3DGS, and how they turn."""
+"""Spherical harmonics of 3DGS, and how they rotate."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -25,11 +25,11 @@ def sh_basis(directions: Float64[np.ndarray, "P 3"], degree: int) -> Float64[np.
 
 
 def sh_rotation(rotation: Float64[np.ndarray, "3 3"], degree: int) -> Float64[np.ndarray, "K K"]:
-    """Matrix that turns spherical-harmonics coefficients: the colour seen along R d is that along d before.
+    """Matrix that rotates spherical-harmonics coefficients: the colour along R d is what it was along d.
 
-    The harmonics of one band turn among themselves, so the matrix has a block per band. Each is
-    solved from the harmonics at more directions than the band has members; it is exact but for
-    rounding, because a turned harmonic lies in the band.
+    Rotation keeps each band to itself, so the matrix has a block per band. Each is solved from the
+    harmonics at more directions than the band has members; it is exact up to rounding, because a
+    rotated harmonic lies in its band.
     """
     # directions spread over the sphere along a spiral
     number = 64

@@ -17,11 +17,11 @@ logger = logging.getLogger(__name__)
 SH_0 = 0.28209479177387814
 FIRST_OPACITY = 0.1  # 3DGS
 MIN_POINTS = 200
-"""With fewer sparse points, random points that cameras see make up the difference."""
+"""With fewer sparse points, random points that cameras see are added."""
 ADDED_POINTS = 2_000
-"""Random points beside too few sparse ones."""
+"""Random points added to too few sparse ones."""
 RANDOM_POINTS = 10_000
-"""Number of points of a random start."""
+"""Random points with `gaussians.initial` "random"."""
 
 
 def first_gaussians(
@@ -30,11 +30,11 @@ def first_gaussians(
     """Round Gaussians at the sparse points, as wide as the mean distance to their 3 nearest (3DGS).
 
     With fewer than MIN_POINTS sparse points, random grey ones in front of random cameras are added;
-    with `settings.initial` "random" they take the place of all, with "frozen" every sparse point
+    with `settings.initial` "random" they replace all sparse points, with "frozen" every sparse point
     becomes one Gaussian, however many there are.
 
     Raises:
-        SceneError: points that are to be frozen are missing or not finite.
+        SceneError: points to be frozen are missing or not finite.
     """
     xyz, rgb = scene.points_xyz.astype(np.float64), to_float(scene.points_rgb)
     finite = np.isfinite(xyz).all(axis=1)
@@ -62,7 +62,7 @@ def first_gaussians(
     n = len(xyz)
     distances = cKDTree(xyz).query(xyz, k=min(4, n))[0].reshape(n, -1)[:, 1:]
     spacing = distances.mean(axis=1) if distances.shape[1] else np.full(n, 0.1)
-    # points on one spot would get no width; points far from all others would fill the view
+    # points in the same place would get no width; points far from all others would fill the view
     extent = camera_extent(cameras)
     spacing = np.clip(spacing, 1e-4 * extent, 0.1 * extent)
     sh = np.zeros((n, (settings.sh_degree + 1) ** 2, 3), np.float32)
@@ -70,7 +70,7 @@ def first_gaussians(
     return {
         "means": xyz.astype(np.float32),
         "log_scales": np.repeat(np.log(spacing)[:, None], 3, axis=1).astype(np.float32),
-        "quats": np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        "quats": np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
         "opacity_logits": np.full(n, np.log(FIRST_OPACITY / (1 - FIRST_OPACITY)), np.float32),
         "sh": sh,
     }
@@ -79,7 +79,7 @@ def first_gaussians(
 def _random_points(
     cameras: list[Camera], known: np.ndarray, number: int, generator: np.random.Generator
 ) -> np.ndarray:
-    """Points seen by random cameras, at depths about the known points' or the cameras' spread."""
+    """Points seen by random cameras, at depths like those of the known points, or of the cameras' spread."""
     extent = camera_extent(cameras)
     depths = []
     for camera in cameras:

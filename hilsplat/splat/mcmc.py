@@ -18,17 +18,17 @@ from hilsplat.splat.optimise import FIELDS, Adam
 from hilsplat.splat.rasterise.cpu import Gradients, over_ranges
 
 MAX_TOGETHER = 51
-"""At most this many Gaussians count as sharing one place (paper's code); more would change little."""
+"""At most this many Gaussians share one place (the paper's code); more would change little."""
 MAX_OPACITY = 1 - 1e-6
 """Opacity 1 has no logit."""
 NOISE_SHARPNESS = 100.0
 """How fast noise falls with opacity (paper: k = 100): at opacity 0.1 it is down to e^-9.5."""
 LEAST_GATE = 1e-6
-"""Smaller shares of the noise are not drawn."""
+"""A smaller share of the noise is skipped."""
 
 
 def shared_opacity(opacity: Float[np.ndarray, " N"], number: Int[np.ndarray, " N"]) -> np.ndarray:
-    """Opacity of each of `number` equal Gaussians on one spot that together cover like one of `opacity`.
+    """Opacity of each of `number` equal Gaussians in one place that together cover as one of `opacity` does.
 
     1 - (1 - new)^number = old (paper, Eq. 9).
     """
@@ -103,25 +103,20 @@ def add_noise(
 ) -> None:
     """Move the means of transparent Gaussians at random, along their own axes (SGLD; paper, Eq. 8).
 
-    The step is noise weight x rate of the means x gate x covariance x normal numbers, and never longer
-    than the extent. The paper's lengths are those of scenes of extent 1; here the covariance is
-    measured in units of the extent, so that a scene in other units moves alike.
+    The step is noise weight x rate of the means x gate x covariance x normal numbers, and at most as
+    long as the extent. The paper's lengths are those of scenes of extent 1; here the covariance is
+    measured in units of the extent, so that the unit of a scene makes no difference.
 
     Args:
         rate_of_means: step size of the means, in units of the extent.
         extent: radius of the cameras, scene units.
-        threads: the result is the same bytes for any number.
+        threads: the result has the same bytes for any number.
     """
     p = adam.parameters
     normal = generator.standard_normal(p["means"].shape, dtype=np.float32)
     arrays = (p["means"], p["log_scales"], p["quats"], p["opacity_logits"], normal)
-    over_ranges(
-        lambda begin, end: _noise_rows(
-            begin, end, *arrays, settings.min_opacity, settings.mcmc_noise * rate_of_means, extent
-        ),
-        len(adam),
-        threads,
-    )
+    weight = settings.mcmc_noise * rate_of_means
+    over_ranges(_noise_rows, len(adam), threads, *arrays, settings.min_opacity, weight, extent)
 
 
 def add_regularisers(adam: Adam, gradients: Gradients, settings: GaussiansSettings, extent: float) -> None:
@@ -140,8 +135,8 @@ def add_regularisers(adam: Adam, gradients: Gradients, settings: GaussiansSettin
 def relocate_and_grow(adam: Adam, settings: GaussiansSettings, generator: np.random.Generator) -> None:
     """Move the dead onto the living, then add Gaussians on the living up to the cap.
 
-    A place is drawn with a probability proportional to its opacity. Together,
-    those that share it cover what the one Gaussian covered before.
+    A place is drawn with a probability proportional to its opacity. The Gaussians that then share it
+    cover together what the one covered before.
     """
     dead = opacities(adam) <= settings.min_opacity
     if dead.any() and not dead.all():
@@ -165,7 +160,7 @@ def least_alive_logit(min_opacity: float) -> np.float32:
     The float32 nearest to the threshold's logit may lie below it: that of 0.005 has opacity 0.0049999995.
     """
     exact = float(logit(min_opacity))
-    return np.float32(exact + 1e-6 * max(abs(exact), 1.0))  # rounding moves it by 6e-8 of its size at most
+    return np.float32(exact + 1e-6 * max(abs(exact), 1.0))  # rounding changes it by at most 6e-8 of its size
 
 
 def _relocate(
@@ -190,14 +185,14 @@ def _draw(weights: Float[np.ndarray, " N"], number: int, generator: np.random.Ge
 def _share(
     adam: Adam, source: Int[np.ndarray, " M"], settings: GaussiansSettings
 ) -> dict[str, Float32[np.ndarray, "M ..."]]:
-    """Reduce the drawn rows to their share of the place; return the copies that join them there."""
+    """Give the drawn rows their share of the place; return the copies that join them there."""
     p = adam.parameters
     rows, drawn = np.unique(source, return_counts=True)
     number = np.minimum(drawn + 1, MAX_TOGETHER)
     old = np.minimum(expit(p["opacity_logits"][rows].astype(np.float64)), MAX_OPACITY)
     new = shared_opacity(old, number)
     p["log_scales"][rows] += np.log(scale_factor(old, new, number)).astype(np.float32)[:, None]
-    # at or below the threshold they would be relocated again at once
+    # at or below the threshold they would be relocated again in the next round
     alive = least_alive_logit(settings.min_opacity)
     p["opacity_logits"][rows] = np.maximum(logit(new).astype(np.float32), alive)
     for name in FIELDS:

@@ -69,8 +69,10 @@ class Adam:
     @staticmethod
     def start(parameters: dict[str, np.ndarray]) -> "Adam":
         """Moments at zero."""
-        zeros = [{name: np.zeros_like(values) for name, values in parameters.items()} for _ in range(2)]
-        return Adam(parameters, *zeros)
+        first, second = (
+            {name: np.zeros_like(values) for name, values in parameters.items()} for _ in range(2)
+        )
+        return Adam(parameters, first, second)
 
     def __len__(self) -> int:
         return len(self.parameters["means"])
@@ -105,13 +107,8 @@ class Adam:
                 for array in (values, getattr(gradients, name), self.first[name], self.second[name])
             ]
             head = 3 if name == "sh" else columns
-            over_ranges(
-                lambda begin, end, flat=flat, rates=(rate, rate_rest), sizes=(columns, head): _adam_rows(
-                    begin, end, *flat, *rates, *sizes, root, one_minus1
-                ),
-                len(values),
-                threads,
-            )
+            sizes = (rate, rate_rest, columns, head, root, one_minus1)
+            over_ranges(_adam_rows, len(values), threads, *flat, *sizes)
 
     def keep(self, rows: np.ndarray) -> None:
         """Keep these rows (mask or indices), with their moments."""

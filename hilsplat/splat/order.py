@@ -10,12 +10,12 @@ BITS = 21
 def morton_order(means: Float[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
     """Order points along a Z-shaped curve (Morton 1966) through their box.
 
-    Whatever goes over Gaussians and their neighbours, as G of the language field does, then finds most of
-    them in the processor's cache. The box leaves out the farthest hundredth on each side: a few
-    Gaussians far away would otherwise put all others into one cell.
+    Loops over Gaussians and their neighbours, such as G of the language field, then find most of them
+    in the processor's cache. The box leaves out the farthest hundredth on each side: a few Gaussians
+    far away would otherwise put all others into one cell.
 
     Returns:
-        the rows, in that order; equal cells keep theirs.
+        the rows, in that order; rows of one cell keep their order.
     """
     if not len(means):
         return np.zeros(0, np.int64)

@@ -26,10 +26,10 @@ _ZERO, _TWO = np.float32(0.0), np.float32(2.0)
 @compiled
 @no_type_check
 def _ssim_rows(begin, end, num, stride, image, target, slopes, ssim_sums, l1_sums):
-    """SSIM of padded rows begin..end and, in `slopes`, its derivatives by mean, square and product.
+    """SSIM of padded rows begin..end and, in `slopes`, its derivatives.
 
     `slopes` (3 padded maps, flat) receives dSSIM/dE[x] (means' own part and that of the variances),
-    dSSIM/dE[x^2], dSSIM/dE[x y] of every pixel's window. Empty: values only.
+    dSSIM/dE[x^2], dSSIM/dE[x y] of every pixel's window. If it is empty, only values are computed.
     """
     groups = (num + _LANES - 1) // _LANES
     row_length = groups * _LANES + 2 * _SIDE
@@ -153,12 +153,12 @@ def photometric_loss(
     ssim_weight: float,
     threads: int = 1,
 ) -> tuple[float, Float32[np.ndarray, "H W 3"]]:
-    """(1 - w) mean |image - target| + w (1 - SSIM), and its gradient by `image` (3DGS, Eq. 7).
+    """(1 - w) mean |image - target| + w (1 - SSIM), and its gradient with respect to `image` (3DGS, Eq. 7).
 
     Args:
         image, target: RGB in [0, 1].
         ssim_weight: w; 3DGS takes 0.2.
-        threads: the result is the same bytes for any number.
+        threads: the result has the same bytes for any number.
     """
     height, width, _ = image.shape
     num = 3 * width
@@ -166,19 +166,11 @@ def photometric_loss(
     t, _ = _padded(target)
     slopes = np.zeros(3 * len(x), np.float32)
     ssim_sums, l1_sums = np.empty(height), np.empty(height)
-    over_ranges(
-        lambda begin, end: _ssim_rows(begin, end, num, stride, x, t, slopes, ssim_sums, l1_sums),
-        height,
-        threads,
-    )
+    over_ranges(_ssim_rows, height, threads, num, stride, x, t, slopes, ssim_sums, l1_sums)
     gradient = np.empty((height, num), np.float32)
     count = height * num
     weights = np.float32((1 - ssim_weight) / count), np.float32(ssim_weight / count)
-    over_ranges(
-        lambda begin, end: _gradient_rows(begin, end, num, stride, x, t, slopes, *weights, gradient),
-        height,
-        threads,
-    )
+    over_ranges(_gradient_rows, height, threads, num, stride, x, t, slopes, *weights, gradient)
     loss = (1 - ssim_weight) * l1_sums.sum() / count + ssim_weight * (1 - ssim_sums.sum() / count)
     return float(loss), gradient.reshape(height, width, 3)
 

@@ -50,14 +50,14 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
 def load_ply(path: Path, fix: str = "delete it and run the gaussians stage again") -> Gaussians:
     """Read a 3DGS PLY, of this package or another; the number of f_rest columns gives the degree.
 
-    Binary or ASCII, properties in any order and of any number type; properties that 3DGS does not
-    know (colours, labels) and normals are passed over, present or not.
+    Binary or ASCII, properties in any order and of any number type; normals and properties unknown to
+    3DGS (colours, labels) are ignored.
 
     Args:
-        fix: what a person can do about a file that cannot be used.
+        fix: advice for a file that cannot be used.
 
     Raises:
-        ArtifactError: the file is missing, damaged, no 3DGS PLY or holds numbers that are not finite.
+        ArtifactError: the file is missing, damaged or not a 3DGS PLY, or holds numbers that are not finite.
     """
     path = Path(path)
     try:
@@ -65,7 +65,7 @@ def load_ply(path: Path, fix: str = "delete it and run the gaussians stage again
     except FileNotFoundError as error:
         raise ArtifactError(f"{path} is missing", fix="run the gaussians stage") from error
     except (PlyParseError, KeyError, ValueError, EOFError) as error:
-        raise ArtifactError(f"{path} cannot be read as a PLY: {error}", fix=fix) from error
+        raise ArtifactError(f"{path} is not a readable PLY: {error}", fix=fix) from error
     found = {prop.name for prop in vertex.properties}
     if "packed_position" in found:
         raise ArtifactError(f"{path} is a compressed PLY", expected="a plain 3DGS PLY", fix=fix)

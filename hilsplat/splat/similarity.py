@@ -36,14 +36,14 @@ def decompose(similarity: Float[np.ndarray, "4 4"]) -> tuple[float, Float64[np.n
 def move_gaussians(gaussians: Gaussians, similarity: Float[np.ndarray, "4 4"]) -> Gaussians:
     """Gaussians in other coordinates: a camera moved along with them sees the same image.
 
-    Means are mapped, scales multiplied, quaternions turned, and spherical harmonics turned band by
+    Means are mapped, scales multiplied, quaternions rotated, and spherical harmonics rotated band by
     band, because they are functions of the direction in the world. Opacities stay.
 
     Args:
-        similarity: b_from_a, for Gaussians given in a.
+        similarity: b_from_a; the Gaussians are given in a and returned in b.
 
     Raises:
-        HilsplatError: `similarity` is not one.
+        HilsplatError: `similarity` is not a similarity.
     """
     scale, rotation, translation = decompose(similarity)
     means = gaussians.means.detach().cpu().double().numpy()

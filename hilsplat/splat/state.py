@@ -17,7 +17,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass
 class FitState:
-    """Everything that the next step depends on, so that a stopped fit goes on as if it had not stopped.
+    """Everything that the next step depends on, so that a fit resumes as if it had never stopped.
 
     Attributes:
         adam: parameters and moments.
@@ -56,26 +56,26 @@ class FitState:
 
     @staticmethod
     def load(path: Path, key: str) -> "FitState | None":
-        """Read a checkpoint of this very fit; None if there is none, or only one of another fit."""
+        """Read the checkpoint of this fit; None if there is none, or it is damaged or another fit's."""
         if not path.is_file():
             return None
         try:
             arrays = read_npz(path)
         except ArtifactError as error:
-            logger.warning("checkpoint is passed over, the fit starts anew: %s", error)
+            logger.warning("ignoring the checkpoint, the fit starts over: %s", error)
             return None
         if arrays["key"].item() != key:
-            logger.info("checkpoint %s belongs to other inputs; the fit starts anew", path)
+            logger.info("checkpoint %s belongs to other inputs; the fit starts over", path)
             return None
-        tables = [
+        parameters, first, second = (
             {name: arrays[f"{table}_{name}"] for name in FIELDS}
             for table in ("parameters", "first", "second")
-        ]
+        )
         generator = np.random.default_rng()
         generator.bit_generator.state = json.loads(arrays["generator"].item())
         step, adam_steps = (int(count) for count in arrays["counts"])
         return FitState(
-            Adam(*tables, steps=adam_steps),
+            Adam(parameters, first, second, adam_steps),
             ScreenGradients(arrays["gradient_total"], arrays["gradient_seen"]),
             generator,
             arrays["order"].tolist(),

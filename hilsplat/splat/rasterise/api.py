@@ -40,7 +40,7 @@ class Rendering:
 
 
 def to_parameters(gaussians: Gaussians) -> Parameters:
-    """Gaussians as contiguous float32 arrays (shared memory if they are so already)."""
+    """Gaussians as contiguous float32 arrays, which share memory with tensors that are so already."""
     tensors = (gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh)
     return Parameters(*(_to_array(tensor) for tensor in tensors))
 
@@ -55,7 +55,7 @@ def _checked_degree(gaussians: Gaussians, sh_degree: int | None) -> int:
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     if not 0 <= degree <= min(gaussians.sh_degree, 3):
         raise HilsplatError(
-            f"spherical harmonics of degree {degree} cannot be used",
+            f"spherical harmonics of degree {degree} are not available",
             expected=f"0 to {gaussians.sh_degree}, the degree of these Gaussians, and at most 3",
         )
     return degree
@@ -126,14 +126,15 @@ def render(
     Args:
         features: further channels to blend in the same pass; any number.
         sh_degree: degree of the spherical harmonics to use; all of them by default.
-        threads: CPU threads; the result is the same bytes for any number.
+        threads: CPU threads; the result has the same bytes for any number.
         device: backend; see `device.choose_device`.
 
     Returns:
-        Images on the device of `gaussians`.
+        images on the device of `gaussians`.
 
     Raises:
-        HilsplatError: parameters that are not finite, zero quaternions, or features of other rows.
+        HilsplatError: parameters are not finite, quaternions are zero, or features have another number
+            of rows.
     """
     degree = _checked_degree(gaussians, sh_degree)
     g = gaussians
@@ -158,7 +159,7 @@ def draw(parameters: Parameters, camera: Camera, degree: int, *, threads: int, d
     """One view of a fit, on plain arrays: image, alpha, and the gradients on demand.
 
     Raises:
-        HilsplatError: parameters that are not finite, or quaternions of length zero.
+        HilsplatError: parameters are not finite, or quaternions have length zero.
     """
     if device == "cuda":
         return cuda.draw(parameters, camera, degree)

@@ -11,7 +11,7 @@ from hilsplat.base.compiled import compiled
 TILE = 16
 """Side of a tile, px."""
 MAX_ENTRIES = 2**21
-"""Entries of tile lists that are held at a time: 8 MiB, and 72 MiB of gradients for 3 channels."""
+"""Entries of tile lists held at a time: 8 MiB, and 72 MiB of gradients for 3 channels."""
 
 
 @dataclass(frozen=True)

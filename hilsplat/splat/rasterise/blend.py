@@ -39,9 +39,9 @@ from hilsplat.splat.rasterise.project import MIN_ALPHA, MOMENTS
 MAX_ALPHA = 0.999
 """Alpha of one Gaussian at a pixel is cut here, and passes no gradient beyond (gsplat: 0.999)."""
 MIN_TRANSMITTANCE = 1e-4
-"""A pixel is finished before the Gaussian that would leave less light than this (3DGS, gsplat)."""
+"""Blending stops at a pixel before the Gaussian that would leave less light than this (3DGS, gsplat)."""
 CHECK_EVERY = 8
-"""Gaussians between two looks at which blocks are finished."""
+"""Gaussians between two checks for finished blocks."""
 
 _CUT = np.float32(np.log2(MIN_ALPHA))
 _TOP = np.float32(MAX_ALPHA)
@@ -113,14 +113,14 @@ def _place(geometry, i, x0, y0):
 @compiled(inline="always")
 @no_type_check
 def _to_mean(mean, at, centres):
-    """Distances of a block's pixel centres to the mean along an axis; `at` counts blocks."""
+    """Distances from a block's pixel centres to the mean along an axis; `at` counts blocks."""
     return lanes(np.float32(mean - np.float32(4 * at))) - centres
 
 
 @compiled(inline="always")
 @no_type_check
 def _shine(exponent, transmittance, block):
-    """Blend a Gaussian into a block: take its light; returns alpha uncut, alpha and the weight."""
+    """Blend a Gaussian into a block and reduce its transmittance; returns uncut alpha, alpha and weight."""
     uncut = exp2_negative(exponent)
     alpha = keep_ge(exponent, lanes(_CUT), smaller(uncut, lanes(_TOP)))
     light = load(transmittance, block * LANES)

@@ -1,6 +1,6 @@
 """The CPU backend: projection, tile lists and blending over threads, on plain arrays.
 
-Threads take ranges of Gaussians or tiles; nothing is summed across threads, so every result is the
+Threads take ranges of Gaussians or tiles; nothing is summed across threads, so every result has the
 same bytes for any number of them.
 """
 
@@ -21,7 +21,7 @@ from hilsplat.splat.rasterise.blend import add_slots, blend, blend_backward, ble
 from hilsplat.splat.rasterise.project import GEOMETRY, MOMENTS, pack_camera, project, project_backward
 
 RANGES_PER_THREAD = 4
-"""Ranges that work is cut into for each thread, so that threads end together."""
+"""Ranges of work per thread, so that threads finish together."""
 
 
 @cache
@@ -29,17 +29,24 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="rasterise")
 
 
-def over_edges(work: Callable[[int, int], Any], edges: list[int], threads: int) -> list[Any]:
-    """Call `work(begin, end)` for all neighbours in `edges`, on threads; results in order."""
+def over_edges(work: Callable[..., Any], edges: list[int], threads: int, *arguments: Any) -> list[Any]:
+    """Call `work(begin, end, *arguments)` for all neighbours in `edges`, on threads; results in order."""
     if threads <= 1:
-        return [work(begin, end) for begin, end in pairwise(edges)]
-    return list(_pool(threads).map(work, edges[:-1], edges[1:]))
+        return [work(begin, end, *arguments) for begin, end in pairwise(edges)]
+    return list(_pool(threads).map(lambda begin, end: work(begin, end, *arguments), edges[:-1], edges[1:]))
 
 
-def over_ranges(work: Callable[[int, int], Any], count: int, threads: int) -> list[Any]:
-    """Call `work(begin, end)` over ranges that cover 0..count, on threads; results in range order."""
+def over_ranges(
+    work: Callable[..., Any], count: int, threads: int, *arguments: Any, first: int = 0
+) -> list[Any]:
+    """Call `work(begin, end, *arguments)` over ranges that cover `count` numbers from `first`, on threads.
+
+    Returns:
+        results in the order of the ranges.
+    """
     pieces = min(count, RANGES_PER_THREAD * threads) if threads > 1 and count > 1 else 1
-    return over_edges(work, np.linspace(0, count, pieces + 1).astype(int).tolist(), threads)
+    edges = first + np.linspace(0, count, pieces + 1).astype(int)
+    return over_edges(work, edges.tolist(), threads, *arguments)
 
 
 @dataclass(frozen=True)
@@ -99,7 +106,7 @@ class Drawn:
         image: premultiplied RGB, without background.
         alpha: coverage.
         drawn: whether a Gaussian reaches a pixel of the view.
-        gradients: of the parameters, from those of image and alpha.
+        gradients: function from the gradients of image and alpha to those of the parameters.
     """
 
     image: Float32[np.ndarray, "H W 3"]
@@ -131,25 +138,10 @@ def project_gaussians(parameters: Parameters, camera: Camera, degree: int, threa
     row = pack_camera(camera)
     p = parameters
 
-    def work(begin: int, end: int) -> int:
-        return project(
-            begin,
-            end,
-            p.means,
-            p.log_scales,
-            p.quats,
-            p.opacity_logits,
-            p.sh,
-            degree,
-            row,
-            geometry,
-            box,
-            colours,
-        )
-
-    refuse_broken(sum(over_ranges(work, n, threads)), n)
+    known = (p.means, p.log_scales, p.quats, p.opacity_logits, p.sh, degree, row)
+    refuse_broken(sum(over_ranges(project, n, threads, *known, geometry, box, colours)), n)
     tiles = bin_gaussians(box, geometry[:, 6], camera.size_hw)
-    return Projected(row, tuple(camera.size_hw), degree, geometry, box, colours, tiles)
+    return Projected(row, camera.size_hw, degree, geometry, box, colours, tiles)
 
 
 @dataclass(frozen=True)
@@ -161,17 +153,15 @@ class Band:
     base: int
     gaussian: Int32[np.ndarray, " E"]
 
-    def over_tiles(self, work: Callable[[int, int], Any], threads: int) -> None:
-        """Call `work(begin, end)` over ranges that cover the band's tiles, on threads."""
-        over_ranges(
-            lambda begin, end: work(self.begin + begin, self.begin + end), self.end - self.begin, threads
-        )
+    def over_tiles(self, work: Callable[..., Any], threads: int, *arguments: Any) -> None:
+        """Call `work(begin, end, *arguments)` over ranges that cover the band's tiles, on threads."""
+        over_ranges(work, self.end - self.begin, threads, *arguments, first=self.begin)
 
 
 def tile_lists(view: Projected, threads: int) -> Iterator[Band]:
     """Fill the tile lists, a band of tiles at a time so that memory stays bounded.
 
-    Where one band holds all tiles it is kept for the next pass over the view.
+    If one band holds all tiles, it is kept for the next pass over the view.
     """
     if view.only_band:
         yield view.only_band[0]
@@ -181,14 +171,11 @@ def tile_lists(view: Projected, threads: int) -> Iterator[Band]:
     for begin, end in bands:
         base = int(t.tile_start[begin])
         gaussian = np.empty(int(t.tile_start[end]) - base, np.int32)
-
-        def fill(first: int, last: int, base: int = base, gaussian: np.ndarray = gaussian) -> None:
-            fill_lists(first, last, base, t.tiles_x, t.order, t.tile_start, view.box, gaussian)
-
         # every range reads the whole depth order: one per thread, with as many entries each
         shares = base + np.linspace(0, len(gaussian), max(threads, 1) + 1)
         edges = np.searchsorted(t.tile_start, shares[1:-1]).clip(begin, end).tolist()
-        over_edges(fill, [begin, *edges, end], threads)
+        lists = (base, t.tiles_x, t.order, t.tile_start, view.box, gaussian)
+        over_edges(fill_lists, [begin, *edges, end], threads, *lists)
         band = Band(begin, end, base, gaussian)
         if len(bands) == 1:
             view.only_band.append(band)
@@ -201,13 +188,10 @@ def blend_forward(
     """Blend per-Gaussian channels: premultiplied image and alpha."""
     image = np.empty((*view.size_hw, channels.shape[1]), np.float32)
     alpha = np.empty(view.size_hw, np.float32)
-    t, geometry, box = view.tiles, view.geometry, view.box
+    t, blended = view.tiles, (view.geometry, view.box, channels, image, alpha)
     for band in tile_lists(view, threads):
         lists = (band.base, t.tiles_x, t.tile_start, band.gaussian)
-        band.over_tiles(
-            lambda begin, end, lists=lists: blend(begin, end, *lists, geometry, box, channels, image, alpha),
-            threads,
-        )
+        band.over_tiles(blend, threads, *lists, *blended)
     return image, alpha
 
 
@@ -234,25 +218,19 @@ def blend_gradients(
     for band in tile_lists(view, threads):
         slots = np.empty((len(band.gaussian), columns), np.float32)
         lists = (band.base, t.tiles_x, t.tile_start, band.gaussian)
-        band.over_tiles(
-            lambda begin, end, lists=lists, slots=slots: blend_backward(begin, end, *lists, *blended, slots),
-            threads,
-        )
+        band.over_tiles(blend_backward, threads, *lists, *blended, slots)
         # every range reads all entries, so there is one per thread
-        over_edges(
-            lambda begin, end, lists=lists, slots=slots: add_slots(begin, end, lists[-1], slots, sums),
-            np.linspace(0, n, max(threads, 1) + 1).astype(int).tolist(),
-            threads,
-        )
+        edges = np.linspace(0, n, max(threads, 1) + 1).astype(int).tolist()
+        over_edges(add_slots, edges, threads, band.gaussian, slots, sums)
     # np.zeros leaves the zeroing to the threads that first write there; np.zeros_like would do it here
-    fields = (p.means, p.log_scales, p.quats, p.opacity_logits, p.sh)
-    zeros = [np.zeros(values.shape, np.float32) for values in fields]
-    out = Gradients(*zeros, sums[:, MOMENTS + 3 :].astype(np.float32), np.zeros((n, 2), np.float32))
+    out = Gradients(
+        **{name: np.zeros(values.shape, np.float32) for name, values in vars(p).items()},
+        features=sums[:, MOMENTS + 3 :].astype(np.float32),
+        means_px=np.zeros((n, 2), np.float32),
+    )
     known = (p.means, p.log_scales, p.quats, p.sh, view.degree, view.camera, view.geometry, view.box)
     outputs = (out.means, out.log_scales, out.quats, out.opacity_logits, out.sh, out.means_px)
-    over_ranges(
-        lambda begin, end: project_backward(begin, end, *known, view.colours, sums, *outputs), n, threads
-    )
+    over_ranges(project_backward, n, threads, *known, view.colours, sums, *outputs)
     return out
 
 
@@ -285,18 +263,13 @@ def sparse_weights(
     def walk(cursor: np.ndarray, columns: np.ndarray, weights: np.ndarray) -> None:
         rows = (np.float32(min_weight), cursor, columns, weights)
         for band in tile_lists(view, threads):
-            lists = (view.size_hw, t.tile_start, band.gaussian, view.geometry, view.box)
-            band.over_tiles(
-                lambda begin, end, base=band.base, lists=lists: blend_weights(
-                    begin, end, base, t.tiles_x, *lists, *rows
-                ),
-                threads,
-            )
+            lists = (band.base, t.tiles_x, view.size_hw, t.tile_start, band.gaussian, view.geometry, view.box)
+            band.over_tiles(blend_weights, threads, *lists, *rows)
 
     walk(count, np.empty(0, np.int32), np.empty(0, np.float32))
     row_start = np.concatenate([[0], np.cumsum(count)])
     columns, weights = np.empty(row_start[-1], np.int32), np.empty(row_start[-1], np.float32)
     if len(columns):
         walk(row_start[:-1].copy(), columns, weights)
-        over_ranges(lambda begin, end: sort_rows(begin, end, row_start, columns, weights), pixels, threads)
+        over_ranges(sort_rows, pixels, threads, row_start, columns, weights)
     return row_start, columns, weights

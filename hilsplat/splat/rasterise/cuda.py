@@ -43,7 +43,7 @@ def _on_device(gaussians: Gaussians) -> Gaussians:
 def blend(
     gaussians: Gaussians, camera: Camera, channels: Float[Tensor, "N C"]
 ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"], dict[str, Any]]:
-    """Blend channels of Gaussians that are on the device: premultiplied image, alpha, gsplat's notes."""
+    """Blend channels of Gaussians on the device: premultiplied image, alpha, intermediate results."""
     import gsplat
 
     height, width = camera.size_hw
@@ -80,7 +80,7 @@ def colours(gaussians: Gaussians, camera: Camera, degree: int) -> Float[Tensor, 
 def render_channels(
     gaussians: Gaussians, camera: Camera, degree: int, features: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Premultiplied RGB (+ features) and alpha, on the device of the Gaussians."""
+    """Premultiplied RGB (+ features) and alpha, on the Gaussians' device."""
     home = gaussians.means.device
     if len(gaussians) == 0:
         width = 3 + (features.shape[1] if features is not None else 0)
@@ -95,10 +95,10 @@ def render_channels(
 
 
 def pixel_weights(gaussians: Gaussians, camera: Camera, min_weight: float) -> csr_matrix:
-    """Blending weights of each Gaussian at each pixel, as the CPU backend's `pixel_weights`.
+    """Blending weights of each Gaussian at each pixel, as `api.pixel_weights` returns them.
 
-    gsplat lists who is blended at each pixel; the weights follow from the projected Gaussians. The
-    list takes about 60 bytes a hit on the device (some 40 hits a pixel).
+    gsplat lists which Gaussians are blended at each pixel; the weights follow from the projected
+    Gaussians. The list takes about 60 bytes per entry on the device (some 40 entries per pixel).
     """
     import gsplat
 
@@ -165,7 +165,11 @@ def draw(parameters: Parameters, camera: Camera, degree: int) -> Drawn:
             [torch.from_numpy(np.ascontiguousarray(grad)).cuda() for grad in (grad_image, grad_alpha)],
         )
         *by_field, by_mean_px = (grad.cpu().numpy() for grad in grads)
-        return Gradients(*by_field, np.zeros((len(leaves[0]), 0), np.float32), by_mean_px[0])
+        return Gradients(
+            **dict(zip(fields, by_field, strict=True)),
+            features=np.zeros((len(leaves[0]), 0), np.float32),
+            means_px=by_mean_px[0],
+        )
 
     drawn = (notes["radii"][0] > 0).all(dim=-1).cpu().numpy()
     return Drawn(image.detach().cpu().numpy(), alpha.detach().cpu().numpy(), drawn, gradients)

@@ -27,18 +27,18 @@ def cuda_problem() -> str | None:
 
 @cache
 def choose_device(wanted: Literal["auto", "cpu", "cuda"]) -> Device:
-    """The backend for a stage; the log names it the first time.
+    """The backend for a stage, logged the first time.
 
     Args:
         wanted: `auto` takes CUDA if torch finds a device and gsplat can be imported.
 
     Raises:
-        DeviceError: `cuda` was asked for and cannot be used; the CPU never replaces it.
+        DeviceError: `cuda` was requested and cannot be used. There is no fallback.
     """
     problem = cuda_problem()
     if wanted == "cuda" and problem:
         raise DeviceError(
-            "device: cuda was asked for and cannot be used",
+            "device: cuda was requested but cannot be used",
             expected="a CUDA build of torch that finds a device, and gsplat",
             found=problem,
             fix="pip install 'hilsplat[gpu]' on a machine with a CUDA device, or set device: auto or cpu",

@@ -120,7 +120,7 @@ def exp2_negative(typingctx, value):
     """2**x for x in [-126, 0], relative error below 3e-7.
 
     Truncation gives x = k + f with f in (-1, 0]; a degree-6 polynomial is 2**f and k goes into the
-    exponent bits. Lanes outside the range hold something finite or infinite, never a trap.
+    exponent bits. Lanes outside the range get some finite or infinite number; nothing traps.
     """
 
     def codegen(context, builder, sig, args):

@@ -24,7 +24,7 @@ NEAR = 0.01
 LOW_PASS_PX2 = 0.3
 """Added to the projected variance, px^2 (3DGS, gsplat: 0.3)."""
 MIN_ALPHA = 1.0 / 255.0
-"""Contributions below are not drawn (3DGS, gsplat: 1 / 255)."""
+"""A smaller alpha is not drawn (3DGS, gsplat: 1 / 255)."""
 MAX_LOG_SCALE = np.float32(20.0)
 """Scales are cut at exp(20), 5e8 scene units, and get no gradient beyond. A Gaussian that wide covers any
 view evenly along that axis; at exp(40) the columns of its pixel box would overflow 64-bit integers. float32
@@ -98,7 +98,7 @@ def _sh_basis(x, y, z, degree, basis):
 @compiled(inline="always")
 @no_type_check
 def _sh_slope(x, y, z, degree, slope):
-    """Derivatives of `_sh_basis` by x, y, z (taken as independent): slope[k] = (d/dx, d/dy, d/dz)."""
+    """Derivatives of `_sh_basis` with respect to x, y, z as if independent: slope[k] = (d/dx, d/dy, d/dz)."""
     slope[:, :] = 0.0
     if degree >= 1:
         slope[1, 1] = -_C1
@@ -151,7 +151,7 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
     pixel row where alpha can reach MIN_ALPHA (last < first: not drawn), colours.
 
     Returns:
-        How many Gaussians hold a number that is not finite, or a zero quaternion.
+        number of Gaussians with a number that is not finite or a zero quaternion.
     """
     height, width = int(camera[23]), int(camera[24])
     fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
@@ -200,7 +200,7 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
             continue
         inverse = 1.0 / determinant
         px, py = fx * x * inverse_z + cx, fy * y * inverse_z + cy
-        # The level set alpha = MIN_ALPHA has half-widths sqrt(q cov); a hair wider for rounding.
+        # The level set alpha = MIN_ALPHA has half-widths sqrt(q cov); slightly more for rounding.
         q = 2.0 * math.log(opacity / MIN_ALPHA)
         half_x, half_y = math.sqrt(q * xx) + 1e-2, math.sqrt(q * yy) + 1e-2
         if not (px + half_x > 0.0 and px - half_x < width and py + half_y > 0.0 and py - half_y < height):
@@ -252,7 +252,7 @@ def project_backward(
 ):
     """Gradients of Gaussians begin..end from their moments and dL/dcolours (rows of `sums`).
 
-    The outputs come in as zeros. `grad_means_px` is dL/d(projected mean), per pixel.
+    The outputs must hold zeros. `grad_means_px` is dL/d(projected mean), per pixel.
     """
     fx, fy = camera[12], camera[13]
     axes, factor, grad_factor = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
@@ -360,7 +360,7 @@ def project_backward(
         grad_quats[i, 2] = (dy - along * qy) * norm
         grad_quats[i, 3] = (dz - along * qz) * norm
 
-        # colour; a channel that is clamped at 0 passes nothing on
+        # colour; a channel that is clamped at 0 passes no gradient
         vx, vy, vz = mx - camera[16], my - camera[17], mz - camera[18]
         inverse = 1.0 / math.sqrt(vx * vx + vy * vy + vz * vz)
         vx, vy, vz = vx * inverse, vy * inverse, vz * inverse

@@ -141,10 +141,10 @@ def test_a_copy_that_lost_its_settings_says_so(desk, elsewhere, caplog):
     shutil.copytree(desk / SCENE, elsewhere / "desk")
     shutil.copytree(desk / "models", elsewhere / "models")
     hilsplat.open("desk")
-    assert "the default settings answer" not in caplog.text
+    assert "using the default settings" not in caplog.text
     (elsewhere / "desk/default/scores.csv.provenance.json").unlink()
     hilsplat.open("desk")
-    assert "the default settings answer" in caplog.text
+    assert "using the default settings" in caplog.text
 
 
 def test_an_unknown_device_is_named(desk):

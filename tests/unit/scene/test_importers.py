@@ -83,7 +83,7 @@ def test_images_and_poses_without_a_partner_are_named(tmp_path):
 def test_an_incomplete_colmap_folder_is_refused(tmp_path):
     write_colmap(tmp_path / "in")
     (tmp_path / "in" / "sparse" / "0" / "points3D.bin").unlink()
-    with pytest.raises(SceneError, match="holds no complete COLMAP model"):
+    with pytest.raises(SceneError, match="does not hold a complete COLMAP model"):
         import_scene(tmp_path / "in", tmp_path / "scene")
 
 

@@ -77,7 +77,7 @@ def test_damaged_photographs_are_all_named(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]  # no scene, no work folder
 
 
-def test_noise_registers_nowhere_and_each_photograph_is_told_why(tmp_path):
+def test_noise_registers_nowhere_and_every_photograph_has_its_reason(tmp_path):
     with pytest.raises(
         RegistrationError, match=r"no camera pose(.|\n)*0\.png: (too few matches|no features)"
     ):
@@ -93,10 +93,10 @@ def test_renders_are_posed_with_unchanged_pixels_and_reruns_are_identical(tmp_pa
         )
     scene = Scene.load(tmp_path / "first")
     assert scene.views("train") == [f"{number}.png" for number in range(5)]  # too few for a test view
-    assert scene.unit == "arbitrary"  # structure from motion knows no metre
+    assert scene.unit == "arbitrary"  # structure from motion cannot recover the metre
     np.testing.assert_array_equal(scene.image("2.png"), read_image(tmp_path / "renders" / "2.png"))
     centres = np.array([scene.cameras[view].centre for view in scene.views()])
-    # ratios of distances do not depend on the similarity that SfM leaves open
+    # ratios of distances do not depend on the similarity that SfM leaves undetermined
     found = np.linalg.norm(centres[1:] - centres[0], axis=1)
     true = np.linalg.norm(true_centres[1:] - true_centres[0], axis=1)
     np.testing.assert_allclose(found / found[-1], true / true[-1], rtol=0.05)
@@ -171,7 +171,7 @@ def test_the_gate_on_the_registered_share_names_the_lost_photographs(tmp_path):
         check_registration(tmp_path, "photos/test", found(6, [6, 4]), settings)
 
 
-def test_several_models_stop_the_stage_only_where_asked(tmp_path):
+def test_several_models_stop_the_stage_only_if_asked(tmp_path):
     check_registration(tmp_path, "photos/test", found(8, [8, 3]), PosesSettings())
     with pytest.raises(RegistrationError, match=r"2 separate models(.|\n)*8\.jpg"):
         check_registration(tmp_path, "photos/test", found(8, [8, 3]), PosesSettings(several_models="stop"))

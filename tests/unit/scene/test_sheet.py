@@ -27,7 +27,7 @@ def write_photos(folder, count, size=(40, 30), seed=0):
     return folder
 
 
-def test_rows_are_read_in_order_and_comments_are_passed_over(tmp_path):
+def test_rows_are_read_in_order_and_comments_are_skipped(tmp_path):
     write_photos(tmp_path / "desk", 3)
     sheet = write_sheet(
         tmp_path,
@@ -134,7 +134,7 @@ def test_inspection_finds_damaged_turned_and_copied_photographs(tmp_path):
     (folder / "text.png").write_text("no image")
     (folder / "phone.heic").write_bytes(b"x")
 
-    report = inspect_photos(tmp_path)  # the folder above images/ is understood too
+    report = inspect_photos(tmp_path)  # the folder above images/ works too
     assert report.folder == folder
     assert report.sizes == {(30, 40): 4, (40, 30): 1}  # height, width
     assert (report.num_readable, report.num_distinct, report.num_rotated) == (5, 4, 1)
@@ -179,11 +179,11 @@ def test_photographs_that_differ_only_in_suffix_are_refused(tmp_path):
         inspect_photos(folder)
 
 
-def test_data_sources_lie_below_the_data_root(tmp_path):
+def test_data_sources_are_below_the_data_root(tmp_path):
     row = ("lerf", "figurines", "lerf", "data:lerf_ovs/figurines", "arbitrary")
     sheet = write_sheet(tmp_path, row)
     assert read_sheet(sheet)[0].folder is None
-    found = read_sheet(sheet, data_root=str(tmp_path / "data"))  # absent ones are the workflow's business
+    found = read_sheet(sheet, data_root=str(tmp_path / "data"))  # the workflow deals with missing ones
     assert found[0].folder == tmp_path / "data/lerf_ovs/figurines"
 
 
@@ -195,7 +195,7 @@ def test_a_group_that_is_not_run_is_not_checked(tmp_path):
 WITH_GAUSSIANS = HEADER.replace("\n", "\tgaussians\n")
 
 
-def test_a_ply_of_somebody_is_found_from_the_project_folder(tmp_path):
+def test_a_ready_made_ply_is_found_from_the_project_folder(tmp_path):
     write_photos(tmp_path / "desk", 3)
     (tmp_path / "theirs.ply").write_bytes(b"ply\nformat ...")
     rows = [

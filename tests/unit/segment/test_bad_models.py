@@ -1,4 +1,4 @@
-"""What a user reads whose model folder is half there or of another make."""
+"""Errors for a model folder that is incomplete or of another kind."""
 
 import json
 
@@ -39,7 +39,7 @@ def test_a_network_without_its_weights_file_is_named(make_disc_sam, tmp_path):
         SamModel.load(folder)
 
 
-def test_a_pointer_of_git_lfs_is_told_from_a_network(make_disc_sam, tmp_path):
+def test_a_git_lfs_pointer_is_recognised(make_disc_sam, tmp_path):
     folder = make_disc_sam(tmp_path / "sam")
     (folder / "onnx" / "vision_encoder.onnx").write_text(
         "version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 2548000000\n"
@@ -65,7 +65,7 @@ def test_preprocessing_that_is_switched_off_is_refused(make_disc_sam, tmp_path):
 
 
 def retyped(folder, shape: list, kind: int) -> None:
-    """Declare the encoder's input anew; onnxruntime believes it."""
+    """Redeclare the encoder's input; onnxruntime trusts the declaration."""
     path = folder / "onnx" / "vision_encoder.onnx"
     cast = helper.make_node("Cast", ["pixel_values"], ["as_float"], to=TensorProto.FLOAT)
     pool = helper.make_node("GlobalAveragePool", ["as_float"], ["image_embeddings"])

@@ -22,7 +22,7 @@ def candidates_of(logits: np.ndarray, frame: Frame) -> Candidates:
     return keep_candidates(scores, logits, frame, 0, EVERYTHING)
 
 
-def test_windows_hold_the_band_and_outside_stands_the_lowest_logit() -> None:
+def test_windows_hold_the_band_and_outside_is_the_lowest_logit() -> None:
     logits = smooth_logits(12, 48, seed=3)
     kept = candidates_of(logits.reshape(4, 3, 48, 48), Frame((48, 48), (48, 48), (48, 48)))
     assert len(kept) == 12
@@ -47,7 +47,7 @@ def test_masks_of_windows_are_the_decoders_masks_enlarged(original_hw: tuple[int
         assert min((mask != other).mean() for other in expected) < 2e-4
 
 
-def test_windows_pack_small() -> None:
+def test_windows_compress_well() -> None:
     y, x = np.mgrid[:128, :128]
     ripples = np.sin(x * 7.1) * np.cos(y * 3.3)
     logits = np.tile((30 - np.hypot(x - 60, y - 60) + ripples).astype(np.float32), (1, 3, 1, 1))
@@ -60,5 +60,5 @@ def test_a_mask_over_the_whole_picture_has_no_edge() -> None:
     np.testing.assert_array_equal(unpacked(kept), np.full((3, 8, 8), 127))
 
 
-def test_a_mask_without_a_pixel_is_no_candidate() -> None:
+def test_a_mask_without_a_pixel_is_not_a_candidate() -> None:
     assert len(candidates_of(np.full((2, 3, 8, 8), -3, np.float32), Frame((8, 8), (8, 8), (8, 8)))) == 0

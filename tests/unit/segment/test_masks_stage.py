@@ -1,4 +1,4 @@
-"""The stages masks and tree on a small scene, and what a user reads when a model is missing."""
+"""The stages masks and coverage_tree on a small scene, and the errors for a missing model."""
 
 import json
 
@@ -116,7 +116,7 @@ def test_missing_file_is_listed(make_disc_sam, tmp_path):
         open_model_folder(folder, "sam")
 
 
-def test_networks_may_stand_beside_the_configuration(make_disc_sam, tmp_path):
+def test_networks_may_be_beside_the_configuration(make_disc_sam, tmp_path):
     folder = make_disc_sam(tmp_path / "sam")
     for path in (folder / "onnx").iterdir():
         path.rename(folder / path.name)

@@ -1,4 +1,4 @@
-"""Views that no one expects go through both segmenters all the same."""
+"""Views of unusual size or content pass through both segmenters."""
 
 import numpy as np
 import pytest

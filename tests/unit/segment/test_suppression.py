@@ -51,7 +51,7 @@ def test_best_box_stays_and_its_neighbour_goes():
 
 
 def test_a_dropped_box_drops_no_other():
-    # 0-1 and 1-2 overlap by 0.6, 0-2 by a third: 1 goes because of 0, so 2 stays
+    # 0-1 and 1-2 overlap by 0.6, 0-2 by a third: 0 drops 1, so 2 stays
     boxes = np.array([[0, 0, 8, 1], [2, 0, 10, 1], [4, 0, 12, 1]])
     assert suppress_boxes(boxes, np.array([0.9, 0.8, 0.7]), iou_max=0.5).tolist() == [0, 2]
 

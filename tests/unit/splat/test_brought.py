@@ -1,4 +1,4 @@
-"""Somebody's Gaussians take the place of a fit: as others write them, in the source's coordinates."""
+"""Ready-made Gaussians replace a fit: as other programs write them, in the source's coordinates."""
 
 import shutil
 from pathlib import Path
@@ -78,7 +78,7 @@ def test_the_stage_reports_on_brought_gaussians_without_a_fit(
     np.testing.assert_allclose(again.means, load_ply(source_ply).means, atol=1e-4)
 
 
-def test_gaussians_elsewhere_are_told_of(turned_scene, tmp_path):
+def test_gaussians_elsewhere_are_reported(turned_scene, tmp_path):
     save_ply(tmp_path / "elsewhere.ply", three_gaussians())
     out = tmp_path / "out"
     settings = GaussiansSettings()
@@ -87,7 +87,7 @@ def test_gaussians_elsewhere_are_told_of(turned_scene, tmp_path):
     assert "other coordinates" in read_json(out / "r" / "report.json")["warnings"][0]
 
 
-def test_a_ply_of_ours_comes_back_through_the_json_beside_it(turned_scene, source_ply, tmp_path):
+def test_a_ply_of_this_package_returns_through_the_json_beside_it(turned_scene, source_ply, tmp_path):
     out = tmp_path / "first"
     settings = GaussiansSettings()
     run_gaussians(turned_scene.folder, out / "g.ply", out / "r", tmp_path, settings, 0, 1, brought=source_ply)
@@ -155,7 +155,7 @@ def zero(columns: dict, name: str, value: float) -> dict:
         (lambda c: zero(c, "scale_1", -np.inf), "1 of 3 Gaussians hold a number that is not finite"),
         (lambda c: zero(zero(zero(zero(c, "rot_0", 0), "rot_1", 0), "rot_2", 0), "rot_3", 0), "no rotation"),
         (lambda c: {"packed_position": c["x"].astype(np.uint32)}, "compressed"),
-        (lambda c: {k: v[:0] for k, v in c.items()}, "holds no Gaussian"),
+        (lambda c: {k: v[:0] for k, v in c.items()}, "does not hold any Gaussians"),
     ],
 )
 def test_what_cannot_be_used_is_named(turned_scene, source_ply, tmp_path, change, message):

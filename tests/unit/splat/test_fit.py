@@ -41,7 +41,7 @@ def outputs(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
 def test_stage_writes_the_same_bytes_on_any_threads_and_after_a_stop(scene, tmp_path, monkeypatch, strategy):
-    monkeypatch.setenv("PATH", "")  # without ffmpeg, whatever this machine has
+    monkeypatch.setenv("PATH", "")  # without ffmpeg, even if this machine has it
     settings = SETTINGS.model_copy(update={"strategy": strategy, "background": "random"})
 
     def stage(name: str, threads: int) -> dict[str, bytes]:

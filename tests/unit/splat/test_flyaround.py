@@ -1,4 +1,4 @@
-"""The fly-around: a smooth closed path, a contact sheet always, a film where ffmpeg is there."""
+"""The fly-around: a smooth closed path, a contact sheet always, a film if ffmpeg is there."""
 
 import os
 import stat
@@ -76,7 +76,7 @@ def test_short_round_undoes_crossings():
 
 
 def flat_picture(camera: Camera) -> np.ndarray:
-    """A colour that tells where the camera is."""
+    """A colour that encodes where the camera is."""
     return np.full((48, 48, 3), int(128 + 40 * camera.centre[0]), np.uint8)
 
 
@@ -90,7 +90,7 @@ def test_sheet_without_ffmpeg_and_one_line_about_it(tmp_path, monkeypatch):
 
 
 def fake_ffmpeg(folder: Path, monkeypatch, script: str) -> None:
-    """A program of that name on PATH, for what becomes of its exit."""
+    """A shell script called ffmpeg on PATH."""
     program = folder / "bin" / "ffmpeg"
     program.parent.mkdir()
     program.write_text("#!/bin/sh\n" + script)
@@ -99,7 +99,7 @@ def fake_ffmpeg(folder: Path, monkeypatch, script: str) -> None:
 
 
 def test_film_gets_every_frame(tmp_path, monkeypatch):
-    # keeps what is fed in, as the file that is named last
+    # writes its input to the file named last
     fake_ffmpeg(tmp_path, monkeypatch, 'for last; do :; done\ncat > "$last"\n')
     (tmp_path / "out").mkdir()
     cameras = ring(12, 48)
@@ -111,7 +111,7 @@ def test_film_gets_every_frame(tmp_path, monkeypatch):
     np.testing.assert_array_equal(raw[7], flat_picture(path[7]))
 
 
-def test_an_ffmpeg_that_fails_is_told_of_and_stops_nothing(tmp_path, monkeypatch):
+def test_an_ffmpeg_that_fails_is_reported_and_stops_nothing(tmp_path, monkeypatch):
     fake_ffmpeg(tmp_path, monkeypatch, "cat > /dev/null\necho Unknown encoder libx264 >&2\nexit 1\n")
     (tmp_path / "out").mkdir()
     cameras = ring(12, 48)

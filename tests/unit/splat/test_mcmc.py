@@ -192,7 +192,7 @@ def test_noise_is_normal_numbers_times_the_covariance():
     np.testing.assert_allclose(adam.parameters["means"] - parameters["means"], expected, atol=2e-6)
 
 
-def test_noise_moves_a_scene_in_other_units_alike():
+def test_noise_does_not_depend_on_the_unit_of_the_scene():
     shifts = []
     for size in (1.0, 10.0):
         parameters = some_gaussians([0.004] * 5, scale=0.02 * size)

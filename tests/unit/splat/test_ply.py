@@ -50,12 +50,12 @@ def test_broken_files_are_refused(tmp_path):
     with pytest.raises(ArtifactError, match="is missing"):
         load_ply(tmp_path / "none.ply")
     (tmp_path / "text.ply").write_text("hello")
-    with pytest.raises(ArtifactError, match="cannot be read as a PLY"):
+    with pytest.raises(ArtifactError, match="is not a readable PLY"):
         load_ply(tmp_path / "text.ply")
     save_ply(tmp_path / "g.ply", some_gaussians(3, 1))
     whole = (tmp_path / "g.ply").read_bytes()
     (tmp_path / "g.ply").write_bytes(whole[:-9])
-    with pytest.raises(ArtifactError, match="cannot be read as a PLY"):
+    with pytest.raises(ArtifactError, match="is not a readable PLY"):
         load_ply(tmp_path / "g.ply")
     (tmp_path / "g.ply").write_bytes(whole.replace(b"opacity", b"opaqity"))
     with pytest.raises(ArtifactError, match="without opacity"):

@@ -47,7 +47,7 @@ def test_bands_of_tiles_give_the_same_bytes(monkeypatch, max_entries):
 
 def test_bands_cover_all_tiles_and_hold_no_more_than_asked():
     tiles = binning.Tiles(2, np.empty(0, np.int32), np.array([0, 3, 3, 10, 12, 13]))
-    # tile 2 alone has 7 entries, more than asked for, and stands alone
+    # tile 2 alone has 7 entries, more than asked for, and forms a band alone
     assert tiles.bands(5) == [(0, 2), (2, 3), (3, 5)]
     assert tiles.bands() == [(0, 5)]
 
@@ -98,7 +98,7 @@ def test_compiling_is_announced_once_and_only_when_it_happens(tmp_path):
 
 @pytest.fixture
 def no_cuda(monkeypatch):
-    """A machine without CUDA, whatever this one has."""
+    """A machine without CUDA, even if this one has it."""
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     for cached in (cuda_problem, choose_device):
         cached.cache_clear()
@@ -117,5 +117,5 @@ def test_auto_takes_the_cpu_without_cuda_and_says_so_once(caplog):
 
 @pytest.mark.usefixtures("no_cuda")
 def test_cuda_is_never_replaced_by_the_cpu():
-    with pytest.raises(DeviceError, match=r"device: cuda was asked for(?s:.*)finds no CUDA device(?s:.*)gpu"):
+    with pytest.raises(DeviceError, match=r"device: cuda was requested(?s:.*)finds no CUDA device(?s:.*)gpu"):
         choose_device("cuda")

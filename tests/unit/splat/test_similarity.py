@@ -1,4 +1,4 @@
-"""Gaussians moved by a similarity look the same from a camera that moved along."""
+"""Gaussians moved by a similarity look the same from a camera that moved with them."""
 
 import math
 
@@ -93,7 +93,7 @@ def test_there_and_back_is_nothing():
     np.testing.assert_allclose(same.abs(), 1, atol=1e-6)
 
 
-def test_what_is_no_similarity_is_refused():
+def test_a_matrix_that_is_not_a_similarity_is_refused():
     with pytest.raises(HilsplatError, match="not a similarity"):
         decompose(np.diag([1.0, 1.0, -1.0, 1.0]))  # mirrors
     with pytest.raises(HilsplatError, match="not a similarity"):

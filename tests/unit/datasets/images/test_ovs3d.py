@@ -82,7 +82,7 @@ def test_the_poses_stage_imports_llff(tmp_path, true_world, root):
     ("change", "message"),
     [
         (lambda rows: rows[:, :16], r"shape \(4, 16\)"),
-        (lambda rows: np.where(np.arange(17) == 3, np.nan, rows), "holds no LLFF poses"),
+        (lambda rows: np.where(np.arange(17) == 3, np.nan, rows), "does not hold LLFF poses"),
         (lambda rows: rows * np.where(np.arange(17) % 5 == 0, -1, 1), "row 0: not a rigid pose"),
         (
             lambda rows: np.where((np.arange(17) == 14) & (np.arange(4) == 2)[:, None], 0, rows),
