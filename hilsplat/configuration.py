@@ -50,6 +50,10 @@ class StageSettings(Section):
     figures: FiguresSettings = FiguresSettings()
     training: TrainingSettings = TrainingSettings()
 
+    def depends_on_seed(self, stage: str) -> bool:
+        """Whether the result of a stage, or of one that it reads, depends on the variant's seed."""
+        return any(getattr(self, section).is_random for section in UPSTREAM[stage])
+
 
 SECTIONS: dict[str, type[Section]] = {name: type(section) for name, section in StageSettings()}
 
@@ -117,8 +121,8 @@ UPSTREAM: dict[str, tuple[str, ...]] = {
 """Sections that each variant stage depends on, through its inputs too."""
 
 
-SEEDED = re.compile(r"(?P<variant>.+?)(?:\.seed(?P<seed>[0-9]+))?")
-"""A variant's name, with the number of the seed behind it where it is not the first."""
+SEEDED = re.compile(r"(.+)\.seed([0-9]+)")
+"""The name of a variant under another seed than the first: the variant, and the number of the seed."""
 
 
 class RunSettings(StageSettings):
@@ -157,29 +161,29 @@ class RunSettings(StageSettings):
 
     def variant_names(self) -> list[str]:
         """Variants that a run may need, "default" first; with more than one seed each of them per seed."""
-        lists = (self.main_variants, self.ablation_variants, self.theta_variants)
-        lists += (self.omega_variants, self.pruning_variants)
-        names = dict.fromkeys(["default", *(name for names in lists for name in names)])
-        return [name for first in names for name in self._all_seeds(first)]
+        names = (
+            *self.main_variants,
+            *self.ablation_variants,
+            *self.theta_variants,
+            *self.omega_variants,
+            *self.pruning_variants,
+        )
+        return [name for first in dict.fromkeys(["default", *names]) for name in self._all_seeds(first)]
 
     def seeded(self, variant: str, scopes: tuple[str, ...] = ()) -> list[str]:
         """A variant under every seed: its own name, then `<name>.seed1`, ...
 
         One in which nothing is random has one seed: it would be computed again to the same bytes.
         """
-        return self._all_seeds(variant) if self.is_random("evaluate", variant, scopes) else [variant]
+        is_random = self.stages(variant, scopes).depends_on_seed("evaluate")
+        return self._all_seeds(variant) if is_random else [variant]
 
     def _all_seeds(self, variant: str) -> list[str]:
         return [variant, *(f"{variant}.seed{number}" for number in range(1, self.seeds))]
 
-    def is_random(self, stage: str, variant: str, scopes: tuple[str, ...] = ()) -> bool:
-        """Whether a variant's stage, or one that it reads, depends on the variant's seed."""
-        stages = self.stages(variant, scopes)
-        return any(getattr(stages, section).is_random for section in UPSTREAM[stage])
-
     def seed_of(self, variant: str) -> int:
         """Seed of a variant's networks."""
-        return self.seed + int(SEEDED.fullmatch(variant)["seed"] or 0)
+        return self.seed + _parts_of(variant)[1]
 
     def stages(self, variant: str = "default", scopes: tuple[str, ...] = ()) -> StageSettings:
         """Settings of a variant for a scene.
@@ -191,7 +195,7 @@ class RunSettings(StageSettings):
         Raises:
             SettingsError: the variant is unknown or an override cannot be used.
         """
-        variant = SEEDED.fullmatch(variant)["variant"]
+        variant, _ = _parts_of(variant)
         merged = {name: getattr(self, name).model_dump() for name in SECTIONS}
         layers = [(f"overrides.{scope}", self.overrides.get(scope, {})) for scope in scopes]
         if variant != "default" or variant in self.variants:
@@ -221,6 +225,12 @@ class RunSettings(StageSettings):
         return StageSettings.model_validate(merged)
 
 
+def _parts_of(name: str) -> tuple[str, int]:
+    """A variant without its seed, and the number of the seed; 0 if the name has none."""
+    found = SEEDED.fullmatch(name)
+    return (found[1], int(found[2])) if found else (name, 0)
+
+
 def parse_run(config: dict[str, Any]) -> RunSettings:
     """Validate a whole configuration, variants and overrides included.
 
@@ -247,20 +257,21 @@ def config_schema() -> dict[str, Any]:
 def knob_table() -> str:
     """Every knob as text: name, default, range, unit, origin, meaning."""
     lines = []
-    models = {"": RunSettings, **SECTIONS}
+    models: dict[str, type[BaseModel]] = {"": RunSettings, **SECTIONS}
     for section, model in models.items():
         for name, field in model.model_fields.items():
             if not section and name in SECTIONS:
                 continue
-            extra = field.json_schema_extra or {}
+            extra = field.json_schema_extra
+            assert isinstance(extra, dict), name  # every field is a knob
             limits = ", ".join(
                 f"{symbol} {getattr(limit, attribute)}"
                 for limit in field.metadata
                 for attribute, symbol in (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
                 if hasattr(limit, attribute)
             )
-            facts = [limits, extra.get("unit", ""), f"origin: {extra.get('origin', 'ours')}"]
+            facts = [limits, extra["unit"], f"origin: {extra['origin']}"]
             place = f"{section}.{name}" if section else name
-            lines.append(f"{place} = {field.default!r}  ({'; '.join(fact for fact in facts if fact)})")
+            lines.append(f"{place} = {field.default!r}  ({'; '.join(str(fact) for fact in facts if fact)})")
             lines.append(f"    {field.description}")
     return "\n".join(lines)

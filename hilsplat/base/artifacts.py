@@ -10,13 +10,15 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from hilsplat.base.errors import ArtifactError, DiskSpaceError
+
+Made = TypeVar("Made")
 
 ZIP64_BYTES = 2**30
 """Arrays above this size get an entry whose size may pass 2 GiB."""
@@ -157,7 +159,7 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
         ) from error
 
 
-def read_into(maker: Callable[..., Any], path: Path, **more: Any) -> Any:
+def read_into(maker: type[Made], path: Path, **more: Any) -> Made:
     """Make something of the arrays of an .npz, by name.
 
     Args:
@@ -169,7 +171,7 @@ def read_into(maker: Callable[..., Any], path: Path, **more: Any) -> Any:
         ArtifactError: the file is missing or damaged, or another version of the program wrote it.
     """
     arrays = read_npz(path)
-    expected = {field.name for field in fields(maker) if field.init} - set(more)
+    expected = _arguments(maker) - set(more)
     if set(arrays) != expected:
         raise ArtifactError(
             f"{path} is of another version",
@@ -178,6 +180,11 @@ def read_into(maker: Callable[..., Any], path: Path, **more: Any) -> Any:
             fix="run its stage again",
         )
     return maker(**arrays, **more)
+
+
+def _arguments(maker: type) -> set[str]:
+    assert is_dataclass(maker), maker
+    return {field.name for field in fields(maker) if field.init}
 
 
 def write_npy(path: Path, array: np.ndarray) -> None:

@@ -7,6 +7,7 @@ import typer
 
 from hilsplat.cli.apps import datasets_app
 from hilsplat.cli.stage import (
+    DataRoot,
     Log,
     PathOut,
     stage,
@@ -16,7 +17,7 @@ from hilsplat.cli.stage import (
 
 @datasets_app.command("list")
 def datasets_list(
-    data_root: Annotated[Path | None, typer.Option(help="folder of the data sets' folders")] = None,
+    data_root: Annotated[Path | None, typer.Option(help="folder that holds the data sets")] = None,
 ) -> None:
     """List data sets: citation, licence, layout and, with --data-root, the scenes found."""
     start_logging(None)
@@ -28,7 +29,7 @@ def datasets_list(
 @datasets_app.command("check")
 def datasets_check(
     name: Annotated[str, typer.Argument(help="data set, such as lerf_ovs")],
-    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders", show_default=False)],
+    data_root: DataRoot,
     scene: Annotated[
         list[str] | None, typer.Option(help="scene to read; default: all that are found")
     ] = None,
@@ -47,7 +48,7 @@ def datasets_check(
 @datasets_app.command("export")
 def datasets_export(
     name: Annotated[str, typer.Argument(help="scene with labelled points, such as scannet/scene0000_00")],
-    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders", show_default=False)],
+    data_root: DataRoot,
     out: PathOut,
     log: Log = None,
 ) -> None:

@@ -8,9 +8,11 @@ import typer
 
 from hilsplat.cli.apps import app
 from hilsplat.cli.stage import (
+    DataRoot,
     Log,
     PathIn,
     PathOut,
+    Results,
     Settings,
     Threads,
     section_of,
@@ -20,6 +22,12 @@ from hilsplat.cli.stage import (
 
 if TYPE_CHECKING:
     from hilsplat.scene.finished import SceneParts
+
+Truth = Annotated[Path | None, typer.Option(help="annotations of a synthetic scene")]
+LabelledScene = Annotated[
+    str, typer.Option(help="or a scene of a published data set that has labels, such as lerf_ovs/figurines")
+]
+Queries = Annotated[str, typer.Option(help="JSON list of texts, for a scene without labels")]
 
 
 @app.command()
@@ -34,11 +42,11 @@ def evaluate(
     out: PathOut,
     dataset: Annotated[str, typer.Option(help="data set, for the rows")],
     name: Annotated[str, typer.Option(help="scene, for the rows")],
-    truth: Annotated[Path | None, typer.Option(help="annotations of a synthetic scene")] = None,
+    truth: Truth = None,
     labels: Annotated[
         list[str] | None, typer.Option(help="or labels of published data sets, such as lerf_ovs/figurines")
     ] = None,
-    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders")] = Path(),
+    data_root: DataRoot = Path(),
     kind: Annotated[
         str,
         typer.Option(help="of a synthetic scene: tabletop, room or street; the data sets it stands in for"),
@@ -52,8 +60,8 @@ def evaluate(
     section = section_of("evaluate", settings)
     parts = _parts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
     inputs = {**parts.as_inputs(), **({"truth": truth} if truth else {})}
-    more = {"inputs": inputs, "plugins": _readers(labels or ())}
-    with stage("evaluate", out, log, settings=section, threads=threads, **more):
+    plugins = _readers(labels or ())
+    with stage("evaluate", out, log, settings=section, threads=threads, inputs=inputs, plugins=plugins):
         from hilsplat.evaluate.stage import run_evaluate
 
         run_evaluate(
@@ -118,10 +126,10 @@ def figures(
     field: PathIn,
     autoencoder: PathIn,
     out: Annotated[Path, typer.Option(help="panel PNG; registration.png and fit.png go beside it")],
-    truth: Annotated[Path | None, typer.Option(help="truth folder of a synthetic scene")] = None,
-    labels: Annotated[str, typer.Option(help="or a labelled scene, such as lerf_ovs/figurines")] = "",
-    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders")] = Path(),
-    queries: Annotated[str, typer.Option(help="JSON list of texts, for a scene without labels")] = "[]",
+    truth: Truth = None,
+    labels: LabelledScene = "",
+    data_root: DataRoot = Path(),
+    queries: Queries = "[]",
     settings: Settings = "{}",
     evaluate: Settings = "{}",
     threads: Threads = 1,
@@ -134,8 +142,8 @@ def figures(
     parts = _parts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
     inputs = {**parts.as_inputs(), "fit": fit, **({"truth": truth} if truth else {})}
     recorded = {"figures": section, "evaluate": protocol}
-    more = {"inputs": inputs, "plugins": _readers([labels])}
-    with stage("figures", out, log, settings=recorded, threads=threads, **more):
+    plugins = _readers([labels])
+    with stage("figures", out, log, settings=recorded, threads=threads, inputs=inputs, plugins=plugins):
         from hilsplat.evaluate.figures.panel import run_figures
 
         run_figures(
@@ -158,10 +166,10 @@ def comparison(
     variants: Annotated[str, typer.Option(help="JSON list of variants that are compared")],
     out: Annotated[Path, typer.Option(help="PNG; views.png, features.png and PDFs are written beside it")],
     names: Annotated[str, typer.Option(help="JSON: how figures name a variant")] = "{}",
-    truth: Annotated[Path | None, typer.Option(help="truth folder of a synthetic scene")] = None,
-    labels: Annotated[str, typer.Option(help="or a labelled scene, such as lerf_ovs/figurines")] = "",
-    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders")] = Path(),
-    queries: Annotated[str, typer.Option(help="JSON list of texts, for a scene without labels")] = "[]",
+    truth: Truth = None,
+    labels: LabelledScene = "",
+    data_root: DataRoot = Path(),
+    queries: Queries = "[]",
     settings: Settings = "{}",
     evaluate: Settings = "{}",
     threads: Threads = 1,
@@ -173,8 +181,8 @@ def comparison(
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
     recorded, compared = {"figures": section, "evaluate": protocol}, json.loads(variants)
     inputs = {f"scores of {variant}": folder / variant / "scores.csv" for variant in compared}
-    more = {"inputs": inputs, "plugins": _readers([labels])}
-    with stage("comparison", out, log, settings=recorded, threads=threads, **more):
+    plugins = _readers([labels])
+    with stage("comparison", out, log, settings=recorded, threads=threads, inputs=inputs, plugins=plugins):
         from hilsplat.evaluate.figures.comparison import run_comparison
 
         run_comparison(
@@ -208,7 +216,7 @@ def sweep(
 
 @app.command()
 def efficiency(
-    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    results: Results = Path("results"),
     out: Annotated[Path, typer.Option(help="the CSV; .md beside it")] = Path("results/efficiency.csv"),
 ) -> None:
     """Print where the time went, from the benchmark files of a run."""

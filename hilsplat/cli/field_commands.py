@@ -149,8 +149,9 @@ def method(
 
     parts = MethodInputs(scene, gaussians, masks, contributions, autoencoder, threads)
     plugins = (METHODS.places[section.name],) if section.name in METHODS else ()
-    more = {"settings": section, "seed": seed, "threads": threads, "inputs": inputs, "plugins": plugins}
-    with stage("method", out, log, **more):
+    with stage(
+        "method", out, log, settings=section, seed=seed, threads=threads, inputs=inputs, plugins=plugins
+    ):
         from hilsplat.methods.stage import run_method
 
         run_method(parts, out, section, seed)

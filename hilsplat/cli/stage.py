@@ -21,6 +21,8 @@ Threads = Annotated[int, typer.Option(min=1, help="threads; results do not depen
 Seed = Annotated[int, typer.Option(min=0, help="seed of everything random")]
 Log = Annotated[Path | None, typer.Option(help="also write the log to this file")]
 Cache = Annotated[Path, typer.Option(help="folder of finished views, for resuming")]
+Results = Annotated[Path, typer.Option(help="results folder")]
+DataRoot = Annotated[Path, typer.Option(help="folder that holds the data sets")]
 
 DEFAULT_CACHE = Path("results/.cache")
 MIN_FREE_MIB = 200.0

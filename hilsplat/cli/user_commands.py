@@ -7,6 +7,7 @@ import typer
 
 from hilsplat.cli.apps import app
 from hilsplat.cli.stage import (
+    Results,
     Threads,
     start_logging,
 )
@@ -15,7 +16,6 @@ SceneName = Annotated[
     str,
     typer.Argument(help="dataset/scene in the results folder, such as photos/desk, or a path to its folder"),
 ]
-Results = Annotated[Path, typer.Option(help="results folder")]
 
 
 @app.command()

@@ -9,6 +9,7 @@ from hilsplat.cli.apps import world_app
 from hilsplat.cli.stage import (
     Log,
     PathOut,
+    Results,
     Settings,
     Threads,
     section_of,
@@ -36,7 +37,7 @@ def world_make(
 @world_app.command("show")
 def world_show(
     scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that was made")],
-    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    results: Results = Path("results"),
     out: Annotated[Path | None, typer.Option(help="PNG to write; default: beside the scene")] = None,
 ) -> None:
     """Write a contact sheet: views, labels by level, the tree with its texts."""
@@ -79,7 +80,7 @@ def world_gallery(
 def world_inconsistency(
     scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has masks")],
     variant: Annotated[str, typer.Option(help="variant whose masks are measured")] = "default",
-    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    results: Results = Path("results"),
     neighbours: Annotated[
         int, typer.Option(min=1, help="number of nearest views that each view is compared with")
     ] = 2,
@@ -99,7 +100,7 @@ def world_inconsistency(
 def world_masks(
     scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has masks")],
     variant: Annotated[str, typer.Option(help="variant whose masks are measured")] = "default",
-    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    results: Results = Path("results"),
     out: Annotated[
         Path | None, typer.Option(help="PNG to write, a CSV and a PDF beside it; default: beside the masks")
     ] = None,
@@ -120,7 +121,7 @@ def world_masks(
 def world_tree(
     scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has a tree")],
     variant: Annotated[str, typer.Option(help="variant whose tree is measured")] = "default",
-    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    results: Results = Path("results"),
     out: Annotated[Path | None, typer.Option(help="CSV to write; default: beside the tree")] = None,
     threads: Threads = 2,
 ) -> None:

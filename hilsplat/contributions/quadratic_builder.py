@@ -97,9 +97,9 @@ class GramBuilder:
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Go on from `state`."""
-        names = ("indptr", "indices", "values")
         self._blocks = [
-            tuple(state[f"{name}_{number}"] for name in names) for number in range(len(self._blocks))
+            (state[f"indptr_{number}"], state[f"indices_{number}"], state[f"values_{number}"])
+            for number in range(len(self._blocks))
         ]
 
     def finish(self) -> Gram:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import scipy.sparse as sp
@@ -98,7 +99,7 @@ def _mapped(path: Path) -> np.ndarray:
     """
     try:
         # A file without a single number cannot be mapped.
-        mode = "r" if path.stat().st_size > HEADER_BYTES else None
+        mode: Literal["r"] | None = "r" if path.stat().st_size > HEADER_BYTES else None
         return np.load(path, mmap_mode=mode, allow_pickle=False).view(np.ndarray)
     except FileNotFoundError as error:
         raise ArtifactError(f"{path} is missing", fix="run the contributions stage again") from error

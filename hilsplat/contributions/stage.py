@@ -14,6 +14,7 @@ Every loss of the language field, and the 3D semantic tree, need nothing else of
 
 import hashlib
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache as cache_calls
 from pathlib import Path
@@ -206,12 +207,14 @@ def run_contributions(
                     )
                     return normalised_weights(raw)
 
-                part = store.get(
-                    view.key,
-                    lambda view=view, weights=weights, masks=masks: view_contributions(
-                        view.name, weights(), masks
-                    ),
-                )
+                def compute(
+                    name: str = view.name,
+                    weights: Callable[[], sp.csr_matrix] = weights,
+                    masks: HierarchicalMasks = masks,
+                ) -> dict[str, np.ndarray]:
+                    return view_contributions(name, weights(), masks)
+
+                part = store.get(view.key, compute)
                 for name, matrix in matrices.items():
                     matrix.append(*(part[f"{name}_{what}"] for what in ("data", "indices", "indptr")))
                 mass.append(part["mass"][None])

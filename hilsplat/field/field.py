@@ -18,7 +18,7 @@ from hilsplat.base.artifacts import atomic_path, read_index, read_npz, sha256_of
 from hilsplat.base.device import compute_device
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.progress import stage_log
-from hilsplat.contributions.mask_operator import MaskOperator
+from hilsplat.contributions.mask_operator import MaskOperator, MaskProducts
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.autoencoder import autoencoder_file, load_latents, one_torch_thread
 from hilsplat.field.contrast import Contrast, view_relations
@@ -104,14 +104,14 @@ def run_field(
             settings.start,
         )
         relations = view_relations(contributions, parents, settings, masks.means(problem.lifted))
+        products: tuple[MaskProducts, MaskProducts] = masks, half_masks
         if device != "cpu":
             from hilsplat.contributions.cuda_algebra import DeviceMasks, DeviceQuadratic
 
-            masks, half_masks = DeviceMasks.of(masks, device), DeviceMasks.of(half_masks, device)
-            problem = replace(problem, masks=masks, quadratic=DeviceQuadratic.of(quadratic, device))
-        contrast = Contrast(
-            masks, half_masks, pixels, contributions.half_pixels.astype(np.float32), relations, settings
-        )
+            products = DeviceMasks.of(masks, device), DeviceMasks.of(half_masks, device)
+            problem = replace(problem, masks=products[0], quadratic=DeviceQuadratic.of(quadratic, device))
+        half_pixels = contributions.half_pixels.astype(np.float32)
+        contrast = Contrast(*products, pixels, half_pixels, relations, settings)
         features, report = solve_field(problem, contrast, settings)
         total_mass = contributions.mass().sum(axis=0, dtype=np.float64)
         features = keep_labelled(features, problem.mass, total_mass, settings.min_labelled_share)

@@ -127,6 +127,7 @@ def run_reference(
                 threads=threads,
                 device=chosen,
             )
+            assert shown.features is not None  # asked for above
             loss = rendered_loss(
                 shown.features, shown.alpha, labels[number], own_latents[number], settings.loss
             )

@@ -98,7 +98,8 @@ def query_panel(
     found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
     title = f"“{text}” in {scene.scene.name}: {found}{note}"
     figure.suptitle("\n".join([title, *map(str, doubts_of(scene, hits))]), fontsize=12, fontweight="bold")
-    upper, lower = figure.subfigures(2, 1, height_ratios=[len(views) * row_in, map_in])
+    heights = [len(views) * row_in, map_in]
+    (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)
     grid = upper.subplots(len(views), columns, squeeze=False)
     for axes, view in zip(grid, views, strict=True):
         image, mask = scene.image(view), scene.node_masks(view, hits.ids)
@@ -116,7 +117,8 @@ def query_panel(
             show(
                 axes[2 + each.index], picture, f"relevancy, {each.label}: {top:.2f}", bold=each is hits.level
             )
-    selected = np.isin(scene.tree.node_of_gaussian, hits.ids).any(axis=1)
+    selected = np.zeros(len(scene.gaussians), np.bool_)
+    selected[scene.gaussians_of(hits.ids)] = True
     title = f"from above: {np.count_nonzero(selected)} of {len(selected)} Gaussians; triangles are cameras"
     show_from_above(lower.subplots(), scene.gaussians, scene.scene.cameras, selected, title)
     save_figure(figure, out_png)
@@ -136,8 +138,8 @@ def report(scene: LanguageScene, text: str, found: NodeHits, view: str | None = 
     hits, doubts = hits_of(scene, found, LISTED), doubts_of(scene, found)
     if not hits:
         levels = ", ".join(f"--level {each.label}" for each in LEVELS if each is not found.level)
-        more = "" if view is None else ", or leave --view out"
-        return f"nothing in {place} answers to {text!r} at level {found.level.label}; try {levels}{more}"
+        other = "" if view is None else ", or leave out --view"
+        return f"nothing in {place} answers to {text!r} at level {found.level.label}; try {levels}{other}"
     lengths = "metres" if scene.scene.unit == "metre" else "scene units"
     lines = [
         f"{counted(len(hits), 'answer')} to {text!r} in {place}; lengths in {lengths}",

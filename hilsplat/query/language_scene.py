@@ -273,8 +273,8 @@ class LanguageScene:
 
         def measure() -> np.ndarray:
             num = len(self.tree)
-            area_px = sum(self._view_nodes(view, level).area_px(num) for level in LEVELS)
-            return area_px >= MIN_SHOWN_SHARE * height * width
+            area_px = np.sum([self._view_nodes(view, level).area_px(num) for level in LEVELS], axis=0)
+            return np.asarray(area_px >= MIN_SHOWN_SHARE * height * width)
 
         return self._views.get(("shown", view), measure, lambda kept: kept.nbytes)
 
@@ -390,16 +390,15 @@ class LanguageScene:
             exact: a network decodes every pixel for every call; else a view is decoded once and answers
                 within 2e-3 of that (see `latent_relevancy`). A linear code has one way.
         """
-        by_look_up = self._latent_relevancy.is_linear or not exact
-        shown, placed = self._view_latents(view), self._placed_latents(view) if by_look_up else None
-        vectors = self.text_vectors(texts)
         answer = self._latent_relevancy
+        shown, vectors = self._view_latents(view), self.text_vectors(texts)
+        placed = self._placed_latents(view) if answer.is_linear or not exact else None
         height, width = self._camera(view).size_hw
         maps = np.zeros((len(texts), len(LEVELS), height * width), np.float32)
         for index, (pixels, latents) in enumerate(shown):
             if not len(pixels):
                 continue
-            found = answer.fast(placed[index], vectors) if by_look_up else answer.exact(latents, vectors)
+            found = answer.exact(latents, vectors) if placed is None else answer.fast(placed[index], vectors)
             for row, level_map in zip(found, maps[:, index], strict=True):
                 if len(pixels) == len(level_map):
                     level_map[:] = row

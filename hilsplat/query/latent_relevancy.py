@@ -45,10 +45,13 @@ class LatentRelevancy:
     ) -> None:
         self._device = compute_device(device)
         self._code, self._canonical, self._scale, self._threads = code, canonical, scale, threads
+        self._look_up: LinearLookUp | ProjectedLookUp = (
+            LinearLookUp(code, canonical, scale)
+            if isinstance(code, LinearCode)
+            else ProjectedLookUp(code, canonical, scale)
+        )
         self.is_linear = isinstance(code, LinearCode)
         """Whether the fast way loses nothing but rounding."""
-        look_up = LinearLookUp if self.is_linear else ProjectedLookUp
-        self._look_up = look_up(code, canonical, scale)
 
     def exact(
         self, latents: Float32[np.ndarray, "P D"], texts: Float32[np.ndarray, "T C"]
@@ -65,6 +68,7 @@ class LatentRelevancy:
 
     def prepare(self, latents: Float32[np.ndarray, "P D"]) -> Placed:
         """What a look-up of these latents needs; once per view."""
+        placed: PlacedLinear | PlacedProjected
         if isinstance(self._look_up, LinearLookUp):
             placed = self._look_up.place(latents)
         else:
@@ -85,14 +89,27 @@ class LatentRelevancy:
         out = np.empty((len(texts), len(placed.generic)), np.float32)
         for text, row in zip(texts, out, strict=True):
             if isinstance(placed, PlacedOnDevice):
-                row[:] = placed.relevancy(*self._look_up.text_weights(placed, text), self._scale)
+                row[:] = placed.relevancy(*self._text_weights(placed, text), self._scale)
                 continue
 
             def answer(span: slice, text: np.ndarray = text, row: np.ndarray = row) -> None:
-                self._look_up.look_up(placed, span, text, row[span])
+                if isinstance(self._look_up, LinearLookUp):
+                    assert isinstance(placed, PlacedLinear)  # `prepare` made it
+                    self._look_up.look_up(placed, span, text, row[span])
+                else:
+                    assert isinstance(placed, PlacedProjected)
+                    self._look_up.look_up(placed, span, text, row[span])
 
             self._in_parts(answer, len(placed.generic))
         return out
+
+    def _text_weights(
+        self, placed: PlacedOnDevice, text: Float32[np.ndarray, " C"]
+    ) -> tuple[np.float32, Float32[np.ndarray, " R"]]:
+        if isinstance(self._look_up, LinearLookUp):
+            return self._look_up.text_weights(text)
+        assert placed.directions is not None  # those of a network's latents
+        return self._look_up.text_weights(placed.directions, text)
 
     def _decode_in_parts(self, work: Callable[[slice], None], count: int) -> None:
         """`_in_parts` for work that decodes; torch takes one thread, as the parts share the cores."""

@@ -64,14 +64,12 @@ class LinearLookUp:
         out: Float32[np.ndarray, " p"],
     ) -> None:
         """Write the relevancy of a text at the latents of a span."""
-        offset, slope = self.text_weights(placed, text)
+        offset, slope = self.text_weights(text)
         linear_relevancy(
             placed.channels, placed.length, placed.generic, span.start, offset, slope, self._scale, out
         )
 
-    def text_weights(
-        self, placed: object, text: Float32[np.ndarray, " C"]
-    ) -> tuple[np.float32, Float32[np.ndarray, " D"]]:
+    def text_weights(self, text: Float32[np.ndarray, " C"]) -> tuple[np.float32, Float32[np.ndarray, " D"]]:
         """A text's cosine is (offset + weights . channels) / length; the same for every view."""
         offsets, slopes, _, _ = self._code.cosine_terms(text[None])
         return offsets[0], slopes[0]

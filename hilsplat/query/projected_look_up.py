@@ -10,7 +10,6 @@ promise (`lost_for_error`), such as a small object that the sample missed, get d
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int16
@@ -54,13 +53,6 @@ class PlacedProjected:
         return self.coordinates.nbytes + self.directions.nbytes + self.generic.nbytes
 
 
-@runtime_checkable
-class HasDirections(Protocol):
-    """What was placed, wherever it is kept."""
-
-    directions: Float32[np.ndarray, "R C"]
-
-
 class ProjectedLookUp:
     """Relevancy of a network's latents: that of the decoded vectors to `ERROR`, at every pixel."""
 
@@ -102,14 +94,14 @@ class ProjectedLookUp:
         out: Float32[np.ndarray, " p"],
     ) -> None:
         """Write the relevancy of a text at the latents of a span."""
-        _, weights = self.text_weights(placed, text)
+        _, weights = self.text_weights(placed.directions, text)
         projected_relevancy(placed.coordinates, placed.generic, span.start, weights, self._scale, out)
 
     def text_weights(
-        self, placed: HasDirections, text: Float32[np.ndarray, " C"]
+        self, directions: Float32[np.ndarray, "R C"], text: Float32[np.ndarray, " C"]
     ) -> tuple[np.float32, Float32[np.ndarray, " R"]]:
         """A text's cosine is offset + weights . coordinates."""
-        return np.float32(0), (placed.directions @ text / STEPS).astype(np.float32)
+        return np.float32(0), (directions @ text / STEPS).astype(np.float32)
 
     def _directions(
         self, latents: Float32[np.ndarray, "P D"], among: Float64[np.ndarray, "A C"]

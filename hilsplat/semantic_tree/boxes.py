@@ -30,8 +30,8 @@ class OrientedBox:
     @staticmethod
     def from_array(rows: Float[np.ndarray, "5 3"]) -> "OrientedBox":
         """From its stored form: centre, three axes, sizes."""
-        centre, *axes, size = (tuple(row) for row in np.asarray(rows, np.float64).tolist())
-        return OrientedBox(centre, tuple(axes), size)
+        centre, first, second, third, size = ((x, y, z) for x, y, z in np.asarray(rows, np.float64).tolist())
+        return OrientedBox(centre, (first, second, third), size)
 
     def corners(self) -> Float[np.ndarray, "8 3"]:
         """The eight corners."""

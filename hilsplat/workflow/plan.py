@@ -165,18 +165,14 @@ class Plan:
     def shared_variant(self, stage: str, job: VariantJob) -> str:
         """First variant whose settings, up to a stage, equal those of the job's variant."""
         scopes = scopes_of(self.row(job))
-        seed = self.run.seed_of(job.variant) if self._is_random(stage, job.variant, scopes) else None
         wanted = self._stages(job.variant, scopes)
+        seed = self.run.seed_of(job.variant) if wanted.depends_on_seed(stage) else None
         for name in self.run.variant_names():
             other = self._stages(name, scopes)
             same = all(getattr(other, part) == getattr(wanted, part) for part in UPSTREAM[stage])
             if same and seed in (None, self.run.seed_of(name)):
                 return name
         return str(job.variant)
-
-    def _is_random(self, stage: str, variant: str, scopes: tuple[str, ...]) -> bool:
-        stages = self._stages(variant, scopes)
-        return any(getattr(stages, section).is_random for section in UPSTREAM[stage])
 
     # ---- photographs and poses ----------------------------------------------------------------------
 

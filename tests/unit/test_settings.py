@@ -88,9 +88,9 @@ def test_only_what_holds_something_random_is_repeated_per_seed() -> None:
     assert run.seeded("langsplat") == ["langsplat", "langsplat.seed1", "langsplat.seed2"]
     assert len(run.seeded("default", scopes=("photos",))) == 3
     assert [run.seed_of(name) for name in run.seeded("network")] == [0, 1, 2]
-    assert not run.is_random("autoencoder", "langsplat")
-    assert run.is_random("field", "langsplat")
-    assert not run.is_random("semantic_tree", "network")
+    assert not run.stages("langsplat").depends_on_seed("autoencoder")
+    assert run.stages("langsplat").depends_on_seed("field")
+    assert not run.stages("network").depends_on_seed("semantic_tree")
 
 
 def test_every_knob_has_description_and_origin() -> None:
