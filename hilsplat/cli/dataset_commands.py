@@ -1,4 +1,4 @@
-"""Benchmarks: what they are, which are here, and world scenes in their layouts."""
+"""Published data sets: list, check, export."""
 
 from pathlib import Path
 from typing import Annotated
@@ -19,7 +19,7 @@ from hilsplat.cli.stage import (
 def datasets_list(
     data_root: Annotated[Path | None, typer.Option(help="folder that holds the data sets")] = None,
 ) -> None:
-    """List data sets: citation, licence, layout and, with --data-root, the scenes found."""
+    """List the data sets: citation, licence, layout and, with --data-root, the scenes found."""
     start_logging(None)
     from hilsplat.datasets.overview import overview
 
@@ -30,11 +30,9 @@ def datasets_list(
 def datasets_check(
     name: Annotated[str, typer.Argument(help="data set, such as lerf_ovs")],
     data_root: DataRoot,
-    scene: Annotated[
-        list[str] | None, typer.Option(help="scene to read; default: all that are found")
-    ] = None,
+    scene: Annotated[list[str] | None, typer.Option(help="scene to read; default: all found")] = None,
 ) -> None:
-    """Read every label of a data set, scene by scene, and report findings and warnings."""
+    """Read all labels of a data set and report, scene by scene, what was found and what is wrong."""
     start_logging(None)
     from hilsplat.datasets.overview import check
     from hilsplat.datasets.registry import dataset_of
@@ -52,7 +50,7 @@ def datasets_export(
     out: PathOut,
     log: Log = None,
 ) -> None:
-    """Write images and poses of such a scene as a folder that `poses` imports."""
+    """Write the images and poses of a scene as a folder that `poses` imports."""
     from hilsplat.datasets.registry import readers_of
 
     with stage("source", out, log, plugins=readers_of([name])):
