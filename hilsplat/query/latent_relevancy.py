@@ -1,7 +1,7 @@
 """Relevancy of rendered latents without decoding every pixel.
 
-- a linear code (PCA): cosines are ratios of d numbers and need no decoding at all (`linear_look_up`).
-- a network: a view is decoded once and kept as coordinates in few directions (`projected_look_up`).
+- A linear code (PCA): cosines follow from the d numbers of a latent without decoding (`linear_look_up`).
+- A network: a view is decoded once and kept as coordinates along few directions (`projected_look_up`).
 """
 
 from collections.abc import Callable
@@ -31,8 +31,8 @@ class LatentRelevancy:
         code: decodes latents.
         canonical: unit vectors of the generic phrases.
         scale: of the cosines.
-        threads: pixels are shared among them; results do not depend on it.
-        device: "cpu", or "cuda": where the fast way runs; the same to rounding.
+        threads: number of threads that share the pixels; results do not depend on it.
+        device: "cpu" or "cuda" for `fast`; results are equal up to rounding.
     """
 
     def __init__(
@@ -51,12 +51,12 @@ class LatentRelevancy:
             else ProjectedLookUp(code, canonical, scale)
         )
         self.is_linear = isinstance(code, LinearCode)
-        """Whether the fast way loses nothing but rounding."""
+        """Whether `fast` equals `exact` up to rounding."""
 
     def exact(
         self, latents: Float32[np.ndarray, "P D"], texts: Float32[np.ndarray, "T C"]
     ) -> Float32[np.ndarray, "T P"]:
-        """By decoding every latent."""
+        """Relevancy by decoding every latent."""
         out = np.empty((len(texts), len(latents)), np.float32)
 
         def decode(span: slice) -> None:
@@ -67,7 +67,7 @@ class LatentRelevancy:
         return out
 
     def prepare(self, latents: Float32[np.ndarray, "P D"]) -> Placed:
-        """What a look-up of these latents needs; once per view."""
+        """Prepare these latents for look-ups; once per view."""
         placed: PlacedLinear | PlacedProjected
         if isinstance(self._look_up, LinearLookUp):
             placed = self._look_up.place(latents)
@@ -80,7 +80,7 @@ class LatentRelevancy:
         placed: Placed,
         texts: Float32[np.ndarray, "T C"],
     ) -> Float32[np.ndarray, "T P"]:
-        """The fast way of this code; see the module for which that is.
+        """Relevancy by the look-up for this code (see the module).
 
         Args:
             placed: what `prepare` returned.
@@ -112,10 +112,10 @@ class LatentRelevancy:
         return self._look_up.text_weights(placed.directions, text)
 
     def _decode_in_parts(self, work: Callable[[slice], None], count: int) -> None:
-        """`_in_parts` for work that decodes; torch takes one thread, as the parts share the cores."""
+        """`_in_parts` for work that decodes: torch takes one thread, since the parts share the cores."""
 
         def alone(span: slice) -> None:
-            torch.set_num_threads(1)  # holds for one thread of the pool
+            torch.set_num_threads(1)  # applies to this thread of the pool only
             work(span)
 
         with one_torch_thread():
