@@ -1,11 +1,11 @@
 """`make bench`: every room's timings in one table, printed and written as Markdown and JSON.
 
-A room is one file `test_<room>.py`. A case notes in `benchmark.extra_info`:
+A room is one file `test_<room>.py`. A case records in `benchmark.extra_info`:
     case: its name, such as "forward, 100k 800x600, D=3, 1 thread";
     count, of: how many of what one call handles, for the rate (optional);
-    flop: useful float operations of one call, for the share of the peak (optional);
-    peak_mib: peak memory beyond what was held before (optional).
-A room's list GOALS (see `goals.Goal`) becomes lines of the second table.
+    flop: useful floating-point operations of one call, for the share of the peak (optional);
+    peak_mib: peak memory beyond that held before (optional).
+The list GOALS of a room (see `goals.Goal`) becomes rows of the second table.
 """
 
 import datetime
@@ -29,7 +29,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def _cases(session: Any, peak_gflops: float) -> list[dict[str, Any]]:
-    """One record per case that was timed."""
+    """One record per timed case."""
     out = []
     for bench in session.benchmarks:
         if bench.has_error or not bench.stats.data:
@@ -69,7 +69,7 @@ def _row(case: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _machine(peak_gflops: float) -> dict[str, Any]:
-    """What the figures depend on."""
+    """The machine and versions that the figures depend on."""
     model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.is_file():
@@ -120,6 +120,6 @@ GOALS: pytest.StashKey[list] = pytest.StashKey()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Gather the goals of the rooms that are run."""
+    """Gather the goals of the rooms to run."""
     modules = dict.fromkeys(item.module for item in items)
     config.stash[GOALS] = [goal for module in modules for goal in getattr(module, "GOALS", [])]

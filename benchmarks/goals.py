@@ -1,10 +1,10 @@
-"""Goals of a room: a figure made from its timings, and what it should be."""
+"""Goals of a room: a figure computed from its timings, and its target."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 Times = dict[str, float]
-"""Case -> its least time, ms; what a case is called is written in its row of the table."""
+"""Name of a case, as in its row of the table -> its least time, ms."""
 
 
 @dataclass(frozen=True)
@@ -14,8 +14,8 @@ class Goal:
     Attributes:
         what: the figure.
         unit: its unit.
-        limit: what it should be at most (or at least, where `at_least`).
-        figure: the figure from the times of all cases; KeyError where a case was not run.
+        limit: the target: an upper limit, or a lower one with `at_least`.
+        figure: computes the figure from the times of all cases; KeyError if a case was not run.
         at_least: larger is better.
     """
 
@@ -26,7 +26,7 @@ class Goal:
     at_least: bool = False
 
     def row(self, times: Times) -> tuple[str, str, str, str] | None:
-        """What, figure, goal and whether it is met; None where the cases were not run."""
+        """Row of the table: what, figure, goal, and whether it is met; None if the cases were not run."""
         try:
             value = self.figure(times)
         except KeyError:

@@ -1,12 +1,12 @@
-"""A scene of the size of a large capture, made up, and the time and memory of each stage of the method.
+"""A synthetic scene as large as a large capture, and the time and memory of each stage of the method.
 
     python -m benchmarks.large_scene LARGE                             # 1M Gaussians, 250 views of 986 x 728
     python -m benchmarks.large_scene SMALL --gaussians 100000 --views 48 --width 800 --height 600
 
-makes a floor with 400 balls on it, a ring of cameras, masks of each view at three levels (balls, their
-halves, their eighths; the largest of each level) with a CLIP vector each, and then runs tree, contributions,
-semantic tree, autoencoder and field one after the other, each in a process of its own. What is there already
-is not made again; times and peaks are printed and written to `times.md`.
+makes a floor with 400 balls on it, a ring of cameras, and masks of each view at three levels (balls, halves,
+eighths; the largest of each level) with a CLIP vector each, and then runs coverage tree, contributions,
+semantic tree, autoencoder and field one after the other, each in its own process. It keeps what already
+exists, and prints times and peaks and writes them to `times.md`.
 """
 
 import argparse
@@ -46,7 +46,7 @@ from hilsplat.splat.ply import save_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 
 ROWS = 20
-"""Balls stand in so many rows and columns, a metre apart."""
+"""Number of rows and of columns of balls, a metre apart."""
 RADIUS = 0.38
 CHANNELS = 512
 MIN_AREA_PX = 50
@@ -54,10 +54,10 @@ STAGES = ("coverage_tree", "contributions", "semantic_tree", "autoencoder", "fie
 
 
 def made_gaussians(number: int) -> tuple[Gaussians, np.ndarray]:
-    """Balls (seven tenths of all) and floor, in the order in which a fit leaves them.
+    """Gaussians of the balls (seven tenths of all) and the floor, in the order that a fit gives them.
 
     Returns:
-        the Gaussians, and (N, 3) whose ball, half and eighth each is, -1 on the floor.
+        the Gaussians, and (N, 3) the ball, half and eighth of each, -1 on the floor.
     """
     rng = np.random.default_rng(0)
     on_balls = number * 7 // 10
@@ -86,7 +86,7 @@ def made_gaussians(number: int) -> tuple[Gaussians, np.ndarray]:
 
 
 def ring_of_cameras(number: int, size_hw: tuple[int, int]) -> Cameras:
-    """Cameras at two heights round the balls, looking at points near the middle."""
+    """Cameras at two heights around the balls, looking at points near the middle."""
     rng = np.random.default_rng(1)
     poses = np.tile(np.eye(4), (number, 1, 1))
     for index in range(number):
@@ -146,7 +146,7 @@ def make(out: Path, number: int, views: int, size_hw: tuple[int, int], masks: in
 
 
 def front_gaussian(weights) -> np.ndarray:
-    """The Gaussian of the largest weight of each pixel; -1 where there is none."""
+    """The Gaussian with the largest weight at each pixel, -1 for none."""
     front = np.full(weights.shape[0], -1, np.int64)
     counts = np.diff(weights.indptr)
     filled = np.flatnonzero(counts)
@@ -158,7 +158,7 @@ def front_gaussian(weights) -> np.ndarray:
 
 
 def stages(out: Path, threads: int) -> dict[str, Callable[[], None]]:
-    """What is timed."""
+    """The stages to time."""
     code = AutoencoderSettings(code="pca", latent=16)
     return {
         "coverage_tree": lambda: run_coverage_tree(
@@ -202,9 +202,11 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=250)
     parser.add_argument("--width", type=int, default=986)
     parser.add_argument("--height", type=int, default=728)
-    parser.add_argument("--masks", type=int, default=300, help="of a view, all levels together")
+    parser.add_argument("--masks", type=int, default=300, help="masks of a view, all levels together")
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--stage", choices=STAGES, help="run this one here and print seconds and MiB")
+    parser.add_argument(
+        "--stage", choices=STAGES, help="run this stage in this process and print seconds and MiB"
+    )
     asked = parser.parse_args()
     asked.out.mkdir(parents=True, exist_ok=True)
     if asked.stage:

@@ -1,4 +1,4 @@
-"""What the machine can do: its peak of fused multiply-adds."""
+"""Peak rate of fused multiply-adds of the machine."""
 
 import time
 from typing import no_type_check
@@ -15,7 +15,7 @@ CHAINS = 12
 @numba.njit
 @no_type_check
 def _multiply_add(rounds, factor, term):
-    """CHAINS x 16 fused multiply-adds a round."""
+    """CHAINS x 16 fused multiply-adds per round."""
     x, y = lanes(factor), lanes(term)
     a, b, c, d, e, f = y, y, y, y, y, y
     g, h, i, j, k, m = y, y, y, y, y, y
@@ -27,7 +27,7 @@ def _multiply_add(rounds, factor, term):
 
 
 def fma_peak_gflops() -> float:
-    """Most float32 operations per second of one core, a multiply-add counted as two: GFLOP/s."""
+    """Largest rate of float32 operations of one core, GFLOP/s; a multiply-add counts as two."""
     rounds = 2_000_000
     factor, term = np.float32(0.999), np.float32(1e-3)
     _multiply_add(1, factor, term)

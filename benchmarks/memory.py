@@ -1,10 +1,9 @@
-"""Peak memory of one forward and one backward pass, in a process of its own (Linux).
+"""Peak memory of one forward and one backward pass, in a separate process (Linux).
 
     python -m benchmarks.memory 1000000 2160 3840 3     # Gaussians, height, width, channels
 
-prints what forward, and forward and backward, take at their peak beyond the scene itself, MiB. What
-counts are the image and alpha, all gradients, and everything in between; not the gradients of the
-image that are handed in.
+prints the peak of forward, and of forward and backward, beyond the scene itself, MiB. The image and alpha,
+all gradients and everything in between count; the gradients of the image, which are inputs, do not.
 """
 
 import subprocess
@@ -32,7 +31,7 @@ def _measure(num_gaussians: int, size_hw: tuple[int, int], channels: int) -> tup
         parameters = to_parameters(gaussians)
         features = np.ones((num, channels - 3), np.float32)
         grad = np.ones((*size_hw, channels), np.float32), np.ones(size_hw, np.float32)
-        # a first peak that is forgotten: the process begins with what it holds now
+        # reset the peak to what the process holds now
         Path("/proc/self/clear_refs").write_text("5")
         before = status_mib("VmRSS")
         view = project_gaussians(parameters, camera, 3, 1)

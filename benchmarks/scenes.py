@@ -1,4 +1,4 @@
-"""Random scenes that cost what fitted ones cost: each pixel blends 33 to 43 Gaussians."""
+"""Random scenes that cost as much as fitted ones: each pixel blends 33 to 43 Gaussians."""
 
 import math
 
@@ -21,7 +21,7 @@ SPREAD = 0.9
 def random_scene(
     num_gaussians: int, size_hw: tuple[int, int], *, seed: int = 0, sh_degree: int = 3
 ) -> tuple[Gaussians, Camera]:
-    """Anisotropic Gaussians spread evenly over a frustum, and the one camera that sees them.
+    """Anisotropic Gaussians spread evenly over a frustum, and the camera that sees them.
 
     Widths are log-normal and shrink with the root of the number; opacities are logit-normal. Images
     are nearly opaque: alpha is 0.95 to 0.99 on average.

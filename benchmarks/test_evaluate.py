@@ -1,4 +1,4 @@
-"""Scoring a view: 20 annotated texts in 986 x 728 px, relevancy maps and node masks given."""
+"""Scoring a view: 20 annotated texts at 986 x 728 px, with given relevancy maps and node masks."""
 
 import time
 from functools import cache
@@ -42,7 +42,7 @@ class Answers:
 
 @cache
 def annotated_view() -> tuple[Answers, ViewTruth]:
-    """Five things of 200 x 300 px with a half and two quarters each."""
+    """Five things of 200 x 300 px, each with a half, a quarter and a rim."""
     queries, regions, by_path = [], [], {}
     for thing in range(5):
         top, left = 60 + 250 * (thing // 3), 20 + 320 * (thing % 3)

@@ -1,8 +1,8 @@
-"""Queries on tree and field, the linkage of masks and the solver, on made-up scenes of known size.
+"""Queries on tree and field, the linkage of masks and the solver, on synthetic scenes of known size.
 
-The scene of the queries: 200,000 Gaussians before one camera of 986 x 728 px, parted into blocks that
-are the nodes of three levels; CLIP vectors of 512 numbers. What is timed is an open scene's answer:
-the view was drawn before, the text was embedded before (`text model` is the model's own business).
+The scene of the queries: 200,000 Gaussians in front of one camera of 986 x 728 px, divided into blocks that
+are the nodes of three levels; CLIP vectors of 512 numbers. The timings are those of an open scene: the view
+was drawn and the text embedded before (the time of the text model depends on the model).
 """
 
 import time
@@ -33,7 +33,7 @@ from hilsplat.splat.rasterise.api import pixel_weights
 
 SIZE_HW = (728, 986)
 BLOCKS = ((6, 8), (12, 16), (24, 32))
-"""Nodes of each level, down and across the image: 48, 192 and 768."""
+"""Rows and columns of nodes at each level: 48, 192 and 768 nodes."""
 
 CHANNELS = 512
 VIEW = "view"
@@ -46,7 +46,7 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 
 @cache
 def open_scene(code_name: str, threads: int = 1) -> LanguageScene:
-    """A scene whose field has three numbers (network) or sixteen (pca)."""
+    """A scene whose latents have three numbers (network) or sixteen (pca)."""
     gaussians, camera = random_scene(200_000, SIZE_HW, sh_degree=0)
     rng = np.random.default_rng(0)
     place = gaussians.means.numpy() @ camera.K.T

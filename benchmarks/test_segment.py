@@ -1,7 +1,7 @@
-"""A view's masks but for the network: reading logits, filters, suppression, tree, writing.
+"""A view's masks without the network: reading logits, filters, suppression, tree, writing.
 
-Timed on one thread by the processor's clock, which stands while the network answers (a table of
-blobs, `canned_sam`). Cases handle all 3 x 1024 answers to a grid of 32 x 32 prompts.
+Timed on one thread by the processor's clock, which stops while the network (a table of blobs, `canned_sam`)
+answers. Cases handle all 3 x 1024 answers to a grid of 32 x 32 prompts.
 """
 
 import time
@@ -20,7 +20,7 @@ from hilsplat.segment.suppression import suppress_masks
 from hilsplat.settings import MasksSettings
 
 SETTINGS = MasksSettings(predicted_iou_min=0.7, stability_min=0.5, min_area_px=100)
-"""Nothing falls to the filters, so that 1024 candidates a level reach the suppression."""
+"""The filters drop nothing, so that 1024 candidates per level reach the suppression."""
 
 VIEW_HW = (600, 800)
 LANGSPLAT_HW = (728, 986)

@@ -1,8 +1,8 @@
 """The CPU rasteriser, the photometric loss and a whole fit iteration, on random scenes.
 
-One thread is timed by the processor's clock, which a busy machine disturbs less; more threads by the
-wall. Both report the least of many rounds. Useful operations are counted for hits alone (a Gaussian
-blended at a pixel): 22 + 2 D forward, 40 + 4 D backward, where D counts colour and feature channels.
+One thread is timed by the processor's clock, which other load disturbs less, more threads by the wall clock.
+Both report the least of many rounds. Useful operations count hits only (a Gaussian blended at a pixel):
+22 + 2 D forward, 40 + 4 D backward, where D is the number of colour and feature channels.
 """
 
 import time
@@ -40,7 +40,7 @@ SETTINGS = GaussiansSettings(
     opacity_reset_every=4 * HALF_WAY,
     device="cpu",
 )
-"""Half-way through a fit: all harmonics, gradients are gathered, density control does not strike."""
+"""Half-way through a fit: all harmonics are on, gradients are gathered, density control does not run."""
 
 scenes = pytest.mark.parametrize("scene", SIZES)
 threads = pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def test_photometric_loss(benchmark, threads):
 
 @pytest.mark.parametrize("channels", [3, 16])
 def test_peak_memory(benchmark, channels):
-    """Timed is the measuring process as a whole; what matters is its column of MiB."""
+    """The timing covers the whole measuring process; only its column of MiB matters."""
     benchmark.extra_info |= {"case": memory_case(channels)}
     _, peak = benchmark.pedantic(lambda: peaks_mib(*SIZES[LARGE], channels), rounds=1)
     benchmark.extra_info["peak_mib"] = peak
@@ -156,7 +156,7 @@ def memory_case(channels: int) -> str:
 
 
 def _ratio(what: str, above: tuple, below: tuple):
-    """Goal function: one case's time over another's."""
+    """Figure of a goal: the time of one case divided by that of another."""
     return lambda times: times[name(what, *above)] / times[name(what, *below)]
 
 

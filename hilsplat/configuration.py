@@ -3,7 +3,7 @@
 import difflib
 import json
 import re
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -31,7 +31,7 @@ from hilsplat.settings import (
 
 
 class StageSettings(Section):
-    """All sections, one per stage."""
+    """All sections, by name."""
 
     world: WorldSettings = WorldSettings()
     poses: PosesSettings = PosesSettings()
@@ -50,12 +50,16 @@ class StageSettings(Section):
     figures: FiguresSettings = FiguresSettings()
     training: TrainingSettings = TrainingSettings()
 
+    def depends_on_seed(self, stage: str) -> bool:
+        """Whether the result of a stage, or of one that it reads, depends on the variant's seed."""
+        return any(getattr(self, section).is_random for section in UPSTREAM[stage])
+
 
 SECTIONS: dict[str, type[Section]] = {name: type(section) for name, section in StageSettings()}
 
 
 def parse_section(name: str, text: str) -> Any:
-    """Read one section from JSON, as a rule hands it to a stage.
+    """Read one section from JSON, as a rule passes it to a stage.
 
     Raises:
         SettingsError: a key is unknown, or a value is of the wrong type or out of range.
@@ -67,7 +71,7 @@ def parse_section(name: str, text: str) -> Any:
 
 
 def settings_error(error: ValidationError, where: str, model: type[BaseModel]) -> SettingsError:
-    """Turn pydantic's report into one line per key: place, problem, what is allowed."""
+    """Turn pydantic's report into one line per key: its place, the problem, what is allowed."""
     lines = []
     for problem in error.errors():
         path = [str(part) for part in problem["loc"]]
@@ -102,7 +106,7 @@ VARIANT_SECTIONS = (
     "method",
     "evaluate",
 )
-"""Sections a variant may override; the stages before them are shared by all variants."""
+"""Sections that a variant may override; all variants share the stages before them."""
 
 UPSTREAM: dict[str, tuple[str, ...]] = {
     "masks": ("masks", "perturb"),
@@ -114,72 +118,76 @@ UPSTREAM: dict[str, tuple[str, ...]] = {
     "field": VARIANT_SECTIONS[:-1],
     "evaluate": VARIANT_SECTIONS,
 }
-"""Sections that each variant stage depends on, through its inputs too."""
+"""Sections that each stage of a variant depends on, directly or through its inputs."""
 
 
-SEEDED = re.compile(r"(?P<variant>.+?)(?:\.seed(?P<seed>[0-9]+))?")
-"""A variant's name, with the number of the seed behind it where it is not the first."""
+SEEDED = re.compile(r"(.+)\.seed([0-9]+)")
+"""Name of a variant under another seed than the first: the variant, and the number of the seed."""
 
 
 class RunSettings(StageSettings):
-    """The whole configuration: what is run, with which settings."""
+    """The whole configuration: what to run, and with which settings."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    seed: int = knob(0, "seed of everything random", ge=0)
+    seed: int = knob(0, "seed for everything random", ge=0)
     scenes: str = knob("config/scenes.tsv", "scene sheet, relative to the project")
-    groups: tuple[str, ...] = knob(("benchmark",), "groups of the scene sheet that are run")
+    groups: tuple[str, ...] = knob(("benchmark",), "groups of the scene sheet to run")
     only: tuple[str, ...] = knob(
-        (), "names of scenes, to run these alone: table-1, or synthetic/table-1; of any group if need be"
+        (),
+        "the only scenes to run, of whatever group: table-1, or synthetic/table-1; empty: all of the groups",
     )
-    data_root: str = knob("", "folder of the real data sets; empty: they are skipped")
+    data_root: str = knob("", "folder of the published data sets; empty: their scenes are skipped")
     main_variants: tuple[str, ...] = knob(("default",), "variants in the main tables")
     ablation_variants: tuple[str, ...] = knob((), "variants in the ablation table")
     theta_variants: tuple[str, ...] = knob((), "variants in the sweep over theta")
     omega_variants: tuple[str, ...] = knob((), "variants in the sweep over Omega")
     pruning_variants: tuple[str, ...] = knob((), "variants in the table of pruned pairs")
     sweep_scenes: tuple[str, ...] = knob(
-        (), "names of scenes for ablation, sweeps and pruning; empty: all tabletop and photographed ones"
+        (), "scenes for ablation, sweeps and pruning; empty: all tabletop and photographed ones"
     )
     seeds: int = knob(
-        1, "seeds of trained autoencoders and fields; more than one gives mean and spread", ge=1, le=10
+        1,
+        "number of seeds for what is trained at random; with several, tables give mean and spread",
+        ge=1,
+        le=10,
     )
     variants: dict[str, dict[str, dict[str, Any]]] = knob(
         {}, "named overrides: variant -> section -> knob -> value; 'default' always exists"
     )
-    labels: dict[str, str] = knob({}, "how tables name a variant")
+    labels: dict[str, str] = knob({}, "variant -> its name in tables")
     overrides: dict[str, dict[str, dict[str, Any]]] = knob(
-        {}, "settings of a whole group or of one scene: group or dataset/scene -> section -> knob -> value"
+        {}, "settings of a group or of one scene: group or dataset/scene -> section -> knob -> value"
     )
     queries: dict[str, tuple[str, ...]] = knob(
-        {}, "texts shown in the panel of a scene without labels on images, by dataset/scene or by data set"
+        {}, "texts in the panel of a scene without labels on its images, by dataset/scene or by data set"
     )
 
     def variant_names(self) -> list[str]:
-        """Variants that a run may need, "default" first; with more than one seed each of them per seed."""
-        lists = (self.main_variants, self.ablation_variants, self.theta_variants)
-        lists += (self.omega_variants, self.pruning_variants)
-        names = dict.fromkeys(["default", *(name for names in lists for name in names)])
-        return [name for first in names for name in self._all_seeds(first)]
+        """Variants that a run may need, "default" first; with several seeds, each of them per seed."""
+        names = (
+            *self.main_variants,
+            *self.ablation_variants,
+            *self.theta_variants,
+            *self.omega_variants,
+            *self.pruning_variants,
+        )
+        return [name for first in dict.fromkeys(["default", *names]) for name in self._all_seeds(first)]
 
     def seeded(self, variant: str, scopes: tuple[str, ...] = ()) -> list[str]:
         """A variant under every seed: its own name, then `<name>.seed1`, ...
 
-        One in which nothing is random has one seed: it would be computed again to the same bytes.
+        A variant in which nothing is random has one seed: others would give the same bytes.
         """
-        return self._all_seeds(variant) if self.is_random("evaluate", variant, scopes) else [variant]
+        is_random = self.stages(variant, scopes).depends_on_seed("evaluate")
+        return self._all_seeds(variant) if is_random else [variant]
 
     def _all_seeds(self, variant: str) -> list[str]:
         return [variant, *(f"{variant}.seed{number}" for number in range(1, self.seeds))]
 
-    def is_random(self, stage: str, variant: str, scopes: tuple[str, ...] = ()) -> bool:
-        """Whether a variant's stage, or one that it reads, depends on the variant's seed."""
-        stages = self.stages(variant, scopes)
-        return any(getattr(stages, section).is_random for section in UPSTREAM[stage])
-
     def seed_of(self, variant: str) -> int:
         """Seed of a variant's networks."""
-        return self.seed + int(SEEDED.fullmatch(variant)["seed"] or 0)
+        return self.seed + _parts_of(variant)[1]
 
     def stages(self, variant: str = "default", scopes: tuple[str, ...] = ()) -> StageSettings:
         """Settings of a variant for a scene.
@@ -191,7 +199,7 @@ class RunSettings(StageSettings):
         Raises:
             SettingsError: the variant is unknown or an override cannot be used.
         """
-        variant = SEEDED.fullmatch(variant)["variant"]
+        variant, _ = _parts_of(variant)
         merged = {name: getattr(self, name).model_dump() for name in SECTIONS}
         layers = [(f"overrides.{scope}", self.overrides.get(scope, {})) for scope in scopes]
         if variant != "default" or variant in self.variants:
@@ -211,7 +219,7 @@ class RunSettings(StageSettings):
                     raise SettingsError(
                         f"{where}.{section}: a variant cannot change this section, all variants share it",
                         expected=f"one of {', '.join(VARIANT_SECTIONS)}",
-                        fix="use overrides: for a group or a scene, or a configuration file of its own",
+                        fix="put it under overrides for a group or a scene, or in another configuration file",
                     )
                 merged[section].update(values)
                 try:
@@ -221,11 +229,17 @@ class RunSettings(StageSettings):
         return StageSettings.model_validate(merged)
 
 
+def _parts_of(name: str) -> tuple[str, int]:
+    """A variant without its seed, and the number of the seed; 0 if the name has none."""
+    found = SEEDED.fullmatch(name)
+    return (found[1], int(found[2])) if found else (name, 0)
+
+
 def parse_run(config: dict[str, Any]) -> RunSettings:
     """Validate a whole configuration, variants and overrides included.
 
     Raises:
-        SettingsError: naming each key that cannot be used.
+        SettingsError: keys cannot be used; the message names each of them.
     """
     try:
         run = RunSettings.model_validate(config)
@@ -245,22 +259,24 @@ def config_schema() -> dict[str, Any]:
 
 
 def knob_table() -> str:
-    """Every knob as text: name, default, range, unit, origin, meaning."""
+    """Every knob as text: name, default, choices or range, unit, origin, meaning."""
     lines = []
-    models = {"": RunSettings, **SECTIONS}
+    models: dict[str, type[BaseModel]] = {"": RunSettings, **SECTIONS}
     for section, model in models.items():
         for name, field in model.model_fields.items():
             if not section and name in SECTIONS:
                 continue
-            extra = field.json_schema_extra or {}
+            extra = field.json_schema_extra
+            assert isinstance(extra, dict), name  # every field is a knob
             limits = ", ".join(
                 f"{symbol} {getattr(limit, attribute)}"
                 for limit in field.metadata
                 for attribute, symbol in (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
                 if hasattr(limit, attribute)
             )
-            facts = [limits, extra.get("unit", ""), f"origin: {extra.get('origin', 'ours')}"]
+            choices = "|".join(get_args(field.annotation)) if get_origin(field.annotation) is Literal else ""
+            facts = [choices, limits, extra["unit"], f"origin: {extra['origin']}"]
             place = f"{section}.{name}" if section else name
-            lines.append(f"{place} = {field.default!r}  ({'; '.join(fact for fact in facts if fact)})")
+            lines.append(f"{place} = {field.default!r}  ({'; '.join(str(fact) for fact in facts if fact)})")
             lines.append(f"    {field.description}")
     return "\n".join(lines)

@@ -10,16 +10,18 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from hilsplat.base.errors import ArtifactError, DiskSpaceError
 
+Made = TypeVar("Made")
+
 ZIP64_BYTES = 2**30
-"""Arrays above this size get an entry whose size may pass 2 GiB."""
+"""Larger arrays get an archive entry that may exceed 2 GiB."""
 
 INDEX = "index.json"
 """Written last into a folder artifact: its presence means that the folder is complete."""
@@ -81,7 +83,7 @@ def _full_disk_told(path: Path) -> Iterator[None]:
 
 
 def require_free_space(folder: Path, needed_mib: float) -> None:
-    """Refuse to begin if the disk cannot hold what is about to be written.
+    """Refuse to start if the disk cannot hold what is about to be written.
 
     Raises:
         DiskSpaceError: less than `needed_mib` MiB is free on the folder's disk.
@@ -133,15 +135,15 @@ def write_npz(path: Path, **arrays: np.ndarray) -> None:
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
     ):
         for name, array in arrays.items():
-            # Entries opened by name get the time 1980-01-01. What is written goes out piece by piece: a
-            # large array is held neither twice nor compressed.
+            # Entries opened by name get the time 1980-01-01. They are written piece by piece, so that neither
+            # a copy of a large array nor its compressed form is held in memory.
             large = array.nbytes > ZIP64_BYTES
             with archive.open(f"{name}.npy", "w", force_zip64=large) as stream:
                 np.lib.format.write_array(stream, np.ascontiguousarray(array), allow_pickle=False)
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """Read an .npz into a dict; nothing is unpickled.
+    """Read an .npz into a dict, without unpickling anything.
 
     Raises:
         ArtifactError: the file is missing, damaged or holds objects.
@@ -157,11 +159,11 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
         ) from error
 
 
-def read_into(maker: Callable[..., Any], path: Path, **more: Any) -> Any:
-    """Make something of the arrays of an .npz, by name.
+def read_into(maker: type[Made], path: Path, **more: Any) -> Made:
+    """Make a dataclass from the arrays of an .npz.
 
     Args:
-        maker: a dataclass; its fields are the arrays and `more`.
+        maker: the dataclass; its fields are the names of the arrays and of `more`.
         path: the file.
         more: fields that are not in the file.
 
@@ -169,7 +171,7 @@ def read_into(maker: Callable[..., Any], path: Path, **more: Any) -> Any:
         ArtifactError: the file is missing or damaged, or another version of the program wrote it.
     """
     arrays = read_npz(path)
-    expected = {field.name for field in fields(maker) if field.init} - set(more)
+    expected = _arguments(maker) - set(more)
     if set(arrays) != expected:
         raise ArtifactError(
             f"{path} is of another version",
@@ -180,6 +182,11 @@ def read_into(maker: Callable[..., Any], path: Path, **more: Any) -> Any:
     return maker(**arrays, **more)
 
 
+def _arguments(maker: type) -> set[str]:
+    assert is_dataclass(maker), maker
+    return {field.name for field in fields(maker) if field.init}
+
+
 def write_npy(path: Path, array: np.ndarray) -> None:
     """Write one array as .npy atomically."""
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
@@ -187,7 +194,7 @@ def write_npy(path: Path, array: np.ndarray) -> None:
 
 
 def read_npy(path: Path) -> np.ndarray:
-    """Read one .npy array; nothing is unpickled.
+    """Read one .npy array, without unpickling anything.
 
     Raises:
         ArtifactError: the file is missing or damaged.
@@ -203,7 +210,7 @@ def read_npy(path: Path) -> np.ndarray:
 
 
 def sha256_of_bytes(*parts: bytes) -> str:
-    """SHA-256 of the parts, each preceded by its length so that borders count."""
+    """SHA-256 of the parts, each preceded by its length so that the boundaries count."""
     digest = hashlib.sha256()
     for part in parts:
         digest.update(len(part).to_bytes(8, "little"))
@@ -223,7 +230,7 @@ def sha256_of_file(path: Path) -> str:
 
 
 def sha256_of_path(path: Path) -> str:
-    """SHA-256 of a file, or of a folder's files (names and bytes; hidden files left out)."""
+    """SHA-256 of a file, or of the names and bytes of a folder's files, without hidden ones."""
     path = Path(path)
     if path.is_file():
         return sha256_of_file(path)
@@ -242,7 +249,7 @@ def read_index(folder: Path) -> dict[str, Any]:
     """Read a folder artifact's index.
 
     Raises:
-        ArtifactError: there is none, so the folder is missing or incomplete.
+        ArtifactError: there is no index, so the folder is missing or incomplete.
     """
     path = Path(folder) / INDEX
     if not path.is_file():
@@ -253,10 +260,10 @@ def read_index(folder: Path) -> dict[str, Any]:
 
 
 def read_full_index(folder: Path, *entries: str) -> dict[str, Any]:
-    """Read a folder artifact's index and check that it has some entries.
+    """Read a folder artifact's index and check that it has the given entries.
 
     Raises:
-        ArtifactError: there is none, or another version of the program wrote it.
+        ArtifactError: there is no index, or another version of the program wrote it.
     """
     index = read_index(folder)
     if missing := [entry for entry in entries if entry not in index]:
@@ -271,9 +278,9 @@ def read_full_index(folder: Path, *entries: str) -> dict[str, Any]:
 class ViewCache:
     """Finished views of a long stage, kept outside its declared output and keyed by content.
 
-    A stage that was killed finds them again, and one added photo costs one photo. An entry is one
-    .npz file under a key that must cover everything the result depends on: the digests of image,
-    model and code, and the settings.
+    A stage that was killed finds them again, and adding one photograph costs one photograph. An entry is an
+    .npz file. Its key must cover everything that the result depends on: the digests of image, model and code,
+    and the settings.
 
     Args:
         folder: holds the entries, such as `results/.cache/masks`.
@@ -307,7 +314,7 @@ class ViewCache:
 
 @contextmanager
 def output_lock(output: Path) -> Iterator[None]:
-    """Hold an output for writing; a second writer of the same output is refused.
+    """Lock an output for writing; a second writer of the same output is refused.
 
     Raises:
         ArtifactError: another process is writing it.

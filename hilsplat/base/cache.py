@@ -1,4 +1,4 @@
-"""How large the caches of finished views are, and how to make them smaller."""
+"""Sizes of the caches of finished views, and their pruning."""
 
 import time
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from pathlib import Path
 from hilsplat.base.errors import HilsplatError
 
 VIEW_CACHES = ("masks", "clip", "contributions")
-"""Caches that can be pruned: an entry that is missing costs time, never a result."""
+"""Caches that can be pruned: a missing entry costs time, never a result."""
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,7 @@ class Entries:
 
     Attributes:
         name: of its folder.
-        files: whole entries; what a writer is still at is left out.
+        files: complete entries, without those still being written.
         size_mib: of all of them.
     """
 
@@ -51,13 +51,13 @@ def size_table(folder: Path) -> str:
 def prune_cache(
     folder: Path, stages: list[str], *, days: float | None = None, max_mib: float | None = None
 ) -> tuple[int, float]:
-    """Delete entries of view caches, those that were not used for longest first.
+    """Delete entries of view caches, the least recently used first.
 
     Args:
         folder: cache folder.
         stages: which of `VIEW_CACHES`; empty: all of them.
-        days: entries not used for so long go.
-        max_mib: of what is left, so many go that the rest is at most this large.
+        days: delete entries not used for this many days.
+        max_mib: then delete entries until at most this much is left.
 
     Returns:
         files deleted, and their size in MiB.
@@ -68,11 +68,12 @@ def prune_cache(
     strangers = sorted(set(stages) - set(VIEW_CACHES))
     if strangers:
         raise HilsplatError(
-            f"{', '.join(strangers)}: no cache of finished views", expected=f"one of {', '.join(VIEW_CACHES)}"
+            f"there is no cache of finished views for {', '.join(strangers)}",
+            expected=f"one of {', '.join(VIEW_CACHES)}",
         )
     if days is None and max_mib is None:
         raise HilsplatError(
-            "nothing says what to delete", fix="give --days, --max-mib or both; --days 0 deletes everything"
+            "neither --days nor --max-mib is given", fix="give one or both; --days 0 deletes everything"
         )
     chosen = set(stages or VIEW_CACHES)
     files = [path for cache in caches(folder) if cache.name in chosen for path in cache.files]

@@ -1,7 +1,7 @@
-"""Cutting the one network of an exported CLIP into the two that we read.
+"""Split the single network of an exported CLIP into the two that we read.
 
-Optimum writes a CLIP as `model.onnx`, which takes a picture and a text at once. Its picture vectors
-depend on the picture alone and its text vectors on the text alone, so each half is a subgraph.
+Optimum writes a CLIP as `model.onnx`, which takes an image and a text together. Its image vectors depend on
+the image alone and its text vectors on the text alone, so each half is a subgraph.
 """
 
 from pathlib import Path
@@ -10,7 +10,7 @@ from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.errors import ModelError
 
 WHOLE = "model.onnx"
-"""The network of both halves, at the root of the folder or under `onnx/`."""
+"""The network that holds both halves, in the folder itself or under `onnx/`."""
 
 HALVES = {
     "vision_model": (("pixel_values",), ("image_embeds",)),
@@ -20,7 +20,7 @@ HALVES = {
 
 
 def whole_clip(folder: Path) -> Path | None:
-    """The network of both halves, if a folder has one."""
+    """The network that holds both halves, if a folder has one."""
     places = (Path(folder) / WHOLE, Path(folder) / "onnx" / WHOLE)
     return next((place for place in places if place.is_file()), None)
 
@@ -40,7 +40,7 @@ def split_clip(folder: Path) -> list[Path]:
     whole = whole_clip(folder)
     if whole is None:
         raise ModelError(
-            f"model folder {folder} has no {WHOLE} to cut",
+            f"model folder {folder} has no {WHOLE} to split",
             fix="export the model first: optimum-cli export onnx --model NAME FOLDER (docs/models.md)",
         )
     try:
@@ -60,7 +60,7 @@ def split_clip(folder: Path) -> list[Path]:
             found=f"{', '.join(sorted(inputs))} -> {', '.join(sorted(outputs))}",
             fix="export it with optimum's task feature-extraction",
         )
-    # Shapes inside the graph do not matter here, and inferring them fails beyond 2 GiB.
+    # Shapes inside the graph do not matter here, and inferring them fails above 2 GiB.
     extractor = Extractor(model)
     written = []
     for name, (wanted, given) in HALVES.items():

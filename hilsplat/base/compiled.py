@@ -1,4 +1,4 @@
-"""Loops compiled by numba and kept on disk, with a notice when they must be compiled."""
+"""Loops compiled by numba and cached on disk, with a notice when they must be compiled."""
 
 import inspect
 import logging
@@ -16,21 +16,21 @@ logger = logging.getLogger(__name__)
 def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """`numba.njit` without the interpreter lock, cached on disk until code that the loop reaches changes.
 
-    numba takes a cached loop to be stale when its own file changes, and only then: an edited function of
-    another file that the loop calls would go unnoticed, a comment would compile it anew.
+    numba itself recompiles a cached loop if and only if its own file changes: it would miss an edit to a
+    function of another file that the loop calls, and recompile for a comment.
     """
     if function is None:
         return lambda later: compiled(later, **options)
     function = inspect.unwrap(function)  # the tests' type checker wraps every function
     dispatcher = numba.njit(nogil=True, cache=True, **options)(function)
     if function.__module__.split(".")[0] == PACKAGE and "<locals>" not in function.__qualname__:
-        # numba has no public way to say what else a cached function was made from
+        # numba has no public way to declare what else a cached function depends on
         dispatcher._cache._cache_file._source_stamp = _Stamp(function, options)
     return dispatcher
 
 
 class _Stamp:
-    """What a loop was compiled from, digested when numba first looks into its cache."""
+    """Digest of what a loop is compiled from, taken when numba first looks into its cache."""
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         self.function, self.options = function, options
@@ -46,7 +46,7 @@ class _Stamp:
 
 
 class _Notice(event.Listener):
-    """Says once that loops are compiled; numba reports compilations only, not loops from the cache."""
+    """Logs once that loops are being compiled; numba does not report loops from the cache."""
 
     given = False
 
@@ -54,10 +54,10 @@ class _Notice(event.Listener):
         module = happening.data["dispatcher"].py_func.__module__ or ""
         if not self.given and module.split(".")[0] == PACKAGE:
             self.given = True
-            logger.info("compiling kernels, once: a quarter of a minute; later runs load them from disk")
+            logger.info("compiling kernels, once: about 15 s; later runs load them from disk")
 
     def on_end(self, happening: Any) -> None:
-        """Nothing to say."""
+        """Nothing to report."""
 
 
 event.register("numba:compile", _Notice())

@@ -1,4 +1,4 @@
-"""Square crops of masked regions: what CLIP sees, in training and at run time alike."""
+"""Square crops of masked regions, as CLIP sees them in training and at run time."""
 
 import cv2
 import numpy as np
@@ -18,14 +18,14 @@ def square_crop(
     context: float,
     size: int,
 ) -> UInt8[np.ndarray, "size size 3"]:
-    """Cut out a mask's box with a margin, and make it a square (`crop_to_square`).
+    """Cut out a mask's box with a margin, and make it square (`crop_to_square`).
 
     Args:
         image: the view.
         mask: region of the view, not empty.
         background: see `crop_to_square`.
-        context: margin on each side of the box, as a share of the box's longer side; it ends at the
-            image's border.
+        context: margin on each side of the box, as a share of the box's longer side, clipped at the
+            border of the image.
         size: side of the result, px.
 
     Raises:
@@ -43,19 +43,18 @@ def square_crop(
 def crop_to_square(
     box: UInt8[np.ndarray, "h w 3"], inside: Bool[np.ndarray, "h w"], background: str, size: int
 ) -> UInt8[np.ndarray, "size size 3"]:
-    """Centre a mask's box in a black square and resize that (LangSplat's preprocessing).
+    """Centre a mask's box in a black square and resize it (LangSplat's preprocessing).
 
-    The square's side is the longer side of the box. Shrinking averages areas, enlarging is bilinear.
+    The side of the square is the longer side of the box. Shrinking averages areas; enlarging is bilinear.
 
     Args:
         box: the part of the image inside the mask's box.
         inside: the mask in it.
-        background: pixels outside the mask: `black`, `keep` (as they are), or `dim` (0.35 of their
-            brightness).
+        background: pixels outside the mask: `black`, `keep` (unchanged), or `dim` (0.35 of their brightness).
         size: side of the result, px.
     """
     if background not in BACKGROUNDS:
-        raise ValueError(f"background {background!r} is none of {', '.join(BACKGROUNDS)}")
+        raise ValueError(f"background {background!r} is not one of {', '.join(BACKGROUNDS)}")
     if background != "keep":
         outside = (box * DIM + 0.5).astype(np.uint8) if background == "dim" else np.uint8(0)
         box = np.where(inside[..., None], box, outside)

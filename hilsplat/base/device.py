@@ -1,4 +1,4 @@
-"""What runs the sparse algebra after the fit: our kernels on the CPU, or torch on CUDA."""
+"""The device of the sparse algebra after the fit: our kernels on the CPU, or torch on CUDA."""
 
 import logging
 from functools import cache
@@ -24,18 +24,18 @@ def compute_device(wanted: ComputeDevice) -> ComputeDevice:
     """The device of a stage.
 
     Args:
-        wanted: `cuda` has to be asked for: its sums agree with the CPU's to rounding, but are not the
-            same bytes.
+        wanted: the default is never `cuda`: its sums agree with the CPU's up to rounding, but not byte for
+            byte.
 
     Raises:
-        DeviceError: `cuda` was asked for and torch finds no device. There is no fallback.
+        DeviceError: `wanted` is `cuda`, and torch finds no device. There is no fallback.
     """
     if wanted == "cpu":
         return "cpu"
     problem = cuda_missing()
     if problem:
         raise DeviceError(
-            "device: cuda was asked for and cannot be used",
+            "device: cuda cannot be used here",
             expected="a CUDA build of torch that finds a device",
             found=problem,
             fix="set device: cpu",

@@ -1,8 +1,8 @@
-"""Errors a user can fix: where, expected, found, and the way out."""
+"""Errors that a user can fix: where, expected, found, and the way out."""
 
 
 class HilsplatError(Exception):
-    """Base of every error that a file, a setting or a user brings.
+    """Base of every error that a file, a setting or a user causes.
 
     The command prints `str(error)` without a traceback and exits with 1.
 
@@ -29,7 +29,7 @@ class HilsplatError(Exception):
 
 
 class SettingsError(HilsplatError):
-    """A key is unknown, or a value is of the wrong type or out of its range."""
+    """A key is unknown, or a value has the wrong type or is out of range."""
 
 
 class SceneError(HilsplatError):
@@ -45,7 +45,7 @@ class RegistrationError(HilsplatError):
 
 
 class ModelError(HilsplatError):
-    """A model folder is missing, incomplete or not of the kind that was asked for."""
+    """A model folder is missing, incomplete or of the wrong kind."""
 
 
 class ArtifactError(HilsplatError):
@@ -57,7 +57,7 @@ class MisalignedArtifactError(ArtifactError):
 
 
 class EmptyMaskError(HilsplatError):
-    """A mask without a pixel was given to something that needs one."""
+    """A mask has no pixel where at least one is needed."""
 
 
 class DiskSpaceError(HilsplatError):
@@ -65,4 +65,4 @@ class DiskSpaceError(HilsplatError):
 
 
 class DeviceError(HilsplatError):
-    """A device was asked for that this machine does not have."""
+    """This machine does not have the device that the settings name."""

@@ -1,4 +1,4 @@
-"""Which files of a folder are images; light enough for the workflow's start-up."""
+"""Which files of a folder are images; light enough to import at the start of the workflow."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Image files of a folder, by name; other files and hidden ones are passed over."""
+    """Image files of a folder, by name; other and hidden files are ignored."""
     return sorted(
         path
         for path in Path(folder).iterdir()

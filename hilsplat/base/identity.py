@@ -1,17 +1,18 @@
 """The identity of code: a digest over the definitions that a function can reach.
 
-One mechanism tells rules what to rerun, caches which entries still hold, and numba which compiled loops are
-stale. It reads syntax trees, never runs the code, and follows names from definition to definition: functions,
-classes and module-level statements of this package. What cannot change a result does not count:
+One mechanism decides which rules rerun, which cache entries are valid, and which compiled loops are stale. It
+reads syntax trees, never runs the code, and follows names from definition to definition: functions, classes
+and
+module-level statements of this package. What cannot change a result does not count:
 
 - comments, formatting, docstrings and other bare strings;
 - the words of `raise` statements and of log messages (the names in them do count);
 - descriptions: words in `knob()` and `Dataset()` that only people read (`PROSE`);
-- annotations of functions, but for those of a root, whose arguments come from outside;
-- the entries of a `Plugins` table: who uses one names it as a further root.
+- annotations of functions, except for roots, whose arguments come from outside;
+- the entries of a `Plugins` table: a stage that uses one names it as a further root.
 
-A reached class counts as a whole. A module of which something is reached adds its statements that bind no
-name, and definitions whose decorators may register them, for importing it runs both.
+A reached class counts as a whole. If anything in a module is reached, its statements that bind no name count
+too, and so do definitions whose decorators may register them, because importing the module runs both.
 """
 
 import ast
@@ -56,11 +57,11 @@ Key = tuple[str, str]
 
 
 def code_digest(*roots: Code, root: Path = ROOT) -> str:
-    """Digest everything of the package that the roots can reach.
+    """Digest every definition of the package that the roots can reach.
 
     Args:
-        roots: functions or classes, as objects or as "hilsplat.field.field:run_field". A module's name alone
-            stands for all of its definitions.
+        roots: functions or classes, as objects or as "hilsplat.field.field:run_field". The name of a module
+            alone means all of its definitions.
         root: folder of the package.
 
     Returns:
@@ -97,7 +98,7 @@ def _place(code: Code) -> str:
 
 
 def _reach(roots: tuple[str, ...], root: Path) -> dict[Key, list[bytes]]:
-    """Every definition that is reached, with the text that counts of it."""
+    """Every definition that is reached, with those parts of its text that count."""
     found: dict[Key, list[bytes]] = {}
     waiting: list[tuple[str, str]] = []
 
@@ -109,7 +110,7 @@ def _reach(roots: tuple[str, ...], root: Path) -> dict[Key, list[bytes]]:
             waiting.append((module, name))
 
     def follow(module: str, chain: tuple[str, ...]) -> str:
-        """Reach what a dotted name means in a module; say what an imported name stands for."""
+        """Reach what a dotted name means in a module; return what an imported name refers to."""
         statement = _module(module, root).bindings.get(chain[0])
         if statement is None:
             return ""
@@ -131,7 +132,7 @@ def _reach(roots: tuple[str, ...], root: Path) -> dict[Key, list[bytes]]:
             name = rest[0]
         if _path(source, root) is None:
             raise HilsplatError(f"{module} imports {source}, which does not exist under {root}")
-        if not name:  # the module itself is handed around
+        if not name:  # the module itself is passed around
             for each in _module(source, root).bindings:
                 follow(source, (each,))
         elif name in _module(source, root).bindings:
@@ -185,9 +186,9 @@ class _Statement:
     """A statement at the top of a module.
 
     Attributes:
-        text: what counts of it.
+        text: the parts that count.
         names: dotted names that it looks up in the module.
-        inner: what it imports itself, inside functions, and the attributes that it takes of that.
+        inner: what it imports itself, inside functions, and the attributes that it takes from that.
         imports: for import statements, what each name means.
         signature: names in the annotations of a function's arguments, or of a class's methods.
     """
@@ -325,7 +326,7 @@ def _annotations(node: ast.FunctionDef | ast.AsyncFunctionDef) -> list[ast.expr]
 
 
 def _strip(top: ast.AST) -> None:
-    """Take out of a syntax tree, in place, what cannot change a result."""
+    """Remove from a syntax tree, in place, what cannot change a result."""
     in_functions = {
         id(inner)
         for node in ast.walk(top)
@@ -385,7 +386,7 @@ _COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 
 @dataclass
 class _Scope:
-    """Names of a function, comprehension or class; those that it imports with their meaning."""
+    """Names of a function, comprehension or class, and the meaning of those that it imports."""
 
     names: set[str]
     imports: dict[str, _Import]
@@ -393,7 +394,7 @@ class _Scope:
 
 
 class _Names:
-    """Finds the names that a statement looks up outside of itself."""
+    """Finds the names that a statement looks up outside itself."""
 
     def __init__(self, package: str) -> None:
         self.package = package
@@ -402,7 +403,7 @@ class _Names:
         self.inner: dict[tuple[_Import, tuple[str, ...]], None] = {}
 
     def of(self, node: ast.AST) -> tuple[list[tuple[str, ...]], list[tuple[_Import, tuple[str, ...]]]]:
-        """Dotted names of the module, and what is taken of modules that functions import themselves."""
+        """Dotted names of the module, and what is taken from modules that functions import themselves."""
         self._visit(node)
         return list(self.names), list(self.inner)
 

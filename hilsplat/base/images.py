@@ -22,17 +22,17 @@ __all__ = [
 
 
 DEEP_MAX = 65535
-"""Largest value of a 16-bit channel; 257 of its steps are one of 8 bits."""
+"""Largest value of a 16-bit channel; 257 of its steps are one step of 8 bits."""
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     """Read an image as upright RGB.
 
-    The EXIF orientation is applied, alpha is dropped, grey is repeated, CMYK is converted, and of 16
-    bits per channel the upper 8 are kept (rounded).
+    The EXIF orientation is applied, alpha is dropped, grey is repeated, CMYK is converted, and 16 bits per
+    channel are rounded to 8.
 
     Raises:
-        ImageError: the file is missing, empty, truncated or no image.
+        ImageError: the file is missing, empty, truncated or not an image.
     """
     path = Path(path)
     try:
@@ -56,7 +56,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
         raise ImageError(
             f"image {path} cannot be read: {error}",
             found=f"a file of {size} bytes",
-            fix="remove it from the folder or replace it by a whole copy",
+            fix="remove it from the folder, or replace it with an intact copy",
         ) from error
 
 
@@ -67,17 +67,17 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
 
 
 def to_float(pixels: UInt8[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """uint8 at rest to float32 in [0, 1] in flight."""
+    """Convert uint8 to float32 in [0, 1]."""
     return pixels.astype(np.float32) / np.float32(255)
 
 
 def to_uint8(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
-    """float in [0, 1] to uint8, rounded, clipped."""
+    """Convert float in [0, 1] to uint8, rounded and clipped."""
     return (np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def resize_to_fit(pixels: UInt8[np.ndarray, "H W 3"], max_side_px: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Shrink so that the longer side is at most `max_side_px` (area filter); never enlarges."""
+    """Shrink so that the longer side is at most `max_side_px` (area filter); never enlarge."""
     import cv2
 
     height, width = pixels.shape[:2]

@@ -1,8 +1,8 @@
 """Model folders in the layout of the Hugging Face ONNX exports: finding, checking, running.
 
-A folder holds `config.json`, `preprocessor_config.json`, for CLIP `tokenizer.json`, and the networks
-as `<name>.onnx`, either beside them or under `onnx/`. Everything that turns a photograph into a
-network's input is read from the folder, so folder and digest together are the model's identity.
+A folder holds `config.json`, `preprocessor_config.json`, for CLIP `tokenizer.json`, and the networks as
+`<name>.onnx`, either beside them or under `onnx/`. Everything needed to turn a photograph into a network's
+input is read from the folder, so its digest identifies the model.
 """
 
 import logging
@@ -28,12 +28,12 @@ Axes = tuple[int | None, ...]
 
 @dataclass(frozen=True)
 class NetworkSpec:
-    """What one network of a model takes and gives.
+    """Inputs and outputs of one network of a model.
 
     Attributes:
-        inputs: names and axes of the inputs that must be there.
-        outputs: names and axes of the outputs that must be there; others are ignored.
-        optional: names of inputs that are fed if the network has them.
+        inputs: names and axes of required inputs.
+        outputs: names and axes of required outputs; others are ignored.
+        optional: names of inputs that are passed if the network has them.
     """
 
     inputs: Mapping[str, Axes]
@@ -64,7 +64,7 @@ KINDS: dict[str, dict[str, NetworkSpec]] = {
         "text_model": NetworkSpec({"input_ids": _ANY2}, {"text_embeds": _ANY2}, optional=("attention_mask",)),
     },
 }
-"""Networks of each kind of model, by `model_type` of its config.json."""
+"""Networks of each kind of model, by the `model_type` in its config.json."""
 
 DESCRIPTIONS = {
     "sam": ("config.json", "preprocessor_config.json"),
@@ -73,7 +73,7 @@ DESCRIPTIONS = {
 """Files beside the networks, by kind."""
 
 SWITCHES = ("do_resize", "do_rescale", "do_normalize")
-"""Steps of the preprocessing that our code always takes."""
+"""Preprocessing steps that our code always performs."""
 
 POINTER_BYTES = 1024
 """Files smaller than this may be the pointers that a clone without Git LFS leaves."""
@@ -89,7 +89,7 @@ DTYPES = {
 
 @dataclass(frozen=True)
 class ModelFolder:
-    """A model folder whose files are all there.
+    """A model folder that is complete.
 
     Attributes:
         folder: as the settings name it.
@@ -97,7 +97,7 @@ class ModelFolder:
         config: content of `config.json`.
         preprocessing: content of `preprocessor_config.json`.
         networks: file of each network by name.
-        files: all files that take part, for the digest.
+        files: all files that count for the digest.
     """
 
     folder: Path
@@ -109,7 +109,7 @@ class ModelFolder:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 over names and bytes of the files used, whatever the folder's path. Hashed once."""
+        """SHA-256 over names and bytes of the files, independent of the folder's path. Computed once."""
         return sha256_of_json(
             [(path.relative_to(self.folder).as_posix(), sha256_of_file(path)) for path in self.files]
         )
@@ -118,7 +118,7 @@ class ModelFolder:
         """Open one of the model's networks and check its inputs and outputs.
 
         Raises:
-            ModelError: it cannot be read, or its names or numbers of axes are not the expected ones.
+            ModelError: it cannot be read, or its inputs or outputs have other names or axes than expected.
         """
         return Network(self.networks[name], KINDS[self.kind][name], threads)
 
@@ -129,7 +129,7 @@ def open_model_folder(folder: Path, kind: str | None = None, *, fix: str = "") -
     Args:
         folder: the model folder.
         kind: "sam" or "clip"; None accepts either.
-        fix: an additional way out, for the message about a missing folder.
+        fix: another way out, added to the message about a missing folder.
 
     Raises:
         ModelError: the folder or some of its files are missing, or it holds another kind of model.
@@ -168,7 +168,7 @@ def open_model_folder(folder: Path, kind: str | None = None, *, fix: str = "") -
     missing += [path.name for path in described if not path.is_file()]
     if missing:
         if found_kind == "clip" and whole_clip(folder):
-            fix = f"cut the whole network into the two that are read: hilsplat models split {folder}"
+            fix = f"split its single network into the two that are needed: hilsplat models split {folder}"
         found = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
         raise ModelError(
             f"model folder {folder} lacks {', '.join(missing)}",
@@ -212,17 +212,16 @@ def open_model_folder(folder: Path, kind: str | None = None, *, fix: str = "") -
 
 
 def execution_providers() -> list[str]:
-    """onnxruntime's execution providers in the order we ask for them: CUDA if there is one, CPU."""
+    """onnxruntime's execution providers in our order of preference: CUDA if there is one, then CPU."""
     available = onnxruntime.get_available_providers()
     return [name for name in ("CUDAExecutionProvider", "CPUExecutionProvider") if name in available]
 
 
 class Network:
-    """One ONNX network: checked names, inputs cast to what it takes, outputs as float32.
+    """One ONNX network: checked names, inputs cast to its types, outputs as float32.
 
-    A call runs in one thread by default: stages go faster by working on several views at once, and
-    the sums inside a call then never depend on the number of threads. Calls from several threads
-    are allowed.
+    A call runs in one thread by default: stages are faster when they process several views at once, and the
+    sums inside a call then do not depend on the number of threads. Several threads may call it.
     """
 
     def __init__(self, path: Path, spec: NetworkSpec, threads: int = 1) -> None:
@@ -236,7 +235,7 @@ class Network:
         if path.stat().st_size < POINTER_BYTES and path.read_bytes().startswith(b"version https://git-lfs"):
             raise ModelError(
                 f"network {path} is a Git LFS pointer, not the network",
-                found=f"a text of {path.stat().st_size} bytes",
+                found=f"a text file of {path.stat().st_size} bytes",
                 fix="fetch the file itself: git lfs pull, or download it from the model's page",
             )
         try:
@@ -257,7 +256,7 @@ class Network:
     def _check(
         self, what: str, expected: Mapping[str, Axes], found: dict[str, Any], optional: tuple[str, ...]
     ) -> None:
-        """Compare names, axes and types of numbers."""
+        """Compare names, axes and types with the expected ones."""
         wrong = [name for name in expected if name not in found]
         wrong += [name for name in found if name not in expected and name not in optional]
         wrong += [
@@ -306,7 +305,7 @@ class Network:
         for (name, axes), output in zip(self.spec.outputs.items(), outputs, strict=True):
             if output.ndim != len(axes):
                 raise ModelError(
-                    f"network {self.path} gave {name} with {output.ndim} axes",
+                    f"network {self.path} returned {name} with {output.ndim} axes",
                     expected=f"{len(axes)} axes",
                     found=f"shape {output.shape}",
                     fix="export the model in the layout of the Hugging Face ONNX exports",
@@ -325,7 +324,7 @@ def _fits(shape: Sequence[Any], axes: Axes) -> bool:
 
 
 def side_px(size: Any, default: int) -> int:
-    """Side of a square input from a preprocessor's size: a number, or a dict of any of its forms."""
+    """Side of a square input, from a preprocessor's size: a number, or a dict in any of its forms."""
     if isinstance(size, dict):
         for key in ("longest_edge", "shortest_edge", "height"):
             if key in size:
@@ -345,14 +344,14 @@ def input_side_px(model: ModelFolder) -> int:
 
 
 def require_three_heads(path: Path, iou_scores: np.ndarray, pred_masks: np.ndarray) -> None:
-    """Refuse a decoder that does not give three masks per prompt.
+    """Refuse a decoder that does not return three masks per prompt.
 
     Raises:
         ModelError: the third axis is not 3 long.
     """
     if iou_scores.shape[2] != 3 or pred_masks.shape[2] != 3:
         raise ModelError(
-            f"decoder {path} does not give three masks per prompt",
+            f"decoder {path} does not return three masks per prompt",
             expected="iou_scores (images, prompts, 3) and pred_masks (images, prompts, 3, h, w)",
             found=f"{iou_scores.shape} and {pred_masks.shape}",
             fix="export it with multimask output",
@@ -360,7 +359,7 @@ def require_three_heads(path: Path, iou_scores: np.ndarray, pred_masks: np.ndarr
 
 
 def require_one_space(folder: Path, image_numbers: int | None, text_numbers: int | None) -> None:
-    """Refuse a CLIP whose two networks give vectors of different width; None is a width not known yet.
+    """Refuse a CLIP whose two networks return vectors of different widths; None means not known yet.
 
     Raises:
         ModelError: the widths differ.

@@ -1,4 +1,4 @@
-"""Working on several views at once, with results in order."""
+"""Process several views at once, with results in order."""
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -11,7 +11,7 @@ Result = TypeVar("Result")
 def in_order(work: Callable[[Item], Result], items: Sequence[Item], threads: int) -> Iterator[Result]:
     """Results of `work` in the order of `items`, up to `threads` at once.
 
-    At most twice as many results wait to be taken. When one fails, those not begun are given up.
+    At most twice as many results are waiting at any time. If one item fails, those not started are dropped.
     """
     threads = max(1, threads)
     with ThreadPoolExecutor(max_workers=threads) as pool:

@@ -1,4 +1,4 @@
-"""Tables of interchangeable parts, such as readers and baselines, imported when they are asked for."""
+"""Tables of interchangeable parts, such as readers and baselines, imported on first use."""
 
 import importlib
 from collections.abc import Iterator, Mapping

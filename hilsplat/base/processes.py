@@ -1,4 +1,4 @@
-"""Work on many things in processes of their own, with results in order."""
+"""Process many items in separate processes, with results in order."""
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -13,14 +13,14 @@ def in_processes(
 ) -> Iterator[Result]:
     """Results of `work(*item)` in the order of `items`.
 
-    For work that holds Python's lock, such as Embree's wrapper. Processes are spawned, since forking one
-    that has threads may hang; with one worker, or one item, there is none.
+    For work that holds Python's lock, such as Embree's wrapper. Processes are spawned, since forking a
+    process that has threads may hang. With one worker or one item, no process is started.
 
     Args:
         work: a function at the top level of a module, or a `functools.partial` of one.
         items: arguments of each call.
-        workers: processes.
-        chunk: items that a process takes at a time.
+        workers: number of processes.
+        chunk: number of items that a process takes at a time.
     """
     if workers <= 1 or len(items) <= 1:
         for item in items:

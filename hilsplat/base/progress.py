@@ -21,7 +21,7 @@ def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterato
     """Yield the items, showing how many are done.
 
     Args:
-        items: what is worked through.
+        items: what to iterate over.
         what: a few words, such as "masks of views".
         total: number of items, if `len(items)` is not available.
     """
@@ -52,7 +52,7 @@ def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterato
 def stage_log(stage: str, scene: str) -> Iterator[dict[str, object]]:
     """Log one line when a stage starts and one when it ends, with the counts that matter.
 
-    Yields a dict; what the stage puts in it is printed in the closing line.
+    Yields a dict; the closing line prints what the stage puts in it.
     """
     counts: dict[str, object] = {}
     logger.info("%s %s: start", stage, scene)

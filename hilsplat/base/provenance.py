@@ -1,4 +1,4 @@
-"""Where an artifact comes from, written beside it."""
+"""Provenance of artifacts, written beside them."""
 
 import functools
 import platform
@@ -25,7 +25,7 @@ LIBRARIES = (
 
 
 def provenance_path(artifact: Path) -> Path:
-    """Path of the provenance of a file or folder artifact: beside it, under its name."""
+    """Path of the provenance of a file or folder artifact: beside it, with its name."""
     artifact = Path(artifact)
     return artifact.with_name(f"{artifact.name}.provenance.json")
 

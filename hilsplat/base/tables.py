@@ -1,4 +1,4 @@
-"""Small tables: CSV files with known columns, and the same as Markdown."""
+"""Small tables: CSV files with known columns, and Markdown."""
 
 import csv
 import io
@@ -21,7 +21,7 @@ def read_csv(path: Path, columns: Sequence[str], fix: str) -> list[dict[str, str
 
     Args:
         path: the file.
-        columns: that it must have, in their order.
+        columns: the columns that it must have, in order.
         fix: what to do if the file is missing or has other columns.
 
     Raises:

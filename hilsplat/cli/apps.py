@@ -3,18 +3,18 @@
 import typer
 
 app = typer.Typer(
-    help="Photographs in, a 3D Gaussian scene out that answers text queries at three semantic levels.",
+    help="Turn photographs into a 3D Gaussian scene that answers text queries at three semantic levels.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-world_app = typer.Typer(help="The synthetic world.", no_args_is_help=True)
-models_app = typer.Typer(help="Model folders (SAM, CLIP).", no_args_is_help=True)
-datasets_app = typer.Typer(
-    help="Benchmarks: layouts, licences, and what is found of them.", no_args_is_help=True
+world_app = typer.Typer(help="Make and inspect scenes of the synthetic world.", no_args_is_help=True)
+models_app = typer.Typer(help="Check, split and train models (SAM, CLIP).", no_args_is_help=True)
+datasets_app = typer.Typer(help="List, check and export published data sets.", no_args_is_help=True)
+cache_app = typer.Typer(help="Show or prune the caches of finished views.", invoke_without_command=True)
+langsplat_app = typer.Typer(
+    help="Read or write LangSplat's files of masks and CLIP vectors.", no_args_is_help=True
 )
-cache_app = typer.Typer(help="Caches of finished views.", invoke_without_command=True)
-langsplat_app = typer.Typer(help="LangSplat's files of masks and CLIP vectors.", no_args_is_help=True)
 app.add_typer(world_app, name="world")
 app.add_typer(models_app, name="models")
 app.add_typer(datasets_app, name="datasets")

@@ -30,16 +30,17 @@ def cache_show(
 def cache_prune(
     context: typer.Context,
     days: Annotated[
-        float | None, typer.Option(min=0, help="delete what was not used for this many days")
+        float | None, typer.Option(min=0, help="delete entries not used for this many days")
     ] = None,
     max_mib: Annotated[
-        float | None, typer.Option(min=0, help="delete the longest unused until this much is left")
+        float | None,
+        typer.Option(min=0, help="delete the least recently used entries until this much is left"),
     ] = None,
     stage: Annotated[
-        list[str] | None, typer.Option(help="masks, clip, contributions; default: all of them")
+        list[str] | None, typer.Option(help="cache to prune: masks, clip or contributions; default: all")
     ] = None,
 ) -> None:
-    """Delete finished views; a stage that needs one computes it again."""
+    """Delete cached views; a stage that needs one computes it again."""
     from hilsplat.base.cache import prune_cache, size_table
 
     number, freed_mib = prune_cache(context.obj, stage or [], days=days, max_mib=max_mib)

@@ -1,4 +1,4 @@
-"""Benchmarks: what they are, which are here, and world scenes in their layouts."""
+"""Published data sets: list, check, export."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,6 +7,7 @@ import typer
 
 from hilsplat.cli.apps import datasets_app
 from hilsplat.cli.stage import (
+    DataRoot,
     Log,
     PathOut,
     stage,
@@ -16,9 +17,9 @@ from hilsplat.cli.stage import (
 
 @datasets_app.command("list")
 def datasets_list(
-    data_root: Annotated[Path | None, typer.Option(help="folder of the data sets' folders")] = None,
+    data_root: Annotated[Path | None, typer.Option(help="folder that holds the data sets")] = None,
 ) -> None:
-    """List data sets: citation, licence, layout and, with --data-root, the scenes found."""
+    """List the data sets: citation, licence, layout and, with --data-root, the scenes found."""
     start_logging(None)
     from hilsplat.datasets.overview import overview
 
@@ -28,12 +29,10 @@ def datasets_list(
 @datasets_app.command("check")
 def datasets_check(
     name: Annotated[str, typer.Argument(help="data set, such as lerf_ovs")],
-    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders", show_default=False)],
-    scene: Annotated[
-        list[str] | None, typer.Option(help="scene to read; default: all that are found")
-    ] = None,
+    data_root: DataRoot,
+    scene: Annotated[list[str] | None, typer.Option(help="scene to read; default: all found")] = None,
 ) -> None:
-    """Read every label of a data set, scene by scene, and report findings and warnings."""
+    """Read all labels of a data set and report, scene by scene, what was found and what is wrong."""
     start_logging(None)
     from hilsplat.datasets.overview import check
     from hilsplat.datasets.registry import dataset_of
@@ -47,11 +46,11 @@ def datasets_check(
 @datasets_app.command("export")
 def datasets_export(
     name: Annotated[str, typer.Argument(help="scene with labelled points, such as scannet/scene0000_00")],
-    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders", show_default=False)],
+    data_root: DataRoot,
     out: PathOut,
     log: Log = None,
 ) -> None:
-    """Write images and poses of such a scene as a folder that `poses` imports."""
+    """Write the images and poses of a scene as a folder that `poses` imports."""
     from hilsplat.datasets.registry import readers_of
 
     with stage("source", out, log, plugins=readers_of([name])):

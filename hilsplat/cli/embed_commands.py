@@ -1,4 +1,4 @@
-"""CLIP vectors of masks, and the files of LangSplat."""
+"""CLIP vectors of masks, and LangSplat's files."""
 
 from pathlib import Path
 from typing import Annotated
@@ -44,13 +44,13 @@ def langsplat_read(
     files: Annotated[Path, typer.Option(help="LangSplat's folder of _s.npy and _f.npy", show_default=False)],
     masks: Annotated[Path, typer.Option(help="masks artifact to write", show_default=False)],
     clip: Annotated[Path, typer.Option(help="clip artifact to write", show_default=False)],
-    resize: Annotated[bool, typer.Option(help="take maps of another size, nearest pixel")] = False,
-    settings: Annotated[
-        str, typer.Option(help="the clip section as JSON: the model that embeds texts")
-    ] = "{}",
+    resize: Annotated[
+        bool, typer.Option(help="accept maps of another size and take the nearest pixel")
+    ] = False,
+    settings: Annotated[str, typer.Option(help="section clip as JSON; its model embeds the texts")] = "{}",
     log: Log = None,
 ) -> None:
-    """Take masks and CLIP vectors that LangSplat's preprocessing made, in place of masks and clip."""
+    """Import masks and CLIP vectors from LangSplat's preprocessing, instead of running masks and clip."""
     section = section_of("clip", settings)
     inputs = {"scene": scene, "files": files}
     with stage("langsplat", masks, log, inputs=inputs):
@@ -65,7 +65,7 @@ def langsplat_read(
 
 @langsplat_app.command("write")
 def langsplat_write(masks: PathIn, clip: PathIn, out: PathOut, log: Log = None) -> None:
-    """Write masks and CLIP vectors as LangSplat's preprocessing does."""
+    """Write masks and CLIP vectors in the format of LangSplat's preprocessing."""
     with stage("langsplat", out, log, inputs={"masks": masks, "clip": clip}):
         from hilsplat.embed.langsplat_files import write_langsplat
 

@@ -8,9 +8,11 @@ import typer
 
 from hilsplat.cli.apps import app
 from hilsplat.cli.stage import (
+    DataRoot,
     Log,
     PathIn,
     PathOut,
+    Results,
     Settings,
     Threads,
     section_of,
@@ -20,6 +22,15 @@ from hilsplat.cli.stage import (
 
 if TYPE_CHECKING:
     from hilsplat.scene.finished import SceneParts
+
+Truth = Annotated[Path | None, typer.Option(help="annotations of a synthetic scene")]
+LabelledScene = Annotated[
+    str, typer.Option(help="or a scene of a published data set that has labels, such as lerf_ovs/figurines")
+]
+EvaluateSection = Annotated[
+    str, typer.Option(help="section evaluate as JSON; missing keys take their defaults")
+]
+Queries = Annotated[str, typer.Option(help="JSON list of texts, for a scene without labels")]
 
 
 @app.command()
@@ -32,28 +43,30 @@ def evaluate(
     clip: PathIn,
     masks: PathIn,
     out: PathOut,
-    dataset: Annotated[str, typer.Option(help="data set, for the rows")],
-    name: Annotated[str, typer.Option(help="scene, for the rows")],
-    truth: Annotated[Path | None, typer.Option(help="annotations of a synthetic scene")] = None,
+    dataset: Annotated[str, typer.Option(help="data set to name in the scores")],
+    name: Annotated[str, typer.Option(help="scene to name in the scores")],
+    truth: Truth = None,
     labels: Annotated[
         list[str] | None, typer.Option(help="or labels of published data sets, such as lerf_ovs/figurines")
     ] = None,
-    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders")] = Path(),
+    data_root: DataRoot = Path(),
     kind: Annotated[
         str,
-        typer.Option(help="of a synthetic scene: tabletop, room or street; the data sets it stands in for"),
+        typer.Option(
+            help="kind of a synthetic scene: tabletop, room or street; decides which data sets it replaces"
+        ),
     ] = "",
-    variant: Annotated[str, typer.Option(help="variant, for the rows")] = "default",
+    variant: Annotated[str, typer.Option(help="variant to name in the scores")] = "default",
     settings: Settings = "{}",
     threads: Threads = 1,
     log: Log = None,
 ) -> None:
-    """Ask every annotated text in every test view, or every labelled one, and score the answers."""
+    """Query every annotated text in every test view, or every labelled view, and score the answers."""
     section = section_of("evaluate", settings)
     parts = _parts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
     inputs = {**parts.as_inputs(), **({"truth": truth} if truth else {})}
-    more = {"inputs": inputs, "plugins": _readers(labels or ())}
-    with stage("evaluate", out, log, settings=section, threads=threads, **more):
+    plugins = _readers(labels or ())
+    with stage("evaluate", out, log, settings=section, threads=threads, inputs=inputs, plugins=plugins):
         from hilsplat.evaluate.stage import run_evaluate
 
         run_evaluate(
@@ -88,15 +101,17 @@ def _parts(*paths: Path) -> "SceneParts":
 def table(
     name: Annotated[str, typer.Argument(help="table: hierarchy, lerf, ablation, ... (docs/tables.md)")],
     published: PathIn,
-    out: Annotated[Path, typer.Option(help="the CSV; .md, .tex and .html are written beside it")],
+    out: Annotated[Path, typer.Option(help="CSV to write, with .md, .tex and .html beside it")],
     scores: Annotated[
         list[Path] | None, typer.Argument(help="scores.csv files of the scenes and variants")
     ] = None,
-    labels: Annotated[str, typer.Option(help="JSON: how the table names a variant")] = "{}",
-    absent: Annotated[list[str] | None, typer.Option(help="what was not measured, and why")] = None,
+    labels: Annotated[str, typer.Option(help="JSON: variant -> its name in the table")] = "{}",
+    absent: Annotated[
+        list[str] | None, typer.Option(help="a sentence about what was not measured, and why")
+    ] = None,
     log: Log = None,
 ) -> None:
-    """Build one table of the paper: reported rows, measured rows, stand-in rows."""
+    """Build one table of the paper, with reported, measured and stand-in rows."""
     import json
 
     scores = scores or []
@@ -111,31 +126,31 @@ def table(
 def figures(
     scene: PathIn,
     gaussians: PathIn,
-    fit: Annotated[Path, typer.Option(help="report folder of the fit")],
+    fit: Annotated[Path, typer.Option(help="folder of the fit's report")],
     masks: PathIn,
     clip: PathIn,
     semantic_tree: PathIn,
     field: PathIn,
     autoencoder: PathIn,
-    out: Annotated[Path, typer.Option(help="panel PNG; registration.png and fit.png go beside it")],
-    truth: Annotated[Path | None, typer.Option(help="truth folder of a synthetic scene")] = None,
-    labels: Annotated[str, typer.Option(help="or a labelled scene, such as lerf_ovs/figurines")] = "",
-    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders")] = Path(),
-    queries: Annotated[str, typer.Option(help="JSON list of texts, for a scene without labels")] = "[]",
+    out: Annotated[Path, typer.Option(help="PNG to write, with registration.png and fit.png beside it")],
+    truth: Truth = None,
+    labels: LabelledScene = "",
+    data_root: DataRoot = Path(),
+    queries: Queries = "[]",
     settings: Settings = "{}",
-    evaluate: Settings = "{}",
+    evaluate: EvaluateSection = "{}",
     threads: Threads = 1,
     log: Log = None,
 ) -> None:
-    """Draw a scene's panel: photograph, masks, field, relevancy, answers, truth."""
+    """Draw the panel of a scene: photograph, masks, field, relevancy, answers, truth."""
     import json
 
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
     parts = _parts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
     inputs = {**parts.as_inputs(), "fit": fit, **({"truth": truth} if truth else {})}
     recorded = {"figures": section, "evaluate": protocol}
-    more = {"inputs": inputs, "plugins": _readers([labels])}
-    with stage("figures", out, log, settings=recorded, threads=threads, **more):
+    plugins = _readers([labels])
+    with stage("figures", out, log, settings=recorded, threads=threads, inputs=inputs, plugins=plugins):
         from hilsplat.evaluate.figures.panel import run_figures
 
         run_figures(
@@ -154,27 +169,29 @@ def figures(
 
 @app.command()
 def comparison(
-    folder: Annotated[Path, typer.Option(help="results/<dataset>/<scene>, finished", show_default=False)],
-    variants: Annotated[str, typer.Option(help="JSON list of variants that are compared")],
-    out: Annotated[Path, typer.Option(help="PNG; views.png, features.png and PDFs are written beside it")],
-    names: Annotated[str, typer.Option(help="JSON: how figures name a variant")] = "{}",
-    truth: Annotated[Path | None, typer.Option(help="truth folder of a synthetic scene")] = None,
-    labels: Annotated[str, typer.Option(help="or a labelled scene, such as lerf_ovs/figurines")] = "",
-    data_root: Annotated[Path, typer.Option(help="folder of the data sets' folders")] = Path(),
-    queries: Annotated[str, typer.Option(help="JSON list of texts, for a scene without labels")] = "[]",
+    folder: Annotated[
+        Path, typer.Option(help="finished scene, results/<dataset>/<scene>", show_default=False)
+    ],
+    variants: Annotated[str, typer.Option(help="JSON list of the variants to compare")],
+    out: Annotated[Path, typer.Option(help="PNG to write, with views.png, features.png and PDFs beside it")],
+    names: Annotated[str, typer.Option(help="JSON: variant -> its name in figures")] = "{}",
+    truth: Truth = None,
+    labels: LabelledScene = "",
+    data_root: DataRoot = Path(),
+    queries: Queries = "[]",
     settings: Settings = "{}",
-    evaluate: Settings = "{}",
+    evaluate: EvaluateSection = "{}",
     threads: Threads = 1,
     log: Log = None,
 ) -> None:
-    """Draw queries by method, one query over four views, and features at three levels."""
+    """Compare variants: queries by method, one query in four views, features at three levels."""
     import json
 
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
     recorded, compared = {"figures": section, "evaluate": protocol}, json.loads(variants)
     inputs = {f"scores of {variant}": folder / variant / "scores.csv" for variant in compared}
-    more = {"inputs": inputs, "plugins": _readers([labels])}
-    with stage("comparison", out, log, settings=recorded, threads=threads, **more):
+    plugins = _readers([labels])
+    with stage("comparison", out, log, settings=recorded, threads=threads, inputs=inputs, plugins=plugins):
         from hilsplat.evaluate.figures.comparison import run_comparison
 
         run_comparison(
@@ -195,11 +212,11 @@ def comparison(
 @app.command()
 def sweep(
     name: Annotated[str, typer.Argument(help="theta or omega")],
-    table: Annotated[Path, typer.Option(help="the finished CSV of that table")],
-    out: Annotated[Path, typer.Option(help="PNG; the PDF is written beside it")],
+    table: Annotated[Path, typer.Option(help="finished CSV of that table")],
+    out: Annotated[Path, typer.Option(help="PNG to write, with a PDF beside it")],
     log: Log = None,
 ) -> None:
-    """Plot a sweep from its table: the paper's curves, and ours."""
+    """Plot a sweep from its table: the paper's curves and ours."""
     with stage("sweep", out, log, inputs={"table": table}):
         from hilsplat.evaluate.figures.sweep_plot import run_sweep_plot
 
@@ -208,10 +225,12 @@ def sweep(
 
 @app.command()
 def efficiency(
-    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
-    out: Annotated[Path, typer.Option(help="the CSV; .md beside it")] = Path("results/efficiency.csv"),
+    results: Results = Path("results"),
+    out: Annotated[Path, typer.Option(help="CSV to write, with .md beside it")] = Path(
+        "results/efficiency.csv"
+    ),
 ) -> None:
-    """Print where the time went, from the benchmark files of a run."""
+    """Print the time of each stage, from the benchmark files of a run."""
     start_logging(None)
     from hilsplat.evaluate.tables.efficiency import run_efficiency
 

@@ -30,7 +30,7 @@ def contributions(
     threads: Threads = 1,
     log: Log = None,
 ) -> None:
-    """Weights of each Gaussian in each mask, from one pass over the views."""
+    """Compute the weight of each Gaussian in each mask, in one pass over the views."""
     section = section_of("contributions", settings)
     inputs = {"scene": scene, "gaussians": gaussians, "masks": masks}
     with stage("contributions", out, log, settings=section, threads=threads, inputs=inputs):
@@ -68,7 +68,7 @@ def autoencoder(
     seed: Seed = 0,
     log: Log = None,
 ) -> None:
-    """Train the scene's autoencoder of CLIP vectors and encode the masks."""
+    """Make the scene's code of CLIP vectors (PCA or autoencoder) and encode the masks."""
     section = section_of("autoencoder", settings)
     inputs = {"clip": clip, "semantic_tree": semantic_tree, "contributions": contributions}
     with stage("autoencoder", out, log, settings=section, seed=seed, inputs=inputs):
@@ -87,7 +87,7 @@ def field(
     threads: Threads = 1,
     log: Log = None,
 ) -> None:
-    """Train the language field: regression, L_h, L_ins and L_part over three levels."""
+    """Solve the language field: regression, L_h, L_ins and L_part over three levels."""
     section = section_of("field", settings)
     inputs = {"contributions": contributions, "coverage_tree": coverage_tree, "autoencoder": autoencoder}
     with stage("field", out, log, settings=section, threads=threads, inputs=inputs):
@@ -105,12 +105,12 @@ def field_reference(
     autoencoder: PathIn,
     out: PathOut,
     settings: Settings = "{}",
-    device: Annotated[str, typer.Option(help="what rasterises: auto, cpu or cuda")] = "auto",
+    device: Annotated[str, typer.Option(help="rasteriser: auto, cpu or cuda")] = "auto",
     seed: Seed = 0,
     threads: Threads = 1,
     log: Log = None,
 ) -> None:
-    """Train a field by rendering one random view per step: what the solver is compared with; slow."""
+    """Train a field by rendering one random view per step: the slow reference for the solver."""
     section = section_of("reference", settings)
     inputs = {
         "scene": scene,
@@ -140,7 +140,7 @@ def method(
     threads: Threads = 1,
     log: Log = None,
 ) -> None:
-    """Let a baseline write the language field: langsplat, lifted (settings: name)."""
+    """Compute the language field by a baseline, langsplat or lifted (name in the settings)."""
     section = section_of("method", settings)
     inputs = {"scene": scene, "gaussians": gaussians, "masks": masks}
     inputs |= {"contributions": contributions, "autoencoder": autoencoder}
@@ -149,8 +149,9 @@ def method(
 
     parts = MethodInputs(scene, gaussians, masks, contributions, autoencoder, threads)
     plugins = (METHODS.places[section.name],) if section.name in METHODS else ()
-    more = {"settings": section, "seed": seed, "threads": threads, "inputs": inputs, "plugins": plugins}
-    with stage("method", out, log, **more):
+    with stage(
+        "method", out, log, settings=section, seed=seed, threads=threads, inputs=inputs, plugins=plugins
+    ):
         from hilsplat.methods.stage import run_method
 
         run_method(parts, out, section, seed)

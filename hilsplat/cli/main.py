@@ -9,8 +9,8 @@ import os
 import sys
 from typing import Annotated
 
-# Linear algebra libraries sum in another order for another number of threads. Stages that use
-# several cores do so through numba or pools of our own, whose results do not depend on it.
+# The order in which linear algebra libraries sum depends on the number of threads. Stages use several
+# cores through numba or our own pools, whose results do not.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"
 
@@ -19,7 +19,7 @@ import typer  # noqa: E402
 from hilsplat.base.errors import HilsplatError  # noqa: E402
 from hilsplat.cli.apps import app  # noqa: E402
 
-# In the order in which `hilsplat --help` lists their commands.
+# `hilsplat --help` lists the commands in this order.
 # isort: off
 from hilsplat.cli import scene_commands, segment_commands, embed_commands  # noqa: E402, F401
 from hilsplat.cli import field_commands  # noqa: E402, F401
@@ -29,7 +29,7 @@ from hilsplat.cli import world_commands, model_commands, dataset_commands  # noq
 
 
 def main() -> None:
-    """Run the command; a mistake that a user can fix ends in a sentence, without a traceback."""
+    """Run the command; an error that a user can fix ends in a message, without a traceback."""
     try:
         app()
     except HilsplatError as error:

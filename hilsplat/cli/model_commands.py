@@ -19,7 +19,7 @@ from hilsplat.cli.stage import (
 
 @models_app.command("check")
 def models_check(folder: Annotated[Path, typer.Argument(help="model folder")]) -> None:
-    """Say what a model folder holds, and time one image."""
+    """Describe a model folder, and time one image."""
     start_logging(None)
     from hilsplat.embed.model_check import check_model
 
@@ -28,7 +28,7 @@ def models_check(folder: Annotated[Path, typer.Argument(help="model folder")]) -
 
 @models_app.command("split")
 def models_split(folder: Annotated[Path, typer.Argument(help="folder of an exported CLIP")]) -> None:
-    """Cut the model.onnx of an exported CLIP into the two networks that are read."""
+    """Split the model.onnx of an exported CLIP into its image and text networks."""
     start_logging(None)
     from hilsplat.base.clip_split import split_clip
 
@@ -38,17 +38,20 @@ def models_split(folder: Annotated[Path, typer.Argument(help="folder of an expor
 
 @models_app.command("train")
 def models_train(
-    out: Annotated[Path, typer.Option(help="folder that holds sam-tiny and clip-tiny")] = Path("models"),
-    cache: Annotated[Path, typer.Option(help="views and training states")] = DEFAULT_CACHE / "models",
+    out: Annotated[Path, typer.Option(help="folder for sam-tiny and clip-tiny")] = Path("models"),
+    cache: Annotated[Path, typer.Option(help="folder for rendered views and training states")] = DEFAULT_CACHE
+    / "models",
     settings: Settings = "{}",
     seed: Seed = 0,
     threads: Threads = 2,
-    stage: Annotated[list[str] | None, typer.Option(help="render, sam, clip; default: all of them")] = None,
+    stage: Annotated[
+        list[str] | None, typer.Option(help="step to run: render, sam or clip; default: all")
+    ] = None,
     log: Log = None,
 ) -> None:
     """Train the small SAM and CLIP on training scenes of the synthetic world.
 
-    A killed training resumes; a finished one continues if it is given more minutes.
+    Training resumes after a kill, and continues if a finished one is given more minutes.
     """
     start_logging(log)
     from hilsplat.world.tiny.train import train_models

@@ -27,7 +27,7 @@ def new(
     photos: Annotated[Path, typer.Argument(help="folder of photographs")],
     sheet: Annotated[Path, typer.Option(help="scene sheet")] = Path("config/scenes.tsv"),
 ) -> None:
-    """Add a folder of photographs to the scene sheet and report what was found."""
+    """Add a folder of photographs to the scene sheet, and report on its images."""
     start_logging(None)
     from hilsplat.scene.photos import add_scene
 
@@ -45,14 +45,14 @@ def poses(
     images: PathIn,
     out: PathOut,
     name: Annotated[str, typer.Option(help="dataset/scene, for messages")] = "scene",
-    unit: Annotated[str, typer.Option(help="what one length unit is: metre or arbitrary")] = "arbitrary",
+    unit: Annotated[str, typer.Option(help="unit of length: metre or arbitrary")] = "arbitrary",
     render: Annotated[bool, typer.Option(help="the images are renders: an ideal pinhole lens")] = False,
     settings: Settings = "{}",
     seed: Seed = 0,
     threads: Threads = 1,
     log: Log = None,
 ) -> None:
-    """Find the cameras of photographs (or import a COLMAP model or transforms.json)."""
+    """Find the cameras of photographs, or import a COLMAP model or transforms.json."""
     section = section_of("poses", settings)
     with stage("poses", out, log, settings=section, seed=seed, threads=threads, inputs={"images": images}):
         from hilsplat.scene.poses import run_poses
@@ -64,7 +64,7 @@ def poses(
 def gaussians(
     scene: PathIn,
     out: PathOut,
-    report: Annotated[Path, typer.Option(help="folder of the fit's report")],
+    report: Annotated[Path, typer.Option(help="folder for the fit's report")],
     settings: Settings = "{}",
     brought: Annotated[
         Path | None,
@@ -75,7 +75,7 @@ def gaussians(
     threads: Threads = 1,
     log: Log = None,
 ) -> None:
-    """Fit 3D Gaussians to the training views, or take your own; the JSON beside them holds coordinates."""
+    """Fit 3D Gaussians to the training views, or take your own; a JSON beside them gives the coordinates."""
     section = section_of("gaussians", settings)
     inputs = {"scene": scene, **({"brought": brought} if brought else {})}
     with stage("gaussians", out, log, settings=section, seed=seed, threads=threads, inputs=inputs):

@@ -27,9 +27,9 @@ def masks(
     out: PathOut,
     settings: Settings = "{}",
     truth: Annotated[
-        Path | None, typer.Option(help="truth folder; for the segmenter truth-perturbed alone")
+        Path | None, typer.Option(help="truth folder, for the segmenter truth-perturbed only")
     ] = None,
-    perturb: Annotated[str, typer.Option(help="faults of truth-perturbed as JSON")] = "{}",
+    perturb: Annotated[str, typer.Option(help="faults of truth-perturbed, as JSON")] = "{}",
     cache: Cache = DEFAULT_CACHE,
     threads: Threads = 1,
     log: Log = None,
@@ -43,7 +43,7 @@ def masks(
         raise HilsplatError(
             f"masks: the segmenter {section.segmenter} must not see the truth",
             found=f"--truth {truth}",
-            fix="leave --truth out, or set masks.segmenter: truth-perturbed, a diagnostic",
+            fix="leave out --truth, or set masks.segmenter: truth-perturbed, a diagnostic",
         )
     with stage("masks", out, log, settings=section, threads=threads, inputs={"scene": scene}):
         from hilsplat.segment.stage import run_masks
@@ -54,12 +54,12 @@ def masks(
 def _masks_from_truth(
     scene: Path, truth: Path | None, out: Path, section: Any, faults: Any, threads: int, log: Path | None
 ) -> None:
-    """The diagnostic segmenter, a stage of its own in provenance and code."""
+    """Run the diagnostic segmenter, which is a separate stage in provenance and code."""
     if truth is None:
         raise HilsplatError(
             "masks: the segmenter truth-perturbed needs the true labels of a synthetic scene",
             expected="--truth results/<dataset>/<scene>/world/truth",
-            fix="name the folder, or take masks.segmenter: sam or graph",
+            fix="name the folder, or choose masks.segmenter: sam or graph",
         )
     inputs = {"scene": scene, "truth": truth}
     with stage("truth_masks", out, log, settings=faults, seed=faults.seed, threads=threads, inputs=inputs):
@@ -70,7 +70,7 @@ def _masks_from_truth(
 
 @app.command("coverage-tree")
 def coverage_tree(masks: PathIn, out: PathOut, settings: Settings = "{}", log: Log = None) -> None:
-    """Find the parent of each mask (coverage tree of each view)."""
+    """Find the parent of each mask: the coverage tree of each view."""
     section = section_of("coverage_tree", settings)
     with stage("coverage_tree", out, log, settings=section, inputs={"masks": masks}):
         from hilsplat.segment.coverage_stage import run_coverage_tree
@@ -82,13 +82,13 @@ def coverage_tree(masks: PathIn, out: PathOut, settings: Settings = "{}", log: L
 def show_masks(
     scene: PathIn,
     masks: PathIn,
-    out: Annotated[Path, typer.Option(help="PNG to write; trees go beside it")] = Path("masks.png"),
+    out: Annotated[Path, typer.Option(help="PNG to write, with the trees beside it")] = Path("masks.png"),
     coverage_tree: Annotated[
-        Path | None, typer.Option(help="what the coverage_tree stage wrote; draws the trees too")
+        Path | None, typer.Option(help="output of the coverage_tree stage, to draw the trees too")
     ] = None,
-    view: Annotated[str | None, typer.Option(help="view name; default: the middle one")] = None,
+    view: Annotated[str | None, typer.Option(help="name of the view; default: the middle one")] = None,
 ) -> None:
-    """Write a picture of a view's masks at three levels, and of its coverage trees."""
+    """Draw a view's masks at three levels, and its coverage trees."""
     start_logging(None)
     from hilsplat.segment.pictures import masks_overview
 

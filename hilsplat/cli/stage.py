@@ -14,17 +14,21 @@ from hilsplat.base.artifacts import output_lock, require_free_space
 from hilsplat.base.errors import HilsplatError
 from hilsplat.workflow.stages import stage_code
 
-PathIn = Annotated[Path, typer.Option(help="input", show_default=False)]
+PathIn = Annotated[Path, typer.Option(help="input artifact", show_default=False)]
 PathOut = Annotated[Path, typer.Option(help="output; written atomically", show_default=False)]
-Settings = Annotated[str, typer.Option(help="the stage's settings as JSON; missing keys take their defaults")]
-Threads = Annotated[int, typer.Option(min=1, help="threads; results do not depend on it")]
-Seed = Annotated[int, typer.Option(min=0, help="seed of everything random")]
+Settings = Annotated[
+    str, typer.Option(help="settings of the stage as JSON; missing keys take their defaults")
+]
+Threads = Annotated[int, typer.Option(min=1, help="number of threads; results do not depend on it")]
+Seed = Annotated[int, typer.Option(min=0, help="seed for everything random")]
 Log = Annotated[Path | None, typer.Option(help="also write the log to this file")]
-Cache = Annotated[Path, typer.Option(help="folder of finished views, for resuming")]
+Cache = Annotated[Path, typer.Option(help="folder of the caches of finished views, for resuming")]
+Results = Annotated[Path, typer.Option(help="results folder")]
+DataRoot = Annotated[Path, typer.Option(help="folder that holds the data sets")]
 
 DEFAULT_CACHE = Path("results/.cache")
 MIN_FREE_MIB = 200.0
-"""A stage does not begin with less free space than this."""
+"""A stage does not start with less free space than this."""
 
 
 def start_logging(log: Path | None) -> None:
@@ -85,7 +89,7 @@ def stage(
             )
     except HilsplatError:
         raise
-    except Exception:  # a mistake of ours: the traceback belongs in the log
+    except Exception:  # a bug of ours: the traceback belongs in the log
         logging.getLogger("hilsplat").exception("%s failed on %s", name, out)
         sys.exit(1)
 

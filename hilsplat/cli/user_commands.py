@@ -1,4 +1,4 @@
-"""What people ask of a finished scene, and the manual of the settings."""
+"""Query and export a finished scene, and print the manual of the settings."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,6 +7,7 @@ import typer
 
 from hilsplat.cli.apps import app
 from hilsplat.cli.stage import (
+    Results,
     Threads,
     start_logging,
 )
@@ -15,7 +16,6 @@ SceneName = Annotated[
     str,
     typer.Argument(help="dataset/scene in the results folder, such as photos/desk, or a path to its folder"),
 ]
-Results = Annotated[Path, typer.Option(help="results folder")]
 
 
 @app.command()
@@ -38,16 +38,14 @@ def query(
     answerer: Annotated[
         str, typer.Option(help="tree: nodes of the semantic tree answer; field: the paper's language field")
     ] = "tree",
-    view: Annotated[
-        str | None, typer.Option(help="look only at what this view shows, such as 000.png")
-    ] = None,
+    view: Annotated[str | None, typer.Option(help="find only what this view shows, such as 000.png")] = None,
     out: Annotated[
         Path | None,
         typer.Option(
             help="folder for panel.png and selection.ply; default: queries/TEXT in the scene's folder"
         ),
     ] = None,
-    device: Annotated[str, typer.Option(help="cpu or cuda: what looks up the field")] = "cpu",
+    device: Annotated[str, typer.Option(help="cpu or cuda, for look-ups of the field")] = "cpu",
     threads: Threads = 2,
 ) -> None:
     """Find what a text names in a finished scene.
@@ -77,14 +75,14 @@ def query(
 @app.command()
 def export(
     scene: SceneName,
-    variant: Annotated[str, typer.Option(help="variant whose tree is written")] = "default",
+    variant: Annotated[str, typer.Option(help="variant whose tree to write")] = "default",
     results: Results = Path("results"),
     out: Annotated[
         Path | None, typer.Option(help="folder to write; default: export/VARIANT in the scene's folder")
     ] = None,
     threads: Threads = 2,
 ) -> None:
-    """Write the semantic tree of a finished scene: JSON, a PLY with nodes per Gaussian, a picture."""
+    """Write the semantic tree of a finished scene as JSON, a picture, and a PLY with nodes per Gaussian."""
     start_logging(None)
     from hilsplat.query.tree_picture import export_tree
 
@@ -92,7 +90,7 @@ def export(
 
 
 def _folder(scene: str, results: Path) -> Path:
-    """Folder of a scene that is named by data set and name, or by its path."""
+    """Folder of a scene, given as dataset/scene or as a path."""
     named, path = results / scene, Path(scene)
     return path if path.is_dir() and not named.is_dir() else named
 
@@ -103,7 +101,7 @@ def settings(
         bool, typer.Option(help="print the JSON schema of the configuration, for editors")
     ] = False,
 ) -> None:
-    """Print every knob: default, unit, range, origin."""
+    """Print every setting: default, choices or range, unit, origin, meaning."""
     import json
 
     from hilsplat.configuration import config_schema, knob_table

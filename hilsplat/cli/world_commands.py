@@ -1,4 +1,4 @@
-"""The synthetic world: make a scene, look at it, compare with its truth."""
+"""The synthetic world: make a scene, look at it, measure masks and trees against its truth."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +9,7 @@ from hilsplat.cli.apps import world_app
 from hilsplat.cli.stage import (
     Log,
     PathOut,
+    Results,
     Settings,
     Threads,
     section_of,
@@ -19,7 +20,7 @@ from hilsplat.cli.stage import (
 
 @world_app.command("make")
 def world_make(
-    source: Annotated[str, typer.Option(help="what to make, as world:KIND:SEED")],
+    source: Annotated[str, typer.Option(help="scene to make, as world:KIND:SEED")],
     out: PathOut,
     settings: Settings = "{}",
     threads: Threads = 1,
@@ -36,10 +37,10 @@ def world_make(
 @world_app.command("show")
 def world_show(
     scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that was made")],
-    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    results: Results = Path("results"),
     out: Annotated[Path | None, typer.Option(help="PNG to write; default: beside the scene")] = None,
 ) -> None:
-    """Write a contact sheet: views, labels by level, the tree with its texts."""
+    """Draw a contact sheet: views, labels by level, the tree with its texts."""
     start_logging(None)
     from hilsplat.world.sheet import show_world
 
@@ -52,7 +53,7 @@ def world_show(
 def world_classes(
     out: Annotated[Path, typer.Option(help="PNG to write")] = Path("world_classes.png"),
 ) -> None:
-    """Write a picture of one object of each class of the table."""
+    """Draw one object of each class."""
     start_logging(None)
     from hilsplat.world.gallery import draw_classes
 
@@ -66,7 +67,7 @@ def world_gallery(
     seeds: Annotated[list[int], typer.Argument(help="seeds of the scenes")],
     out: Annotated[Path | None, typer.Option(help="PNG to write; default: world_KIND.png")] = None,
 ) -> None:
-    """Write a picture of some scenes, a view of each with its true labels by level."""
+    """Draw one view of each of some scenes, with its true labels by level."""
     start_logging(None)
     from hilsplat.world.gallery import draw_scenes
 
@@ -78,14 +79,14 @@ def world_gallery(
 @world_app.command("inconsistency")
 def world_inconsistency(
     scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has masks")],
-    variant: Annotated[str, typer.Option(help="variant whose masks are measured")] = "default",
-    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    variant: Annotated[str, typer.Option(help="variant whose masks to measure")] = "default",
+    results: Results = Path("results"),
     neighbours: Annotated[
         int, typer.Option(min=1, help="number of nearest views that each view is compared with")
     ] = 2,
     out: Annotated[Path | None, typer.Option(help="CSV to write; default: beside the masks")] = None,
 ) -> None:
-    """Measure how often a surface point gets different masks in neighbouring views, by exact geometry."""
+    """Measure by exact geometry how often a surface point gets different masks in neighbouring views."""
     truth, masks_folder = results / scene / "world" / "truth", results / scene / variant / "masks"
     target = out or masks_folder.with_name("consistency.csv")
     with stage("consistency", target, None, inputs={"truth": truth, "masks": masks_folder}):
@@ -98,14 +99,15 @@ def world_inconsistency(
 @world_app.command("masks")
 def world_masks(
     scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has masks")],
-    variant: Annotated[str, typer.Option(help="variant whose masks are measured")] = "default",
-    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    variant: Annotated[str, typer.Option(help="variant whose masks to measure")] = "default",
+    results: Results = Path("results"),
     out: Annotated[
-        Path | None, typer.Option(help="PNG to write, a CSV and a PDF beside it; default: beside the masks")
+        Path | None,
+        typer.Option(help="PNG to write, with a CSV and a PDF beside it; default: beside the masks"),
     ] = None,
     log: Log = None,
 ) -> None:
-    """Measure the masks against the true regions by level, and draw where they fail."""
+    """Measure masks against the true regions by level, and draw where they fail."""
     folder = results / scene
     truth, masks_folder = folder / "world" / "truth", folder / variant / "masks"
     target = out or masks_folder.with_name("masks_truth.png")
@@ -120,8 +122,8 @@ def world_masks(
 @world_app.command("semantic-tree")
 def world_tree(
     scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has a tree")],
-    variant: Annotated[str, typer.Option(help="variant whose tree is measured")] = "default",
-    results: Annotated[Path, typer.Option(help="results folder")] = Path("results"),
+    variant: Annotated[str, typer.Option(help="variant whose tree to measure")] = "default",
+    results: Results = Path("results"),
     out: Annotated[Path | None, typer.Option(help="CSV to write; default: beside the tree")] = None,
     threads: Threads = 2,
 ) -> None:

@@ -1,4 +1,4 @@
-"""Compositing weights as averages: what a pixel shows is a mean of the Gaussians it sees."""
+"""Normalised compositing weights: a pixel shows an average of the Gaussians it sees."""
 
 import numpy as np
 import scipy.sparse as sp
@@ -7,14 +7,14 @@ from jaxtyping import Float32
 from hilsplat.base.compiled import compiled
 
 MIN_ALPHA = 0.5
-"""Pixels that the Gaussians cover less than this are ignored: their features are extrapolated."""
+"""Pixels with a smaller alpha are ignored: their features would be extrapolated."""
 
 
 def normalised_weights(weights: sp.csr_matrix, min_alpha: float = MIN_ALPHA) -> sp.csr_matrix:
     """Divide the weights of each pixel by their sum, the accumulated alpha.
 
-    Kept weights then sum to 1, so that a rendered feature is an average of features. Weights that
-    the rasteriser dropped as too small are no part of the sum.
+    The weights then sum to 1, so that a rendered feature is an average of features. Weights that the
+    rasteriser dropped as too small do not count in the sum.
 
     Args:
         weights: compositing weights (pixels x Gaussians).
@@ -32,7 +32,7 @@ def normalised_weights(weights: sp.csr_matrix, min_alpha: float = MIN_ALPHA) -> 
 
 
 def visible_mass(weights: sp.csr_matrix) -> Float32[np.ndarray, " N"]:
-    """Sum of each Gaussian's weights over the pixels, summed in float64, px."""
+    """Sum of each Gaussian's weights over the pixels, px; summed in float64."""
     out = np.zeros(weights.shape[1], np.float64)
     _add_columns(weights.indices, weights.data, out)
     return out.astype(np.float32)

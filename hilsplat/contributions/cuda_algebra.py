@@ -1,8 +1,8 @@
 """The sparse products of the solver and of the linkage by torch, for CUDA devices.
 
-The operators have the methods of `mask_operator.MaskOperator` and `quadratic.Quadratic`: arrays in,
-arrays out, sums in the type of what comes in. They are those of the CPU to rounding (tested), not the
-same bytes. The code runs on torch's CPU too, which is how it is tested where there is no device.
+The operators have the methods of `mask_operator.MaskOperator` and `quadratic.Quadratic`: arrays in, arrays
+out, sums in the type of the input. Results equal those of the CPU up to rounding (tested), not byte for byte.
+The code also runs on torch's CPU, where the tests run it on machines without a device.
 """
 
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class DeviceMasks:
 
     @staticmethod
     def of(masks: MaskOperator, device: str) -> "DeviceMasks":
-        """Move A."""
+        """Copy A to the device."""
         A = sp.csr_matrix(
             (masks.data, masks.indices, masks.indptr), shape=(len(masks.level_index), masks.num_gaussians)
         )
@@ -78,7 +78,7 @@ class DeviceQuadratic:
         forward: W, or the upper triangle of G of each level.
         backward: W', or the strictly lower triangle of each level.
         valid: which pixels of W count at each level; None for G.
-        device: where they are.
+        device: torch device.
         num_gaussians: N.
     """
 
@@ -90,7 +90,7 @@ class DeviceQuadratic:
 
     @staticmethod
     def of(quadratic: Quadratic, device: str) -> "DeviceQuadratic":
-        """Move G or W."""
+        """Copy G or W to the device."""
         num = quadratic.num_gaussians
         if not isinstance(quadratic, Gram):
             W = quadratic.weights
@@ -134,7 +134,7 @@ def shared_pairs_on(
     view: Int32[np.ndarray, " M"],
     device: str,
 ) -> tuple[sp.csr_matrix, Float[np.ndarray, "M V"]]:
-    """The two products of the linkage's evidence: shared weight of pairs, and sizes as views see them.
+    """The two products behind the linkage's evidence: shared weights of pairs, and sizes as views see them.
 
     Args:
         weighted: w s of each mask and Gaussian.

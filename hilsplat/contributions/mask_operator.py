@@ -15,7 +15,7 @@ MEDIAN_SOFTENING = 1e-4
 
 @runtime_checkable
 class MaskProducts(Protocol):
-    """The two products with A that the solver takes, whoever computes them."""
+    """The two products with A that the solver needs, on any device."""
 
     def means(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "M D"]:
         """A F: mean rendered feature of each mask at its level."""
@@ -28,12 +28,12 @@ class MaskProducts(Protocol):
 class MaskOperator:
     """A for all levels: features of Gaussians to means of masks, and back.
 
-    A is used where it is (such as in its file): nothing of its size is copied.
+    A is used in place, for instance mapped from its file: nothing of its size is copied.
 
     Attributes:
-        indptr: of A in CSR form, as are `indices` and `data`; a row is a mask.
-        indices: Gaussians.
-        data: mean weights.
+        indptr: row starts of A in CSR form; a row is a mask.
+        indices: Gaussians of the stored values.
+        data: the stored values, mean weights.
         level_index: level of each mask, from 0.
         num_gaussians: N.
     """
@@ -46,7 +46,7 @@ class MaskOperator:
 
     @staticmethod
     def of(A: sp.csr_matrix, level: UInt8[np.ndarray, " M"]) -> "MaskOperator":
-        """Take A (M x N) with the level of its rows."""
+        """From A (M x N) and the level of each row."""
         return MaskOperator(A.indptr, A.indices, A.data, level.astype(np.int64) - 1, A.shape[1])
 
     def means(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "M D"]:
@@ -68,10 +68,10 @@ def lifted_average(
     pixels: Float32[np.ndarray, " M"],
     latents: Float32[np.ndarray, "M D"],
 ) -> Float32[np.ndarray, "N 3 D"]:
-    """Average of the latents of the pixels that show a Gaussian, weighted by how much they show it.
+    """Average, for each Gaussian, the latents of the pixels that show it, weighted by how much they do.
 
-    Exact, one sparse product, and within about a tenth of the regression's optimum. Gaussians that
-    no labelled pixel shows get 0.
+    Exact, one sparse product, and within about a tenth of the regression's optimum. Gaussians that no
+    labelled pixel shows get 0.
     """
     sums = masks.spread(pixels[:, None] * latents)
     return np.where(mass[:, :, None] > 0, sums / np.maximum(mass, 1e-12)[:, :, None], np.float32(0))
@@ -84,10 +84,10 @@ def lifted_median(
     start: Float32[np.ndarray, "N 3 D"],
     steps: int = 15,
 ) -> Float32[np.ndarray, "N 3 D"]:
-    """Geometric median of the same latents with the same weights: what LangSplat's L1 tends to.
+    """Geometric median of the same latents with the same weights, which LangSplat's L1 converges to.
 
-    Masks that merge or miss things pull an average away, a median hardly. Weiszfeld's iteration: each
-    step averages with weights over the distance to the point so far; one pass over A.
+    Masks that merge or miss things shift an average, but hardly a median. By Weiszfeld's iteration: each
+    step, one pass over A, averages with the weights divided by the distance to the latest estimate.
 
     Args:
         masks: A.

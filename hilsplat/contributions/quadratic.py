@@ -1,8 +1,8 @@
 """The quadratic form of frozen geometry: G_l = sum over views of W' diag(valid_l) W.
 
-W holds the compositing weights of all pixels that have a mask at some level. G is stored once for
-all levels, as an upper triangle with three values per pair of Gaussians; where W has fewer
-non-zeros, W is kept and streamed instead. Both give the same products.
+W holds the compositing weights of all pixels that have a mask at some level. G is stored once for all
+levels, as an upper triangle with three values per pair of Gaussians. If W has fewer non-zeros, it is kept
+and streamed instead. Both give the same products.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -20,18 +20,19 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
 
 PRODUCT_PARTS = 4
-"""Parts of equally many pairs in which a product with G is summed. Fixed, so that the number of threads
+"""A product with G is summed in this many parts of equally many pairs. Fixed, so that the number of threads
 changes no byte; each part holds the sums of its rows and of those below."""
 
 
 @dataclass(frozen=True)
 class Gram:
-    """Upper triangle of G for all levels, with one pattern.
+    """Upper triangle of G for all levels, which share one sparsity pattern.
 
     Attributes:
-        indptr: of the CSR pattern (N, N), as are `indices`; columns from the diagonal on.
-        values: G of each level at each pair of the pattern, float32.
-        threads: that share a product.
+        indptr: row starts of the CSR pattern (N, N).
+        indices: its columns, from the diagonal on.
+        values: G of each level at each pair of the pattern.
+        threads: number of threads that share a product.
     """
 
     indptr: np.ndarray
@@ -50,7 +51,7 @@ class Gram:
         return len(self.indptr) - 1
 
     def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
-        """G_l F_l for every level; summed in their precision, in one order on any number of threads."""
+        """G_l F_l for every level, in the precision of F; sums have one order on any number of threads."""
         features = np.ascontiguousarray(features)
         shares = np.linspace(0, self.nonzeros, PRODUCT_PARTS + 1)[1:-1]
         edges = [0, *np.searchsorted(self.indptr, shares).tolist(), self.num_gaussians]
@@ -74,7 +75,7 @@ class Gram:
 
 @dataclass(frozen=True)
 class StackedWeights:
-    """W of all labelled pixels of all views, and at which levels each pixel has a mask.
+    """W of all labelled pixels of all views, and the levels at which each pixel has a mask.
 
     Attributes:
         weights: CSR (P, N); rows sum to 1.
@@ -95,7 +96,7 @@ class StackedWeights:
         return self.weights.shape[1]
 
     def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
-        """W' diag(valid_l) W F_l for every level; summed in their precision, by one thread, in one order."""
+        """W' diag(valid_l) W F_l for every level, in the precision of F; by one thread, in one order."""
         out = np.zeros_like(features)
         _weights_product(
             self.weights.indptr,
@@ -124,14 +125,14 @@ Quadratic = Gram | StackedWeights
 
 @runtime_checkable
 class QuadraticProduct(Protocol):
-    """The product with G that the solver takes, whoever computes it."""
+    """The product with G that the solver needs, on any device."""
 
     def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
         """G_l F_l for every level."""
 
 
 def level_mass(quadratic: Quadratic) -> Float32[np.ndarray, "N 3"]:
-    """Visible mass of each Gaussian in the labelled pixels of each level: G_l 1, as rows of W sum to 1."""
+    """Visible mass of each Gaussian in the labelled pixels of each level: G_l 1, since rows of W sum to 1."""
     ones = np.ones((quadratic.num_gaussians, len(LEVELS), 1), np.float32)
     return quadratic.product(ones)[:, :, 0]
 
@@ -140,11 +141,11 @@ def load_quadratic(folder: Path, threads: int = 1) -> Quadratic:
     """Read `G.npz` or `W.npz`, whichever the contributions stage kept.
 
     Args:
-        folder: of the contributions.
-        threads: that share a product with G (one with W is one thread's).
+        folder: the contributions artifact.
+        threads: number of threads that share a product with G; products with W take one.
 
     Raises:
-        ArtifactError: neither is there.
+        ArtifactError: the folder holds neither.
     """
     if (folder / "G.npz").is_file():
         return read_into(Gram, folder / "G.npz", threads=threads)

@@ -19,28 +19,28 @@ from hilsplat.contributions.quadratic import Gram, Quadratic, StackedWeights
 logger = logging.getLogger(__name__)
 
 BLOCKS = 64
-"""Blocks of rows in which G is built, one a thread at a time; the result does not depend on it. A block
-whose Gaussians a part does not show is left as it is, which a Morton order makes frequent."""
+"""G is built in this many blocks of rows, one per thread at a time; the result does not depend on it. A block
+of Gaussians that a part does not show stays untouched, which a Morton order makes frequent."""
 
 CHUNK_WEIGHTS = 2**25
-"""Non-zeros of W that are gathered before they are added to G; 0.7 GiB while they are."""
+"""Non-zeros of W to gather before adding them to G; adding takes 0.7 GiB."""
 
 MAX_WEIGHTS = 2**28
-"""Non-zeros up to which W of all views is held in memory, 2 GiB."""
+"""W of all views is held in memory up to this many non-zeros, 2 GiB."""
 
 CHECKPOINT_SECONDS = 300.0
-"""Time between two checkpoints of a long pass; short ones never write any."""
+"""Time between checkpoints of a long pass; short passes write none."""
 
 
 class GramBuilder:
     """Sums G over parts of W, such as one view's after another; memory grows with G alone.
 
-    Entries are summed in float64 in the order of the pixels, so the bytes depend neither on how the
-    pixels were parted nor on the number of threads.
+    Entries are summed in float64 in the order of the pixels, so the bytes depend neither on how the pixels
+    were divided into parts nor on the number of threads.
 
     Args:
         num_gaussians: N.
-        threads: blocks of rows are shared among them.
+        threads: number of threads that share the blocks of rows.
     """
 
     def __init__(self, num_gaussians: int, threads: int) -> None:
@@ -56,7 +56,7 @@ class GramBuilder:
         return sum(len(indices) for _, indices, _ in self._blocks)
 
     def add(self, part: StackedWeights) -> None:
-        """Add W' diag(valid) W of further pixels; columns of W are sorted within rows."""
+        """Add W' diag(valid) W of further pixels; the columns of W must be sorted within rows."""
         weights = part.weights
         arrays = (weights.indptr, weights.indices, weights.data, part.valid)
         columns = self._columns(weights)
@@ -73,10 +73,10 @@ class GramBuilder:
             list(pool.map(grow, range(len(self._blocks))))
 
     def _columns(self, weights: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where each Gaussian's weights lie: begins in the lists, pixels, and places in W.
+        """Find each Gaussian's weights: start of its list, and lists of pixels and of places in W.
 
-        From such a place on lie the columns of the upper triangle. The lists are used again for the next
-        part, for new memory costs more time than filling it.
+        From such a place on, the pixel's row of W holds the columns of the upper triangle. The lists are
+        reused for the next part: allocating memory takes longer than filling it.
         """
         dtype = np.int32 if weights.nnz < 2**31 else np.int64
         if len(self._places) < weights.nnz or self._places.dtype != dtype:
@@ -87,7 +87,7 @@ class GramBuilder:
         return begins, self._pixels, self._places
 
     def state(self) -> dict[str, np.ndarray]:
-        """Everything that was summed, as arrays."""
+        """Everything summed so far, as arrays."""
         names = ("indptr", "indices", "values")
         return {
             f"{name}_{number}": array
@@ -96,10 +96,10 @@ class GramBuilder:
         }
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Go on from `state`."""
-        names = ("indptr", "indices", "values")
+        """Continue from `state`."""
         self._blocks = [
-            tuple(state[f"{name}_{number}"] for name in names) for number in range(len(self._blocks))
+            (state[f"indptr_{number}"], state[f"indices_{number}"], state[f"values_{number}"])
+            for number in range(len(self._blocks))
         ]
 
     def finish(self) -> Gram:
@@ -119,20 +119,20 @@ class GramBuilder:
 
 
 def _empty_block(rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of G without a pair: begins, columns, values."""
+    """Rows of G without a pair: row starts, columns, values."""
     return np.zeros(rows + 1, np.int64), np.zeros(0, np.int32), np.zeros((0, len(LEVELS)))
 
 
 class QuadraticBuilder:
     """Collects W part by part and keeps whichever of G and W has fewer non-zeros.
 
-    One product touches each of them equally often. W is let go of as soon as it has more non-zeros
-    than `MAX_WEIGHTS`, and G is kept then.
+    A product reads each non-zero of either equally often. W is dropped, and G kept, as soon as W has more
+    than `MAX_WEIGHTS` non-zeros.
 
     Args:
         num_gaussians: N.
-        keep: "auto", or "gram" or "weights" to insist on one.
-        threads: for building G.
+        keep: "auto", or "gram" or "weights" to force one.
+        threads: number of threads that build G.
     """
 
     def __init__(self, num_gaussians: int, keep: str, threads: int) -> None:
@@ -158,7 +158,7 @@ class QuadraticBuilder:
                 self._waiting = []
 
     def state(self) -> dict[str, np.ndarray]:
-        """Everything that was added, as arrays."""
+        """Everything added so far, as arrays."""
         out = {"nonzeros": np.array([self.weights_nonzeros, self._keeps_weights], np.int64)}
         if self._gram is not None:
             out |= {f"gram_{name}": array for name, array in self._gram.state().items()}
@@ -172,7 +172,7 @@ class QuadraticBuilder:
         return out
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Go on from `state`; the result is the same bytes as without a stop."""
+        """Continue from `state`; the result has the same bytes as without interruption."""
         self.weights_nonzeros, self._keeps_weights = int(state["nonzeros"][0]), bool(state["nonzeros"][1])
         if self._gram is not None:
             prefix = "gram_"
@@ -198,12 +198,12 @@ class QuadraticBuilder:
 
 
 class QuadraticCheckpoint:
-    """What is summed so far, kept on disk while a long pass runs.
+    """The sums so far, kept on disk while a long pass runs.
 
     Args:
-        folder: where checkpoints lie.
+        folder: holds checkpoints.
         keys: digests of what each view contributes, in order.
-        keep: which form is insisted on.
+        keep: as in `QuadraticBuilder`.
     """
 
     def __init__(self, folder: Path, keys: list[str], keep: str) -> None:
@@ -213,9 +213,9 @@ class QuadraticCheckpoint:
         self._last = time.monotonic()
 
     def resume(self, builder: QuadraticBuilder) -> int:
-        """Put the builder where it was; returns the number of views it holds, 0 without a checkpoint.
+        """Restore the builder; returns the number of views it then holds, 0 without a checkpoint.
 
-        A checkpoint that lacks a file, as after the cache was pruned, is forgotten.
+        A checkpoint that lacks a file, for instance after the cache was pruned, is deleted.
         """
         if not (self._folder / INDEX).is_file():
             return 0
@@ -223,14 +223,14 @@ class QuadraticCheckpoint:
             index = read_index(self._folder)
             state = {name: read_npy(self._folder / f"{name}.npy") for name in index["arrays"]}
         except ArtifactError as error:
-            logger.warning("checkpoint of the contributions is incomplete and forgotten: %s", error)
+            logger.warning("discarding an incomplete checkpoint of the contributions: %s", error)
             self.forget()
             return 0
         builder.restore(state)
         return int(index["summed"])
 
     def offer(self, builder: QuadraticBuilder, summed: int) -> None:
-        """Write a checkpoint where the last one is old enough and views are left."""
+        """Write a checkpoint if the last one is old enough and views are left."""
         if summed == len(self._keys) or time.monotonic() - self._last < CHECKPOINT_SECONDS:
             return
         state = builder.state()
@@ -246,7 +246,7 @@ class QuadraticCheckpoint:
 
 
 def stack_weights(parts: list[StackedWeights]) -> StackedWeights:
-    """One after the other."""
+    """Stack parts, one below the other."""
     if len(parts) == 1:
         return parts[0]
     matrix = sp.vstack([part.weights for part in parts], format="csr")
@@ -255,7 +255,7 @@ def stack_weights(parts: list[StackedWeights]) -> StackedWeights:
 
 @compiled
 def _transpose(indptr, indices, begins, pixels, places):
-    """Begins of each column, and the row and place of its values; `begins` comes as zeros."""
+    """Start of each column's list, and the row and place of its values; `begins` must be zero."""
     for k in range(indptr[-1]):
         begins[indices[k] + 1] += 1
     begins[:] = np.cumsum(begins)
@@ -284,7 +284,7 @@ def _grown_block(
     old_values,
     levels,
 ):
-    """Rows begin..end of G with the new pixels added to the old values; columns sorted."""
+    """Rows begin..end of G: old values plus the new pixels; columns sorted."""
     num = len(begins) - 1
     seen = np.full(num, -1, np.int64)
     sums = np.zeros((num, levels), np.float64)

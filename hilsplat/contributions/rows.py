@@ -1,7 +1,8 @@
-"""The finished contributions of a scene: one row per mask of all train views."""
+"""The finished contributions of a scene: one row per mask of the train views."""
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import scipy.sparse as sp
@@ -16,22 +17,22 @@ from hilsplat.contributions.streams import HEADER_BYTES
 
 @dataclass(frozen=True)
 class Contributions:
-    """The finished stage: its rows in memory, its matrices read when asked for.
+    """The finished stage: its rows in memory, its matrices read on request.
 
-    M rows are the masks of all train views, view by view, in each view's own order.
+    The M rows are the masks of all train views, view by view, in the order of each view.
 
     Attributes:
         folder: the artifact.
         views: train views in the order of `view`.
         num_gaussians: N.
-        gaussians_sha256: digest of the PLY the weights belong to.
+        gaussians_sha256: digest of the PLY that the weights belong to.
         min_weight: smaller weights of a Gaussian at a pixel were dropped.
         view: index of each row's view in `views`.
         mask: row of the mask among its view's masks.
         level: `Level` of the mask.
         area_px: pixels of the raw mask.
-        pixels: pixels at which the mask is painted and the Gaussians cover the image, n.
-        half_pixels: those of them in the random half.
+        pixels: number n of pixels that show the mask and that the Gaussians cover.
+        half_pixels: how many of them are in the random half.
     """
 
     folder: Path
@@ -54,12 +55,12 @@ class Contributions:
         return np.flatnonzero(self.level == int(level))
 
     def matrix(self, name: str) -> sp.csr_matrix:
-        """`A`, `A_half` or `S` (M x N); read from the file as it is used, not held in memory."""
+        """`A`, `A_half` or `S` (M x N), mapped from its file rather than held in memory."""
         parts = (_mapped(self.folder / name / f"{part}.npy") for part in ("data", "indices", "indptr"))
         return sp.csr_matrix(tuple(parts), shape=(len(self), self.num_gaussians), copy=False)
 
     def mass(self) -> Float32[np.ndarray, "V N"]:
-        """Visible mass of each Gaussian in each train view, px; read as it is used."""
+        """Visible mass of each Gaussian in each train view, px; mapped from its file."""
         return _mapped(self.folder / "mass.npy")
 
     def means(self) -> Float32[np.ndarray, "N 3"]:
@@ -67,7 +68,7 @@ class Contributions:
         return read_npy(self.folder / "means.npy")
 
     def quadratic(self, threads: int = 1) -> Quadratic:
-        """Read G, or the stacked weights where those are smaller."""
+        """Read G, or the stacked weights if those are smaller."""
         return load_quadratic(self.folder, threads)
 
     @staticmethod
@@ -91,14 +92,14 @@ class Contributions:
 
 
 def _mapped(path: Path) -> np.ndarray:
-    """An array that stays in its file.
+    """Map an array from its file.
 
     Raises:
         ArtifactError: the file is missing or damaged.
     """
     try:
-        # A file without a single number cannot be mapped.
-        mode = "r" if path.stat().st_size > HEADER_BYTES else None
+        # A file without any number cannot be mapped.
+        mode: Literal["r"] | None = "r" if path.stat().st_size > HEADER_BYTES else None
         return np.load(path, mmap_mode=mode, allow_pickle=False).view(np.ndarray)
     except FileNotFoundError as error:
         raise ArtifactError(f"{path} is missing", fix="run the contributions stage again") from error
@@ -112,7 +113,7 @@ def mask_embeddings(clip_folder: Path, contributions: Contributions) -> Float32[
     """CLIP vectors of all masks, in the contributions' row order.
 
     Raises:
-        MisalignedArtifactError: a view has another number of vectors than masks.
+        MisalignedArtifactError: a view has more or fewer vectors than masks.
     """
     parts = []
     counts = np.bincount(contributions.view, minlength=len(contributions.views))

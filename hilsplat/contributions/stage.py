@@ -1,19 +1,20 @@
-"""What the masks of all views say about each Gaussian while geometry is frozen.
+"""The stage `contributions`: how much each Gaussian weighs in each mask, with frozen geometry.
 
-For a view with compositing weights W (pixels x Gaussians, rows divided by their sum) and the masks
-painted into one label map per level, B their indicator and n their areas:
+For a view with compositing weights W (pixels x Gaussians, rows divided by their sum) and its masks painted
+into one label map per level, with indicator B and areas n:
 
-- A = diag(1/n) B W: the mean weight of each Gaussian in each mask; A F are the mask means,
+- A = diag(1/n) B W: the mean weight of each Gaussian in each mask; A F holds the mask means,
 - G_l = sum over views of W' diag(valid_l) W (see `quadratic`),
 - A_half: A over a random half of each mask's pixels, for the part loss,
 - S = D W with the raw, overlapping masks D: how much of a Gaussian falls into a mask,
 - mass: how much of a Gaussian is visible in each view.
 
-Every loss of the language field, and the 3D semantic tree, need nothing else of the images.
+The losses of the language field and the 3D semantic tree need nothing else from the images.
 """
 
 import hashlib
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache as cache_calls
 from pathlib import Path
@@ -55,12 +56,12 @@ MATRICES = ("A", "A_half", "S")
 
 
 def label_maps(masks: HierarchicalMasks) -> Int32[np.ndarray, "P 3"]:
-    """Row of the painted mask at each pixel and level, -1 where there is none."""
+    """Row of the painted mask at each pixel and level, -1 for none."""
     return np.stack([masks.label_map(level).reshape(-1) for level in LEVELS], axis=1)
 
 
 def painted_indicator(labels: Int32[np.ndarray, "P 3"], num_masks: int, pixels: np.ndarray) -> sp.csr_matrix:
-    """B: one row per mask, ones at the given pixels where it is painted (float64)."""
+    """B: one row per mask, ones at those of the given pixels that show it (float64)."""
     rows, columns = [], []
     for index in range(labels.shape[1]):
         row = labels[:, index]
@@ -74,7 +75,7 @@ def painted_indicator(labels: Int32[np.ndarray, "P 3"], num_masks: int, pixels: 
 def mask_means(
     indicator: sp.csr_matrix, weights: sp.csr_matrix
 ) -> tuple[sp.csr_matrix, Int64[np.ndarray, " M"]]:
-    """diag(1/n) B W with the weights in float64, and n; a mask without a pixel has an empty row."""
+    """diag(1/n) B W with weights in float64, and n; the row of a mask without a pixel is empty."""
     pixels = np.diff(indicator.indptr).astype(np.int64)
     scale = sp.diags(1.0 / np.maximum(pixels, 1))
     return _single(scale @ (indicator @ weights)), pixels
@@ -94,16 +95,16 @@ def raw_indicator(masks: HierarchicalMasks, pixels: np.ndarray) -> sp.csr_matrix
 
 
 def random_half(view: str, pixels: int) -> np.ndarray:
-    """A fair coin per pixel, fixed by the view's name."""
+    """A random half of the pixels, a fair coin for each, seeded by the view's name."""
     seed = int.from_bytes(hashlib.sha256(view.encode()).digest()[:8], "little")
     return np.random.default_rng(seed).random(pixels) < 0.5
 
 
 def view_contributions(view: str, weights: sp.csr_matrix, masks: HierarchicalMasks) -> dict[str, np.ndarray]:
-    """All matrices of one view but W, as plain arrays (`A_data`, `A_indices`, `A_indptr`, ...).
+    """All matrices of one view except W, as plain arrays (`A_data`, `A_indices`, `A_indptr`, ...).
 
     Args:
-        view: its name, which fixes the random halves.
+        view: its name, which seeds the random halves.
         weights: normalised weights (see `normalised_weights`).
         masks: the view's masks.
     """
@@ -162,12 +163,12 @@ def run_contributions(
     settings: ContributionsSettings,
     threads: int,
 ) -> None:
-    """One pass over the train views: write A, A_half, S, mass, and G or W.
+    """Write A, A_half, S, mass, and G or W, in one pass over the train views.
 
-    Views are worked on one by one and their rows go to disk at once; memory holds one view, G as far as it
-    is summed, and the weights that wait to be added to it (`quadratic_builder`). A killed run finds
-    finished views' matrices in the cache, and G as it was at most `CHECKPOINT_SECONDS` (and one view)
-    before; W of views that G lacks is rasterised again.
+    Views are processed one by one and their rows written at once; memory holds one view, the sum of G so far,
+    and the weights waiting to be added to it (`quadratic_builder`). A run after a
+    killed one finds the matrices of finished views in the cache, and G as of at most `CHECKPOINT_SECONDS`
+    (and one view) before; it rasterises W again for the views that G lacks.
 
     Raises:
         MisalignedArtifactError: masks and images differ in size.
@@ -206,12 +207,14 @@ def run_contributions(
                     )
                     return normalised_weights(raw)
 
-                part = store.get(
-                    view.key,
-                    lambda view=view, weights=weights, masks=masks: view_contributions(
-                        view.name, weights(), masks
-                    ),
-                )
+                def compute(
+                    name: str = view.name,
+                    weights: Callable[[], sp.csr_matrix] = weights,
+                    masks: HierarchicalMasks = masks,
+                ) -> dict[str, np.ndarray]:
+                    return view_contributions(name, weights(), masks)
+
+                part = store.get(view.key, compute)
                 for name, matrix in matrices.items():
                     matrix.append(*(part[f"{name}_{what}"] for what in ("data", "indices", "indptr")))
                 mass.append(part["mass"][None])

@@ -1,4 +1,4 @@
-"""Arrays that grow on disk, so that a stage never holds what it writes."""
+"""Arrays that grow on disk, so that a stage never holds all that it writes."""
 
 from pathlib import Path
 from types import TracebackType
@@ -9,12 +9,12 @@ HEADER_BYTES = 128
 
 
 class ArrayStream:
-    """A .npy file that is written row by row; its header is completed when it is closed.
+    """A .npy file written row by row; closing it completes its header.
 
     Args:
         path: the file.
-        dtype: of the numbers.
-        columns: numbers per row; None for a plain sequence.
+        dtype: type of the numbers.
+        columns: numbers per row; None for a one-dimensional array.
     """
 
     def __init__(self, path: Path, dtype: type, columns: int | None = None) -> None:
@@ -42,7 +42,7 @@ class ArrayStream:
     def close(self) -> None:
         """Complete the header."""
         shape = (self._rows,) if self._columns is None else (self._rows, self._columns)
-        # Format 1.0 of numpy: magic, length of the text, and the text padded with blanks.
+        # NumPy's format 1.0: magic, length of the header, and the header padded with spaces.
         text = f"{{'descr': '{self._dtype.str}', 'fortran_order': False, 'shape': {shape}, }}"
         length = HEADER_BYTES - 10
         self._stream.seek(0)

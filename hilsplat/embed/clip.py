@@ -18,19 +18,19 @@ from hilsplat.settings import ClipSettings
 logger = logging.getLogger(__name__)
 
 INSTALLED = Path(__file__).resolve().parents[2]
-"""The project that this package runs from; its `models/` are there in a checkout."""
+"""The project that this package runs from; a checkout has its `models/` there."""
 
 MODEL_PATTERNS = ("*/config.json", "*/*/config.json")
-"""Where a folder `models/` holds model folders."""
+"""Places of model folders under `models/`."""
 
 
 class ClipModel:
-    """A CLIP folder, ready to run.
+    """A CLIP, ready to run.
 
     Attributes:
         digest: SHA-256 of the model's files.
         side_px: side of the square crops the vision network takes.
-        max_tokens: longest text the text network takes; None where the folder names no limit.
+        max_tokens: longest text the text network takes; None if the folder names no limit.
     """
 
     def __init__(self, model: ModelFolder, threads: int = 1, template: str = "{}") -> None:
@@ -47,7 +47,7 @@ class ClipModel:
             self.text.declared_axis("text_embeds", 1),
         )
         self.side_px = input_side_px(model)
-        # CLIP's own statistics where the folder names none, as in transformers
+        # CLIP's own statistics if the folder names none, as in transformers
         preprocessing = model.preprocessing
         self.mean = np.array(preprocessing.get("image_mean", (0.48145466, 0.4578275, 0.40821073)), np.float32)
         self.std = np.array(preprocessing.get("image_std", (0.26862954, 0.26130258, 0.27577711)), np.float32)
@@ -77,31 +77,31 @@ class ClipModel:
 
         Args:
             folder: in the layout of the Hugging Face ONNX exports.
-            threads: batches of crops worked on at once; results do not depend on it.
-            template: sentence that every text is put into, at `{}`.
+            threads: batches of crops embedded at once; results do not depend on it.
+            template: sentence around every text, which replaces `{}`.
 
         Raises:
-            ModelError: it is missing, incomplete or no CLIP, or its networks do not belong together.
+            ModelError: it is missing, incomplete or not a CLIP, or its networks do not belong together.
         """
         return ClipModel(open_model_folder(folder, "clip"), threads, template)
 
     @property
     def width(self) -> int:
-        """Numbers of a vector."""
+        """Numbers in a vector."""
         return self.vision.declared_axis("image_embeds", 1) or self.embed_texts(["object"]).shape[1]
 
     def require_width(self, numbers: int, what: str) -> None:
-        """Refuse to go on with something that was made for vectors of another width.
+        """Refuse something made for vectors of another width.
 
         Raises:
-            MisalignedArtifactError: naming both.
+            MisalignedArtifactError: the widths differ.
         """
         if self.width != numbers:
             raise MisalignedArtifactError(
                 f"{what} does not belong to the CLIP in {self.model.folder}",
                 expected=f"vectors of {self.width} numbers, as this CLIP gives",
                 found=f"{numbers} numbers",
-                fix="take the CLIP it was made with (clip.model), or run the clip stage and all after it",
+                fix="use the CLIP it was made with (clip.model), or rerun the clip stage and those after it",
             )
 
     def prepare(self, crops: UInt8[np.ndarray, "B side side 3"]) -> Float32[np.ndarray, "B 3 side side"]:
@@ -125,14 +125,14 @@ class ClipModel:
         Args:
             image: the view.
             masks: its masks.
-            settings: what is shown outside the mask, crops per network call; None: defaults.
+            settings: what fills the crop outside the mask, and crops per network call; None: defaults.
         """
         settings = settings or ClipSettings()
 
         def embed(start: int) -> np.ndarray:
             crops = []
             for row in range(start, min(len(masks), start + settings.batch)):
-                # only the box is unpacked: a photograph may have 40 million pixels
+                # Only the box is unpacked: a photograph may have 40 million pixels.
                 x0, y0, x1, y1 = box = tuple(masks.box_xyxy[row].tolist())
                 inside = masks.window(row, box)
                 crops.append(crop_to_square(image[y0:y1, x0:x1], inside, settings.background, self.side_px))
@@ -144,10 +144,10 @@ class ClipModel:
         return np.concatenate(parts).astype(np.float16)
 
     def embed_texts(self, texts: list[str]) -> Float32[np.ndarray, "T C"]:
-        """Unit vectors of texts, in order, each put into the template.
+        """Unit vectors of texts, in order, each inserted into the template.
 
-        Texts run one by one: the vector of a query then never depends on the queries beside it, and a
-        text that was asked before costs nothing.
+        Texts run one by one, so the vector of a query never depends on other queries. A repeated text
+        costs nothing.
 
         Raises:
             ModelError: a text has no token.
@@ -163,7 +163,7 @@ class ClipModel:
             raise ModelError(f"text {text!r} has no token", fix="give each query at least one word")
         encoding = self.tokenizer.encode(self.template.replace("{}", text))
         if encoding.overflowing:
-            logger.warning("text cut at %d tokens: %r", self.max_tokens, text)
+            logger.warning("text cut off after %d tokens: %r", self.max_tokens, text)
         (vector,) = self.text(
             input_ids=np.array([encoding.ids], dtype=np.int64),
             attention_mask=np.array([encoding.attention_mask], dtype=np.int64),
@@ -180,9 +180,9 @@ def unit(vectors: Float32[np.ndarray, "N C"]) -> Float32[np.ndarray, "N C"]:
 def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> ClipModel:
     """Open the CLIP that embedded the masks of a clip artifact, wherever its folder is now.
 
-    It is recognised by its digest. Looked at are the recorded path and every folder in `models/`, each
-    relative to the working directory, to the folders around the artifact (the project that holds the results
-    is among them) and to the project that this package runs from.
+    Its digest identifies it. The search covers the recorded path and every folder in `models/`, each relative
+    to the working directory, to the folders above the artifact (such as the project that holds the results)
+    and to the project that this package runs from.
 
     Args:
         clip_folder: what the clip stage wrote.
@@ -190,7 +190,7 @@ def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> C
         template: as in `ClipModel.load`.
 
     Raises:
-        ModelError: none of the CLIPs found has the digest of the one that embedded the masks.
+        ModelError: no CLIP found has the digest of the one that embedded the masks.
     """
     index = read_full_index(clip_folder, "model", "model_sha256")
     recorded, wanted = Path(index["model"]), index["model_sha256"]
@@ -214,6 +214,6 @@ def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> C
         expected=f"a model folder with digest {wanted[:12]}; it was {recorded}",
         found=", ".join(f"{folder} with digest {digest[:12]}" for folder, digest in seen.items())
         or f"no CLIP at {recorded} or in {', '.join(map(str, stores)) or 'any folder models/'}",
-        fix="copy that model folder into models/ beside the results folder, or run the clip stage again with "
-        "the CLIP you have",
+        fix="copy that model folder into models/ beside the results folder, or rerun the clip stage with the "
+        "CLIP you have",
     )

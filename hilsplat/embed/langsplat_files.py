@@ -1,10 +1,10 @@
-"""LangSplat's files of masks and vectors, read and written (its preprocessing, `language_features/`).
+"""Read and write LangSplat's masks and vectors (the `language_features/` of its preprocessing).
 
-Of an image `a.jpg` there are two plain arrays:
-    a_s.npy  float32 (4, H, W): row of `a_f.npy` at each pixel, -1 where there is none;
+An image `a.jpg` has two plain arrays:
+    a_s.npy  float32 (4, H, W): row of `a_f.npy` at each pixel, -1 for none;
     a_f.npy  float32 (N, C): a CLIP vector per mask.
-The four maps are default, s, m, l: all heads mixed, then from fine to coarse. Rows count through all
-four. A name is cut at its first dot.
+The four maps are default, s, m, l: all heads mixed, then from fine to coarse. Row numbers run through all
+four. File names are cut at their first dot.
 """
 
 from pathlib import Path
@@ -23,11 +23,11 @@ from hilsplat.segment.stage import train_views
 from hilsplat.settings import ClipSettings
 
 MAPS: tuple[Level | None, ...] = (None, Level.SUBPART, Level.PART, Level.WHOLE)
-"""What the four maps hold, in their order; the first mixes all levels."""
+"""Levels of the four maps, in their order; the first mixes all levels."""
 
 
 def stem_of(view: str) -> str:
-    """Name of a view's files: cut at the first dot, as LangSplat does."""
+    """Stem of a view's files: its name, cut at the first dot as LangSplat does."""
     return view.split(".")[0]
 
 
@@ -35,13 +35,13 @@ def _stems(views: list[str]) -> dict[str, str]:
     """Stem of each view.
 
     Raises:
-        ArtifactError: two views share one.
+        ArtifactError: two views have the same stem.
     """
     stems = {view: stem_of(view) for view in views}
     twins = [view for view in views if list(stems.values()).count(stems[view]) > 1]
     if twins:
         raise ArtifactError(
-            f"LangSplat's files cannot tell views apart: {', '.join(twins[:4])}",
+            f"these views would share LangSplat's files: {', '.join(twins[:4])}",
             expected="names that differ before their first dot",
             fix="rename the images",
         )
@@ -53,14 +53,14 @@ def read_view(
 ) -> tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]:
     """Masks and vectors of one view, rows in `content_order`.
 
-    The map of mixed levels is left out. What another mask of the same level was painted over is lost
-    in these files. They hold no scores: predicted IoU and stability are 1.
+    The map of mixed levels is ignored. Where masks of one level overlap, these files keep only the one
+    painted last. They hold no scores: predicted IoU and stability are 1.
 
     Args:
-        folder: with `<stem>_s.npy` and `<stem>_f.npy`.
+        folder: holds `<stem>_s.npy` and `<stem>_f.npy`.
         view: its name.
         size_hw: of the view.
-        resize: take maps of another size, nearest pixel.
+        resize: accept maps of another size and take the nearest pixel.
 
     Raises:
         ArtifactError: a file is missing, damaged, pickled, or not as described above.
@@ -76,7 +76,7 @@ def read_view(
         )
     if vectors.ndim != 2 or vectors.dtype.kind != "f" or not np.isfinite(vectors).all():
         raise ArtifactError(
-            f"{vectors_path} holds no vectors",
+            f"{vectors_path} is not an array of vectors",
             expected="finite floating-point numbers of shape (masks, channels)",
             found=f"{vectors.dtype} of shape {vectors.shape}",
         )
@@ -85,9 +85,9 @@ def read_view(
     if not finite or (labels != maps).any() or labels.min() < -1 or labels.max() >= len(vectors):
         raise ArtifactError(
             f"{maps_path} does not belong to {vectors_path.name}",
-            expected=f"whole numbers from -1 to {len(vectors) - 1}, a row each",
+            expected=f"row numbers from -1 (none) to {len(vectors) - 1}",
             found=f"numbers from {maps.min():g} to {maps.max():g}",
-            fix="take both files from one run of the preprocessing",
+            fix="take both files from the same run of the preprocessing",
         )
     if labels.shape[1:] != size_hw:
         if not resize:
@@ -95,7 +95,7 @@ def read_view(
                 f"{maps_path} and view {view} differ in size",
                 expected=f"{size_hw} (height, width)",
                 found=f"{labels.shape[1:]}",
-                fix="give --resize (nearest pixel), or make both at one size; LangSplat shrinks to 1080 rows",
+                fix="pass --resize (nearest pixel), or make both at one size; LangSplat shrinks to 1080 rows",
             )
         at = [
             ((np.arange(n) + 0.5) * m / n).astype(int) for n, m in zip(size_hw, labels.shape[1:], strict=True)
@@ -120,10 +120,10 @@ def read_view(
 def _read_all(
     scene: Scene, folder: Path, resize: bool
 ) -> dict[str, tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]]:
-    """Every training view.
+    """Masks and vectors of every training view.
 
     Raises:
-        ArtifactError: views without files.
+        ArtifactError: a view has no files.
     """
     stems = _stems(train_views(scene))
     missing = [view for view, stem in stems.items() if not (folder / f"{stem}_s.npy").is_file()]
@@ -132,7 +132,7 @@ def _read_all(
             f"{folder} lacks the maps of {len(missing)} of {len(stems)} training views of {scene.name}",
             expected=", ".join(f"{stems[view]}_s.npy" for view in missing[:5]),
             found=", ".join(sorted(path.name for path in folder.glob("*_s.npy"))[:5]) or "none",
-            fix="name LangSplat's folder language_features of the same images",
+            fix="pass the folder language_features that LangSplat made from the same images",
         )
     return {
         view: read_view(folder, view, scene.cameras[view].size_hw, resize)
@@ -156,8 +156,8 @@ def read_clip(scene_folder: Path, files: Path, out: Path, resize: bool, settings
     """Write LangSplat's vectors as the clip stage would: `<view>.npy`, rows as in `read_masks`.
 
     Raises:
-        MisalignedArtifactError: the vectors are of another width than those of `settings.model`, which
-            must embed the texts.
+        MisalignedArtifactError: the vectors have another width than those of `settings.model`, which
+            embeds the texts.
     """
     scene = Scene.load(scene_folder)
     model = ClipModel.load(Path(settings.model))
@@ -183,7 +183,7 @@ def read_clip(scene_folder: Path, files: Path, out: Path, resize: bool, settings
 def maps_of(
     masks: HierarchicalMasks,
 ) -> tuple[Float32[np.ndarray, "4 H W"], Int64[np.ndarray, " N"]]:
-    """LangSplat's four maps of a view, and which mask each row of its vectors belongs to.
+    """LangSplat's four maps of a view, and the mask that each row of its vectors belongs to.
 
     The map of mixed levels holds all masks, large to small.
     """
@@ -202,7 +202,7 @@ def write_langsplat(masks_folder: Path, clip_folder: Path, out: Path) -> None:
     """Write `<stem>_s.npy` and `<stem>_f.npy` of every view that has masks.
 
     Raises:
-        MisalignedArtifactError: masks and vectors have other rows.
+        MisalignedArtifactError: a view has more or fewer vectors than masks.
     """
     index = read_index(masks_folder)
     stems = _stems(list(index["views"]))
@@ -212,7 +212,7 @@ def write_langsplat(masks_folder: Path, clip_folder: Path, out: Path) -> None:
             vectors = read_npy(Path(clip_folder) / f"{view}.npy")
             if len(vectors) != len(masks):
                 raise MisalignedArtifactError(
-                    f"masks and vectors of view {view} differ",
+                    f"masks and vectors of view {view} do not belong together",
                     expected=f"{len(masks)} vectors, one per mask",
                     found=f"{len(vectors)}",
                     fix="run the clip stage again",

@@ -1,4 +1,4 @@
-"""Is a model folder usable? Runs each of its networks once and says what it is."""
+"""Check that a model folder works, and describe it."""
 
 import time
 from pathlib import Path

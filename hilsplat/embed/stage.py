@@ -30,15 +30,15 @@ def run_clip(
 
     Args:
         scene_folder: the `Scene` artifact.
-        masks_folder: what the masks stage wrote.
+        masks_folder: output of the masks stage.
         out: folder to write: `<view>.npy`, float16 (M, C) unit vectors with rows as the masks, and
             `index.json` with the number C and the model.
         cache: folder of the view cache.
         settings: model and cropping.
-        threads: views worked on at once; the result does not depend on it.
+        threads: views embedded at once; the result does not depend on it.
 
     Raises:
-        MisalignedArtifactError: the masks are of other views or sizes than the scene's.
+        MisalignedArtifactError: the masks belong to other views, or have other sizes, than the scene's.
     """
     scene = Scene.load(scene_folder)
     views = list(read_index(masks_folder)["views"])
@@ -74,8 +74,8 @@ def run_clip(
     strangers = sorted(set(views) - set(scene.views("train")))
     if strangers:
         raise MisalignedArtifactError(
-            f"masks in {masks_folder} are not of the training views of {scene.name}",
-            expected=f"only views among its {len(scene.views('train'))} training views",
+            f"masks in {masks_folder} do not belong to the training views of {scene.name}",
+            expected=f"only masks of its {len(scene.views('train'))} training views",
             found=", ".join(strangers[:5]),
             fix="run the masks stage again for this scene",
         )

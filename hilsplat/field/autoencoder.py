@@ -34,13 +34,13 @@ logger = logging.getLogger(__name__)
 ENCODER_WIDTHS = (256, 128, 64, 32)
 DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
 CHUNK_ROWS = 4096
-"""Rows decoded at once: hidden layers of 4 MiB stay in the processor's cache. Chunks of 65,536 took twice as
-long."""
+"""Rows to decode at once: their hidden layers, 4 MiB, stay in the processor's cache. Chunks of 65,536 rows
+took twice as long."""
 
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Sum in one order: the same bytes whatever number of threads the stage was given."""
+    """Make torch sum in one order: the same bytes for any number of threads of the stage."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -52,13 +52,12 @@ def one_torch_thread() -> Iterator[None]:
 class Autoencoder(nn.Module):
     """LangSplat's scene autoencoder, C -> 256 -> 128 -> 64 -> 32 -> d and back, unit length at both ends.
 
-    Departs: layer widths never exceed C. The encoder's BatchNorm (measured better than LayerNorm or
-    none) only ever sees full batches, and ends with the statistics of all vectors: see
-    `train_autoencoder`.
+    Departs: layer widths never exceed C. The encoder's BatchNorm (better than LayerNorm or none when
+    measured) sees full batches only, and ends with the statistics of all vectors: see `train_autoencoder`.
 
     Args:
-        channels: C, of the CLIP vectors.
-        latent: d.
+        channels: width C of the CLIP vectors.
+        latent: size d of a latent.
     """
 
     def __init__(self, channels: int, latent: int) -> None:
@@ -131,16 +130,16 @@ def load_code(folder: Path) -> Code:
 
 
 def autoencoder_file(folder: Path) -> Path:
-    """Where the weights lie in a finished folder."""
+    """File of the weights in a finished folder."""
     return Path(folder) / "autoencoder.safetensors"
 
 
 def reconstruction_loss(
     decoded: Float[Tensor, "B C"], vectors: Float[Tensor, "B C"], cosine_weight: float
 ) -> Float[Tensor, ""]:
-    """Mean squared error plus `cosine_weight` times the mean of 1 - cosine, the cosine per vector.
+    """Mean squared error plus `cosine_weight` times the mean over vectors of 1 - cosine.
 
-    Departs: LangSplat takes the cosine over the batch axis, which compares channels, not vectors.
+    Departs: LangSplat takes the cosine along the batch axis, which compares channels, not vectors.
     """
     cosine = nn.functional.cosine_similarity(decoded, vectors, dim=1)
     return (decoded - vectors).square().mean() + cosine_weight * (1 - cosine).mean()
@@ -149,15 +148,15 @@ def reconstruction_loss(
 def train_autoencoder(
     vectors: Float32[np.ndarray, "B C"], settings: AutoencoderSettings, seed: int
 ) -> Autoencoder:
-    """Train on one scene's vectors: Adam, full batches drawn without replacement, cosine-decayed steps.
+    """Train on one scene's vectors: Adam with cosine decay, full batches drawn without replacement.
 
     Args:
         vectors: unit CLIP vectors, at least one.
         settings: latent size, steps and weights.
-        seed: of the first weights and the order of vectors.
+        seed: for the initial weights and the order of vectors.
 
     Returns:
-        the trained model; the same bytes for the same input and seed, on any number of threads.
+        the trained model; the same bytes for the same input and seed on any number of threads.
     """
     with one_torch_thread(), torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -186,7 +185,7 @@ def train_autoencoder(
 
 @torch.no_grad()
 def settle_batch_norm(model: Autoencoder, data: Float[Tensor, "B C"]) -> None:
-    """Replace the running statistics of the last batches by those of all vectors."""
+    """Replace the running statistics, which favour the last batches, by those of all vectors."""
     for module in model.modules():
         if isinstance(module, nn.BatchNorm1d):
             module.reset_running_stats()
@@ -198,13 +197,13 @@ def settle_batch_norm(model: Autoencoder, data: Float[Tensor, "B C"]) -> None:
 def mask_targets(
     clip: Float32[np.ndarray, "M C"], tree: SemanticTree, targets: str
 ) -> tuple[Float32[np.ndarray, "M C"], Float32[np.ndarray, "B C"]]:
-    """The vector each mask is supervised with, and the distinct vectors to train on.
+    """The target vector of each mask, and the distinct vectors to train on.
 
     Args:
         clip: each mask's own vector.
         tree: nodes, and the node each mask fits.
-        targets: "node": the node's averaged vector where the mask fits one, its own elsewhere (average
-            in CLIP space first, encode afterwards); "mask": always its own, as the paper has it.
+        targets: "node": the node's averaged vector if the mask fits a node, else its own (averaged in CLIP
+            space before encoding); "mask": always its own, as in the paper.
     """
     if targets == "mask":
         return clip, clip
@@ -230,10 +229,10 @@ def run_autoencoder(
     tree = SemanticTree.load(semantic_tree_folder)
     if len(tree.node_of_mask) != len(contributions):
         raise MisalignedArtifactError(
-            f"{semantic_tree_folder} and {contributions_folder} belong to other masks",
+            f"{semantic_tree_folder} and {contributions_folder} belong to different masks",
             expected=f"{len(contributions)} masks",
             found=f"{len(tree.node_of_mask)}",
-            fix="run the semantic tree stage again",
+            fix="rerun the semantic_tree stage",
         )
     clip = mask_embeddings(clip_folder, contributions)
     target, train = mask_targets(clip, tree, settings.targets)
@@ -270,7 +269,7 @@ def load_latents(folder: Path, contributions: Contributions) -> Float32[np.ndarr
     """Latent of each mask, checked against the contributions' rows.
 
     Raises:
-        MisalignedArtifactError: another number of rows.
+        MisalignedArtifactError: the numbers of rows differ.
     """
     read_index(folder)
     latents = read_npz(Path(folder) / "latents.npz")["latents"]

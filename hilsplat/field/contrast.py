@@ -1,6 +1,6 @@
 """The contrastive losses L_ins and L_part (paper, Eq. 3 to 5) as functions of the field.
 
-Both depend on the mask means alone, so that a step costs a sparse product and no rendering.
+Both depend on the mask means alone, so a step costs a sparse product and no rendering.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from hilsplat.field.losses.part import part_loss_disentangle, part_loss_literal
 from hilsplat.settings import FieldSettings
 
 MAX_MASKS_PER_LEVEL = 96
-"""Masks of one view and level that take part: the losses compare all pairs."""
+"""Most masks of one view and level that take part, since the losses compare all pairs."""
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class ViewRelations:
 
     Attributes:
         rows: masks that take part, all levels.
-        depth: depth of the deepest common ancestor of every two of them.
+        depth: depth of the deepest common ancestor of every pair of them.
         level: their levels.
         part_rows: for PART and SUBPART, the masks that take part.
-        part_parent: the row of each one's parent in the coverage tree, -1 for none.
+        part_parent: the row of their parents in the coverage tree, -1 for none.
     """
 
     rows: Tensor
@@ -52,8 +52,8 @@ def view_relations(
     Args:
         contributions: rows.
         parents: per view, the coverage tree's parent of each mask (row among the view's masks).
-        settings: least size of masks, and pruning.
-        means: mean lifted feature of each mask, by which look-alikes are pruned; None keeps all.
+        settings: smallest size of a mask, and pruning.
+        means: mean lifted feature of each mask, to prune masks that look alike; None keeps all.
     """
     relations = []
     for number, view in enumerate(contributions.views):
@@ -93,14 +93,14 @@ def view_relations(
 def distinct(
     means: Float32[np.ndarray, "m D"], depth: Int64[np.ndarray, "m m"], most_alike: float
 ) -> Int64[np.ndarray, " k"]:
-    """Contrastive sample pruning: rows that are no look-alike of an unrelated row kept before them.
+    """Contrastive sample pruning: rows that do not look like an unrelated row kept before them.
 
-    The paper keeps the most distinct samples, without numbers. A mask that is unrelated in the tree but
-    looks like a kept one adds a pair whose gradient says little else than that pair's.
+    The paper keeps the most distinct samples and gives no numbers. A mask that is unrelated to a kept one in
+    the tree, but looks like it, adds a pair whose gradient says little beyond that of the kept pairs.
 
     Args:
         means: features, in order of preference.
-        depth: `common_ancestor_depth` of the rows; 0 is unrelated.
+        depth: `common_ancestor_depth` of the rows; 0 means unrelated.
         most_alike: cosine above which a row is dropped.
     """
     unit = means / np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12)
@@ -119,7 +119,7 @@ def instance_term(
     Args:
         means: mean feature of each mask.
         relations: per view.
-        settings: which reading, and Omega.
+        settings: the reading of L_ins, and Omega.
     """
     losses = []
     for view in relations:
@@ -144,10 +144,10 @@ def part_term(
 
     Args:
         means: mean feature of each mask.
-        halves: mean over a random half of its pixels.
-        other_halves: mean over the other pixels.
+        halves: mean feature over a random half of each mask's pixels.
+        other_halves: mean feature over the other pixels.
         relations: per view.
-        settings: which reading, and tau.
+        settings: the reading of L_part, and tau.
     """
     losses = []
     for view in relations:
@@ -175,7 +175,7 @@ class Contrast:
         masks: A.
         half_masks: A over a random half of each mask's pixels.
         pixels: n.
-        half_pixels: pixels of the halves.
+        half_pixels: number of pixels in the halves.
         relations: per view.
         settings: readings and weights.
     """
@@ -197,7 +197,7 @@ class Contrast:
     def weighted(
         self, features: Float32[np.ndarray, "N 3 D"], weights: tuple[float, float]
     ) -> tuple[float, Float32[np.ndarray, "N 3 D"]]:
-        """The weighted sum of L_ins and L_part and its gradient; a loss without weight costs nothing."""
+        """The weighted sum of L_ins and L_part, and its gradient; a loss of weight 0 is not computed."""
         means, halves = (values.requires_grad_() for values in self._means(features))
         losses = self._losses(means, halves, (weights[0] != 0, weights[1] != 0))
         total = weights[0] * losses[0] + weights[1] * losses[1]
@@ -208,14 +208,14 @@ class Contrast:
         return float(total.detach()), gradient
 
     def _means(self, features: np.ndarray) -> tuple[Tensor, Tensor]:
-        """Mean feature of each mask, and over its random half, in float64."""
+        """Mean feature of each mask and of its random half, in float64."""
         return (
             torch.from_numpy(self.masks.means(features)).double(),
             torch.from_numpy(self.half_masks.means(features)).double(),
         )
 
     def _losses(self, means: Tensor, halves: Tensor, wanted: tuple[bool, bool]) -> tuple[Tensor, Tensor]:
-        """L_ins and L_part; 0 for one that is not wanted."""
+        """L_ins and L_part; 0 for one that is not asked for."""
         n = torch.from_numpy(self.pixels).double()[:, None]
         half = torch.from_numpy(self.half_pixels).double()[:, None]
         others = (n * means - half * halves) / (n - half).clamp(min=1)

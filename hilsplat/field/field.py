@@ -1,7 +1,7 @@
 """The language field: one latent per Gaussian and level, and the stage that solves it.
 
-Geometry is frozen, so that everything the losses need is in the contributions: see `problem` for the
-quadratic part, `contrast` for the hierarchy losses and `solver` for how they are minimised.
+Geometry is frozen, so the contributions hold everything that the losses need: see `problem` for the quadratic
+part, `contrast` for the hierarchy losses and `solver` for how they are minimised.
 """
 
 import json
@@ -18,7 +18,7 @@ from hilsplat.base.artifacts import atomic_path, read_index, read_npz, sha256_of
 from hilsplat.base.device import compute_device
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.progress import stage_log
-from hilsplat.contributions.mask_operator import MaskOperator
+from hilsplat.contributions.mask_operator import MaskOperator, MaskProducts
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.autoencoder import autoencoder_file, load_latents, one_torch_thread
 from hilsplat.field.contrast import Contrast, view_relations
@@ -35,8 +35,8 @@ class LanguageField:
     """One latent per Gaussian and level.
 
     Attributes:
-        features: N Gaussians, L = 3 levels coarse to fine, D latent numbers; 0 where masks say nothing.
-        gaussians_sha256: digest of the PLY they belong to.
+        features: latents of N Gaussians at L = 3 levels, coarse to fine; 0 without a latent.
+        gaussians_sha256: digest of the PLY that they belong to.
         autoencoder_sha256: digest of the autoencoder that decodes them.
     """
 
@@ -57,16 +57,14 @@ class LanguageField:
         """Read `field.safetensors`.
 
         Raises:
-            ArtifactError: the file is missing, damaged or no language field.
+            ArtifactError: the file is missing, damaged or not a language field.
         """
         try:
             with safe_open(path, framework="np") as file:
                 about = json.loads(file.metadata()[METADATA_KEY])
                 return LanguageField(file.get_tensor("features"), **about)
         except (FileNotFoundError, SafetensorError, KeyError, TypeError) as error:
-            raise ArtifactError(
-                f"{path} cannot be read: {error}", fix="run the language stage again"
-            ) from error
+            raise ArtifactError(f"{path} cannot be read: {error}", fix="rerun the field stage") from error
 
 
 def run_field(
@@ -79,8 +77,8 @@ def run_field(
 ) -> None:
     """Solve the language field of a scene: `field.safetensors` and `field.report.json` beside it.
 
-    Nothing is random (halves of masks are fixed by the view's name), and the result does not depend on
-    `threads` (sums are taken in one order).
+    Nothing is random (the view's name seeds the halves of masks), and the result does not depend on `threads`
+    (sums have one order).
 
     Raises:
         MisalignedArtifactError: coverage trees or latents belong to other masks.
@@ -104,14 +102,14 @@ def run_field(
             settings.start,
         )
         relations = view_relations(contributions, parents, settings, masks.means(problem.lifted))
+        products: tuple[MaskProducts, MaskProducts] = masks, half_masks
         if device != "cpu":
             from hilsplat.contributions.cuda_algebra import DeviceMasks, DeviceQuadratic
 
-            masks, half_masks = DeviceMasks.of(masks, device), DeviceMasks.of(half_masks, device)
-            problem = replace(problem, masks=masks, quadratic=DeviceQuadratic.of(quadratic, device))
-        contrast = Contrast(
-            masks, half_masks, pixels, contributions.half_pixels.astype(np.float32), relations, settings
-        )
+            products = DeviceMasks.of(masks, device), DeviceMasks.of(half_masks, device)
+            problem = replace(problem, masks=products[0], quadratic=DeviceQuadratic.of(quadratic, device))
+        half_pixels = contributions.half_pixels.astype(np.float32)
+        contrast = Contrast(*products, pixels, half_pixels, relations, settings)
         features, report = solve_field(problem, contrast, settings)
         total_mass = contributions.mass().sum(axis=0, dtype=np.float64)
         features = keep_labelled(features, problem.mass, total_mass, settings.min_labelled_share)
@@ -136,7 +134,7 @@ def run_field(
 
 
 def report_path(field: Path) -> Path:
-    """Where the report of a field lies: `field.report.json` for `field.safetensors`."""
+    """Path of the report on a field: `field.report.json` for `field.safetensors`."""
     return Path(field).with_suffix(".report.json")
 
 
@@ -144,7 +142,7 @@ def read_parents(tree_folder: Path, contributions: Contributions) -> dict[str, n
     """Parent of each mask in the coverage tree of each view.
 
     Raises:
-        MisalignedArtifactError: a tree has another number of masks than the contributions.
+        MisalignedArtifactError: a tree has more or fewer masks than the contributions.
     """
     read_index(tree_folder)
     counts = np.bincount(contributions.view, minlength=len(contributions.views))
@@ -156,7 +154,7 @@ def read_parents(tree_folder: Path, contributions: Contributions) -> dict[str, n
                 f"the coverage tree of view {view} belongs to other masks",
                 expected=f"{count} masks",
                 found=f"{len(parent)} in {tree_folder}",
-                fix="run the coverage_tree and contributions stages again on the same masks",
+                fix="rerun the coverage_tree and contributions stages on the same masks",
             )
         parents[view] = parent
     return parents

@@ -1,4 +1,4 @@
-"""A linear code of CLIP vectors: their mean and principal directions, the alternative to the network."""
+"""A linear code of CLIP vectors, their mean and principal directions: the alternative to the network."""
 
 import json
 from pathlib import Path
@@ -15,9 +15,9 @@ METADATA_KEY = "hilsplat"
 class LinearCode:
     """e = unit(m + U z): d principal directions about the mean.
 
-    Nothing is trained and nothing is random. Averages of codes are codes of averages, which holds for
-    no network, and a cosine with any vector is a ratio of d numbers, so that relevancy needs no
-    decoding. What it gives up: a network bends its d numbers around the vectors of the scene.
+    Nothing is trained and nothing is random. The average of codes is the code of the average, which holds for
+    no network, and a cosine with any vector needs d products, so relevancy needs no decoding. The price: a
+    network can bend its d numbers around the vectors of the scene.
 
     Args:
         mean: m.
@@ -41,7 +41,7 @@ class LinearCode:
     def fit(vectors: Float32[np.ndarray, "B C"], latent: int) -> "LinearCode":
         """Principal directions of the vectors; each direction's largest component is positive.
 
-        Where the vectors span fewer than d directions, the rest is filled with any others.
+        If the vectors span fewer than d directions, arbitrary ones fill the rest.
         """
         data = vectors.astype(np.float64)
         mean = data.mean(axis=0)
@@ -64,10 +64,10 @@ class LinearCode:
         )
 
     def cosine_terms(self, vectors: Float32[np.ndarray, "V C"]) -> tuple:
-        """What cosines with the decoded vectors are made of.
+        """The terms of cosines with decoded vectors.
 
         Returns:
-            m.v and U v of each vector, |m|^2, and U m: with them e.v = (m.v + z.Uv) / |m + U z|.
+            m.v and U v of each vector, |m|^2, and U m: they give e.v = (m.v + z.Uv) / |m + U z|.
         """
         return (
             (vectors @ self.mean).astype(np.float32),

@@ -1,4 +1,4 @@
-"""Minimise a smooth function of the field in few steps, the same bytes on any number of threads."""
+"""Minimise a smooth function of the field in few steps, with the same bytes on any number of threads."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ SUFFICIENT_DECREASE = 1e-4
 MAX_HALVINGS = 12
 
 CHUNK = 2**18
-"""Numbers that a sum takes at a time: two megabytes in float64, whatever the size of the field."""
+"""Numbers to sum at a time: two megabytes in float64, whatever the size of the field."""
 
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
@@ -19,9 +19,9 @@ def lbfgs(objective: Objective, start: np.ndarray, steps: int, first_step: float
 
     Args:
         objective: value and gradient at a point.
-        start: where to begin.
-        steps: iterations; each costs one evaluation unless steps must be halved.
-        first_step: inverse curvature assumed before anything is known.
+        start: initial point.
+        steps: iterations; each costs one evaluation unless its step must be halved.
+        first_step: inverse curvature assumed before the first step.
     """
     point = start
     value, gradient = objective(point)

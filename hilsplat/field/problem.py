@@ -7,7 +7,7 @@ With the rendered map M = W F, the mask means A F, the areas n and the mask late
 - clustering loss L_h (Eq. 2):        tr F'GF - sum n |AF|^2
 - ridge: sum of visible mass x |F - F_lifted|^2
 
-One quadratic form, solved by a few conjugate-gradient steps from the lifted average.
+Together they are one quadratic form, solved by a few conjugate-gradient steps from the lifted average.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class QuadraticProblem:
         mass: G 1, the visible mass of each Gaussian at each level, px.
         pixels: n.
         latents: h.
-        lifted: the lifted average or median, towards which the ridge pulls.
+        lifted: the lifted average or median that the ridge pulls towards.
         weights: of the language loss, the clustering loss and the ridge.
     """
 
@@ -52,7 +52,7 @@ class QuadraticProblem:
         weights: tuple[float, float, float],
         start: Literal["average", "median"] = "average",
     ) -> "QuadraticProblem":
-        """Add mass and lift."""
+        """Compute the mass and the lifted latents."""
         mass = level_mass(quadratic)
         lifted = lifted_average(masks, mass, pixels, latents)
         if start == "median":
@@ -65,7 +65,7 @@ class QuadraticProblem:
         return max(float(self.pixels.sum(dtype=np.float64)), 1.0)
 
     def hessian_product(self, features: Float32[np.ndarray, "N 3 D"]) -> Float32[np.ndarray, "N 3 D"]:
-        """Half the Hessian of the sums, times the features."""
+        """Half the Hessian of the summed losses, times the features."""
         language, clustering, ridge = self.weights
         out = np.float32(language + clustering) * self.quadratic.product(features)
         if clustering:
@@ -74,7 +74,7 @@ class QuadraticProblem:
         return out + np.float32(ridge) * self.mass[:, :, None] * features
 
     def right_side(self) -> Float32[np.ndarray, "N 3 D"]:
-        """Where half the gradient of the sums vanishes: hessian_product(F) = right_side."""
+        """Right side of the optimality condition, hessian_product(F) = right_side()."""
         language, _, ridge = self.weights
         target = np.float32(language) * self.masks.spread(self.pixels[:, None] * self.latents)
         return target + np.float32(ridge) * self.mass[:, :, None] * self.lifted
@@ -102,9 +102,9 @@ class QuadraticProblem:
 def conjugate_gradient(
     problem: QuadraticProblem, start: Float32[np.ndarray, "N 3 D"], steps: int
 ) -> np.ndarray:
-    """Minimise the quadratic part by a few steps, preconditioned by the visible mass.
+    """Minimise the quadratic part in a few steps, preconditioned by the visible mass.
 
-    Levels and channels do not interact, so each has its own step sizes. Dot products are summed in
+    Levels and channels do not interact, so each has its own step size. Dot products are summed in
     float64 in a fixed order.
     """
     scale = problem.mass[:, :, None] * np.float32(max(sum(problem.weights), 1e-12))
@@ -143,5 +143,5 @@ def _channel_dot(
 def _ratio(
     above: Float64[np.ndarray, "3 D"], below: Float64[np.ndarray, "3 D"]
 ) -> Float32[np.ndarray, "3 D"]:
-    """Quotient, and 0 where a channel is already solved."""
+    """Quotient; 0 if a channel is already solved."""
     return np.where(below > 0, above / np.where(below > 0, below, 1), 0).astype(np.float32)

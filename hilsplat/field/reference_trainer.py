@@ -1,12 +1,12 @@
 """The reference trainer of the field: render one random view per step, after LangSplat and the paper.
 
-Slow on purpose. It is what the sparse solver is compared with: the same Gaussians, masks and latents,
-the loss taken on rendered pixels, Adam on the features.
+Slow on purpose: it is the reference for the sparse solver, with the same Gaussians, masks and latents, the
+loss on rendered pixels, and Adam on the features.
 
-Departs from minghanqin/LangSplat `train.py`: views are drawn with replacement (there each once before any
-comes again), the three levels are trained in one run on the same draws, rendered features are divided by
-alpha and thinly covered pixels left out, and features of Gaussians are not scaled to unit length before they
-are blended. `hilsplat.methods.langsplat`, the baseline of the tables, departs in other ways; see there.
+Departs from minghanqin/LangSplat `train.py`: views are drawn with replacement (there, each once before any is
+repeated), one run trains the three levels on the same draws, rendered features are divided by alpha, thinly
+covered pixels are left out, and features of Gaussians are not scaled to unit length before they are blended.
+`hilsplat.methods.langsplat`, the baseline in the tables, departs in other ways; see there.
 """
 
 import logging
@@ -54,9 +54,9 @@ def rendered_loss(
         rendered: blended features, the levels' channels side by side, premultiplied by alpha.
         alpha: coverage; thinly covered pixels do not count.
         labels: row of the painted mask at each pixel and level, -1 for none.
-        latents: of the view's masks.
-        kind: "l1": LangSplat's, absolute differences averaged over all pixels and channels, the
-            unlabelled counting as 0; "squared": the language loss of the sparse solver, squared
+        latents: latents of the view's masks.
+        kind: "l1": LangSplat's, absolute differences averaged over all pixels and channels, unlabelled
+            pixels counting as 0; "squared": the language loss of the sparse solver, squared
             distances averaged over labelled pixels of all levels (`latent_regression_loss`).
 
     Returns:
@@ -86,16 +86,16 @@ def run_reference(
     seed: int,
     threads: int,
 ) -> None:
-    """Train a field step by step; the same artifact as `field.run_field` writes.
+    """Train a field step by step, and write the same artifact as `field.run_field`.
 
     Features start from zero. The report beside the field holds the loss over steps and seconds.
 
     Args:
-        contributions_folder: for the order of masks alone; none of its matrices is read.
-        device: "auto", "cpu" or "cuda": what rasterises.
+        contributions_folder: gives the order of masks; none of its matrices is read.
+        device: "auto", "cpu" or "cuda" for the rasteriser.
 
     Raises:
-        MisalignedArtifactError: the contributions were made for other Gaussians.
+        MisalignedArtifactError: the contributions belong to other Gaussians.
     """
     scene = Scene.load(scene_folder)
     gaussians = load_ply(gaussians_ply)
@@ -127,6 +127,7 @@ def run_reference(
                 threads=threads,
                 device=chosen,
             )
+            assert shown.features is not None  # asked for above
             loss = rendered_loss(
                 shown.features, shown.alpha, labels[number], own_latents[number], settings.loss
             )

@@ -1,6 +1,6 @@
-"""Solve the field: lifted average, conjugate gradient, then L-BFGS where contrastive losses are on.
+"""Solve the field: lifted average, conjugate gradient, then L-BFGS if contrastive losses have a weight.
 
-More steps fit the noise of mask borders, so both solvers stop early.
+More steps would fit the noise of mask borders, so both solvers stop early.
 """
 
 import numpy as np
@@ -15,14 +15,14 @@ from hilsplat.settings import FieldSettings
 def solve_field(
     problem: QuadraticProblem, contrast: Contrast, settings: FieldSettings
 ) -> tuple[Float32[np.ndarray, "N 3 D"], dict[str, object]]:
-    """Lifted average, conjugate gradient, then L-BFGS where a contrastive weight is on.
+    """Lift, conjugate gradient, then L-BFGS if a contrastive loss has a weight.
 
     Returns:
-        the features, and a report: every term before and after, and gradient norms at the lift.
+        the features, and a report: every loss before and after each part, and gradient norms at the lift.
     """
     weights = (settings.weight_instance, settings.weight_part)
     total = problem.total_pixels
-    # The variables of L-BFGS are scaled by the root of the mass: the quadratic part is then about round.
+    # The variables of L-BFGS are scaled by the root of the mass, which makes the quadratic part nearly round.
     root = np.sqrt(problem.mass)[:, :, None]
     inverse_root = np.where(root > 0, 1 / np.maximum(root, 1e-10), 0).astype(np.float32)
     right = problem.right_side()
@@ -54,7 +54,7 @@ def solve_field(
 def gradient_norms(
     problem: QuadraticProblem, contrast: Contrast, inverse_root: Float32[np.ndarray, "N 3 1"]
 ) -> dict[str, float]:
-    """Norm of each unweighted term's gradient at the lifted average, in mass-scaled variables."""
+    """Gradient norm of each unweighted loss at the lifted average, in mass-scaled variables."""
     lifted, factor = problem.lifted, np.float32(2 / problem.total_pixels)
     curved = problem.quadratic.product(lifted)
     means = problem.masks.means(lifted)
@@ -73,16 +73,16 @@ def keep_labelled(
     total_mass: Float[np.ndarray, " N"],
     min_share: float,
 ) -> Float32[np.ndarray, "N 3 D"]:
-    """Take the latent from Gaussians that hardly any mask of a level holds.
+    """Remove the latents of Gaussians that masks of a level hardly hold.
 
-    Table and walls have no parts. But where a mask's border runs over them by a pixel, their Gaussians
-    get its latent in full, and answer to it all over: the regression asks labelled pixels alone.
+    Table and walls have no parts. Yet where the border of a mask strays onto them by a pixel, their Gaussians
+    get its latent in full and answer to it everywhere, since the regression sees labelled pixels only.
 
     Args:
         features: the solved field.
         mass: visible weight in labelled pixels of each level.
         total_mass: visible weight in all pixels.
-        min_share: of the weight that must lie in labelled pixels.
+        min_share: least share of the weight in labelled pixels.
     """
     share = mass / np.maximum(total_mass, 1e-12)[:, None]
     return np.where((share >= min_share)[:, :, None], features, np.float32(0)).astype(np.float32)

@@ -1,21 +1,21 @@
-"""LangSplat: one field per level by itself, L1 between rendered and painted codes, no tree.
+"""LangSplat: an independent field per level, L1 between rendered and painted codes, no tree.
 
-The published code renders a random view per step, each once before any comes again, and compares every
-labelled pixel (minghanqin/LangSplat `train.py`). Geometry is frozen, so what it renders is a product with
-fixed compositing weights; here these are computed once per view.
+The published code renders a random view per step, each view once before any is repeated, and compares every
+labelled pixel (minghanqin/LangSplat `train.py`). Geometry is frozen, so rendering is a product with fixed
+compositing weights, which we compute once per view.
 
 Departs from the published code:
-    - fewer steps, and pixels of a grid in place of all (`MethodSettings`);
-    - L1 is averaged over the labelled pixels of the grid; LangSplat averages over all pixels, the unlabelled
-      counting as 0, so that there a step of a view weighs as much as its masks cover;
-    - rendered codes are divided by alpha, as a query sees them, and pixels covered less than `MIN_ALPHA` are
-      left out; LangSplat compares what is premultiplied, wherever a mask is painted;
-    - codes of Gaussians are blended as they are; LangSplat scales each to unit length first;
+    - fewer steps, and a grid of pixels instead of all (`MethodSettings`);
+    - L1 is averaged over the labelled pixels of the grid; LangSplat averages over all pixels, unlabelled
+      ones counting as 0, so the weight of a view's step grows with the area of its masks;
+    - rendered codes are divided by alpha, as a query sees them, and pixels of alpha below `MIN_ALPHA`
+      are left out; LangSplat compares premultiplied codes wherever a mask is painted;
+    - codes of Gaussians are blended without scaling; LangSplat scales each to unit length first;
     - weights below `contributions.min_weight` are dropped.
 
-`hilsplat.field.reference_trainer` (loss `l1`) renders every step and takes all pixels and LangSplat's average
-over them. It is another trainer, not this one at full length: it draws views with replacement and trains the
-levels in one run; alpha and unit length are treated as here.
+`hilsplat.field.reference_trainer` (loss `l1`) renders at every step, and averages over all pixels as
+LangSplat does. It is a different trainer, not this one with more steps: it draws views with replacement and
+trains the levels in one run. It treats alpha and unit length as this one does.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ from hilsplat.settings import MethodSettings
 
 BETAS = (0.9, 0.999)
 EPS = 1e-15
-"""As the published optimiser is configured."""
+"""As in the published optimiser."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class LevelPixels:
 
     Attributes:
         weights: their compositing weights (pixels x Gaussians), rows summing to 1.
-        targets: code of the mask painted there.
+        targets: code of the mask painted at each pixel.
     """
 
     weights: sp.csr_matrix
@@ -49,11 +49,13 @@ class LevelPixels:
 
 @dataclass(frozen=True)
 class ViewPixels:
-    """Covered pixels of one view that are labelled at any level; most are at all, so weights are held once.
+    """Covered pixels of one view that are labelled at any level.
+
+    Most are labelled at all levels, so their weights are held once.
 
     Attributes:
         weights: their compositing weights (pixels x Gaussians), rows summing to 1.
-        labels: row of the mask painted there at each level, -1 if there is none.
+        labels: row of the mask painted there at each level, -1 for none.
         latents: code of each mask of the view.
     """
 
@@ -68,17 +70,17 @@ class ViewPixels:
         latents: Float32[np.ndarray, "m D"],
         grid: Int64[np.ndarray, " p"],
     ) -> "ViewPixels":
-        """Take pixels of a grid from all P of a view."""
+        """Choose the pixels of a grid from all P of a view."""
         covered = np.diff(weights.indptr)[grid] > 0
         pixels = grid[covered & (labels[grid] >= 0).any(axis=1)]
         return ViewPixels(weights[pixels], labels[pixels], latents)
 
     def is_labelled(self, level: Level) -> bool:
-        """Whether a mask of the level is painted anywhere."""
+        """Whether any pixel shows a mask of the level."""
         return bool((self.labels[:, level.index] >= 0).any())
 
     def at(self, level: Level) -> LevelPixels:
-        """Copy what a level labels, in order."""
+        """Copy the pixels that a level labels, in order."""
         rows = np.flatnonzero(self.labels[:, level.index] >= 0)
         return LevelPixels(self.weights[rows], self.latents[self.labels[rows, level.index]])
 
@@ -96,14 +98,14 @@ def l1_step(
 def train_level(
     views: list[ViewPixels], level: Level, num_gaussians: int, settings: MethodSettings, seed: int
 ) -> Float32[np.ndarray, "N D"]:
-    """Adam from zero, one random view per step (each once before any comes again).
+    """Train by Adam from zero, one random view per step, each once before any is repeated.
 
     Args:
         views: train views in which the level labels a pixel, at least one.
-        level: that is trained.
+        level: the level to train.
         num_gaussians: N.
         settings: steps and rate.
-        seed: of the order of views.
+        seed: for the order of views.
     """
     features = np.zeros((num_gaussians, views[0].latents.shape[1]), np.float32)
     first, second = np.zeros_like(features), np.zeros_like(features)
@@ -121,7 +123,7 @@ def train_level(
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Train the three levels one after the other, each with a seed of its own."""
+    """Train the three levels one after the other, each with its own seed."""
     contributions, latents = inputs.contributions, inputs.latents
     views: list[ViewPixels] = []
     for number, view in enumerate(track(list(contributions.views), "weights of views")):
@@ -139,7 +141,7 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
 
 
 def grid_pixels(size_hw: tuple[int, int], step: int) -> Int64[np.ndarray, " p"]:
-    """Row-major indices of every so many pixels of rows and columns."""
+    """Row-major indices of every `step`-th pixel of every `step`-th row."""
     rows, columns = np.arange(0, size_hw[0], step), np.arange(0, size_hw[1], step)
     return (rows[:, None] * size_hw[1] + columns[None]).ravel()
 

@@ -1,7 +1,7 @@
-"""What a baseline is: something that writes a language field from the artifacts that ours is solved from.
+"""What a baseline is: a function that makes a language field from the same artifacts as ours.
 
-Everything before (Gaussians, masks, CLIP vectors, the scene's code) and after it (queries, protocols,
-tables) is shared, so that a row tells what the method does and nothing else.
+Everything before it (Gaussians, masks, CLIP vectors, the scene's code) and after it (queries, protocols,
+tables) is shared, so that rows of a table differ only by method.
 """
 
 from collections.abc import Callable
@@ -27,10 +27,10 @@ from hilsplat.splat.rasterise.api import pixel_weights
 
 @dataclass(frozen=True)
 class MethodInputs:
-    """Artifacts of a scene, read when asked for.
+    """Artifacts of a scene, read on first use.
 
     Attributes:
-        scene_folder: scene artifact; only its train views may be used.
+        scene_folder: scene artifact; a method may use its train views only.
         gaussians_ply: 3DGS PLY, frozen.
         masks_folder: masks of the train views.
         contributions_folder: weights of each Gaussian in each mask.
@@ -67,7 +67,7 @@ class MethodInputs:
         return normalised_weights(weights)
 
     def view_labels(self, view: str) -> Int32[np.ndarray, "P 3"]:
-        """Row of the view's painted mask at each pixel and level, -1 if there is none."""
+        """Row of the view's painted mask at each pixel and level, -1 for none."""
         return label_maps(HierarchicalMasks.load(Path(self.masks_folder) / f"{view}.npz"))
 
     def view_size_hw(self, view: str) -> tuple[int, int]:
@@ -90,9 +90,9 @@ class Method:
 
     Attributes:
         name: key in the registry, and value of `method.name` in a variant.
-        title: as tables may write it.
-        source: repository or text it follows, and how it departs from it.
-        fit: (inputs, settings, seed) to the features of every Gaussian and level, (N, 3, D).
+        title: name for tables.
+        source: repository or paper that it follows, and how it departs from it.
+        fit: maps (inputs, settings, seed) to the features of every Gaussian and level, (N, 3, D).
     """
 
     name: str

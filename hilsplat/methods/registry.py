@@ -1,4 +1,4 @@
-"""The baselines by name. A new one is a file with a constant `METHOD` and a line here."""
+"""The baselines by name. To add one, write a file with a constant `METHOD` and add a line here."""
 
 from typing import TYPE_CHECKING
 
@@ -17,7 +17,7 @@ METHODS: Plugins["Method"] = Plugins(
 )
 
 OURS: str = MethodSettings().name
-"""The method of this repository, whose field the stage `field` solves."""
+"""The method of this repository; the stage `field` solves its field."""
 
 
 def require_method(name: str) -> None:
@@ -38,7 +38,7 @@ def method_of(name: str) -> "Method":
     """Load a baseline.
 
     Raises:
-        SettingsError: there is none of this name.
+        SettingsError: there is no baseline of this name.
     """
     require_method(name)
     if name == OURS:

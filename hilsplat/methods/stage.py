@@ -1,4 +1,4 @@
-"""The stage of a baseline: artifacts of a scene in, `field.safetensors` out."""
+"""The stage that runs a baseline: artifacts of a scene in, `field.safetensors` out."""
 
 from pathlib import Path
 
@@ -16,13 +16,13 @@ from hilsplat.settings import MethodSettings
 
 
 def run_method(inputs: MethodInputs, out: Path, settings: MethodSettings, seed: int) -> None:
-    """Let a baseline write the field of a scene.
+    """Compute the field of a scene by a baseline.
 
     Args:
         inputs: artifacts of the scene.
         out: `field.safetensors`.
         settings: which method, and its knobs.
-        seed: of everything random.
+        seed: for everything random.
 
     Raises:
         SettingsError: there is no such method.
@@ -35,7 +35,7 @@ def run_method(inputs: MethodInputs, out: Path, settings: MethodSettings, seed: 
         expected = (contributions.num_gaussians, len(LEVELS), inputs.latents.shape[1])
         if features.shape != expected or not np.isfinite(features).all():
             raise ArtifactError(
-                f"method {method.name} returned no language field",
+                f"method {method.name} did not return a language field",
                 expected=f"finite features of shape {expected}",
                 found=f"shape {features.shape}, {np.count_nonzero(~np.isfinite(features))} not finite",
                 fix=f"correct hilsplat/methods/{method.name}.py",

@@ -1,4 +1,4 @@
-"""Ask a finished scene for a text: a ranked list in words, and a picture."""
+"""Ask a finished scene for a text: a ranked list as text, and a picture."""
 
 import re
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ from hilsplat.segment.origin import made_from_truth, masks_label
 from hilsplat.semantic_tree.export import write_selection_ply
 
 LISTED = 10
-"""Answers listed at most."""
+"""Most answers to list."""
 
 
 def answer(
@@ -43,20 +43,21 @@ def answer(
     """Ask a scene; write `panel.png` and `selection.ply`, and say what was found.
 
     Args:
-        folder: `results/<dataset>/<scene>`, or wherever that folder is now.
+        folder: `results/<dataset>/<scene>`, or a copy of it anywhere.
         text: words, or a path such as "bear > head > nose".
         level: auto, whole, part or subpart.
-        variant: whose files answer.
-        views: views in the panel.
+        variant: named set of settings whose files answer.
+        views: number of views in the panel.
         answerer: "tree" or "field", see `LanguageScene.query`.
-        view: asks only for what it shows, and comes first in the panel; None: the whole scene.
+        view: restricts the answers to what this view shows, and puts it first in the panel; None: the
+            whole scene.
         out: folder of both files; by default `queries/<text>` in the scene's folder.
-        device: "cpu" or "cuda": where the field is looked up.
-        threads: threads for rendering.
+        device: "cpu" or "cuda" for look-ups of the field.
+        threads: number of threads for rendering.
 
     Raises:
         ArtifactError: the scene is not finished.
-        SettingsError: level, answerer, view or device are unknown.
+        SettingsError: the level, answerer, view or device is unknown.
         DeviceError: cuda was asked for and torch finds no device.
     """
     found = FinishedScene.locate(Path(folder), variant)
@@ -85,9 +86,9 @@ def query_panel(
     note: str = "",
     answerer: str = "tree",
 ) -> None:
-    """Draw a query: per view photograph, answer and relevancy at three levels; the scene from above.
+    """Draw a query: photograph, answer and relevancy at three levels per view, and the scene from above.
 
-    `note` ends the title, and doubts follow it. With the answerer "field", relevancy is the field's.
+    `note` ends the title; doubts follow below it. With the answerer "field", relevancy is that of the field.
     """
     last = path_of(text)[-1]
     size_hw = scene.scene.cameras[views[0]].size_hw
@@ -98,7 +99,8 @@ def query_panel(
     found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
     title = f"“{text}” in {scene.scene.name}: {found}{note}"
     figure.suptitle("\n".join([title, *map(str, doubts_of(scene, hits))]), fontsize=12, fontweight="bold")
-    upper, lower = figure.subfigures(2, 1, height_ratios=[len(views) * row_in, map_in])
+    heights = [len(views) * row_in, map_in]
+    (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)
     grid = upper.subplots(len(views), columns, squeeze=False)
     for axes, view in zip(grid, views, strict=True):
         image, mask = scene.image(view), scene.node_masks(view, hits.ids)
@@ -116,14 +118,15 @@ def query_panel(
             show(
                 axes[2 + each.index], picture, f"relevancy, {each.label}: {top:.2f}", bold=each is hits.level
             )
-    selected = np.isin(scene.tree.node_of_gaussian, hits.ids).any(axis=1)
+    selected = np.zeros(len(scene.gaussians), np.bool_)
+    selected[scene.gaussians_of(hits.ids)] = True
     title = f"from above: {np.count_nonzero(selected)} of {len(selected)} Gaussians; triangles are cameras"
     show_from_above(lower.subplots(), scene.gaussians, scene.scene.cameras, selected, title)
     save_figure(figure, out_png)
 
 
 def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]:
-    """Views that show the best answers largest, each once; then others, spread over the scene."""
+    """Views that show the best answers largest, without repeats, then others spread over the scene."""
     best = [view for hit in hits for view in hit.best_views[:1]] + [v for hit in hits for v in hit.best_views]
     every = scene.scene.views()
     spread = [every[number * len(every) // count] for number in range(count)]
@@ -131,13 +134,13 @@ def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]
 
 
 def report(scene: LanguageScene, text: str, found: NodeHits, view: str | None = None) -> str:
-    """The answers in words, and what is doubtful about them; with a view, to what was asked of it alone."""
+    """The answers as text, with doubts; `view` is the one that the query was restricted to."""
     place = scene.scene.name if view is None else f"what {view} shows of {scene.scene.name}"
     hits, doubts = hits_of(scene, found, LISTED), doubts_of(scene, found)
     if not hits:
         levels = ", ".join(f"--level {each.label}" for each in LEVELS if each is not found.level)
-        more = "" if view is None else ", or leave --view out"
-        return f"nothing in {place} answers to {text!r} at level {found.level.label}; try {levels}{more}"
+        other = "" if view is None else ", or leave out --view"
+        return f"nothing in {place} answers to {text!r} at level {found.level.label}; try {levels}{other}"
     lengths = "metres" if scene.scene.unit == "metre" else "scene units"
     lines = [
         f"{counted(len(hits), 'answer')} to {text!r} in {place}; lengths in {lengths}",
@@ -167,6 +170,6 @@ def counted(count: int, noun: str) -> str:
 
 
 def file_name(text: str) -> str:
-    """A folder name that is safe on every system, such as `bear--nose`."""
+    """Folder name for a query that is safe on every system, such as `bear--nose`."""
     words = [re.sub(r"[^\w.-]+", "-", part).strip("-.") for part in text.split(PATH_SEPARATOR)]
     return "--".join(word for word in words if word) or "query"

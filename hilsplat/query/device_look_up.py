@@ -1,4 +1,4 @@
-"""Look-ups of relevancy by torch, for CUDA devices; tested on torch's CPU where there is none."""
+"""Look-ups of relevancy by torch, for CUDA devices; tested on torch's CPU if there is none."""
 
 from dataclasses import dataclass
 
@@ -13,11 +13,11 @@ from hilsplat.query.projected_look_up import PlacedProjected
 
 @dataclass(frozen=True)
 class PlacedOnDevice:
-    """What the CPU's look-ups keep of a view, on a device.
+    """What look-ups on the CPU keep of a view, on a device.
 
     Attributes:
-        channels: latents or coordinates (R, P), in the type they are kept in.
-        length: of each decoded vector (P); None where vectors are unit.
+        channels: latents or coordinates (R, P), in their stored type.
+        length: of each decoded vector (P); None if these have unit length.
         generic: cosine with the nearest canonical phrase (P).
         directions: of the coordinates; None for latents.
     """
@@ -29,7 +29,7 @@ class PlacedOnDevice:
 
     @staticmethod
     def of(placed: PlacedLinear | PlacedProjected, device: str) -> "PlacedOnDevice":
-        """Move what was placed."""
+        """Copy to a device what the CPU's look-ups keep."""
         generic = torch.from_numpy(placed.generic).to(device)
         if isinstance(placed, PlacedLinear):
             channels, length = (torch.from_numpy(a).to(device) for a in (placed.channels, placed.length))
@@ -40,7 +40,7 @@ class PlacedOnDevice:
 
     @property
     def nbytes(self) -> int:
-        """Memory held, on the device and beside it."""
+        """Memory held on the device and the host."""
         tensors = [self.channels, self.generic, *([] if self.length is None else [self.length])]
         return sum(tensor.nbytes for tensor in tensors) + (
             0 if self.directions is None else self.directions.nbytes

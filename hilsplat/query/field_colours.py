@@ -7,9 +7,9 @@ from jaxtyping import Float32
 def field_colours(features: Float32[np.ndarray, "N D"]) -> Float32[np.ndarray, "N 3"]:
     """Three principal directions of a level's features over all Gaussians, stretched to [0, 1].
 
-    Each direction's sign is fixed (largest component positive) and its 2nd to 98th percentile is
-    stretched to the colour range, so that views share their colours. Gaussians without a feature are
-    black, and so is what is missing where there are fewer than three directions.
+    The largest component of each direction is positive, and its 2nd to 98th percentile is stretched to the
+    colour range, so that views share their colours. Gaussians without a feature are black; with fewer than
+    three directions, the remaining channels are 0.
     """
     values = features.astype(np.float64)
     seen = np.square(values).sum(axis=1) > 0

@@ -1,4 +1,4 @@
-"""One answer to a text, for people: what was found, where, in which views, and what is doubtful about it."""
+"""Answers for people: what was found, where, in which views, and what is doubtful about it."""
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -22,8 +22,8 @@ class Doubt:
 
     Attributes:
         text: the text.
-        level: the level at which it was searched, if nodes of another level do answer it; else None.
-        score: of the best node of that level, or of any; at most 0.5, and 0 if there is none.
+        level: the level that was searched, if nodes of another level do answer the text; else None.
+        score: of the best node at that level, or at any; at most 0.5, and 0 if there is none.
     """
 
     text: str
@@ -52,7 +52,7 @@ class Hit:
         oriented_box: the box along the node's own axes.
         best_views: up to three train views that show it largest.
         route: as in `NodeHits`.
-        doubts: texts of the query that nothing answers; the whole path is worth no more than its first text.
+        doubts: texts of the query that nothing answers; a path is no better than its first text.
     """
 
     node: int
@@ -72,7 +72,7 @@ class Hit:
         return self._scene.gaussians_of([self.node])
 
     def mask(self, view: str) -> Bool[np.ndarray, "H W"]:
-        """Pixels of a view of which the node's Gaussians make up more than half.
+        """Pixels of a view that consist of the node's Gaussians by more than half.
 
         Raises:
             SettingsError: the scene has no such view.
@@ -81,7 +81,7 @@ class Hit:
 
 
 def hits_of(scene: "LanguageScene", found: NodeHits, limit: int) -> list[Hit]:
-    """Describe the best of the nodes that answered, at most `limit`."""
+    """Describe the best nodes that answered, at most `limit`."""
     tree, doubts = scene.tree, doubts_of(scene, found)
     hits = []
     for node, margin in zip(found.ids[:limit].tolist(), found.margins[:limit], strict=True):

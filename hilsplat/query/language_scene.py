@@ -1,7 +1,7 @@
 """A finished scene that answers texts, by the nodes of its semantic tree or by its decoded language field.
 
-`hilsplat.open` opens it, docs/python.md shows how to ask it. A text reaches its Gaussians in one chain:
-`query` reads it, `select` searches the tree by cosine margins (`node_search.search`), and a `Hit` knows its
+`hilsplat.open` opens it; docs/python.md shows how to query it. A text reaches its Gaussians in one chain:
+`query` parses it, `select` searches the tree by cosine margins (`node_search.search`), and a `Hit` has its
 Gaussians.
 """
 
@@ -41,7 +41,7 @@ from hilsplat.splat.gaussians import Gaussians
 PATH_SEPARATOR = ">"
 
 MIN_SHOWN_SHARE = 1e-4
-"""Of a view: 14 px at 384 x 384 px show nothing."""
+"""Least share of a view that shows a node: 14 px of 384 x 384 show nothing."""
 
 MIN_LATENT_SHARE = 0.5
 """A pixel has a latent at a level if Gaussians with one make up more than this share of it."""
@@ -51,7 +51,7 @@ Answerer = Literal["tree", "field"]
 
 
 class Opened:
-    """Artifacts by path: variants of a scene share most of theirs, and each is opened and hashed once."""
+    """Artifacts by path: variants of a scene share most of them, so each is opened and hashed once."""
 
     def __init__(self) -> None:
         self._kept: dict[tuple[Hashable, ...], Any] = {}
@@ -71,13 +71,13 @@ class LanguageScene:
     Attributes:
         scene: cameras and views.
         gaussians: frozen geometry.
-        tree: nodes.
+        tree: the nodes.
         language: the field.
-        autoencoder: its decoder.
+        autoencoder: decodes the field.
         encode_texts: unit CLIP vectors of texts.
         pixel_weights: compositing weights of a view (pixels x Gaussians).
         settings: canonical phrases, scale of the relevancy, and how nodes are selected.
-        threads: for look-ups.
+        threads: number of threads for look-ups.
         device: "cpu" or "cuda", for look-ups of the field.
     """
 
@@ -98,22 +98,22 @@ class LanguageScene:
     def open(
         folder: Path | str, variant: str = "default", *, threads: int = 1, device: str = "cpu"
     ) -> "LanguageScene":
-        """Open `results/<dataset>/<scene>` with the settings that made it, wherever that folder is now.
+        """Open `results/<dataset>/<scene>`, or a copy of it anywhere, with the settings that made it.
 
-        Canonical phrases, template, scale and what selects nodes are those that the variant was evaluated
-        with, read from its provenance; of a scene without labels those that its panel was drawn with.
+        Canonical phrases, template, scale and the selection of nodes are those of the variant's evaluation,
+        or of its panel if the scene has no labels, read from the provenance.
 
         Args:
-            folder: of a finished scene.
+            folder: a finished scene.
             variant: named set of settings whose files answer.
-            threads: for rasterising and look-ups.
-            device: "cpu" or "cuda": where the field is looked up (`field_relevancy` with exact=False).
+            threads: number of threads for rasterising and look-ups.
+            device: "cpu" or "cuda", for look-ups of the field (`field_relevancy` with exact=False).
 
         Raises:
             ArtifactError: the scene is not finished.
             MisalignedArtifactError: its parts do not belong together.
             ModelError: the CLIP that embedded its masks is not found.
-            DeviceError: cuda was asked for and torch finds no device.
+            DeviceError: the device is cuda, and torch finds none.
         """
         found = FinishedScene.locate(Path(folder), variant)
         settings = found.evaluate_settings()
@@ -131,14 +131,14 @@ class LanguageScene:
         """Read a scene's artifacts, each once, and check that they belong together.
 
         Args:
-            parts: where they are.
-            settings: how it answers; all of it.
+            parts: paths of the artifacts.
+            settings: how the scene answers.
             threads: as in `open`.
             device: as in `open`.
-            opened: what other variants of the scene opened before.
+            opened: artifacts that other variants of the scene opened before.
 
         Raises:
-            MisalignedArtifactError: tree or field were made for other Gaussians, or the field for
+            MisalignedArtifactError: the tree or field was made for other Gaussians, or the field for
                 another autoencoder.
             ModelError: the CLIP that embedded the masks is not found.
         """
@@ -194,18 +194,18 @@ class LanguageScene:
 
         Args:
             text: words, or words separated by ">".
-            level: "whole", "part", "subpart" or "auto"; of a path, that of its last text.
-            answerer: "tree": nodes answer with their averaged CLIP vectors; "field": with what the
-                paper's field holds for their Gaussians, decoded.
-            view: name of a view, to ask only for what it shows; None: the whole scene.
-            threshold: hits are at most 1 - threshold of the range of the level's margins below the best
-                one (that the view shows), and three times as far if they look like it; None: the scene's
-                own (`node_select`).
-            limit: answers at most.
+            level: "whole", "part", "subpart" or "auto"; for a path, the level of its last text.
+            answerer: "tree": nodes answer with their averaged CLIP vectors; "field": with the decoded
+                mean of the paper's field over their Gaussians.
+            view: name of a view, to find only what it shows; None: the whole scene.
+            threshold: a hit's margin is at most (1 - threshold) times the range of the level's margins
+                below the best one (that the view shows), or three times that if it looks like the best;
+                None: the scene's `node_select`.
+            limit: most answers to return.
 
         Raises:
-            SettingsError: the text is empty, level, answerer or view are unknown, or a path has more texts
-                than levels.
+            SettingsError: the text is empty, the level, answerer or view is unknown, or a path has more
+                texts than levels.
         """
         found = self.find(text, level, answerer=answerer, view=view, threshold=threshold)
         return hits_of(self, found, limit)
@@ -219,7 +219,7 @@ class LanguageScene:
         view: str | None = None,
         threshold: float | None = None,
     ) -> NodeHits:
-        """Like `query`, as rows of the tree."""
+        """Like `query`, but return rows of the tree."""
         path = path_of(text)
         if answerer not in get_args(Answerer):
             raise SettingsError(
@@ -244,17 +244,17 @@ class LanguageScene:
         view: str | None = None,
         threshold: float | None = None,
     ) -> NodeHits:
-        """The search behind every answer: `query` and `find` of texts that are already apart.
+        """The search behind every answer: `query` and `find` call it with the texts of a path.
 
         Args:
             path: one text, or several from coarse to fine.
-            level: of the last text; None: chosen by the search.
+            level: level of the last text; None: chosen by the search.
             answerer: as in `query`.
             view: as in `query`.
             threshold: as in `query`.
 
         Raises:
-            SettingsError: the view is unknown, or the path is empty or longer than there are levels.
+            SettingsError: the view is unknown, or the path is empty or has more texts than levels.
         """
         return search(
             self.tree,
@@ -273,8 +273,8 @@ class LanguageScene:
 
         def measure() -> np.ndarray:
             num = len(self.tree)
-            area_px = sum(self._view_nodes(view, level).area_px(num) for level in LEVELS)
-            return area_px >= MIN_SHOWN_SHARE * height * width
+            area_px = np.sum([self._view_nodes(view, level).area_px(num) for level in LEVELS], axis=0)
+            return np.asarray(area_px >= MIN_SHOWN_SHARE * height * width)
 
         return self._views.get(("shown", view), measure, lambda kept: kept.nbytes)
 
@@ -283,7 +283,7 @@ class LanguageScene:
         return np.flatnonzero(np.isin(self.tree.node_of_gaussian, np.asarray(ids)).any(axis=1))
 
     def node_masks(self, view: str, ids: Sequence[int] | Int64[np.ndarray, " n"]) -> Bool[np.ndarray, "H W"]:
-        """Pixels of which Gaussians of the nodes make up more than half; none for no nodes."""
+        """Pixels that consist of the nodes' Gaussians by more than half."""
         ids = np.asarray(ids, np.int64)
         height, width = self._camera(view).size_hw
         if not len(ids):
@@ -305,7 +305,7 @@ class LanguageScene:
         return self.scene.cameras.names
 
     def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
-        """The undistorted photograph of a view; read-only, as it is kept: copy it to draw on it."""
+        """The undistorted photograph of a view; read-only because it is cached, so copy it to draw on it."""
         self._camera(view)
 
         def read() -> np.ndarray:
@@ -339,7 +339,7 @@ class LanguageScene:
         return np.stack([self._texts[text] for text in texts])
 
     def node_margins(self, texts: Sequence[str], answerer: Answerer = "tree") -> Float32[np.ndarray, "T n"]:
-        """Cosine margin of every node for every text, against this scene's canonical phrases."""
+        """Cosine margin of every node for every text, over this scene's canonical phrases."""
         if not len(texts):
             return np.zeros((0, len(self.tree)), np.float32)
         canonical = self.text_vectors(self.settings.canonical)
@@ -354,15 +354,15 @@ class LanguageScene:
         return float(relevancy_of_margins(np.array([margin]), self.settings.relevancy_scale)[0])
 
     def node_vectors(self, answerer: Answerer = "tree") -> Float32[np.ndarray, "n C"]:
-        """Unit vectors by which nodes answer: their own, or what the field holds for their Gaussians."""
+        """Unit vectors that nodes answer with: their own, or decoded from the field of their Gaussians."""
         return self.tree.clip if answerer == "tree" else self._node_field_vectors
 
     def node_relevancy_map(self, texts: Sequence[str], view: str) -> Float32[np.ndarray, "T 3 H W"]:
-        """Relevancy of the nodes a pixel shows, blended by its weights, at each level.
+        """Relevancy of the nodes that a pixel shows, blended by its weights, at each level.
 
-        Gaussians without a node count as the level's least relevant node. Pixels that the Gaussians do
-        not cover get the least relevancy of the covered ones, so that they are never selected and do
-        not stretch the range.
+        Gaussians without a node count as the least relevant node of the level. Pixels that the Gaussians do
+        not cover get the least relevancy of the covered ones, so that they are never selected and do not
+        stretch the range.
         """
         scores = self.node_relevancy(texts)
         height, width = self._camera(view).size_hw
@@ -379,27 +379,26 @@ class LanguageScene:
     def field_relevancy(
         self, texts: Sequence[str], view: str, *, exact: bool = True
     ) -> Float32[np.ndarray, "T 3 H W"]:
-        """Rendered latent -> decoder -> relevancy, at every pixel and level, as the paper answers.
+        """Rendered latent -> decoder -> relevancy, at every pixel and level, as in the paper.
 
-        Pixels that show mostly Gaussians without a latent at the level are as the uncovered ones of
-        `node_relevancy_map`.
+        Pixels that show mostly Gaussians without a latent at the level count as uncovered (see
+        `node_relevancy_map`).
 
         Args:
             texts: queries.
             view: name of the view.
-            exact: a network decodes every pixel for every call; else a view is decoded once and answers
-                within 2e-3 of that (see `latent_relevancy`). A linear code has one way.
+            exact: True: a network decodes every pixel at every call; False: a view is decoded once, and
+                answers differ by at most 2e-3 (see `latent_relevancy`). No difference for a linear code.
         """
-        by_look_up = self._latent_relevancy.is_linear or not exact
-        shown, placed = self._view_latents(view), self._placed_latents(view) if by_look_up else None
-        vectors = self.text_vectors(texts)
         answer = self._latent_relevancy
+        shown, vectors = self._view_latents(view), self.text_vectors(texts)
+        placed = self._placed_latents(view) if answer.is_linear or not exact else None
         height, width = self._camera(view).size_hw
         maps = np.zeros((len(texts), len(LEVELS), height * width), np.float32)
         for index, (pixels, latents) in enumerate(shown):
             if not len(pixels):
                 continue
-            found = answer.fast(placed[index], vectors) if by_look_up else answer.exact(latents, vectors)
+            found = answer.exact(latents, vectors) if placed is None else answer.fast(placed[index], vectors)
             for row, level_map in zip(found, maps[:, index], strict=True):
                 if len(pixels) == len(level_map):
                     level_map[:] = row
@@ -417,7 +416,7 @@ class LanguageScene:
     # -- what is kept of a view -------------------------------------------------------------------
 
     def view_weights(self, view: str) -> sp.csr_matrix:
-        """W of a view with rows divided by alpha, empty below half coverage."""
+        """W of a view with rows divided by alpha; rows of alpha below a half are empty."""
         return self._views.get(
             ("weights", view),
             lambda: normalised_weights(self.pixel_weights(view)),
@@ -432,7 +431,7 @@ class LanguageScene:
         )
 
     def _view_latents(self, view: str) -> list[tuple[np.ndarray, Float32[np.ndarray, "P D"]]]:
-        """Per level the pixels that show mostly Gaussians with a latent, and their rendered latents."""
+        """Per level, the pixels that show mostly Gaussians with a latent, and their rendered latents."""
 
         def render() -> list[tuple[np.ndarray, np.ndarray]]:
             weights = self.view_weights(view)
@@ -442,7 +441,8 @@ class LanguageScene:
                 has = (own != 0).any(axis=1).astype(np.float32)
                 share = weights @ has
                 pixels = np.flatnonzero(share > MIN_LATENT_SHARE)
-                # Gaussians without a latent hold zeros, which a code would read as one: they do not count.
+                # Gaussians without a latent hold zeros, which a code would decode like any other: leave them
+                # out.
                 shown.append((pixels, ((weights[pixels] @ own) / share[pixels, None]).astype(np.float32)))
             return shown
 
@@ -451,7 +451,7 @@ class LanguageScene:
         )
 
     def _placed_latents(self, view: str) -> list:
-        """What look-ups of a view need, level by level; made when it is first looked up."""
+        """What look-ups of a view need, level by level; made at its first look-up."""
         return self._views.get(
             ("placed", view),
             lambda: [self._latent_relevancy.prepare(latents) for _, latents in self._view_latents(view)],
@@ -484,6 +484,7 @@ def path_of(text: str) -> tuple[str, ...]:
     path = tuple(part.strip() for part in text.split(PATH_SEPARATOR))
     if not all(path):
         raise SettingsError(
-            f"the query {text!r} has an empty text", fix='write words, or a path such as "bear > head > nose"'
+            f"a text of the query {text!r} is empty",
+            fix='write words, or a path such as "bear > head > nose"',
         )
     return path

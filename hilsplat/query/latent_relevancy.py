@@ -1,7 +1,7 @@
 """Relevancy of rendered latents without decoding every pixel.
 
-- a linear code (PCA): cosines are ratios of d numbers and need no decoding at all (`linear_look_up`).
-- a network: a view is decoded once and kept as coordinates in few directions (`projected_look_up`).
+- A linear code (PCA): cosines follow from the d numbers of a latent without decoding (`linear_look_up`).
+- A network: a view is decoded once and kept as coordinates along few directions (`projected_look_up`).
 """
 
 from collections.abc import Callable
@@ -31,8 +31,8 @@ class LatentRelevancy:
         code: decodes latents.
         canonical: unit vectors of the generic phrases.
         scale: of the cosines.
-        threads: pixels are shared among them; results do not depend on it.
-        device: "cpu", or "cuda": where the fast way runs; the same to rounding.
+        threads: number of threads that share the pixels; results do not depend on it.
+        device: "cpu" or "cuda" for `fast`; results are equal up to rounding.
     """
 
     def __init__(
@@ -45,15 +45,18 @@ class LatentRelevancy:
     ) -> None:
         self._device = compute_device(device)
         self._code, self._canonical, self._scale, self._threads = code, canonical, scale, threads
+        self._look_up: LinearLookUp | ProjectedLookUp = (
+            LinearLookUp(code, canonical, scale)
+            if isinstance(code, LinearCode)
+            else ProjectedLookUp(code, canonical, scale)
+        )
         self.is_linear = isinstance(code, LinearCode)
-        """Whether the fast way loses nothing but rounding."""
-        look_up = LinearLookUp if self.is_linear else ProjectedLookUp
-        self._look_up = look_up(code, canonical, scale)
+        """Whether `fast` equals `exact` up to rounding."""
 
     def exact(
         self, latents: Float32[np.ndarray, "P D"], texts: Float32[np.ndarray, "T C"]
     ) -> Float32[np.ndarray, "T P"]:
-        """By decoding every latent."""
+        """Relevancy by decoding every latent."""
         out = np.empty((len(texts), len(latents)), np.float32)
 
         def decode(span: slice) -> None:
@@ -64,7 +67,8 @@ class LatentRelevancy:
         return out
 
     def prepare(self, latents: Float32[np.ndarray, "P D"]) -> Placed:
-        """What a look-up of these latents needs; once per view."""
+        """Prepare these latents for look-ups; once per view."""
+        placed: PlacedLinear | PlacedProjected
         if isinstance(self._look_up, LinearLookUp):
             placed = self._look_up.place(latents)
         else:
@@ -76,7 +80,7 @@ class LatentRelevancy:
         placed: Placed,
         texts: Float32[np.ndarray, "T C"],
     ) -> Float32[np.ndarray, "T P"]:
-        """The fast way of this code; see the module for which that is.
+        """Relevancy by the look-up for this code (see the module).
 
         Args:
             placed: what `prepare` returned.
@@ -85,20 +89,33 @@ class LatentRelevancy:
         out = np.empty((len(texts), len(placed.generic)), np.float32)
         for text, row in zip(texts, out, strict=True):
             if isinstance(placed, PlacedOnDevice):
-                row[:] = placed.relevancy(*self._look_up.text_weights(placed, text), self._scale)
+                row[:] = placed.relevancy(*self._text_weights(placed, text), self._scale)
                 continue
 
             def answer(span: slice, text: np.ndarray = text, row: np.ndarray = row) -> None:
-                self._look_up.look_up(placed, span, text, row[span])
+                if isinstance(self._look_up, LinearLookUp):
+                    assert isinstance(placed, PlacedLinear)  # `prepare` made it
+                    self._look_up.look_up(placed, span, text, row[span])
+                else:
+                    assert isinstance(placed, PlacedProjected)
+                    self._look_up.look_up(placed, span, text, row[span])
 
             self._in_parts(answer, len(placed.generic))
         return out
 
+    def _text_weights(
+        self, placed: PlacedOnDevice, text: Float32[np.ndarray, " C"]
+    ) -> tuple[np.float32, Float32[np.ndarray, " R"]]:
+        if isinstance(self._look_up, LinearLookUp):
+            return self._look_up.text_weights(text)
+        assert placed.directions is not None  # those of a network's latents
+        return self._look_up.text_weights(placed.directions, text)
+
     def _decode_in_parts(self, work: Callable[[slice], None], count: int) -> None:
-        """`_in_parts` for work that decodes; torch takes one thread, as the parts share the cores."""
+        """`_in_parts` for work that decodes: torch takes one thread, since the parts share the cores."""
 
         def alone(span: slice) -> None:
-            torch.set_num_threads(1)  # holds for one thread of the pool
+            torch.set_num_threads(1)  # applies to this thread of the pool only
             work(span)
 
         with one_torch_thread():

@@ -1,8 +1,9 @@
-"""Relevancy of latents of a linear code, from ratios of d numbers; nothing is decoded.
+"""Relevancy of the latents of a linear code, without decoding them.
 
-A latent's length and its nearest canonical phrase depend on no text, so that they are found once per view.
-A text then costs d products a pixel. Latents lie channel by channel, which lets the compiler take eight or
-sixteen pixels at once; the limit is reading them: 138 MB for three levels of a 986 x 728 view at d = 16.
+The length of a decoded latent and its nearest canonical phrase do not depend on the text, so they are found
+once per view. A text then costs d products per pixel. Latents are stored channel by channel, which lets the
+compiler process eight or sixteen pixels at once; the limit is reading them: 138 MB for three levels of a 986
+x 728 view at d = 16.
 """
 
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ class PlacedLinear:
 
     Attributes:
         channels: latents, one row per channel.
-        length: of each decoded vector before it is made unit.
+        length: of each decoded vector before normalisation.
         generic: cosine with the nearest canonical phrase.
     """
 
@@ -35,14 +36,14 @@ class PlacedLinear:
 
 
 class LinearLookUp:
-    """Relevancy of a linear code's latents, equal to that of the decoded vectors but for rounding."""
+    """Relevancy of a linear code's latents, equal to that of the decoded vectors up to rounding."""
 
     def __init__(self, code: LinearCode, canonical: Float32[np.ndarray, "K C"], scale: float) -> None:
         self._code, self._scale = code, np.float32(scale)
         self._offsets, self._slopes, self._mean_square, self._cross = code.cosine_terms(canonical)
 
     def place(self, latents: Float32[np.ndarray, "P D"]) -> PlacedLinear:
-        """What no text changes."""
+        """Compute all that does not depend on the text."""
         channels = np.ascontiguousarray(latents.T, np.float32)
         length, generic = (np.empty(len(latents), np.float32) for _ in range(2))
         lengths_and_generic(
@@ -63,15 +64,13 @@ class LinearLookUp:
         text: Float32[np.ndarray, " C"],
         out: Float32[np.ndarray, " p"],
     ) -> None:
-        """Write the relevancy of a text at the latents of a span."""
-        offset, slope = self.text_weights(placed, text)
+        """Write the relevancy of a text for a span of latents."""
+        offset, slope = self.text_weights(text)
         linear_relevancy(
             placed.channels, placed.length, placed.generic, span.start, offset, slope, self._scale, out
         )
 
-    def text_weights(
-        self, placed: object, text: Float32[np.ndarray, " C"]
-    ) -> tuple[np.float32, Float32[np.ndarray, " D"]]:
-        """A text's cosine is (offset + weights . channels) / length; the same for every view."""
+    def text_weights(self, text: Float32[np.ndarray, " C"]) -> tuple[np.float32, Float32[np.ndarray, " D"]]:
+        """Offset and weights of a text, whose cosine is (offset + weights . channels) / length."""
         offsets, slopes, _, _ = self._code.cosine_terms(text[None])
         return offsets[0], slopes[0]

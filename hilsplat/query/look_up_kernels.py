@@ -1,17 +1,17 @@
-"""Loops of the look-ups of relevancy: weighted sums of channels, and what they say of a text."""
+"""Compiled loops of the look-ups: weighted sums of channels, and the relevancy that they give."""
 
 import numpy as np
 
 from hilsplat.base.compiled import compiled
 
 BLOCK = 2048
-"""Pixels worked on at once: their sums stay in the nearest cache, and the part of a channel that is read
-is long enough for the memory to be read ahead."""
+"""Pixels to process at once: their sums stay in the fastest cache, and the part of a channel to read is long
+enough for prefetching."""
 
 
 @compiled
 def _dots_of_block(channels, begin, end, offset, slope, out):
-    """Offset and weighted sum of the channels of pixels begin..end, from the start of `out` on.
+    """Write offset plus weighted sum of the channels of pixels begin..end to the start of `out`.
 
     Eight channels at a time, so that sums are read and written an eighth as often.
     """
@@ -84,8 +84,8 @@ def projected_relevancy(coordinates, generic, first, weights, scale, out):
 def _write_relevancy(cosines, generic, scale, out):
     """1 / (1 + exp(-scale (cosine - generic))) of at most `BLOCK` pixels.
 
-    exp(-x) = 2^n 2^f, n whole and f in [-1/2, 1/2]: the first by the bits of a float, the second by seven
-    terms of its series (1e-8 of it), so that the compiler can take many pixels at once.
+    exp(-x) = 2^n 2^f with integer n and f in [-1/2, 1/2]: the first from the bits of a float, the second from
+    seven terms of its series (relative error 1e-8), so that the compiler can process many pixels at once.
     """
     fraction, bits = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32)
     power = bits.view(np.float32)

@@ -10,23 +10,23 @@ from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.semantic_tree.tree import SemanticTree
 
-# These numbers were chosen on development scenes, with others beside them: docs/semantic_tree.md, "Asking".
+# These numbers were chosen on development scenes; docs/experiments.md ("Query") compares them with others.
 
 ALIKE = 0.9
-"""Nodes whose vectors have at least this cosine look like things of one kind."""
+"""Nodes whose vectors have at least this cosine count as alike, as things of one kind are."""
 
 ALIKE_REACH = 3.0
-"""A node that looks like the best answer may be this many times as far below it as others."""
+"""A node that looks like the best answer may be this many times further below it than others."""
 
 ANCESTORS_SHARE = 0.5
-"""Share of an ancestor's distance below the best of its level that is taken off a path's node."""
+"""Share of an ancestor's distance below the best of its level that is subtracted from a node on a path."""
 
 PLAUSIBLE = 0.25
-"""A node competes on a path only if what holds it is at most this share of the range below the best answer
-to the first text: the nose of something that is not a bear does not answer "bear > nose"."""
+"""A node competes on a path only if its ancestor is at most this share of the range below the best answer to
+the first text: the nose of something that is not a bear does not answer "bear > nose"."""
 
 WITHOUT_ANCESTOR = 0.1
-"""Share of the range by which a missing ancestor counts as below the best."""
+"""A missing ancestor counts as this share of the range below the best."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class TextAnswer:
         text: the text.
         level: the level at which it was searched.
         margin: cosine margin of the best node that competed there; -inf if none did.
-        anywhere: of the best node of any level that may answer; likewise.
+        anywhere: the same for the best node of any level.
     """
 
     text: str
@@ -59,8 +59,8 @@ class NodeHits:
         ids: rows of the semantic tree, best first.
         margins: their cosine margins for the last text.
         route: how the best was reached: "flat", or on a path "child" (it has an ancestor at the level of
-            every text before, the last of them its parent), "descendant" (at some, or the last is not its
-            parent) or "fallback" (at none, or nothing is part of what answers the first text).
+            every earlier text, the last of which is its parent), "descendant" (at some, or the last is not
+            its parent) or "fallback" (at none, or no node is part of what answers the first text).
         texts: how well each text of the query was answered at best, coarse to fine.
     """
 
@@ -86,21 +86,21 @@ def search(
     level: Level | None = None,
     shown: Bool[np.ndarray, " n"] | None = None,
 ) -> NodeHits:
-    """Search the nodes that answer a text, or the last text of a path such as ("bear", "head", "nose").
+    """Find the nodes that answer a text, or the last text of a path such as ("bear", "head", "nose").
 
     Args:
-        tree: nodes.
+        tree: the nodes.
         margin: cosine margin of every node for each text.
-        vectors: unit vectors of every node, by which things look alike.
+        vectors: unit vectors of every node, which decide what looks alike.
         path: the texts, coarse to fine.
         threshold: see `best_nodes`.
-        ancestors: share of the mean margin of a node's ancestors that is added to its own; a path of
-            several texts names the ancestors itself and adds nothing.
-        level: of the last text; None: the one that `automatic_level` or `_search_path` chooses.
+        ancestors: share of the mean margin of a node's ancestors that is added to its own; ignored for a path
+            of several texts, which names the ancestors itself.
+        level: level of the last text; None: chosen by `automatic_level` or `_search_path`.
         shown: which nodes may answer; None: all.
 
     Raises:
-        SettingsError: the path is empty or longer than the levels down to the last text's.
+        SettingsError: the path is empty, or has more texts than there are levels down to that of the last.
     """
     margin = margin.astype(np.float64)
     anywhere = (margin if shown is None else margin[:, shown]).max(axis=1, initial=-np.inf).tolist()
@@ -122,15 +122,16 @@ def best_nodes(
     threshold: float,
     shown: Bool[np.ndarray, " n"] | None = None,
 ) -> Int64[np.ndarray, " h"]:
-    """Candidates near the best one, and those a little further that look like it; best first, of equals the
-    lowest row.
+    """Candidates near the best one, and those a little further away that look like it.
+
+    They are ordered best first, equals by row.
 
     Args:
-        value: what every node is ranked by: its cosine margin, with anything that was added.
+        value: rank of every node: its cosine margin plus anything added.
         vectors: as in `search`.
-        candidates: the nodes of a level; the range of values is theirs.
-        threshold: answers are at most 1 - threshold of the range below the best one of those shown, and
-            `ALIKE_REACH` times as far if they look like it.
+        candidates: the nodes of a level, which define the range of values.
+        threshold: answers are at most (1 - threshold) times the range below the best one shown, or
+            `ALIKE_REACH` times that if they look like it.
         shown: which nodes may answer; None: all.
     """
     may = candidates if shown is None else candidates[shown[candidates]]
@@ -144,7 +145,7 @@ def _near_best(
     vectors: Float32[np.ndarray, "n C"],
     reach: float,
 ) -> Int64[np.ndarray, " h"]:
-    """Candidates at most `reach` below the best, or `ALIKE_REACH` times that if they look like it."""
+    """Candidates at most `reach` below the best one, or `ALIKE_REACH` times that if they look like it."""
     if not len(candidates):
         return np.zeros(0, np.int64)
     own = value[candidates]
@@ -159,8 +160,8 @@ def ancestor_margins(tree: SemanticTree, margin: Float64[np.ndarray, " n"]) -> F
     """Mean margin of each node's ancestors: "kettle knob" more likely means a knob of a kettle.
 
     A node without an ancestor gets the least margin of all. A whole gets 0: wholes have no ancestors and
-    only compete with each other. The share that is added was chosen on development scenes
-    (docs/semantic_tree.md).
+    only compete with each other. The share to add was chosen on development scenes (docs/experiments.md,
+    "Query").
     """
     ancestors = tree.ancestors()
     above = (ancestors != NONE) & (ancestors != np.arange(len(tree))[:, None])
@@ -173,12 +174,12 @@ def ancestor_margins(tree: SemanticTree, margin: Float64[np.ndarray, " n"]) -> F
 def automatic_level(
     tree: SemanticTree, margin: Float64[np.ndarray, " n"], shown: Bool[np.ndarray, " n"] | None = None
 ) -> Level:
-    """Level that a text most likely means: that of the best node; of equally good ones the coarsest.
+    """Level that a text most likely means: that of the best node; of equally good ones, the coarsest.
 
-    LangSplat's rule, asked of nodes instead of pixels. A node's vector is an average over views, and a
-    level has tens of nodes: noise does not lift the finest level above the others, as it does with the
-    highest of 100,000 pixels. Rules that climb to the parent of the best node, that standardise each
-    level's margins or that ask siblings were all worse on development scenes (docs/semantic_tree.md).
+    LangSplat's rule, applied to nodes instead of pixels. A node's vector is an average over views, and a
+    level has tens of nodes, so noise does not lift the finest level above the others, as it does with the
+    maximum over 100,000 pixels. Rules that climb to the parent of the best node, standardise each level's
+    margins or consult siblings were all worse on development scenes (docs/experiments.md, "Query").
     """
     levels = tree.level if shown is None else tree.level[shown]
     own = margin if shown is None else margin[shown]
@@ -188,12 +189,12 @@ def automatic_level(
 
 
 def margin_range(margin: Float64[np.ndarray, " n"]) -> float:
-    """Range of some nodes' margins for a text together with the canonical phrases' own, which is 0.
+    """Range of some nodes' margins for a text, extended to include 0, the margin of the canonical phrases.
 
-    The scale of a path's penalties. Among many things some are further from a text than a generic phrase is,
-    so that 0 lies inside and the range is the nodes' own. With a single thing, or with things that all answer
-    the text, the nodes alone span nothing and a penalty would vanish; the generic phrase is the rival that
-    every scene has.
+    This is the scale of a path's penalties. Among many things, some are further from a text than a generic
+    phrase is, so 0 is inside the range of the nodes. With a single thing, or things that all answer the text,
+    the nodes alone would span next to nothing and penalties would vanish; the generic phrase is a rival in
+    every scene.
     """
     return float(margin.max(initial=0.0) - margin.min(initial=0.0))
 
@@ -208,18 +209,18 @@ def _search_path(
     level: Level | None,
     shown: Bool[np.ndarray, " n"] | None,
 ) -> NodeHits:
-    """Search a node that answers the last text and is part of what answers the texts before.
+    """Find a node that answers the last text and is part of what answers the texts before it.
 
-    Every text has a level of its own. All nodes of the last text's level compete, each together with its
-    ancestors: a bear that answers "bear" a little worse than a cushion does still has the better head and
-    nose. A node that is part of nothing like the first text does not compete (`PLAUSIBLE`), unless that
+    Every text has its own level. All nodes of the last text's level compete, each together with its
+    ancestors: a bear that answers "bear" slightly worse than a cushion does still has the better head and
+    nose. A node that is not part of anything like the first text does not compete (`PLAUSIBLE`), unless that
     leaves none.
 
-    A path shorter than there are levels leaves open which levels it means: a handle of a mug may be a part
-    or a subpart, and the head of ("head", "nose") is not a whole. All ways through the levels are searched.
-    Those whose best answer has an ancestor for every text come first, and of these the one with the largest
-    sum of margins. Ancestors need not be shown; they are compared with what is shown or holds something
-    shown.
+    A path with fewer texts than levels leaves open which levels it means: the handle of a mug may be a part
+    or a subpart, and the head of ("head", "nose") is not a whole. So all ways through the levels are
+    searched. Those whose best answer has an ancestor for every text come first, and of these the one with the
+    largest sum of margins. Ancestors need not be shown; they compete with nodes that are shown or hold a node
+    that is.
     """
     ways = [way for way in combinations(LEVELS, len(path)) if way and level in (None, way[-1])]
     if not ways:
@@ -244,11 +245,12 @@ class _Way:
 
     Attributes:
         ids: answers to the last text, best first.
-        levels: of the texts.
-        margins: of the best node that competed for each text.
+        levels: level of each text.
+        margins: margin of the best node that competed for each text.
         route: as in `NodeHits`.
-        total: sum of the margins of the best answer and of its ancestors.
-        complete: the best answer is part of what answers the first text, and has an ancestor for every text.
+        total: sum of the margins of the best answer and its ancestors.
+        complete: whether the best answer is part of what answers the first text, and has an ancestor for
+            every text.
     """
 
     ids: Int64[np.ndarray, " h"]
@@ -268,7 +270,7 @@ def _search_way(
     threshold: float,
     shown: Bool[np.ndarray, " n"] | None,
 ) -> _Way:
-    """Search the last text at the last of some levels, each text before among the ancestors at its level."""
+    """Search the last text at the last level, and each earlier text among the ancestors at its level."""
     nodes, last = tree.nodes_of(levels[-1]), margin[-1]
     may = nodes if shown is None else nodes[shown[nodes]]
     value, total = last.copy(), last.copy()
@@ -277,7 +279,7 @@ def _search_way(
     for text, (of_text, level) in enumerate(zip(margin[:-1], levels[:-1], strict=True)):
         holder, of_level = ancestors[:, level.index], tree.nodes_of(level)
         rivals = of_level
-        if shown is not None:  # what holds something that is shown may itself be hidden behind it
+        if shown is not None:  # a node may itself be hidden behind a shown one that it holds
             rivals = of_level[shown[of_level] | np.isin(of_level, holder[may])]
         margins.append(float(of_text[rivals].max(initial=-np.inf)))
         best = margins[-1] if len(rivals) else 0.0

@@ -20,11 +20,11 @@ SH_CONSTANT = 0.28209479177387814
 """Value of the constant spherical harmonic; colour is 0.5 + this times row 0 of `sh`."""
 
 MAX_POINTS = 30_000
-"""A map from above shows at most so many Gaussians."""
+"""Most Gaussians that a map from above shows."""
 
 
 def grey(image: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
-    """A photograph as a quiet background: luminance, 0 to 255."""
+    """A photograph as an unobtrusive background: its luminance, 0 to 255."""
     luminance = image @ np.array([0.299, 0.587, 0.114])
     return np.repeat(luminance[..., None], 3, axis=2)
 
@@ -39,7 +39,7 @@ def outline(mask: Bool[np.ndarray, "H W"], width_px: int) -> Bool[np.ndarray, "H
 
 
 def line_px(image: UInt8[np.ndarray, "H W 3"]) -> int:
-    """Width of outlines: visible at any image size."""
+    """Width of outlines, visible at any image size."""
     return max(1, round(max(image.shape[:2]) / 256))
 
 
@@ -71,7 +71,7 @@ def paint_relevancy(
 
 
 def show(axes: Axes, picture: UInt8[np.ndarray, "H W 3"], title: str = "", bold: bool = False) -> None:
-    """A picture without ticks."""
+    """Show a picture without ticks."""
     axes.imshow(picture, interpolation="nearest" if max(picture.shape[:2]) < 300 else "antialiased")
     axes.set_xticks([])
     axes.set_yticks([])
@@ -82,14 +82,14 @@ def show(axes: Axes, picture: UInt8[np.ndarray, "H W 3"], title: str = "", bold:
 
 
 def label_left(axes: Axes, text: str, level: Level | None = None) -> None:
-    """Name of a row of pictures, upright at its left."""
+    """Write the name of a row of pictures along its left side."""
     axes.set_ylabel(f"{text}\n{level.label}" if level else text, fontsize=8)
 
 
 def show_from_above(
     axes: Axes, gaussians: Gaussians, cameras: Cameras, selected: Bool[np.ndarray, " N"], title: str
 ) -> None:
-    """Gaussians seen against the cameras' mean up direction, the selected ones in orange; cameras as dots."""
+    """Gaussians seen along the cameras' mean up direction, selected ones orange; cameras as triangles."""
     means = gaussians.means.detach().numpy().astype(np.float64)
     centres = np.stack([cameras[name].centre for name in cameras.names])
     rotation = _from_above(cameras)
@@ -124,7 +124,7 @@ def _from_above(cameras: Cameras) -> Float[np.ndarray, "3 3"]:
 
 
 def save_figure(figure: Figure, out: Path, dpi: int = 110) -> None:
-    """Write a PNG atomically, without a library version in it."""
+    """Write a PNG atomically, without the library's version in its metadata."""
     with atomic_path(out) as temporary:
         figure.savefig(temporary, format="png", dpi=dpi, facecolor="white", metadata={"Software": None})
 

@@ -1,10 +1,10 @@
-"""How much an embedding answers a text: its cosine margin, and LERF's relevancy made of it."""
+"""How well an embedding answers a text: its cosine margin, and LERF's relevancy, computed from it."""
 
 import numpy as np
 from jaxtyping import Float, Float32
 
 CHUNK_ROWS = 65_536
-"""Embeddings compared at once, so that products with many texts stay small."""
+"""Embeddings to compare at once, so that products with many texts stay small."""
 
 
 def margins(
@@ -12,10 +12,10 @@ def margins(
     texts: Float[np.ndarray, "T C"],
     canonical: Float[np.ndarray, "K C"],
 ) -> Float32[np.ndarray, "T B"]:
-    """Cosine with each text less the cosine with the nearest canonical phrase, in [-2, 2].
+    """Cosine with each text minus the cosine with the nearest canonical phrase, in [-2, 2].
 
-    0 is an embedding as close to the text as to the nearest generic phrase. Whatever ranks or compares
-    embeddings reads margins: relevancies saturate, margins do not.
+    0 means as close to the text as to the nearest generic phrase. All ranking and comparing of embeddings
+    uses margins, because relevancies saturate and margins do not.
 
     Args:
         embeddings: unit vectors.
@@ -34,7 +34,7 @@ def margins(
 
 
 def relevancy_of_margins(margin: Float[np.ndarray, "*n"], scale: float) -> Float[np.ndarray, "*n"]:
-    """The score that people and protocols read: 1 / (1 + exp(-scale * margin)); 0.5 at margin 0."""
+    """The score for people and protocols: 1 / (1 + exp(-scale * margin)), 0.5 at margin 0."""
     return 1 / (1 + np.exp(-scale * margin))
 
 

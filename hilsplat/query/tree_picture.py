@@ -17,11 +17,11 @@ GAP_PX = 6
 LABEL_PX = 20
 BLOCK_GAP_PX = 18
 MARGIN_PX = 84
-"""On the left, for the names of the levels."""
+"""Left margin, for the names of the levels."""
 
 ROW_PX = CELL_PX + LABEL_PX + 2 * GAP_PX
 COLUMNS = 18
-"""Leaves in a row of the picture; wholes are laid beside each other until it is full."""
+"""Leaves in a row of the picture; wholes are placed side by side until it is full."""
 
 BACKGROUND = 250
 LINE = (150, 150, 150)
@@ -34,10 +34,10 @@ def export_tree(folder: Path, variant: str, out: Path | None, threads: int) -> s
     """Write `tree.json`, `tree.ply` (a node per Gaussian and level) and `tree.png` of a finished scene.
 
     Args:
-        folder: `results/<dataset>/<scene>`, or wherever that folder is now.
-        variant: whose tree is written.
+        folder: `results/<dataset>/<scene>`, or a copy of it anywhere.
+        variant: named set of settings whose tree is written.
         out: folder to write; None: `export/<variant>` in the scene's folder.
-        threads: threads for rendering.
+        threads: number of threads for rendering.
 
     Returns:
         what was written, for people.
@@ -55,8 +55,8 @@ def export_tree(folder: Path, variant: str, out: Path | None, threads: int) -> s
 def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
     """Draw the tree: one row of crops per level, blocks of a whole and all below it side by side.
 
-    Orphans of finer levels stand in blocks of their own at their level. A crop shows the node in the
-    view that shows it largest, the rest of that view dimmed; under it stands the node's number.
+    Orphans of finer levels have their own blocks at their level. A crop shows the node in the view that
+    shows it largest, with the rest of that view dimmed, above the node's number.
     """
     tree = scene.tree
     roots = [node for level in LEVELS for node in tree.nodes_of(level) if tree.parent[node] == NONE]
@@ -73,7 +73,7 @@ def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
     placed: list[tuple[int, int, int]] = []
 
     def place(node: int, left: int, top: int) -> tuple[int, int]:
-        """Place a node and what is below it, and draw its lines; returns its middle and the width used."""
+        """Place a node and its descendants and draw their lines; returns its middle and the width used."""
         index = Level(int(tree.level[node])).index
         y = top + index * ROW_PX
         kids, used, middles = tree.children_of(np.array([node])), 0, []
@@ -106,7 +106,7 @@ def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def _write(canvas: UInt8[np.ndarray, "H W 3"], text: str, middle_xy: tuple[int, int]) -> None:
-    """Write a word, its base line's middle at a point."""
+    """Write a word with the middle of its base line at a point."""
     import cv2
 
     (width, _), _ = cv2.getTextSize(text, FONT, FONT_SCALE, 1)
@@ -120,7 +120,7 @@ def _leaves(tree, node: int) -> int:
 
 
 def _crop(scene: LanguageScene, node: int) -> UInt8[np.ndarray, "84 84 3"]:
-    """The node where it is seen largest, square, the rest dimmed."""
+    """A square crop of the node in the view that shows it largest, the rest dimmed."""
     import cv2
 
     view = scene.tree.view_names[int(scene.tree.view_area_px[node].argmax())]

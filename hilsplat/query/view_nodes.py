@@ -1,8 +1,8 @@
-"""How much of each node a pixel shows: what masks and relevancy maps of a view are made of.
+"""How much of each node a pixel shows: the basis of masks and relevancy maps of a view.
 
-A pixel blends some ten Gaussians, but hardly ever more than two nodes of a level. Summing its weights
-by node once per view makes every later answer in that view several times cheaper than a product with
-all weights, for a fraction of the memory.
+A pixel blends about ten Gaussians, but hardly ever more than two nodes of a level. Summing its weights by
+node once per view makes every later answer in that view several times cheaper than a product with all
+weights, with a fraction of the memory.
 """
 
 from dataclasses import dataclass
@@ -19,10 +19,10 @@ class ViewNodes:
     """Nodes of one level in one view, pixel by pixel (CSR over P pixels).
 
     Attributes:
-        indptr: where the entries of each pixel begin.
+        indptr: start of the entries of each pixel.
         nodes: rows of the semantic tree.
-        shares: share of the pixel that they make up; what is left to 1 has no node.
-        covered: pixels that the Gaussians cover.
+        shares: share of the pixel that each node makes up; the remainder to 1 has no node.
+        covered: whether the Gaussians cover each pixel.
     """
 
     indptr: Int64[np.ndarray, " P1"]
@@ -44,7 +44,7 @@ class ViewNodes:
         return sum(each.nbytes for each in (self.indptr, self.nodes, self.shares, self.covered))
 
     def area_px(self, num_nodes: int) -> Int64[np.ndarray, " n"]:
-        """Pixels of which each node makes up more than half."""
+        """Number of pixels of which each node makes up more than half."""
         return np.bincount(self.nodes[self.shares > 0.5], minlength=num_nodes)
 
     def blend(self, values: Float32[np.ndarray, " n"], without: float) -> Float32[np.ndarray, " P"]:

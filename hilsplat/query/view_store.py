@@ -1,20 +1,20 @@
-"""What was computed for views, kept in bounded memory."""
+"""Results per view, kept in bounded memory."""
 
 from collections.abc import Callable
 from typing import Any
 
 VIEW_CACHE_MIB = 1024.0
-"""What is kept of the views that were asked for last."""
+"""Memory for the results used last."""
 
 
 class ViewStore:
-    """What was computed for views, the oldest forgotten once it is more than `VIEW_CACHE_MIB`."""
+    """Results per view; the least recently used go first when they exceed `VIEW_CACHE_MIB`."""
 
     def __init__(self) -> None:
         self._kept: dict[tuple, tuple[Any, int]] = {}
 
     def get(self, key: tuple, compute: Callable[[], Any], size: Callable[[Any], int]) -> Any:
-        """The kept value, or a new one."""
+        """The kept value, or a newly computed one."""
         if key in self._kept:
             self._kept[key] = self._kept.pop(key)
             return self._kept[key][0]

@@ -8,7 +8,7 @@ from jaxtyping import Float, Float32, Int32, UInt8
 from hilsplat.base.levels import Level
 
 BOX_PERCENTILES = (2.0, 98.0)
-"""Of the members' centres: a few stray Gaussians do not blow up a node's box."""
+"""Extent of a box among the members' centres, so that a few stray Gaussians do not inflate it."""
 
 Triple = tuple[float, float, float]
 
@@ -19,8 +19,8 @@ class OrientedBox:
 
     Attributes:
         centre: scene units.
-        axes: three unit vectors at right angles, the longest side's first; right-handed.
-        size: full side along each axis, scene units.
+        axes: three orthogonal unit vectors, right-handed, that of the longest side first.
+        size: full length along each axis, scene units.
     """
 
     centre: Triple
@@ -29,9 +29,9 @@ class OrientedBox:
 
     @staticmethod
     def from_array(rows: Float[np.ndarray, "5 3"]) -> "OrientedBox":
-        """From its stored form: centre, three axes, sizes."""
-        centre, *axes, size = (tuple(row) for row in np.asarray(rows, np.float64).tolist())
-        return OrientedBox(centre, tuple(axes), size)
+        """From the stored form: centre, three axes, sizes."""
+        centre, first, second, third, size = ((x, y, z) for x, y, z in np.asarray(rows, np.float64).tolist())
+        return OrientedBox(centre, (first, second, third), size)
 
     def corners(self) -> Float[np.ndarray, "8 3"]:
         """The eight corners."""
@@ -45,8 +45,8 @@ def oriented_box(
     """Box along the principal axes of weighted points, from the 2nd to the 98th percentile of each.
 
     Returns:
-        centre, three axes (longest side first, right-handed, each one's largest component positive but
-        for the last) and sizes, as `OrientedBox.from_array` reads them.
+        centre, three axes (right-handed, longest side first, the largest component of the first two
+        positive) and sizes, as `OrientedBox.from_array` reads them.
     """
     mean = (weight[:, None] * points).sum(axis=0) / weight.sum()
     centred = points - mean
@@ -70,9 +70,9 @@ def node_boxes(
     means: Float[np.ndarray, "N 3"],
     mass: Float[np.ndarray, " N"],
 ) -> tuple[Float32[np.ndarray, "T 3"], Float32[np.ndarray, "T 2 3"], Float32[np.ndarray, "T 5 3"]]:
-    """Centroid and axes of every node's members, weighted by visible mass, and the boxes of their centres.
+    """Centroid and both boxes of every node's members; centroid and axes are weighted by visible mass.
 
-    Every node has a member (`tree_nodes.renumbered_without_empty`).
+    Every node must have a member (`nodes.renumbered_without_empty`).
     """
     centroid = np.zeros((len(level), 3), np.float32)
     box = np.zeros((len(level), 2, 3), np.float32)

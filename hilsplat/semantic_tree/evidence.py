@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float64, Int32
 from hilsplat.base.compiled import compiled
 
 ROWS_AT_A_TIME = 64
-"""Rows of masks that one thread takes at a time."""
+"""Masks that one thread takes at a time."""
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class Evidence:
     Attributes:
         intersection: of pairs that share Gaussians; symmetric, no diagonal, no pair of one view.
         union: of the same pairs, in the same order of stored values.
-        seen: size of each mask as each of the V views sees it; its whole size in its own view, 0
-            where the view sees too little of it. The union of a pair that is not stored is
-            `seen[a, view[b]] + seen[b, view[a]]`; its intersection is 0.
+        seen: size of each mask as each of the V views sees it: its full size in its own view, 0 in views
+            that see too little of it. A pair that is not stored has intersection 0 and union
+            `seen[a, view[b]] + seen[b, view[a]]`.
         view: view of each mask.
     """
 
@@ -45,27 +45,27 @@ def mask_evidence(
     threads: int = 1,
     device: str = "cpu",
 ) -> Evidence:
-    """Soft intersection and union of every two masks of one level, on the Gaussians both views see.
+    """Soft intersection and union of every two masks of one level, on the Gaussians that both views see.
 
-    With s the share of a Gaussian's visible weight that lies in a mask and w its importance, the
-    intersection of a and b is sum w s_a s_b, the size of a as seen from the view of b is the sum of
-    w s_a^2 over Gaussians visible there (Tanimoto). A fitted Gaussian reaches across borders and has
-    shares between 0 and 1; with squares the IoU of one region with itself stays 1, whereas the sum of
-    w s_a as the size would shrink it (shares of 0.3 give 0.18).
+    With s the share of a Gaussian's visible weight inside a mask and w its importance, the intersection of
+    a and b is the sum of w s_a s_b; the size of a as seen from the view of b is the sum of w s_a^2 over the
+    Gaussians visible there (Tanimoto). Fitted Gaussians reach across borders and have shares between 0 and 1.
+    With squares, the IoU of a region with itself stays 1; with the sum of w s_a as the size it would shrink
+    (shares of 0.3 give 0.18).
 
-    Two masks of one view are different things: they are evidence against a link (intersection 0,
-    union both full sizes). Masks that share Gaussians but see less than `min_covisible` of each
-    other, both ways, are no evidence; of masks that share none, each counts as far as the other's
-    view sees at least that share of it.
+    Two masks of one view are different things, so they are evidence against a link (intersection 0, union
+    both full sizes). Masks that share Gaussians, but whose views each see less than `min_covisible` of the
+    other mask, are no evidence. Of masks that share none, each counts if the other's view sees at least that
+    share of it.
 
     Args:
-        shares: s, one row per mask; zero where the Gaussian is not visible in the mask's view.
+        shares: s, one row per mask; zero if the Gaussian is not visible in the mask's view.
         importance: w, such as the mean visible mass.
         visible: which Gaussians each view sees.
         view: view of each mask.
-        min_covisible: share below which a pair is dropped.
-        threads: rows are shared among them; the bytes do not depend on it.
-        device: "cpu", or where torch forms the two products (see `cuda_algebra`).
+        min_covisible: pairs that see a smaller share of each other are dropped.
+        threads: number of threads that share the rows; the bytes do not depend on it.
+        device: "cpu", or the torch device of the two products (see `cuda_algebra`).
     """
 
     def like(values: np.ndarray) -> sp.csr_matrix:
@@ -80,7 +80,7 @@ def mask_evidence(
     else:
         upper, seen = _evidence_by_torch(*products, device)
     shape = (len(view), len(view))
-    # Adding the transposed keeps the two patterns alike: every stored value is positive.
+    # Adding the transpose keeps the two patterns alike, since every stored value is positive.
     matrices = (sp.csr_matrix((values, *upper[:2]), shape=shape) for values in upper[2:])
     intersection, union = (sp.csr_matrix(each + each.T) for each in matrices)
     intersection.sort_indices()
@@ -100,11 +100,13 @@ def _evidence_by_loops(
     """Pairs a < b that share Gaussians, and `Evidence.seen`.
 
     Args:
-        shares: s; `weighted` is w s and `sizes` what each Gaussian adds to a mask's size, stored alike.
+        shares: s.
+        weighted: w s, stored in the same pattern.
+        sizes: what each Gaussian adds to a mask's size, stored in the same pattern.
         visible, view, min_covisible, threads: as in `mask_evidence`.
 
     Returns:
-        (b, row starts, intersection, union) of the pairs, and sizes.
+        (b, row starts, intersection, union) of the pairs, and the sizes.
     """
     num = shares.shape[0]
     seen_everywhere = np.zeros((num, len(visible)))
@@ -140,7 +142,7 @@ def _evidence_by_torch(
     min_covisible: float,
     device: str,
 ) -> tuple[tuple[np.ndarray, ...], Float64[np.ndarray, "M V"]]:
-    """The same by torch."""
+    """`_evidence_by_loops` with the products by torch."""
     from hilsplat.contributions.cuda_algebra import shared_pairs_on
 
     pairs, everywhere = shared_pairs_on(weighted, shares, sizes, visible, view, device)
@@ -157,7 +159,7 @@ def _evidence_by_torch(
 def _counted(
     seen_everywhere: Float64[np.ndarray, "M V"], view: Int32[np.ndarray, " M"], min_covisible: float
 ) -> Float64[np.ndarray, "M V"]:
-    """Sizes as far as they are evidence: 0 where a view sees too little of a mask."""
+    """Sizes that count as evidence: 0 where a view sees too little of a mask."""
     size = seen_everywhere[np.arange(len(view)), view]
     return np.where(seen_everywhere < min_covisible * size[:, None], 0.0, seen_everywhere)
 

@@ -1,4 +1,4 @@
-"""The semantic tree for people and other programs: JSON, and a PLY with a node per Gaussian and level."""
+"""Export of the semantic tree: JSON, and a PLY with the nodes of each Gaussian."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,22 +36,22 @@ def readable_nodes(tree: "SemanticTree") -> list[dict]:
 
 
 def write_tree_ply(gaussians_ply: Path, tree: "SemanticTree", out: Path) -> None:
-    """Copy a 3DGS PLY with three more properties per Gaussian: `node_whole`, `node_part`, `node_subpart`.
+    """Copy a 3DGS PLY and add three properties per Gaussian: `node_whole`, `node_part`, `node_subpart`.
 
-    Viewers of Gaussians pass them over; tools that show scalar fields colour by them. -1 is no node.
+    Viewers of Gaussians ignore them; tools that show scalar fields can colour by them. -1 means no node.
 
     Raises:
-        MisalignedArtifactError: the PLY holds another number of Gaussians.
+        MisalignedArtifactError: the PLY has more or fewer Gaussians than the tree.
     """
     from plyfile import PlyData
 
     vertex = PlyData.read(str(gaussians_ply))["vertex"].data
     if len(vertex) != len(tree.node_of_gaussian):
         raise MisalignedArtifactError(
-            f"the tree was made for other Gaussians than {gaussians_ply}",
+            f"the semantic tree was made for other Gaussians than {gaussians_ply}",
             expected=f"{len(tree.node_of_gaussian)} Gaussians",
             found=f"{len(vertex)}",
-            fix="run the contributions and semantic tree stages again",
+            fix="rerun the contributions and semantic_tree stages",
         )
     more = [(f"node_{level.label}", "<i4") for level in LEVELS]
     table = np.empty(len(vertex), [*vertex.dtype.descr, *more])
@@ -63,7 +63,7 @@ def write_tree_ply(gaussians_ply: Path, tree: "SemanticTree", out: Path) -> None
 
 
 def write_selection_ply(gaussians_ply: Path, rows: Int64[np.ndarray, " g"], out: Path) -> None:
-    """Copy the given Gaussians of a 3DGS PLY, such as those that answer a query."""
+    """Copy some Gaussians of a 3DGS PLY, such as those that answer a query."""
     from plyfile import PlyData
 
     _write(PlyData.read(str(gaussians_ply))["vertex"].data[rows], out)

@@ -14,10 +14,10 @@ from hilsplat.semantic_tree.nodes import gaussian_nodes, level_fits
 from hilsplat.settings import SemanticTreeSettings
 
 MIN_COVISIBLE = 0.2
-"""Pairs of masks that see less than this share of each other are no evidence."""
+"""Pairs of masks whose views see less than this share of each other are no evidence."""
 
 MIN_MEMBER_SHARE = 0.15
-"""A Gaussian joins its best node if more than this share of its weight lies in it."""
+"""A Gaussian joins its best node if that holds more than this share of its weight."""
 
 MIN_FIT = 0.25
 """A mask shows the node that it fits best, if their IoU in its view is above this."""
@@ -25,10 +25,10 @@ MIN_FIT = 0.25
 
 @dataclass(frozen=True)
 class LevelNodes:
-    """Nodes of one level, counted from 0.
+    """Nodes of one level, numbered from 0.
 
     Attributes:
-        of_mask: node that each mask of the level makes up, -1 for none.
+        of_mask: node that each mask of the level belongs to, -1 for none.
         of_gaussian: node of each Gaussian, -1 for none.
         membership: share of the Gaussian's visible weight that lies in its node's masks.
         quality: of each node.
@@ -52,8 +52,8 @@ def level_nodes(
 ) -> LevelNodes:
     """Link the masks of one level into nodes and give them Gaussians.
 
-    A cluster whose Gaussians others win, as happens to doubles, shows nothing wherever it is asked for: it
-    is no node unless `min_views` masks fit it best.
+    A cluster that loses its Gaussians to others, as duplicates do, could select nothing: it becomes a node
+    only if `min_views` masks fit it best.
 
     Args:
         weights: S of the masks.
@@ -61,9 +61,9 @@ def level_nodes(
         mass: visible mass of each Gaussian in each view, px.
         visible: which Gaussians each view sees.
         importance: mean visible mass, px.
-        total_mass: sum of it, px.
+        total_mass: visible mass of each Gaussian, summed over views, px.
         settings: thresholds.
-        threads: for the evidence.
+        threads: number of threads for the evidence.
     """
     seen_in = view[_row_of(weights)]
     shares = _divide(
@@ -95,7 +95,7 @@ def level_nodes(
     fits = level_fits(winners(kept)[1], len(kept), weights, mass, view, MIN_FIT)
     kept = kept[np.bincount(fits[fits >= 0], minlength=len(kept)) >= settings.min_views]
     of_cluster, node, share = winners(kept)
-    # A node that wins no Gaussian selects nothing: it is dropped.
+    # A node that wins no Gaussian selects nothing, so it is dropped.
     used = np.unique(node[node >= 0])
     renumber = np.full(len(kept) + 1, NONE, np.int64)
     renumber[used] = np.arange(len(used))
@@ -110,7 +110,7 @@ def _row_of(matrix: sp.csr_matrix) -> np.ndarray:
 
 
 def _divide(matrix: sp.csr_matrix, by: np.ndarray) -> sp.csr_matrix:
-    """Divide the stored values one by one (float64); those divided by infinity are dropped."""
+    """Divide each stored value (float64); values divided by infinity are dropped."""
     divided = sp.csr_matrix(
         (matrix.data.astype(np.float64) / by, matrix.indices.copy(), matrix.indptr.copy()), shape=matrix.shape
     )

@@ -1,8 +1,8 @@
 """Link the masks of one level across views: pooled average linkage of their evidence.
 
-Everything is sparse: only masks that share Gaussians can be joined, and how much two clusters see
-of each other is a product of two vectors over views. Cost grows with the pairs of masks that share
-Gaussians, not with all pairs.
+Everything is sparse: only masks that share Gaussians can be joined, and how much two clusters see of each
+other is a product of two vectors over views. The cost grows with the number of pairs that share Gaussians,
+not of all pairs.
 """
 
 import numpy as np
@@ -17,9 +17,9 @@ def pooled_linkage(
 ) -> tuple[Int64[np.ndarray, " M"], Float[np.ndarray, " K"]]:
     """Join clusters while the best pair's pooled IoU is at least the threshold.
 
-    The IoU of two clusters is the sum of intersections over the sum of unions of all their pairs of
-    masks. Pooling is reducible (joining never creates a better pair), so one nearest neighbour per
-    cluster is kept. Of equally good pairs the one with the lowest rows is joined.
+    The IoU of two clusters is the sum of intersections divided by the sum of unions of all their pairs of
+    masks. Pooling is reducible (joining never creates a better pair), so one nearest neighbour per cluster
+    suffices. Of equally good pairs, the one with the lowest rows is joined.
 
     Returns:
         cluster of each mask, numbered by first appearance, and each cluster's pooled IoU over its
@@ -54,10 +54,10 @@ def pooled_linkage(
 
 @compiled
 def _merged_run(begin, end, first, neighbour, inter, extra, root, place_of, self_a, self_b):
-    """Copy a run of neighbours to `first` on, those that have been joined since then summed.
+    """Copy a run of neighbours to `first` and beyond; neighbours joined since it was written are summed.
 
-    Entries already there (from an earlier run of the same cluster) are summed with it. Entries that
-    lead to the cluster itself are left out; their sums are returned. Returns also the end.
+    Entries already there, from an earlier run of the same cluster, are summed too. Entries that lead to
+    the cluster itself are left out. Returns the end of the run and the two sums of those left out.
     """
     own_inter, own_extra = 0.0, 0.0
     last = first
@@ -79,9 +79,9 @@ def _merged_run(begin, end, first, neighbour, inter, extra, root, place_of, self
 
 @compiled
 def _best_neighbour(i, begin, end, neighbour, inter, extra, seen, members, place_of):
-    """The neighbour of the best pooled IoU in a run that `_merged_run` wrote, -1 for none, and that IoU.
+    """The neighbour with the best pooled IoU in a run that `_merged_run` wrote, -1 for none, and that IoU.
 
-    Of equally good ones the lowest row. Takes the run's marks off `place_of`.
+    Of equally good ones, the lowest row. Clears the run's marks in `place_of`.
     """
     best, score = -1, -1.0
     for k in range(begin, end):
@@ -99,7 +99,7 @@ def _best_neighbour(i, begin, end, neighbour, inter, extra, seen, members, place
 
 @compiled
 def _compacted(needed, alive, start, stop, neighbour, inter, extra):
-    """Copy the runs of living clusters to the begin of a pool with room for more; moves `start`, `stop`."""
+    """Copy the runs of living clusters to the start of a pool with room for more; updates `start`, `stop`."""
     living = 0
     for i in range(len(alive)):
         if alive[i]:
@@ -120,14 +120,14 @@ def _compacted(needed, alive, start, stop, neighbour, inter, extra):
 
 @compiled
 def _link(indptr, indices, pair_inter, pair_extra, seen, members, threshold, root, within):
-    """Merge in place; `root` ends as the lowest row of each mask's cluster.
+    """Merge in place; at the end `root` is the lowest row of each mask's cluster.
 
-    A cluster's neighbours lie in a pool, one run per cluster: the neighbour, the sum of intersections
-    (`inter`) and of what the unions of stored pairs have beyond `seen` (`extra`, not positive: what both
-    masks hold is counted twice in their sizes). The union of two clusters is then `extra` and, over views,
-    the sizes of each as seen there times the other's members there. Neighbours that were joined
-    since a run was written are summed when it is next read. A merged cluster's run is written at the
-    end of the pool, which is compacted when it is full.
+    A pool holds the clusters' neighbours, one run per cluster: the neighbour, the sum of intersections
+    (`inter`), and the sum of the differences between the unions of stored pairs and `seen` (`extra`, never
+    positive: sizes count twice what both masks hold). The union of two clusters is `extra` plus, over views,
+    the size of each as seen there times the number of the other's members there. Neighbours joined since a
+    run was written are summed when it is next read. The run of a merged cluster is written at the end of the
+    pool, which is compacted when full.
     """
     num, num_views = seen.shape
     room = 2 * len(indices) + 1024
@@ -140,9 +140,9 @@ def _link(indptr, indices, pair_inter, pair_extra, seen, members, threshold, roo
     used = len(indices)
     alive = np.ones(num, np.bool_)
     best = np.full(num, -1, np.int64)
-    # Merges so far of a cluster, and of its best neighbour when that was found: where they differ the
-    # score is only an upper bound, for joining never creates a better pair. Only bounds that come out
-    # on top are worked out again.
+    # Merges of each cluster so far, and of its best neighbour when that was found. If those differ, the score
+    # is only an upper bound, since joining never creates a better pair. Only bounds that come out on top are
+    # computed again.
     merges, best_merges = np.zeros(num, np.int64), np.full(num, -1, np.int64)
     score = np.full(num, np.inf)
     place_of = np.full(num, -1, np.int64)

@@ -1,4 +1,4 @@
-"""What a node is made of: its Gaussians, its parent, the masks that show it."""
+"""What makes up a node: its Gaussians, its parent, the masks that show it."""
 
 import numpy as np
 import scipy.sparse as sp
@@ -16,10 +16,10 @@ def gaussian_nodes(
     total_mass: Float64[np.ndarray, " N"],
     min_share: float,
 ) -> tuple[Int32[np.ndarray, " N"], Float32[np.ndarray, " N"]]:
-    """Give each Gaussian the node in which the largest share of its visible weight lies.
+    """Give each Gaussian the node that holds the largest share of its visible weight.
 
-    Masks of one view may overlap, and a node may have several there: a Gaussian counts in a view at most as
-    far as it is visible.
+    Masks of one view may overlap, and a node may have several there, so a Gaussian counts at most as much as
+    it is visible in the view.
 
     Args:
         cluster: node of each mask of one level, -1 for none.
@@ -27,11 +27,11 @@ def gaussian_nodes(
         weights: S of the masks.
         view: of each mask.
         mass: visible mass of each Gaussian in each view, px.
-        total_mass: sum of it, px.
-        min_share: Gaussians whose best node holds no more than this stay without a node.
+        total_mass: visible mass of each Gaussian, summed over views, px.
+        min_share: a Gaussian of which no node holds more than this stays without a node.
 
     Returns:
-        node of each Gaussian, -1 for none (of equal shares the lowest node), and its share there.
+        node of each Gaussian, -1 for none (of equal shares, the lowest node), and its share there.
     """
     inside = np.flatnonzero(cluster >= 0)
     ones = np.ones(len(inside))
@@ -64,8 +64,8 @@ def node_parents(
 ) -> Int32[np.ndarray, " T"]:
     """Parent of each node: the coarser node that holds more than `min_coverage` of its visible mass.
 
-    The next coarser level is searched first, then the one above it, so that a subpart may hang
-    directly under a whole. Nodes without such a cover are orphans (-1).
+    The next coarser level is searched first, then the one above it, so that a whole may be the direct
+    parent of a subpart. Nodes without such a parent are orphans (-1).
     """
     num = len(level)
     parent = np.full(num, NONE, np.int32)
@@ -96,10 +96,10 @@ def mask_fits(
     level: UInt8[np.ndarray, " M"],
     min_fit: float,
 ) -> Int32[np.ndarray, " M"]:
-    """Node that each mask shows: the best soft IoU, in the mask's view, of mask and node's Gaussians.
+    """Node that each mask shows: the one whose Gaussians have the best soft IoU with it, in its view.
 
     Returns:
-        node of the mask's level above `min_fit`, else -1.
+        node of the mask's level, -1 if no IoU is above `min_fit`.
     """
     fits = np.full(len(view), NONE, np.int32)
     for each in LEVELS:
@@ -120,12 +120,12 @@ def level_fits(
     """`mask_fits` of one level.
 
     Args:
-        node_of_gaussian: at the level.
-        num_nodes: ids are below it.
+        node_of_gaussian: node of each Gaussian at the level.
+        num_nodes: number of nodes; ids are smaller.
         weights: S of the level's masks.
         mass: visible mass of each Gaussian in each view, px.
         view: of each mask.
-        min_fit: least IoU.
+        min_fit: the IoU must be above this.
     """
     has = np.flatnonzero(node_of_gaussian >= 0)
     node = node_of_gaussian[has]
@@ -151,13 +151,13 @@ def nest_nodes(
     level: UInt8[np.ndarray, " T"],
     parent: Int32[np.ndarray, " T"],
 ) -> Int32[np.ndarray, "N 3"]:
-    """Make every child a subset of its parent: the tree is then nested by construction.
+    """Make every child a subset of its parent, so that the tree is nested by construction.
 
-    A Gaussian of a child that no node of the parent's level holds joins the parent (and the parent's
-    parent), one that another node holds leaves the child. Coarse levels go first.
+    A Gaussian of a child joins the parent, and the parent's parent, if no node holds it there; if another
+    node does, it leaves the child. Coarse levels come first.
 
     Returns:
-        node of each Gaussian, as before but for those.
+        node of each Gaussian; unchanged for all others.
     """
     nested = node_of_gaussian.copy()
     index_of = level.astype(np.int64) - 1
@@ -182,12 +182,12 @@ def nest_nodes(
 def renumbered_without_empty(
     node_of_gaussian: Int32[np.ndarray, "N 3"], num_nodes: int
 ) -> Int32[np.ndarray, " T1"]:
-    """New id of each node, in the old order, NONE for a node that holds no Gaussian and selects nothing.
+    """New id of each node, in the old order; NONE for a node without a Gaussian, which selects nothing.
 
-    Nesting may take a node's last Gaussian; its children are then empty too, so no parent is lost.
+    Nesting may remove a node's last Gaussian; its children are then empty too, so no parent is lost.
 
     Returns:
-        one more entry than nodes: the last is NONE, so that NONE stays NONE where ids are looked up.
+        one entry more than there are nodes: the last is NONE, so that looking up NONE gives NONE.
     """
     used = np.unique(node_of_gaussian[node_of_gaussian >= 0])
     renumber = np.full(num_nodes + 1, NONE, np.int32)
@@ -200,7 +200,7 @@ def node_means(
     level: UInt8[np.ndarray, " T"],
     features: Float32[np.ndarray, "N 3 D"],
 ) -> Float32[np.ndarray, "T D"]:
-    """Mean feature of each node's Gaussians at its level; those without one, all zeros, do not count."""
+    """Mean feature of each node's Gaussians at its level, without those that have none (all zeros)."""
     sums = np.zeros((len(level), features.shape[2]))
     for each in LEVELS:
         own = node_of_gaussian[:, each.index]

@@ -1,9 +1,9 @@
 """The 3D semantic tree: masks of all views linked by the Gaussians they share.
 
-No mask has an identity across views. Two masks of different views and the same level are linked by
-how far they agree on the Gaussians that both views see; clusters of masks become nodes, nodes take
-their Gaussians, a coarser node that holds most of a finer one becomes its parent, and every node
-gets the average of its masks' full CLIP vectors. Queries are answered by ranking nodes.
+No mask has an identity across views. Masks of one level in different views are linked by how far they agree
+on the Gaussians that both views see. Clusters of masks become nodes and take their Gaussians; a coarser node
+that holds most of a finer one becomes its parent; every node gets the average of its masks' full CLIP
+vectors. A query ranks the nodes.
 """
 
 import logging
@@ -41,7 +41,7 @@ from hilsplat.semantic_tree.nodes import (
 from hilsplat.settings import SemanticTreeSettings
 
 MIN_VISIBLE_PX = 0.3
-"""A Gaussian counts as visible in a view from this mass."""
+"""A Gaussian counts as visible in a view if its mass there exceeds this."""
 
 logger = logging.getLogger(__name__)
 
@@ -53,20 +53,20 @@ class SemanticTree:
     Attributes:
         level: `Level` of each node.
         parent: row of the coarser node that holds it, -1 for none.
-        clip: unit CLIP vector, the average of its masks' vectors weighted by the root of their area.
+        clip: unit CLIP vector: the average of its masks' vectors, weighted by the root of their areas.
         centroid: mean of its Gaussians' centres weighted by visible mass, scene units.
         box: axis-aligned box, lower and upper corner, scene units.
         oriented_box: centre, three axes and sizes (see `OrientedBox`), scene units.
         quality: pooled IoU of its masks across views, in [0, 1].
-        views: number of views with a mask of it.
+        views: number of views with masks of it.
         node_of_gaussian: node of each Gaussian at each level, -1 for none.
-        membership: share of the Gaussian's visible weight that lies in its node's masks, in [0, 1]; 0 for
-            those that only joined because a child of the node holds them, or have no node.
+        membership: share of the Gaussian's visible weight that lies in its node's masks, in [0, 1]; 0 without
+            a node, and for a Gaussian that joined only because a child of the node holds it.
         node_of_mask: node that each mask (row of the contributions) fits, -1 for none.
         view_area_px: pixels of its masks in each view.
         view_names: the columns of `view_area_px`.
         gaussians_sha256: digest of the PLY the tree belongs to.
-        min_weight: weights that the contributions dropped; views are drawn with the same.
+        min_weight: the contributions dropped smaller weights; views are drawn with the same limit.
     """
 
     level: UInt8[np.ndarray, " T"]
@@ -97,7 +97,7 @@ class SemanticTree:
         return np.flatnonzero(np.isin(self.parent, nodes))
 
     def ancestors(self) -> Int32[np.ndarray, "T 3"]:
-        """The node that holds each node at each level: itself at its own, -1 below it or where none does."""
+        """The node that holds each node at each level: itself at its own level, -1 for none."""
         found = np.full((len(self), len(LEVELS)), NONE, np.int32)
         rows, above = np.arange(len(self)), np.arange(len(self), dtype=np.int32)
         while len(rows):
@@ -133,16 +133,16 @@ def build_tree(
     settings: SemanticTreeSettings,
     threads: int = 1,
 ) -> SemanticTree:
-    """Link masks, make nodes, and give them Gaussians, parents, vectors and boxes.
+    """Link masks into nodes, and give the nodes Gaussians, parents, vectors and boxes.
 
     Args:
         contributions: rows of the masks.
-        S: weight of each Gaussian in each raw mask.
-        mass: weight of each Gaussian in each view.
+        S: weight of each Gaussian in each raw mask, px.
+        mass: visible mass of each Gaussian in each view, px.
         clip: CLIP vector of each mask.
-        means: centres of the Gaussians.
+        means: centres of the Gaussians, scene units.
         settings: thresholds.
-        threads: for the evidence; results do not depend on it.
+        threads: number of threads for the evidence; results do not depend on it.
     """
     visible = mass > MIN_VISIBLE_PX
     num_visible = visible.sum(axis=0)
@@ -217,7 +217,7 @@ def run_semantic_tree(
     """Write the 3D semantic tree of a scene: `tree.npz`, the readable `tree.json`, `index.json`.
 
     Raises:
-        MisalignedArtifactError: contributions or CLIP vectors were made from other masks.
+        MisalignedArtifactError: contributions or CLIP vectors belong to other masks.
     """
     contributions = Contributions.load(contributions_folder)
     index = read_index(contributions_folder)
@@ -247,7 +247,7 @@ def run_semantic_tree(
         counts |= {**per_level, "orphans": sum(orphans.values())}
         if not len(tree):
             logger.warning(
-                "semantic tree %s has no node: no mask was found again in %d views; "
+                "the semantic tree of %s has no node: no group of linked masks spans %d views; "
                 "lower semantic_tree.min_views or semantic_tree.link_threshold",
                 scene,
                 settings.min_views,

@@ -1,4 +1,4 @@
-"""Digests of model folders, kept while sizes and times of their files stay: ViT-H takes seconds to read."""
+"""Digests of model folders, cached by sizes and times of their files, since ViT-H takes seconds to read."""
 
 import functools
 import json
@@ -9,7 +9,7 @@ from hilsplat.base.artifacts import sha256_of_path, write_json
 
 @functools.cache
 def model_digest(folder: Path, cache: Path) -> str:
-    """Digest of a folder's files; says so if the folder is missing, for the stage itself says what to do.
+    """Digest of a folder's files; for a missing folder a note, since the stage itself says what to do.
 
     Args:
         folder: model folder.

@@ -1,6 +1,6 @@
-"""The plan of a run: its scenes, what each job reads and gets as parameters, and what is built.
+"""The plan of a run: its scenes, the inputs and parameters of each job, and the targets.
 
-The rules fill in paths by asking this module. It knows nothing of Snakemake: a *job* is anything with the
+The rules get their paths from this module. It knows nothing of Snakemake: a *job* is anything with the
 attributes `dataset` and `scene`, and `variant` for the stages that variants share or change, such as the
 wildcards of a rule.
 """
@@ -37,7 +37,7 @@ CACHE = Path("results/.cache")
 
 @runtime_checkable
 class Job(Protocol):
-    """What the wildcards of every rule say."""
+    """The wildcards of every rule."""
 
     @property
     def dataset(self) -> str: ...
@@ -47,7 +47,7 @@ class Job(Protocol):
 
 @runtime_checkable
 class VariantJob(Job, Protocol):
-    """What the wildcards of a variant's rules say."""
+    """The wildcards of a variant's rules."""
 
     @property
     def variant(self) -> str: ...
@@ -60,7 +60,7 @@ class Plan:
         run: the validated configuration.
         rows: every scene of the sheet.
         scenes: those that are run.
-        absent: scenes that were chosen and are skipped -> why.
+        absent: chosen scenes that are skipped -> the reason.
     """
 
     def __init__(self, config: Mapping[str, Any]) -> None:
@@ -75,7 +75,7 @@ class Plan:
         sheet = Path(run.scenes)
         self.rows = tuple(read_sheet(sheet, run.groups, run.data_root))
         chosen = choose_scenes(self.rows, run.groups, run.only)
-        if more := {row.group for row in chosen} - set(run.groups):  # check the sources of these too
+        if more := {row.group for row in chosen} - set(run.groups):  # check their sources too
             read_sheet(sheet, {*run.groups, *more}, run.data_root)
         reasons = {row.name: absence(row.source, run.data_root) for row in chosen}
         self.absent = {name: reason for name, reason in reasons.items() if reason is not None}
@@ -142,7 +142,7 @@ class Plan:
         return lambda job: stage_code(stage(job) if callable(stage) else stage, plugins(job))
 
     def model(self, section: str) -> Callable[[Job], str]:
-        """Parameter: digest of the model folder that a stage reads; "none" if it reads none."""
+        """Parameter: digest of the model folder that a stage reads, or "none"."""
 
         def digest(job: Job) -> str:
             stages = self.stages(job)
@@ -153,9 +153,9 @@ class Plan:
         return digest
 
     def shared(self, stage: str, path: str) -> Callable[[VariantJob], str]:
-        """Input: a stage's output, under the first variant with the same settings up to that stage.
+        """Input: a stage's output, from the first variant with the same settings up to that stage.
 
-        A sweep over Omega thus retrains fields and shares masks, trees and embeddings with `default`.
+        Thus a sweep over Omega solves fields anew and shares masks, trees and embeddings with `default`.
         """
         return lambda job: self.output(job, self.shared_variant(stage, job), path)
 
@@ -176,10 +176,10 @@ class Plan:
         return "/".join(["results", job.dataset, job.scene, *parts])
 
     def shared_variant(self, stage: str, job: VariantJob) -> str:
-        """First variant whose settings, up to a stage, equal those of the job's variant."""
+        """First variant whose settings up to a stage equal those of the job's variant."""
         scopes = scopes_of(self.row(job))
-        seed = self.run.seed_of(job.variant) if self._is_random(stage, job.variant, scopes) else None
         wanted = self._stages(job.variant, scopes)
+        seed = self.run.seed_of(job.variant) if wanted.depends_on_seed(stage) else None
         for name in self.run.variant_names():
             other = self._stages(name, scopes)
             same = all(getattr(other, part) == getattr(wanted, part) for part in UPSTREAM[stage])
@@ -187,14 +187,10 @@ class Plan:
                 return name
         return str(job.variant)
 
-    def _is_random(self, stage: str, variant: str, scopes: tuple[str, ...]) -> bool:
-        stages = self._stages(variant, scopes)
-        return any(getattr(stages, section).is_random for section in UPSTREAM[stage])
-
     # ---- photographs and poses ----------------------------------------------------------------------
 
     def images(self, job: Job) -> str:
-        """Folder that the poses of a scene are found from."""
+        """Folder of the images that the poses of a scene are found from."""
         row = self.row(job)
         if row.world:
             return self.output(job, "world/images")
@@ -205,7 +201,7 @@ class Plan:
         row = self.row(job)
         if row.world or is_exported(row.source):
             return self.images(job)
-        assert row.folder is not None, row.name  # absent data were skipped
+        assert row.folder is not None, row.name  # scenes without data were skipped
         labels = set(self._label_files(row))
         return sorted(
             str(path)
@@ -218,7 +214,7 @@ class Plan:
         return "--render" if self.row(job).world else "--no-render"
 
     def source_files(self, job: Job) -> list[str]:
-        """Input of source: files of a data set that images and poses are written from."""
+        """Input of source: files of a data set with the images and poses."""
         return [str(path) for path in image_files(self.row(job).source, self.run.data_root)]
 
     def source_name(self, job: Job) -> str:
@@ -230,7 +226,7 @@ class Plan:
         return readers_of([self.source_name(job)])
 
     def brought(self, job: Job) -> list[str]:
-        """Input: a PLY that replaces the fit, with the JSON beside it; usually nothing."""
+        """Input: a PLY that replaces the fit, with the JSON beside it if there is one; usually nothing."""
         ply = self.row(job).gaussians
         if ply is None:
             return []
@@ -238,22 +234,22 @@ class Plan:
         return [str(ply), *([str(beside)] if beside.is_file() else [])]
 
     def brought_option(self, job: Job) -> str:
-        """Option that names such a PLY, else nothing."""
+        """Option that names such a PLY, if there is one."""
         ply = self.row(job).gaussians
         return f"--brought {shlex.quote(str(ply))}" if ply is not None else ""
 
     # ---- masks and methods --------------------------------------------------------------------------
 
     def masks_stage(self, job: VariantJob) -> str:
-        """Stage that makes the masks: the diagnostic segmenter is one of its own."""
+        """Stage that makes the masks: the diagnostic segmenter is a separate one."""
         diagnostic = self.stages(job).masks.segmenter == "truth-perturbed"
         return "truth_masks" if diagnostic else "masks"
 
     def masks_truth(self, job: VariantJob) -> list[str]:
-        """Input of masks: the true labels for the diagnostic segmenter, else nothing.
+        """Input of masks: the true labels, for the diagnostic segmenter only.
 
         Raises:
-            SettingsError: it is asked for on a scene without true labels.
+            SettingsError: it is chosen for a scene without true labels.
         """
         if self.masks_stage(job) == "masks":
             return []
@@ -261,13 +257,13 @@ class Plan:
         if not row.world:
             raise SettingsError(
                 f"{row.name}, variant {job.variant}: masks.segmenter truth-perturbed needs the true labels "
-                "of a synthetic scene, and this one has none",
-                fix="name another segmenter, or run the variant on synthetic scenes only",
+                "of a synthetic scene, and this scene has none",
+                fix="choose another segmenter, or run the variant on synthetic scenes only",
             )
         return self.truth(job)
 
     def masks_truth_option(self, job: VariantJob) -> str:
-        """Options of the diagnostic segmenter, else nothing."""
+        """Options of the diagnostic segmenter, if it is chosen."""
         truth = self.masks_truth(job)
         if not truth:
             return ""
@@ -275,7 +271,7 @@ class Plan:
         return f"--truth {shlex.quote(truth[0])} --perturb {shlex.quote(faults)}"
 
     def baseline(self, job: VariantJob) -> tuple[str, ...]:
-        """The baseline that writes a variant's field."""
+        """The baseline that computes a variant's field."""
         return (METHODS.places[self.stages(job).method.name],)
 
     # ---- annotations: for evaluation and figures alone ------------------------------------------------
@@ -289,7 +285,7 @@ class Plan:
         return readers_of(self.labels(self.row(job)))
 
     def _label_files(self, row: SceneRow) -> list[str]:
-        """Files that only evaluation reads: an edited one reruns nothing before it."""
+        """Files that only evaluation reads: editing one reruns nothing before it."""
         return [
             str(path.resolve())
             for labels in self.labels(row)
@@ -297,7 +293,7 @@ class Plan:
         ]
 
     def truth(self, job: Job) -> list[str]:
-        """Input: the annotations of a synthetic scene, else nothing."""
+        """Input: the annotations of a synthetic scene; nothing for others."""
         return [self.output(job, "world/truth")] if self.row(job).world else []
 
     def truth_or_labels(self, job: Job) -> list[str]:
@@ -305,7 +301,7 @@ class Plan:
         return self.truth(job) or self._label_files(self.row(job))
 
     def truth_option(self, job: Job) -> str:
-        """Options of evaluate: what a scene is scored against."""
+        """Options of evaluate: the truth that a scene is scored against."""
         row = self.row(job)
         if row.world:
             return f"--truth {shlex.quote(self.truth(job)[0])} --kind {row.world[0]}"
@@ -313,7 +309,7 @@ class Plan:
         return " ".join([*options, self._data_root_option()])
 
     def figure_truth_option(self, job: Job) -> str:
-        """Options of figures: what names the queries and is outlined, if there is something."""
+        """Options of figures: the truth or labels that give queries and outlines, if there are any."""
         row = self.row(job)
         if row.world:
             return f"--truth {shlex.quote(self.truth(job)[0])}"
@@ -333,7 +329,7 @@ class Plan:
     # ---- tables ---------------------------------------------------------------------------------------
 
     def scores(self, table: str) -> list[str]:
-        """Score files that a table is built from; sweeps take the scenes that are named for them."""
+        """Score files that a table is built from; sweeps take the scenes configured for them."""
         kind = TABLES[table]
         rows = [row for row in self._labelled() if self._data_of(row) in kind.data]
         if kind.is_sweep and self.run.sweep_scenes:
@@ -362,12 +358,12 @@ class Plan:
         return " ".join(f"--absent {shlex.quote(sentence)}" for sentence in sentences)
 
     def _labelled(self) -> list[SceneRow]:
-        """Scenes that have annotations or labels to be scored against."""
+        """Scenes with annotations or labels to be scored against."""
         return [row for row in self.scenes if row.world or self.labels(row)]
 
     @staticmethod
     def _data_of(row: SceneRow) -> str:
-        """What a scene is to a table: its kind of synthetic scene, or its published data set."""
+        """A scene's data as tables name it: its kind of synthetic scene, or its published data set."""
         if row.world:
             return row.world[0]
         place = published(row.source)
@@ -376,20 +372,20 @@ class Plan:
     # ---- targets --------------------------------------------------------------------------------------
 
     def tables(self) -> list[str]:
-        """Every table, measured on whatever scenes there are; the paper's rows are always there."""
+        """Every table, measured on the scenes that there are; all have the paper's rows."""
         return [f"results/tables/{name}.csv" for name in TABLES]
 
     def targets(self) -> list[str]:
         """Pictures of every scene, and tables and plots if the run has a scene to measure.
 
-        A run of photographs would leave tables of reported rows where a benchmark's were.
+        A run of photographs would otherwise replace a benchmark's tables by ones of reported rows alone.
         """
         plots = [f"results/figures/sweep-{name}.png" for name in ("theta", "omega")]
         return [*self.figures(), *(self.tables() + plots if self._labelled() else [])]
 
     def figures(self) -> list[str]:
-        """The panel of every scene, masks against the truth if it is known, and methods side by side in the
-        scenes of the sweeps."""
+        """The panel of every scene, masks against the truth if it is known, and a comparison of methods for
+        the scenes of the sweeps."""
         found = []
         for row in self.scenes:
             compared = not self.run.sweep_scenes or row.scene in self.run.sweep_scenes
@@ -399,12 +395,12 @@ class Plan:
 
 
 def scopes_of(row: SceneRow) -> tuple[str, str]:
-    """Keys of `overrides` that apply to a scene, general first."""
+    """Keys of `overrides` that apply to a scene, the general one first."""
     return (row.group, f"{row.dataset}/{row.scene}")
 
 
 def any_of(names: Collection[str] | Any) -> str:
-    """Regular expression that matches exactly these names; nothing if there is no name."""
+    """Regular expression that matches exactly these names; none matches nothing."""
     return "|".join(sorted({re.escape(name) for name in names})) or "(?!)"
 
 

@@ -1,4 +1,4 @@
-"""Which function is which stage."""
+"""The function of each stage."""
 
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.identity import code_digest
@@ -30,7 +30,7 @@ STAGES: dict[str, str] = {
     "tree_truth": "hilsplat.evaluate.diagnostics.tree_truth:run_tree_truth",
     "models": "hilsplat.world.tiny.train:train_models",
 }
-"""The function, or the functions of a module, that each stage's command calls."""
+"""Stage -> the function that its command calls; a module means all of its functions."""
 
 
 def stage_code(stage: str, plugins: tuple[str, ...] = ()) -> str:
@@ -44,5 +44,5 @@ def stage_code(stage: str, plugins: tuple[str, ...] = ()) -> str:
         HilsplatError: there is no such stage.
     """
     if stage not in STAGES:
-        raise HilsplatError(f"there is no stage {stage!r}", expected=f"one of {', '.join(STAGES)}")
+        raise HilsplatError(f"unknown stage {stage!r}", expected=f"one of {', '.join(STAGES)}")
     return code_digest(STAGES[stage], *plugins)

@@ -9,7 +9,7 @@ from jsonschema import Draft202012Validator
 from snakemake.utils import update_config
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.configuration import SECTIONS, config_schema, parse_run, parse_section
+from hilsplat.configuration import SECTIONS, config_schema, knob_table, parse_run, parse_section
 
 
 def load(project: Path, name: str) -> dict:
@@ -88,9 +88,9 @@ def test_only_what_holds_something_random_is_repeated_per_seed() -> None:
     assert run.seeded("langsplat") == ["langsplat", "langsplat.seed1", "langsplat.seed2"]
     assert len(run.seeded("default", scopes=("photos",))) == 3
     assert [run.seed_of(name) for name in run.seeded("network")] == [0, 1, 2]
-    assert not run.is_random("autoencoder", "langsplat")
-    assert run.is_random("field", "langsplat")
-    assert not run.is_random("semantic_tree", "network")
+    assert not run.stages("langsplat").depends_on_seed("autoencoder")
+    assert run.stages("langsplat").depends_on_seed("field")
+    assert not run.stages("network").depends_on_seed("semantic_tree")
 
 
 def test_every_knob_has_description_and_origin() -> None:
@@ -98,6 +98,12 @@ def test_every_knob_has_description_and_origin() -> None:
         for name, field in model.model_fields.items():
             assert field.description, f"{section}.{name}"
             assert field.json_schema_extra["origin"], f"{section}.{name}"
+
+
+def test_the_manual_names_the_choices_or_the_range_of_a_knob() -> None:
+    manual = knob_table()
+    assert "poses.mapper = 'incremental'  (incremental|global; origin: COLMAP)" in manual
+    assert "poses.test_every = 8  (>= 0; views; origin: 3DGS)" in manual
 
 
 def test_the_schema_for_editors_takes_the_shipped_configuration_and_refuses_a_misspelt_key(

@@ -1,4 +1,4 @@
-"""What the instance and part losses share: softened distances, ancestors, cosines."""
+"""Shared by the instance and part losses: softened distances, ancestors, cosines."""
 
 import numpy as np
 from jaxtyping import Float, Int32, Int64
@@ -10,14 +10,14 @@ SOFTENING = 1e-3
 """Added in quadrature to every distance, so that its logarithm has a finite slope at zero."""
 
 SHORTEST = 1e-6
-"""Added in quadrature to every length that divides, so that the cosine of a zero vector is zero."""
+"""Added in quadrature to every length in a denominator, so that the cosine of a zero vector is zero."""
 
 
 def soft_distances(means: Float[Tensor, "M D"]) -> Float[Tensor, "M M"]:
     """Pairwise sqrt(|m_i - m_j|^2 + SOFTENING^2).
 
-    Squares are taken from products: M x M numbers instead of M x M x D. In float64 what cancels there is
-    far below the softening.
+    Squares are computed from products: M x M numbers instead of M x M x D. In float64 the cancellation error
+    is far below the softening.
     """
     centred = means - means.detach().mean(0)
     squares = centred.square().sum(-1)
@@ -36,8 +36,8 @@ def off_diagonal_mean(values: Float[Tensor, "M M"]) -> Float[Tensor, ""]:
 def common_ancestor_depth(parent: Int32[np.ndarray, " M"]) -> Int64[np.ndarray, "M M"]:
     """Depth of the deepest common ancestor of every two masks of one view's coverage tree.
 
-    A mask counts as its own ancestor, roots have depth 1, and 0 means that two masks are unrelated:
-    a mask and its child share the depth of the mask, two children of a root share depth 1.
+    A mask counts as its own ancestor and roots have depth 1; 0 means that two masks are unrelated. The value
+    for a mask and its child is the depth of the mask; for two children of a root it is 1.
 
     Example:
         >>> common_ancestor_depth(np.array([-1, 0, 0, 1], dtype=np.int32))[3]
@@ -52,7 +52,7 @@ def common_ancestor_depth(parent: Int32[np.ndarray, " M"]) -> Int64[np.ndarray, 
         if not len(has):
             break
         is_ancestor[has, current[has]] = 1
-    # Common ancestors of two masks form a chain from the root down: their number is the depth.
+    # Common ancestors of two masks form a chain from the root down, so their number is the depth.
     # float32 counts exactly and multiplies fast.
     chains = is_ancestor.astype(np.float32)
     return (chains @ chains.T).astype(np.int64)
@@ -63,9 +63,9 @@ def similarity_without_parent(
 ) -> Float[Tensor, "A B"]:
     """s_p of Eq. 4: cosine of two mask means after the anchor's parent mean is subtracted from both.
 
-    Departs: Eq. 4 prints index j twice in the denominator; we take i and j, so that s_p is a cosine.
-    Its one un-indexed parent mean is read as the anchor's, for positives and negatives alike. The
-    parent is detached: parts move against their whole, not the whole against its parts.
+    Departs: Eq. 4 prints index j twice in the denominator; we take i and j, so that s_p is a cosine. We
+    read its parent mean, which has no index, as the anchor's, for positives and negatives alike. The
+    parent is detached: parts move relative to their whole, not the whole relative to its parts.
     """
     parent = parent.detach()
     own = anchors - parent

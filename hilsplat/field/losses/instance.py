@@ -13,8 +13,8 @@ def instance_loss_literal(
 ) -> Float[Tensor, ""]:
     """L_ins as printed (Eq. 3): the distance of two masks should be Omega^-|l_i - l_j|.
 
-    Masks of the same level are thus pushed to distance 1, related or not, which more than D + 1
-    masks cannot all satisfy. Departs only in the softened distance.
+    This pushes masks of the same level to distance 1, related or not, which more than D + 1 masks cannot
+    all satisfy. Departs only in the softened distance.
 
     Args:
         means: mean rendered feature of each mask of one view, all levels.
@@ -31,11 +31,11 @@ def instance_loss_literal(
 def instance_loss_tree(
     means: Float[Tensor, "M D"], depth: Int[Tensor, "M M"], omega: float
 ) -> Float[Tensor, ""]:
-    """L_ins with relation instead of level: the distance should be Omega^-depth.
+    """L_ins by relation instead of level: the distance should be Omega^-depth.
 
-    Departs: |l_i - l_j| of Eq. 3 is replaced by the depth of the deepest common ancestor in the
-    coverage tree, so that unrelated masks go to distance 1, parts of one object to 1 / Omega,
-    subparts of one part to 1 / Omega^2: the nesting the text describes.
+    Departs: the depth of the deepest common ancestor in the coverage tree replaces |l_i - l_j| of Eq. 3, so
+    that unrelated masks go to distance 1, parts of one object to 1 / Omega, and subparts of one part to
+    1 / Omega^2: the nesting that the text describes.
 
     Args:
         means: mean rendered feature of each mask of one view, all levels.

@@ -17,12 +17,12 @@ def part_loss_literal(
 ) -> Float[Tensor, ""]:
     """L_part of one view and level as printed (Eq. 5): siblings attract, children of others repel.
 
-    The denominator holds the negatives alone, as printed. Pulls siblings together ("bear nose" and
-    "bear mouth"), which the prose around it wants told apart.
+    The denominator holds the negatives alone, as printed. This pulls siblings together ("bear nose" and
+    "bear mouth"), whereas the prose around it says to separate them.
 
-    Departs: 1 / (L N_p) is read as the mean over anchors with at least one positive and one
-    negative, of the mean over their positives; the level l = 1, which has no parents, is left out
-    by the caller, orphans here. An anchor is not its own positive.
+    Departs: we read 1 / (L N_p) as the mean, over anchors with at least one positive and one negative, of
+    the mean over their positives. The caller leaves out level l = 1, which has no parents; this function
+    leaves out orphans. An anchor is not its own positive.
 
     Args:
         means: mean rendered feature of each mask of the level.
@@ -31,7 +31,7 @@ def part_loss_literal(
         tau: temperature.
 
     Returns:
-        mean over anchors; 0 where there is none.
+        mean over anchors; 0 if there is none.
     """
     similarity = similarity_without_parent(means, means, parent_means) / tau
     has_parent = parent != NO_PARENT
@@ -55,11 +55,11 @@ def part_loss_disentangle(
     parent_means: Float[Tensor, "M D"],
     tau: float,
 ) -> Float[Tensor, ""]:
-    """L_part of one view and level as its prose wants it: parts of one object are told apart.
+    """L_part of one view and level as its prose describes it: parts of one object are separated.
 
-    Departs: the positive of a mask is the other random half of its own pixels; negatives are the
-    other halves of all other masks of the level, siblings included; the positive stands in the
-    denominator (InfoNCE). The anchor's parent mean is subtracted from all.
+    Departs: the positive of a mask is the other random half of its own pixels; negatives are the other
+    halves of all other masks of the level, siblings included; the denominator includes the positive
+    (InfoNCE). The anchor's parent mean is subtracted from all.
 
     Args:
         half: mean feature over a random half of each mask's pixels.
@@ -69,7 +69,7 @@ def part_loss_disentangle(
         tau: temperature.
 
     Returns:
-        mean over anchors; 0 where there is none, or no second mask.
+        mean over anchors; 0 if there is none, or no second mask.
     """
     anchors = torch.nonzero(has_parent).squeeze(1)
     if not len(anchors) or len(half) < 2:

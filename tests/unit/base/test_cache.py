@@ -1,4 +1,4 @@
-"""The caches of finished views: their size, and what goes first."""
+"""The caches of finished views: their size, and what is deleted first."""
 
 import os
 import time
@@ -57,8 +57,8 @@ def test_the_longest_unused_go_until_the_rest_is_small_enough(cache):
 
 
 def test_a_stage_without_view_cache_and_no_limit_are_refused(cache):
-    with pytest.raises(HilsplatError, match="models: no cache of finished views"):
+    with pytest.raises(HilsplatError, match="there is no cache of finished views for models"):
         prune_cache(cache, ["models"], days=0.0)
-    with pytest.raises(HilsplatError, match="nothing says what to delete"):
+    with pytest.raises(HilsplatError, match="neither --days nor --max-mib"):
         prune_cache(cache, [])
     assert len(left(cache)) == 7

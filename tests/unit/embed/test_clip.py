@@ -173,7 +173,7 @@ def test_vectors_of_another_width_are_refused(colour_clip):
 def test_long_texts_are_cut_and_say_so(colour_clip, caplog):
     vectors = ClipModel.load(colour_clip).embed_texts(["red red red red green"])
     np.testing.assert_allclose(vectors, [[1, 0, 0]])
-    assert "cut at 4 tokens" in caplog.text
+    assert "cut off after 4 tokens" in caplog.text
 
 
 def test_text_without_a_word_is_refused(colour_clip):

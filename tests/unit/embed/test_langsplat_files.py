@@ -142,8 +142,8 @@ def test_maps_of_another_size_are_refused_or_resized(ours, tmp_path):
         (np.full((4, 6, 8), 7.0), np.zeros((7, 5)), "does not belong to a_f.npy"),
         (np.full((4, 6, 8), 0.5), np.zeros((7, 5)), "does not belong to a_f.npy"),
         (np.full((4, 6, 8), np.nan), np.zeros((7, 5)), "does not belong to a_f.npy"),
-        (np.zeros((4, 6, 8)), np.full((1, 5), np.inf), "holds no vectors"),
-        (np.zeros((4, 6, 8)), np.zeros(5), "holds no vectors"),
+        (np.zeros((4, 6, 8)), np.full((1, 5), np.inf), "is not an array of vectors"),
+        (np.zeros((4, 6, 8)), np.zeros(5), "is not an array of vectors"),
         (np.array([{"a": 1}], dtype=object), np.zeros((1, 5)), "cannot be read"),
     ],
 )

@@ -63,7 +63,7 @@ def test_clustering_ignores_a_shift_of_everything():
 
 
 def test_depth_of_common_ancestors():
-    # 0 holds 1 and 2, 1 holds 3; 4 stands alone
+    # 0 holds 1 and 2, 1 holds 3; 4 is unrelated
     depth = common_ancestor_depth(np.array([-1, 0, 0, 1, -1], dtype=np.int32))
     assert depth.tolist() == [
         [1, 1, 1, 1, 0],

@@ -1,4 +1,4 @@
-"""Baselines: small matrices worked by hand, and the example of the documentation as it stands there."""
+"""Baselines: small matrices worked by hand, and the example in the documentation, run from its text."""
 
 import inspect
 import re
@@ -22,7 +22,7 @@ EXTENDING = PROJECT / "docs" / "extending.md"
 
 
 def fit_of(method, inputs, settings):
-    """The field of a method, from inputs that are no MethodInputs."""
+    """The field of a method, from stand-ins for MethodInputs."""
     return inspect.unwrap(method.fit)(inputs, settings, 0)
 
 
@@ -37,7 +37,7 @@ def test_a_gaussian_gets_the_average_of_its_masks_weighed_by_their_share_of_it()
     latents = np.array([[1.0, 0.0], [0.0, 1.0], [0.5, 2.0]], np.float32)
     inputs = types.SimpleNamespace(contributions=contributions, latents=latents)
     features = fit_of(lifted.METHOD, inputs, MethodSettings(name="lifted"))
-    # Gaussian 0: (4 * 0.75 * (1, 0) + 2 * 0.5 * (0, 1)) / 4; Gaussian 1 lies in mask 1 alone; 2 in no whole
+    # Gaussian 0: (4 * 0.75 * (1, 0) + 2 * 0.5 * (0, 1)) / 4; Gaussian 1 is in mask 1 alone, 2 in no whole
     assert features[:, 0].tolist() == [[0.75, 0.25], [0.0, 1.0], [0.0, 0.0]]
     assert features[:, 1].tolist() == [[0.0, 0.0], [0.0, 0.0], [0.5, 2.0]]
     assert not features[:, 2].any()
@@ -163,7 +163,7 @@ def inputs_of(folder):
 def test_a_method_that_returns_no_field_is_refused(tmp_path, monkeypatch, features):
     broken = Method("lifted", "broken", "none", lambda inputs, settings, seed: features)
     monkeypatch.setattr(stage, "method_of", lambda name: broken)
-    with pytest.raises(ArtifactError, match="method lifted returned no language field"):
+    with pytest.raises(ArtifactError, match="method lifted did not return a language field"):
         run_method = inspect.unwrap(stage.run_method)  # the inputs here are no MethodInputs
         run_method(inputs_of(tmp_path), tmp_path / "field.safetensors", MethodSettings(name="lifted"), 0)
 

@@ -119,7 +119,7 @@ def test_another_clip_is_refused(desk, elsewhere):
     assert recorded["model_sha256"][:12] in message
     assert re.search(r"copy/models/colours with digest [0-9a-f]{12}", message)
     assert "models/clip-tiny with digest" in message  # what the checkout has
-    assert "run the clip stage again" in message
+    assert "rerun the clip stage" in message
 
 
 def test_a_copy_without_any_clip_names_the_places(desk, elsewhere, monkeypatch):
@@ -234,7 +234,7 @@ opened_files: Counter[str] | None = None
 
 
 def count_opened(event: str, arguments: tuple) -> None:
-    """Count files that Python opens, while somebody counts; an audit hook cannot be taken out again."""
+    """Count files that Python opens, while a test counts; an audit hook cannot be removed."""
     if opened_files is not None and event == "open" and isinstance(arguments[0], str):
         opened_files[arguments[0]] += 1
 

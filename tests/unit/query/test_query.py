@@ -169,7 +169,7 @@ def test_a_path_stays_inside_its_first_thing(scene):
 
 @pytest.fixture
 def three_wholes(scene) -> SemanticTree:
-    """B top is a whole of its own, with the least margin: wholes range from -1 to 4 in the tests below."""
+    """B top is a separate whole, with the least margin: wholes range from -1 to 4 in the tests below."""
     level, parent = scene.tree.level.copy(), scene.tree.parent.copy()
     level[NODE["B top"]], parent[NODE["B top"]] = 1, -1
     return replace(scene.tree, level=level, parent=parent)
@@ -389,7 +389,7 @@ def test_query_parses_paths_and_describes_hits(scene):
     [
         ("a > b > c > d", "auto", "1 to 3 texts"),
         ("a > b > c", "part", "cannot be searched at level part"),
-        (" ", "auto", "has an empty text"),
+        (" ", "auto", "is empty"),
         ("A", "hole", "unknown"),
         ("A > A top", "hole", "unknown"),
     ],

@@ -23,7 +23,7 @@ def test_gaussians_join_the_node_with_the_largest_share():
     node, membership = gaussian_nodes(
         np.array([0, 0, 1]), 2, weights, np.array([0, 1, 1], np.int32), mass, np.full(3, 10.0), 0.25
     )
-    # 0.9 against 0.2; 0.2 is too little; a tie goes to the lower node
+    # 0.9 against 0.2; 0.2 is too little; of a tie, the lower node
     assert node.tolist() == [0, -1, 0]
     assert membership == pytest.approx([0.9, 0, 0.3])
 

@@ -107,7 +107,7 @@ def test_a_selection_holds_the_chosen_gaussians(ply, tmp_path):
 
 
 def test_a_node_that_nesting_emptied_is_dropped_and_the_others_keep_their_order():
-    # wholes 0 and 1, parts 2 and 3; part 2 belongs to whole 0 and lies wholly inside whole 1
+    # wholes 0 and 1, parts 2 and 3; part 2 belongs to whole 0 and is entirely inside whole 1
     before = np.array([[0, -1, -1], [1, 2, -1], [1, 3, -1]], np.int32)
     level, parent = np.array([1, 1, 2, 2], np.uint8), np.array([-1, -1, 0, 1], np.int32)
     after = nest_nodes(before, level, parent)
