@@ -355,6 +355,8 @@ def _strip(top: ast.AST) -> None:
             for inner in ast.walk(node):
                 if isinstance(inner, ast.Constant) and isinstance(inner.value, str):
                     inner.value = ""
+                elif isinstance(inner, ast.JoinedStr):  # its words also separate its values
+                    inner.values = [part for part in inner.values if isinstance(part, ast.FormattedValue)]
         elif isinstance(node, ast.Call):
             called = (_chain(node.func) or ("",))[-1]
             node.keywords = [each for each in node.keywords if each.arg not in PROSE.get(called, ())]

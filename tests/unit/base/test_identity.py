@@ -75,6 +75,8 @@ def test_what_is_reached_counts_and_what_is_not_does_not(tmp_path, old, new, cou
     [
         ('    raise ValueError("a word")', "a word", "two words", False),
         ('    raise ValueError(f"a word of {x}")', "a word", "two words", False),
+        ('    raise ValueError(f"a word of {x}")', "{x}", "{x}, a row each", False),
+        ('    raise ValueError(f"a word of {x}")', "{x}", "{y}", True),
         ('    raise ValueError("a word")', "ValueError", "KeyError", True),
         ('    logger.info("a word %s", x)', "a word", "two words", False),
         ('    logger.info("a word %s", x)', "x)", "y)", True),
