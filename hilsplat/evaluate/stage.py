@@ -40,6 +40,16 @@ TIMED_TEXTS = 3
 """Queries that are timed, in one view."""
 
 
+@dataclass(frozen=True)
+class TrueAnnotations:
+    """The truth folder of a synthetic scene."""
+
+    folder: Path
+
+
+Annotations = LabelledScene | PointScene | TrueAnnotations
+
+
 def run_evaluate(
     parts: SceneParts,
     out: Path,
@@ -84,11 +94,10 @@ def run_evaluate(
     label = masks_label(parts.masks)
 
     def keep(data: str, view: str, measured: Measured) -> None:
-        names = {"dataset": data, "scene": scene, "variant": variant, "masks": label}
-        scores.append(Score(**names, view=view, **vars(measured)))
+        scores.append(Score(data, scene, variant, label, view=view, **vars(measured)))
 
     with stage_log("evaluate", f"{dataset}/{scene}/{variant}") as counts:
-        scored = [Asked.open(name, data_root) for name in labels]
+        scored: list[tuple[str, Annotations, Asked]] = [Asked.open(name, data_root) for name in labels]
         if truth is not None:
             scored.append((dataset, TrueAnnotations(truth), Asked.of_world(kind)))
         if not scored:
@@ -119,26 +128,19 @@ def run_evaluate(
                     )
                     for view, row in found:
                         keep(data, view, row)
-                for row in point_rows(answers, known, wanted, settings, threads):
-                    if isinstance(row, Measured):
-                        keep(data, "", row)
+                for each in point_rows(answers, known, wanted, settings, threads):
+                    if isinstance(each, Measured):
+                        keep(data, "", each)
                     else:
-                        matches[data, scene, variant, label, row[0]] = row[1]
+                        matches[data, scene, variant, label, each[0]] = each[1]
         counts["rows"] = len(scores)
         write_times(out, dataset, scene, variant, seconds)
         write_instances(out, matches)
         write_scores(out, scores)
 
 
-@dataclass(frozen=True)
-class TrueAnnotations:
-    """The truth folder of a synthetic scene."""
-
-    folder: Path
-
-
 def known_truths(
-    known: LabelledScene | PointScene | TrueAnnotations, posed: Scene, settings: EvaluateSettings
+    known: Annotations, posed: Scene, settings: EvaluateSettings
 ) -> Mapping[str, Callable[[], ViewTruth]]:
     """What is true in views; nothing for labels on points."""
     if isinstance(known, PointScene):
@@ -154,7 +156,7 @@ def known_truths(
 
 def point_rows(
     answers: LanguageScene,
-    known: LabelledScene | PointScene | TrueAnnotations,
+    known: Annotations,
     asked: Asked,
     settings: EvaluateSettings,
     threads: int,

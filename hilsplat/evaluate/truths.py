@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from hilsplat.datasets.labelled import LabelledScene, check_label_size
@@ -22,9 +23,7 @@ def annotated_truths(
     """What is true in each annotated test view, read when its turn comes."""
     annotations = HierarchyAnnotations.load(truth)
     return {
-        view: lambda view=view: ViewTruth.of(
-            annotations, view, posed.cameras[view].size_hw, settings.min_region_px
-        )
+        view: partial(ViewTruth.of, annotations, view, posed.cameras[view].size_hw, settings.min_region_px)
         for view in posed.views("test")
         if annotations.views.get(view)
     }
@@ -42,8 +41,8 @@ def labelled_truths(labels: LabelledScene, posed: Scene) -> dict[str, Callable[[
     for stem, view in labels.posed_views(posed.cameras.names).items():
         size_hw, regions = posed.cameras[view].size_hw, labels.views[stem]
         for label_hw in sorted({region.size_hw for region in regions}):
-            sentence = check_label_size(f"a label of view {view}", label_hw, size_hw, SHAPE_TOLERANCE)
-            if sentence:
-                logger.warning("%s/%s: %s", labels.dataset, labels.scene, sentence)
-        truths[view] = lambda regions=regions, size_hw=size_hw: ViewTruth.of_regions(regions, size_hw)
+            departure = check_label_size(f"a label of view {view}", label_hw, size_hw, SHAPE_TOLERANCE)
+            if departure:
+                logger.warning("%s/%s: %s", labels.dataset, labels.scene, departure)
+        truths[view] = partial(ViewTruth.of_regions, regions, size_hw)
     return truths

@@ -1,7 +1,7 @@
 """Figures of the paper: queries by method, one query over four views, features at three levels."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -120,7 +120,7 @@ def open_variants(folder: Path, variants: Sequence[str], threads: int) -> dict[s
 
 
 def over_views(
-    scene: Scene, rows: Sequence[Shown], truths: Mapping[str, object], count: int = VIEWS
+    scene: Scene, rows: Sequence[Shown], truths: Mapping[str, Callable[[], ViewTruth]], count: int = VIEWS
 ) -> list[Shown]:
     """One query in several views: the first part or subpart that is shown, else the first query.
 
@@ -134,7 +134,6 @@ def over_views(
     for view, truth_of in truths.items():
         if view != chosen.view and len(found) < count:
             known = truth_of()
-            assert isinstance(known, ViewTruth)
             for query in known.queries or known.categories:
                 if (query.text, query.level) == (chosen.text, chosen.level):
                     found.append(Shown(chosen.text, chosen.path, chosen.level, view, query.truth))

@@ -180,7 +180,9 @@ def draw_panel(
     label = label_of_index(index)
     warning = ": a diagnostic, masks made from the true labels" if made_from_truth(label) else ""
     figure.suptitle(scene.name + warning, fontsize=12, fontweight="bold")
-    parts = figure.subfigures(2, 1, height_ratios=[overview_in, queries_in]) if rows else [figure]
+    parts: list[FigureBase] = [figure]
+    if rows:
+        parts = list(figure.subfigures(2, 1, squeeze=False, height_ratios=[overview_in, queries_in]).flat)
     grid = parts[0].subplots(2, 4, squeeze=False)
     image = answers.image(masked)
     masks = HierarchicalMasks.load(Path(masks_folder) / f"{masked}.npz")

@@ -174,7 +174,7 @@ def average_precision(scans: Sequence[InstanceMatches]) -> Float64[np.ndarray, "
 
     nan for a class without a true instance in any scan; 0 where there are instances and no prediction.
     """
-    result = np.full(scans[0].misses.shape, np.nan)
+    result = np.full_like(scans[0].misses, np.nan, dtype=np.float64)
     misses = np.sum([scan.misses for scan in scans], axis=0)
     has_truth = np.any([scan.has_truth for scan in scans], axis=0)
     classes, overlaps, confidence, is_match = (

@@ -73,6 +73,7 @@ class FlatProtocols:
                 mask = nodes_mask
                 if mask is None:
                     rule = LERF_LANGSPLAT.rule
+                    assert rule is not None
                     mask, _ = relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)
                 for row in measure_masks(card, method, {flat.text: mask}, {flat.text: flat.truth}):
                     yield replace(row, protocol=label)

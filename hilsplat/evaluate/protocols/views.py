@@ -16,6 +16,7 @@ or empty prediction counts 0. A field sees what a view shows, and so do the node
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -76,7 +77,7 @@ def label_of(card: ProtocolCard, method: str, settings: EvaluateSettings) -> str
     if method == "truth":
         return card.labelled()
     rule = rule_of(settings)
-    words = []
+    words: list[str] = []
     if method == "field":
         words += rule.departures(RelevancyRule())
     else:  # nodes are selected, not thresholded; localization and diagnostics still read smoothed maps
@@ -130,7 +131,10 @@ def measure_view(
     masks = PackedMasks(size_hw) if masks is None else masks
     rule = rule_of(settings)
 
-    def select(text: str, level: Level | None) -> np.ndarray:
+    def by_map(smoothed: SmoothedRelevancy, level: Level | None) -> np.ndarray:
+        return relevancy_mask(smoothed, level, rule)[0]
+
+    def by_nodes(text: str, level: Level | None) -> np.ndarray:
         return selections.mask(view, selections.nodes((text,), level, view), size_hw)
 
     texts = [query.text for query in truth.categories]
@@ -149,7 +153,7 @@ def measure_view(
                     "field",
                     LERF_LANGSPLAT,
                     smoothed,
-                    lambda _, level, smoothed=smoothed: relevancy_mask(smoothed, level, rule)[0],
+                    partial(by_map, smoothed),
                     category,
                     queries,
                     settings,
@@ -160,11 +164,11 @@ def measure_view(
             if nodes is not None and "tree" in settings.methods:
                 smoothed = SmoothedRelevancy.of(nodes[row], rule)
                 yield from _answer_rows(
-                    "tree", TREE_NODES, smoothed, select, category, queries, settings, masks
+                    "tree", TREE_NODES, smoothed, partial(by_nodes, text), category, queries, settings, masks
                 )
                 yield from _scene_wide_rows(queries, settings, selections, view, masks)
                 if also is not None:
-                    yield from also.add("tree", nodes[row], select(text, None), category, queries)
+                    yield from also.add("tree", nodes[row], by_nodes(text, None), category, queries)
             if nodes is not None and "tree-path" in settings.methods:
                 yield from _path_rows(nodes[row], queries, settings, selections, view, masks)
     if also is not None:
@@ -187,7 +191,7 @@ def _answer_rows(
     method: str,
     flat: ProtocolCard,
     smoothed: SmoothedRelevancy,
-    answer: Callable[[str, Level | None], np.ndarray],
+    answer: Callable[[Level | None], np.ndarray],
     category: Query,
     queries: Sequence[Query],
     settings: EvaluateSettings,
@@ -199,19 +203,19 @@ def _answer_rows(
         method: "field" or "tree".
         flat: protocol of texts whose levels are united.
         smoothed: the text's relevancy.
-        answer: (text, level or None for automatic) -> mask.
+        answer: level, or None for the method's own choice -> mask of the text.
         category: the text with all levels united.
         queries: the same per level.
         settings: as in `measure_view`.
         masks: keeps the answers.
     """
     united, given, auto = (label_of(card, method, settings) for card in (flat, LEVEL_GIVEN, LEVEL_AUTO))
-    auto_mask = answer(category.text, None)
+    auto_mask = answer(None)
     auto_points, _ = peak_points(smoothed.filtered, None)
     yield from mask_rows(method, category, united, auto_mask, auto_points)
     masks.put((method, auto, category.text), auto_mask)
     for query in queries:
-        given_mask = answer(query.text, query.level)
+        given_mask = answer(query.level)
         given_points, _ = peak_points(smoothed.filtered, query.level)
         yield from mask_rows(method, query, given, given_mask, given_points)
         yield from mask_rows(method, query, auto, auto_mask, auto_points)
@@ -270,21 +274,30 @@ def _consistency_rows(truth: ViewTruth, masks: PackedMasks, settings: EvaluateSe
     parents = sum(map(len, transitions))
     if not parents:
         return
-    lookups = {("truth", label_of(ANNOTATIONS, "truth", settings)): lambda path: truth.regions[path]}
+    # (method, protocol) -> function from a path to the rest of its answer's key
+    rest_of: dict[tuple[str, str], Callable[[tuple[str, ...]], tuple]] = {
+        ("truth", label_of(ANNOTATIONS, "truth", settings)): lambda path: (path,)
+    }
     for method in ("field", "tree"):
         if method in settings.methods:
-            auto = (method, label_of(LEVEL_AUTO, method, settings))
-            lookups[auto] = lambda path, key=auto: masks.get((*key, path[-1]))
+            rest_of[method, label_of(LEVEL_AUTO, method, settings)] = lambda path: path[-1:]
             for card in (LEVEL_GIVEN, *([SCENE_WIDE] if method == "tree" else [])):
-                given = (method, label_of(card, method, settings))
-                lookups[given] = lambda path, key=given: masks.get((*key, path[-1], Level(len(path))))
+                rest_of[method, label_of(card, method, settings)] = lambda path: (path[-1], Level(len(path)))
     if "tree-path" in settings.methods:
-        key = ("tree-path", label_of(PATH, "tree-path", settings))
-        lookups[key] = lambda path, key=key: masks.get((*key, path))
-    for (method, protocol), mask_of in lookups.items():
+        rest_of["tree-path", label_of(PATH, "tree-path", settings)] = lambda path: (path,)
+
+    def mask_of(answer: tuple[str, str], path: tuple[str, ...]) -> np.ndarray:
+        return truth.regions[path] if answer[0] == "truth" else masks.get((*answer, *rest_of[answer](path)))
+
+    for answer in rest_of:
+        method, protocol = answer
         families = [
             [
-                Family(mask_of(parent), tuple(mask_of(child) for child in children), truth.regions[parent])
+                Family(
+                    mask_of(answer, parent),
+                    tuple(mask_of(answer, child) for child in children),
+                    truth.regions[parent],
+                )
                 for parent, children in transition
             ]
             for transition in transitions
