@@ -141,11 +141,6 @@ BUILDING_BLOCKS = frozenset(
         "hierarchy.consistency_of_families",
         "hierarchy.family_consistency",
         "hierarchy.mean_over_parents",
-        "averages.accuracy_at",
-        "averages.mean_over_classes",
-        "averages.mean_over_levels",
-        "averages.mean_over_pairs",
-        "averages.mean_over_scenes",
         "instances.average_precision",
         "instances.curve_area",
         "instances.match_instances",
@@ -153,7 +148,7 @@ BUILDING_BLOCKS = frozenset(
         "point_classes.pooled",
     }
 )
-"""Public functions of the metrics that are no metric of a row."""
+"""Public functions of the metrics that are not themselves a metric of a row."""
 
 
 def public_functions():
