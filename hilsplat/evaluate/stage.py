@@ -34,10 +34,10 @@ from hilsplat.settings import EvaluateSettings
 logger = logging.getLogger(__name__)
 
 MAX_CAMERA_ERROR_M = 0.1
-"""Camera poses that are off by more make scores of points meaningless; the log warns."""
+"""Above this median camera error scores of points are meaningless, and the log says so."""
 
 TIMED_TEXTS = 3
-"""Queries that are timed, in one view."""
+"""Number of queries timed, all in one view."""
 
 
 @dataclass(frozen=True)
@@ -66,27 +66,27 @@ def run_evaluate(
 ) -> None:
     """Score every annotated query in every annotated test view, and every labelled point (`protocols`).
 
-    With the labels of a published data set every labelled view is scored, held out or not: most of them
+    With the labels of a published data set every labelled view is scored, held out or not: most benchmarks
     train on all views. `times.csv` (seconds per query) and, for instances, `instances.npz` are written beside
     `scores.csv`.
 
     Args:
-        parts: the finished scene; its test views were held out of every stage before.
-        out: `scores.csv`; without truth and labels a file with a header only.
+        parts: the finished scene; its test views were held out of every earlier stage.
+        out: `scores.csv`; without truth and labels it holds only the header.
         settings: queries and protocols.
         dataset: written into every row, as are `scene` and `variant`.
         scene: scene name.
         variant: named set of settings.
         truth: truth folder of a synthetic scene.
-        kind: kind of the synthetic scene, which decides what it stands in for (`Asked.of_world`).
-        labels: labels of published data sets, such as "lerf_ovs/figurines", in place of a truth.
+        kind: kind of synthetic scene, which decides which benchmarks it stands in for (`Asked.of_world`).
+        labels: labels of published data sets, such as "lerf_ovs/figurines", instead of a truth.
         data_root: folder of the data sets' folders.
         threads: threads for rendering.
 
     Raises:
-        MisalignedArtifactError: label images are of another size than the cameras.
-        SceneError: a data set or a kind is unknown, a labelled view has no pose, or labels are of another
-            shape than their view.
+        MisalignedArtifactError: label images and cameras differ in size.
+        SceneError: a data set or a kind is unknown, a labelled view has no pose, or labels differ in shape
+            from their view.
     """
     scores: list[Score] = []
     matches: dict[tuple[str, ...], InstanceMatches] = {}
@@ -142,7 +142,7 @@ def run_evaluate(
 def known_truths(
     known: Annotations, posed: Scene, settings: EvaluateSettings
 ) -> Mapping[str, Callable[[], ViewTruth]]:
-    """What is true in views; nothing for labels on points."""
+    """True regions by view; empty for labels on points."""
     if isinstance(known, PointScene):
         return {}
     if isinstance(known, LabelledScene):
@@ -161,7 +161,7 @@ def point_rows(
     settings: EvaluateSettings,
     threads: int,
 ) -> Iterator[Measured | tuple[str, InstanceMatches]]:
-    """Rows of labelled points, and the matches of instances; nothing if no protocol asks for points."""
+    """Score labelled points: rows, and matches of instances; nothing if no protocol scores points."""
     if not asked.points or isinstance(known, LabelledScene):
         return
     if isinstance(known, PointScene):
@@ -193,7 +193,7 @@ def timed(
     texts: Sequence[str],
     settings: EvaluateSettings,
 ) -> dict[str, float]:
-    """Seconds of one query in a view by field and tree (see `costs.time_queries`)."""
+    """Seconds that field and tree take for one query in a view (see `costs.time_queries`)."""
     rule = rule_of(settings)
     size_hw = answers.scene.cameras[view].size_hw
 

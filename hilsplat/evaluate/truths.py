@@ -1,4 +1,4 @@
-"""What is true in the views of a scene, read when their turn comes."""
+"""True regions in the views of a scene, loaded on demand."""
 
 import logging
 from collections.abc import Callable
@@ -14,13 +14,13 @@ from hilsplat.settings import EvaluateSettings
 logger = logging.getLogger(__name__)
 
 SHAPE_TOLERANCE = 0.01
-"""Views whose sides were rounded by undistortion or shrinking still fit their labels."""
+"""Relative difference up to which labels fit a view: undistortion and shrinking round its sides."""
 
 
 def annotated_truths(
     truth: Path, posed: Scene, settings: EvaluateSettings
 ) -> dict[str, Callable[[], ViewTruth]]:
-    """What is true in each annotated test view, read when its turn comes."""
+    """True regions in each annotated test view, loaded on demand."""
     annotations = HierarchyAnnotations.load(truth)
     return {
         view: partial(ViewTruth.of, annotations, view, posed.cameras[view].size_hw, settings.min_region_px)
@@ -30,10 +30,10 @@ def annotated_truths(
 
 
 def labelled_truths(labels: LabelledScene, posed: Scene) -> dict[str, Callable[[], ViewTruth]]:
-    """What is true in each labelled view of a published data set, read when its turn comes.
+    """True regions in each labelled view of a published data set, loaded on demand.
 
     Raises:
-        SceneError: a labelled view has no pose, or its labels are of another shape.
+        SceneError: a labelled view has no pose, or its labels differ in shape.
     """
     for sentence in labels.warnings:
         logger.warning("%s/%s: %s", labels.dataset, labels.scene, sentence)

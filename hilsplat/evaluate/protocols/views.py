@@ -10,9 +10,9 @@
 | `hierarchy/scene-wide` | every (text, level) | tree, at the annotation's level, one answer for all views |
 | `hierarchy/annotations` | - | the annotations themselves, HC only: what perfect masks would score |
 
-A path holds one more piece of information than a flat query and is not the paper's protocol. A missing
-or empty prediction counts 0. A field sees what a view shows, and so do the nodes that compete: all but
-`hierarchy/scene-wide` ask for what is in the picture.
+A path gives more information than a flat query and is not the paper's protocol. A missing or empty
+prediction counts 0. A field answers with what the view shows; likewise only nodes that the view shows
+compete, except under `hierarchy/scene-wide`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -54,14 +54,14 @@ from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
 from hilsplat.settings import EvaluateSettings
 
 NO_POINTS = np.zeros((0, 2), np.int64)
-"""Where nothing is localized."""
+"""For answers that are not localized."""
 
 RELEVANCY_CHUNK_MIB = 512
-"""Maps of so many texts are held at once: every chunk decodes the view anew."""
+"""Memory for relevancy maps held at once; each chunk of texts decodes the view again."""
 
 
 def rule_of(settings: EvaluateSettings) -> RelevancyRule:
-    """The map rule that the settings ask for."""
+    """The map rule that the settings describe."""
     return RelevancyRule(
         settings.filter_px,
         settings.mix,
@@ -73,7 +73,7 @@ def rule_of(settings: EvaluateSettings) -> RelevancyRule:
 
 
 def label_of(card: ProtocolCard, method: str, settings: EvaluateSettings) -> str:
-    """Protocol of a row: the card's name, then what the settings change of what this method does."""
+    """Protocol of a row: the card's name, then the settings that change what this method does."""
     if method == "truth":
         return card.labelled()
     rule = rule_of(settings)
@@ -90,12 +90,12 @@ def label_of(card: ProtocolCard, method: str, settings: EvaluateSettings) -> str
 
 
 def given_key(method: str, query: Query, settings: EvaluateSettings) -> tuple:
-    """Under which key the answer at the query's level is kept."""
+    """Key under which the answer at the query's level is kept."""
     return (method, label_of(LEVEL_GIVEN, method, settings), query.text, query.level)
 
 
 def relevancy_departures(settings: EvaluateSettings) -> list[str]:
-    """What the settings change of the relevancy itself, whatever is made of it."""
+    """What the settings change in the relevancy itself."""
     words = []
     if settings.canonical != CANONICAL:
         words.append(f"canonical {'+'.join(settings.canonical)}")
@@ -119,14 +119,14 @@ def measure_view(
     """All numbers of one view, in no particular order.
 
     Args:
-        scene: what answers.
-        selections: its chosen nodes.
-        truth: what is scored.
-        view: its view.
+        scene: scene that answers.
+        selections: the nodes it selects.
+        truth: queries to score, with their regions.
+        view: name of their view.
         size_hw: height and width of the view, px.
-        settings: methods, the map rule and what makes a relevancy.
+        settings: methods, the map rule and the settings of the relevancy.
         also: further protocols for texts without levels, such as `3d-ovs/langsplat`.
-        masks: keeps the answers, for what is measured between views.
+        masks: keeps the answers, for measures between views.
     """
     masks = PackedMasks(size_hw) if masks is None else masks
     rule = rule_of(settings)
@@ -230,7 +230,7 @@ def _scene_wide_rows(
     view: str,
     masks: PackedMasks,
 ) -> Iterator[Measured]:
-    """The tree's answer in 3D, which knows of no view; maps, and so localization, are as with a view."""
+    """Rows of the tree's answer for the whole scene; its maps, and so its localization, are the view's."""
     protocol = label_of(SCENE_WIDE, "tree", settings)
     for query in queries:
         mask = selections.mask(view, selections.nodes((query.text,), query.level, None), masks.size_hw)
@@ -246,7 +246,7 @@ def _path_rows(
     view: str,
     masks: PackedMasks,
 ) -> Iterator[Measured]:
-    """Localization looks inside the prediction for the parent, where there is one."""
+    """Rows of answers to paths; localization looks inside the prediction for the parent, if there is one."""
     protocol = label_of(PATH, "tree-path", settings)
     size_hw = masks.size_hw
     side_px = filter_side_px(settings.filter_px, size_hw[0])

@@ -71,7 +71,7 @@ def omega_table(sources: Sources) -> Table:
 
 
 def reported(sources: Sources, what: str) -> Block:
-    """The paper's rows of an ablation."""
+    """The rows that the paper reports for an ablation."""
     return reported_block(
         sources.published, "LERF, 3D-OVS, Hi-LERF", f"Reported in the paper: {what}", families=False
     )
@@ -115,7 +115,7 @@ def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, C
 def against_default(scores: "pd.DataFrame", part: "pd.DataFrame") -> Cell:
     """How far a row's mIoU is above that of the default field, paired by scene.
 
-    Scenes differ by more than rows do; the spread of the differences tells whether one is better in general.
+    Scenes differ by more than rows do; the spread of the differences shows whether one is better in general.
 
     Args:
         scores: scores with seeds (`with_seeds`).

@@ -18,10 +18,10 @@ SYNTHETIC = "synthetic"
 """Data sets whose names begin with this are stand-ins."""
 
 SEED = re.compile(r"(?P<variant>.+)\.seed(?P<seed>[0-9]+)")
-"""A variant's name with another seed; rows of all seeds of a variant are one row."""
+"""A variant's name with a seed; all seeds of a variant share one row."""
 
 ANSWERS = {"field": "field", "tree": "tree", "tree-path": "tree, path", "truth": "annotations"}
-"""How rows name what answered, in their order."""
+"""Method -> its name in rows, in the order of rows."""
 
 PROTOCOLS = {
     LEVEL_GIVEN.full_name: "level given",
@@ -30,17 +30,17 @@ PROTOCOLS = {
     PATH.full_name: "path of texts",
     ANNOTATIONS.full_name: "reference",
 }
-"""How tables name protocols; others keep their name."""
+"""Protocol -> its name in tables; others keep their own."""
 
 STAND_INS = {
     "synthetic": "tables of the synthetic world",
     "synthetic-rooms": "rooms of the synthetic world",
     "synthetic-streets": "streets of the synthetic world",
 }
-"""Headings of the stand-ins."""
+"""Data set of a stand-in -> its description in headings."""
 
 TRUE_MASKS = "diagnostic, true masks: "
-"""Before the method's name in rows whose masks were made from true labels."""
+"""Prefix of the method's name in rows whose masks were made from true labels."""
 
 
 def measured_blocks(
@@ -58,7 +58,7 @@ def measured_blocks(
 
     Args:
         scores: rows of `scores.csv`.
-        labels: variant -> name.
+        labels: variant -> its name in the table.
         protocols: prefixes of the protocols that make a row.
         cells_of: values of a row, from the scores of one variant, method, masks, protocol and seed.
         columns_of: value columns, from the scores of a data set.
@@ -142,14 +142,14 @@ def in_order(rows: Sequence[tuple[tuple, Row]]) -> list[Row]:
 
 
 def with_seeds(scores: "pd.DataFrame") -> "pd.DataFrame":
-    """The seed in a column of its own; the first seed is "0"."""
+    """Move the seed into its own column; the first seed is "0"."""
     parts = scores["variant"].str.extract(f"^{SEED.pattern}$")
     variant = parts["variant"].fillna(scores["variant"])
     return scores.assign(variant=variant, seed=parts["seed"].fillna("0"))
 
 
 def mean_over_seeds(seeds: Sequence[Mapping[str, Cell]]) -> dict[str, Cell]:
-    """Mean of each cell and its standard deviation (n - 1) over seeds; one seed as it is."""
+    """Mean of each cell and its standard deviation (n - 1) over seeds; one seed stays unchanged."""
     if len(seeds) == 1:
         return dict(seeds[0])
     cells = {}
@@ -164,7 +164,7 @@ def mean_over_seeds(seeds: Sequence[Mapping[str, Cell]]) -> dict[str, Cell]:
 
 
 def without_repeats(rows: Sequence[Row]) -> tuple[Row, ...]:
-    """Keep one of the rows that show the same: the annotations' row is the same for every variant."""
+    """Keep one of each set of equal rows: the annotations' row is the same for every variant."""
     seen: dict[tuple, Row] = {}
     for row in rows:
         key = (*row.names.values(), *(cell.text for cell in row.cells.values()))
@@ -173,7 +173,7 @@ def without_repeats(rows: Sequence[Row]) -> tuple[Row, ...]:
 
 
 def row_name(variant: str, method: str, labels: Mapping[str, str]) -> str:
-    """Name of a row by what answered.
+    """Name of a row, from its variant and method.
 
     The default variant answers by field and tree, `hilsplat (field)` and `hilsplat (tree)`; another
     variant's label is that of its field.
@@ -202,7 +202,7 @@ def scene_cells(
     Args:
         part: the scores of one row.
         metrics: name in the column -> metric.
-        average: begins the name of the mean's column.
+        average: prefix of the mean's column.
     """
     cells = {}
     for name, metric in metrics.items():
@@ -226,7 +226,7 @@ def same_row(scores: "pd.DataFrame", part: "pd.DataFrame", protocols: tuple[str,
     Args:
         scores: scores with seeds (`with_seeds`).
         part: the scores of one row.
-        protocols: how the protocols' names begin.
+        protocols: prefixes of the protocols' names.
     """
     first = part.iloc[0]
     keys = ("dataset", "variant", "seed", "masks", "method")

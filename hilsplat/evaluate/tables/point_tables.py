@@ -64,7 +64,7 @@ def replica_table(sources: Sources) -> Table:
 
 
 def scannet_table(sources: Sources) -> Table:
-    """ScanNet with 19, 15 and 10 classes, ScanNet200 with 200, instances of ScanNet200: one row a method."""
+    """ScanNet with 19, 15, 10 classes, ScanNet200 with 200, instances of ScanNet200: one row per method."""
     blocks = [reported_block(sources.published, "ScanNet", "Reported in the paper: ScanNet, ScanNet200")]
     scores = with_seeds(sources.scores)
     names = tuple(SCANNET_COLUMNS)
@@ -126,7 +126,7 @@ def instance_cells(sources: Sources, part: "pd.DataFrame") -> dict[str, Cell]:
 
 
 def waymo_table(sources: Sources) -> Table:
-    """mIoU over 22 classes, counts of all scenes pooled (paper: Waymo)."""
+    """mIoU over 22 classes, with the counts of all scenes pooled (paper: Waymo)."""
 
     def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
         from hilsplat.datasets.classes.waymo import WAYMO_22
@@ -159,7 +159,7 @@ def waymo_table(sources: Sources) -> Table:
 
 
 def measured_scenes(part: "pd.DataFrame") -> list[list[Measured]]:
-    """Score rows as measured ones, one list per scene."""
+    """Score rows as `Measured`, one list per scene."""
     return [
         [
             Measured(row.method, row.query, row.level, row.metric, row.protocol, row.value, row.n)
