@@ -1,4 +1,4 @@
-# What all rules use: the plan of the run (hilsplat/workflow/plan.py), threads, and the environment.
+# Shared by all rules: the plan of the run (hilsplat/workflow/plan.py), threads, and the environment.
 import json
 from pathlib import Path
 
@@ -20,6 +20,6 @@ ENVIRONMENT = "../workflow/envs/hilsplat.yaml"
 
 try:
     CORES = workflow.cores
-except WorkflowError:  # not given, as with --report and --lint, which run no job
+except WorkflowError:  # not set under --report and --lint, which run no jobs
     CORES = 1
 THREADS = PLAN.threads(CORES)

@@ -1,4 +1,4 @@
-# Scores, tables, efficiency. Only here are label files read.
+# Scores and tables. Only evaluation and figures read the labels of data sets.
 rule evaluate:
     input:
         scene="results/{dataset}/{scene}/scene",

@@ -1,4 +1,4 @@
-# The scene's code of CLIP vectors and the language field.
+# The autoencoder of the scene's CLIP vectors, and the language field.
 rule autoencoder:
     input:
         clip=PLAN.shared("clip", "clip"),

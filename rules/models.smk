@@ -1,4 +1,4 @@
-# The small models of the synthetic world. Off the default path: the trained ones are committed.
+# The small models of the synthetic world. A default run does not train them: trained ones are committed.
 rule train_models:
     output:
         directory("results/models/sam-tiny"),

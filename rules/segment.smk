@@ -2,7 +2,7 @@
 rule masks:
     input:
         scene="results/{dataset}/{scene}/scene",
-        truth=PLAN.masks_truth,  # nothing, but for the diagnostic segmenter
+        truth=PLAN.masks_truth,  # empty, except for the diagnostic segmenter
     output:
         masks=directory("results/{dataset}/{scene}/{variant}/masks"),
     log:

@@ -1,4 +1,4 @@
-# Base 3D Gaussian Splatting: a fit, or somebody's Gaussians (column gaussians of the scene sheet).
+# Base 3D Gaussian Splatting: a fit, or supplied Gaussians (column gaussians of the scene sheet).
 rule gaussians:
     input:
         scene="results/{dataset}/{scene}/scene",

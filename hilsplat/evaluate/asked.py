@@ -1,4 +1,4 @@
-"""Which protocols a scene is scored under: those of its data set, or of the stand-in that it is."""
+"""Which protocols score a scene: those of its data set, or of the benchmarks it stands in for."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,17 +22,17 @@ STAND_INS: Mapping[str, tuple[str, ...]] = {
     "room": (*SCANNET, *SCANNET200, *REPLICA),
     "street": WAYMO,
 }
-"""Kind of synthetic scene -> protocols for which it stands in, beside those of LERF-OVS and levels."""
+"""Kind of synthetic scene -> protocols it stands in for, besides those of LERF-OVS and of levels."""
 
 
 @dataclass(frozen=True)
 class Asked:
-    """Protocols beyond those that every labelled image is scored under (`protocols.views`).
+    """Protocols beyond those that score every labelled image (`protocols.views`).
 
     Attributes:
-        flat: protocols of texts without levels.
-        points: protocols of labelled points.
-        level: level whose texts the flat ones ask; None where the labels have no levels.
+        flat: protocols for texts without levels.
+        points: protocols for labelled points.
+        level: level whose texts the flat protocols query; None if the labels have no levels.
     """
 
     flat: tuple[ProtocolCard, ...] = ()
@@ -44,32 +44,32 @@ class Asked:
         """Protocols of a stand-in; none for kind "".
 
         Raises:
-            SceneError: there is no such kind.
+            SceneError: the kind is unknown.
         """
         if kind and kind not in STAND_INS:
             raise SceneError(
-                f"a synthetic scene of kind {kind!r} stands in for no data set",
+                f"unknown kind of synthetic scene: {kind!r}",
                 expected=f"one of {', '.join(STAND_INS)}",
-                fix="correct it, or leave it out",
+                fix="correct the kind, or leave it out",
             )
         return _asked(STAND_INS.get(kind, ()), Level.WHOLE)
 
     @staticmethod
     def of_dataset(name: str) -> "Asked":
-        """Protocols that the data set names itself.
+        """Protocols that the data set's own entry names.
 
         Raises:
-            SceneError: there is no such data set.
-            ArtifactError: it names a protocol that is none.
+            SceneError: the data set is unknown.
+            ArtifactError: it names an unknown protocol.
         """
         return _asked(dataset_of(name).protocols, None)
 
     @staticmethod
     def open(name: str, data_root: Path) -> "tuple[str, LabelledScene | PointScene, Asked]":
-        """Data set, labels and protocols of a scene named as in "lerf_ovs/figurines".
+        """Data set, labels and protocols of a scene with a name such as "lerf_ovs/figurines".
 
         Raises:
-            SceneError: there is no such data set or scene, or it cannot be read.
+            SceneError: the data set or scene is unknown or cannot be read.
         """
         dataset = name.partition("/")[0]
         return dataset, open_labels(name, data_root), Asked.of_dataset(dataset)

@@ -1,6 +1,6 @@
 """Matches of predicted instances, kept beside `scores.csv` so that scans are evaluated together.
 
-The official average precision pools all scans before it draws a curve; a number per scan would not do.
+The official average precision pools all scans before it draws a curve; a number per scan is not enough.
 """
 
 from collections.abc import Iterable, Mapping
@@ -16,12 +16,12 @@ FIELDS = ("class_index", "overlap_index", "confidence", "is_match", "misses", "h
 
 
 def instances_path(scores: Path) -> Path:
-    """Where the matches of a score file lie."""
+    """Path of the matches that belong to a score file."""
     return Path(scores).with_name("instances.npz")
 
 
 def write_instances(scores: Path, matches: Mapping[tuple[str, ...], "InstanceMatches"]) -> None:
-    """Write the matches of a scene by (data set, scene, variant, masks, method); none removes the file."""
+    """Write a scene's matches by (data set, scene, variant, masks, method); without any, remove the file."""
     path = instances_path(scores)
     if not matches:
         path.unlink(missing_ok=True)
@@ -33,7 +33,7 @@ def write_instances(scores: Path, matches: Mapping[tuple[str, ...], "InstanceMat
 
 
 def read_instances(scores: Iterable[Path]) -> dict[tuple[str, ...], "InstanceMatches"]:
-    """Matches beside score files by (data set, scene, variant, masks, method)."""
+    """Read the matches beside score files by (data set, scene, variant, masks, method)."""
     paths = [path for path in map(instances_path, scores) if path.is_file()]
     if not paths:
         return {}

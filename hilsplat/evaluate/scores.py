@@ -25,12 +25,12 @@ class Score:
         masks: what made the masks, such as `sam-tiny`; see `made_from_truth`.
         method: what answered: `tree`, `tree-path`, `field`, or `truth` for the annotations' own HC.
         view: view name.
-        query: text; empty for a number of a whole view.
-        level: level label of the annotation; empty where the protocol knows none.
+        query: text; empty if the number describes a whole view.
+        level: level label of the annotation; empty if the protocol has no levels.
         metric: a key of `METRICS`.
-        protocol: full name of how the answer was made and compared (`protocols.cards`), with departures.
+        protocol: how the answer was made and compared: a full name, with departures (`protocols.cards`).
         value: in the metric's bounds.
-        n: how many things the value is a mean of.
+        n: number of items that the value averages.
     """
 
     dataset: str
@@ -51,7 +51,7 @@ COLUMNS: tuple[str, ...] = tuple(field.name for field in fields(Score))
 
 
 def write_scores(path: Path, scores: Iterable[Score]) -> None:
-    """Write rows, sorted, values with six decimals: the same rows give the same bytes."""
+    """Write sorted rows, values with six decimals: the same rows give the same bytes."""
     rows = []
     for score in scores:
         assert score.metric in METRICS, score.metric

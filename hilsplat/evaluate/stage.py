@@ -34,10 +34,20 @@ from hilsplat.settings import EvaluateSettings
 logger = logging.getLogger(__name__)
 
 MAX_CAMERA_ERROR_M = 0.1
-"""Camera poses that are off by more make scores of points meaningless; the log warns."""
+"""Above this median camera error scores of points are meaningless, and the log says so."""
 
 TIMED_TEXTS = 3
-"""Queries that are timed, in one view."""
+"""Number of queries timed, all in one view."""
+
+
+@dataclass(frozen=True)
+class TrueAnnotations:
+    """The truth folder of a synthetic scene."""
+
+    folder: Path
+
+
+Annotations = LabelledScene | PointScene | TrueAnnotations
 
 
 def run_evaluate(
@@ -56,27 +66,27 @@ def run_evaluate(
 ) -> None:
     """Score every annotated query in every annotated test view, and every labelled point (`protocols`).
 
-    With the labels of a published data set every labelled view is scored, held out or not: most of them
+    With the labels of a published data set every labelled view is scored, held out or not: most benchmarks
     train on all views. `times.csv` (seconds per query) and, for instances, `instances.npz` are written beside
     `scores.csv`.
 
     Args:
-        parts: the finished scene; its test views were held out of every stage before.
-        out: `scores.csv`; without truth and labels a file with a header only.
+        parts: the finished scene; its test views were held out of every earlier stage.
+        out: `scores.csv`; without truth and labels it holds only the header.
         settings: queries and protocols.
         dataset: written into every row, as are `scene` and `variant`.
         scene: scene name.
         variant: named set of settings.
         truth: truth folder of a synthetic scene.
-        kind: kind of the synthetic scene, which decides what it stands in for (`Asked.of_world`).
-        labels: labels of published data sets, such as "lerf_ovs/figurines", in place of a truth.
+        kind: kind of synthetic scene, which decides which benchmarks it stands in for (`Asked.of_world`).
+        labels: labels of published data sets, such as "lerf_ovs/figurines", instead of a truth.
         data_root: folder of the data sets' folders.
         threads: threads for rendering.
 
     Raises:
-        MisalignedArtifactError: label images are of another size than the cameras.
-        SceneError: a data set or a kind is unknown, a labelled view has no pose, or labels are of another
-            shape than their view.
+        MisalignedArtifactError: label images and cameras differ in size.
+        SceneError: a data set or a kind is unknown, a labelled view has no pose, or labels differ in shape
+            from their view.
     """
     scores: list[Score] = []
     matches: dict[tuple[str, ...], InstanceMatches] = {}
@@ -84,11 +94,10 @@ def run_evaluate(
     label = masks_label(parts.masks)
 
     def keep(data: str, view: str, measured: Measured) -> None:
-        names = {"dataset": data, "scene": scene, "variant": variant, "masks": label}
-        scores.append(Score(**names, view=view, **vars(measured)))
+        scores.append(Score(data, scene, variant, label, view=view, **vars(measured)))
 
     with stage_log("evaluate", f"{dataset}/{scene}/{variant}") as counts:
-        scored = [Asked.open(name, data_root) for name in labels]
+        scored: list[tuple[str, Annotations, Asked]] = [Asked.open(name, data_root) for name in labels]
         if truth is not None:
             scored.append((dataset, TrueAnnotations(truth), Asked.of_world(kind)))
         if not scored:
@@ -119,28 +128,21 @@ def run_evaluate(
                     )
                     for view, row in found:
                         keep(data, view, row)
-                for row in point_rows(answers, known, wanted, settings, threads):
-                    if isinstance(row, Measured):
-                        keep(data, "", row)
+                for each in point_rows(answers, known, wanted, settings, threads):
+                    if isinstance(each, Measured):
+                        keep(data, "", each)
                     else:
-                        matches[data, scene, variant, label, row[0]] = row[1]
+                        matches[data, scene, variant, label, each[0]] = each[1]
         counts["rows"] = len(scores)
         write_times(out, dataset, scene, variant, seconds)
         write_instances(out, matches)
         write_scores(out, scores)
 
 
-@dataclass(frozen=True)
-class TrueAnnotations:
-    """The truth folder of a synthetic scene."""
-
-    folder: Path
-
-
 def known_truths(
-    known: LabelledScene | PointScene | TrueAnnotations, posed: Scene, settings: EvaluateSettings
+    known: Annotations, posed: Scene, settings: EvaluateSettings
 ) -> Mapping[str, Callable[[], ViewTruth]]:
-    """What is true in views; nothing for labels on points."""
+    """True regions by view; empty for labels on points."""
     if isinstance(known, PointScene):
         return {}
     if isinstance(known, LabelledScene):
@@ -154,12 +156,12 @@ def known_truths(
 
 def point_rows(
     answers: LanguageScene,
-    known: LabelledScene | PointScene | TrueAnnotations,
+    known: Annotations,
     asked: Asked,
     settings: EvaluateSettings,
     threads: int,
 ) -> Iterator[Measured | tuple[str, InstanceMatches]]:
-    """Rows of labelled points, and the matches of instances; nothing if no protocol asks for points."""
+    """Score labelled points: rows, and matches of instances; nothing if no protocol scores points."""
     if not asked.points or isinstance(known, LabelledScene):
         return
     if isinstance(known, PointScene):
@@ -191,7 +193,7 @@ def timed(
     texts: Sequence[str],
     settings: EvaluateSettings,
 ) -> dict[str, float]:
-    """Seconds of one query in a view by field and tree (see `costs.time_queries`)."""
+    """Seconds that field and tree take for one query in a view (see `costs.time_queries`)."""
     rule = rule_of(settings)
     size_hw = answers.scene.cameras[view].size_hw
 

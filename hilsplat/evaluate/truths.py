@@ -1,7 +1,8 @@
-"""What is true in the views of a scene, read when their turn comes."""
+"""True regions in the views of a scene, loaded on demand."""
 
 import logging
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from hilsplat.datasets.labelled import LabelledScene, check_label_size
@@ -13,28 +14,26 @@ from hilsplat.settings import EvaluateSettings
 logger = logging.getLogger(__name__)
 
 SHAPE_TOLERANCE = 0.01
-"""Views whose sides were rounded by undistortion or shrinking still fit their labels."""
+"""Relative difference up to which labels fit a view: undistortion and shrinking round its sides."""
 
 
 def annotated_truths(
     truth: Path, posed: Scene, settings: EvaluateSettings
 ) -> dict[str, Callable[[], ViewTruth]]:
-    """What is true in each annotated test view, read when its turn comes."""
+    """True regions in each annotated test view, loaded on demand."""
     annotations = HierarchyAnnotations.load(truth)
     return {
-        view: lambda view=view: ViewTruth.of(
-            annotations, view, posed.cameras[view].size_hw, settings.min_region_px
-        )
+        view: partial(ViewTruth.of, annotations, view, posed.cameras[view].size_hw, settings.min_region_px)
         for view in posed.views("test")
         if annotations.views.get(view)
     }
 
 
 def labelled_truths(labels: LabelledScene, posed: Scene) -> dict[str, Callable[[], ViewTruth]]:
-    """What is true in each labelled view of a published data set, read when its turn comes.
+    """True regions in each labelled view of a published data set, loaded on demand.
 
     Raises:
-        SceneError: a labelled view has no pose, or its labels are of another shape.
+        SceneError: a labelled view has no pose, or its labels differ in shape.
     """
     for sentence in labels.warnings:
         logger.warning("%s/%s: %s", labels.dataset, labels.scene, sentence)
@@ -42,8 +41,8 @@ def labelled_truths(labels: LabelledScene, posed: Scene) -> dict[str, Callable[[
     for stem, view in labels.posed_views(posed.cameras.names).items():
         size_hw, regions = posed.cameras[view].size_hw, labels.views[stem]
         for label_hw in sorted({region.size_hw for region in regions}):
-            sentence = check_label_size(f"a label of view {view}", label_hw, size_hw, SHAPE_TOLERANCE)
-            if sentence:
-                logger.warning("%s/%s: %s", labels.dataset, labels.scene, sentence)
-        truths[view] = lambda regions=regions, size_hw=size_hw: ViewTruth.of_regions(regions, size_hw)
+            departure = check_label_size(f"a label of view {view}", label_hw, size_hw, SHAPE_TOLERANCE)
+            if departure:
+                logger.warning("%s/%s: %s", labels.dataset, labels.scene, departure)
+        truths[view] = partial(ViewTruth.of_regions, regions, size_hw)
     return truths

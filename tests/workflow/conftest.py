@@ -15,7 +15,7 @@ import pytest
 PARTS = ("Snakefile", "rules", "workflow", "config", "hilsplat", "models")
 SCENE = Path("results/synthetic/tiny")
 UNFINISHED = shutil.ignore_patterns("*.pyc", "*.pyc.*", "*.tmp.*")
-"""Python's and numba's files that other tests may be writing, and rename when they are whole."""
+"""Files of Python and numba that other tests may be writing; they are renamed once complete."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -73,14 +73,14 @@ class Project:
         } - {"all"}
 
     def edit(self, path: str, old: str, new: str) -> None:
-        """Replace a text that must be there."""
+        """Replace a text, which must be present."""
         file = self.root / path
         text = file.read_text()
         assert old in text, f"{old!r} is not in {path}"
         file.write_text(text.replace(old, new))
 
     def files(self, folder: Path | str) -> dict[str, bytes]:
-        """Bytes of all files under a folder, but for Snakemake's own hidden time stamps."""
+        """Bytes of all files under a folder, except for Snakemake's own hidden time stamps."""
         base = self.root / folder
         return {
             str(file.relative_to(base)): file.read_bytes()
@@ -90,7 +90,7 @@ class Project:
 
 
 def copy_project(source: Path, target: Path, *, results: bool) -> Project:
-    """Copy the project's own files and, where asked, results with Snakemake's records; times stay.
+    """Copy the project's own files and, on request, results with Snakemake's records; times stay.
 
     Kernels that numba compiled go along: they hold as long as the time of their source does.
     """
@@ -102,7 +102,7 @@ def copy_project(source: Path, target: Path, *, results: bool) -> Project:
             shutil.copytree(origin, target / part, symlinks=True, ignore=UNFINISHED)
         elif origin.exists():
             shutil.copy2(origin, target / part)
-    if not results:  # rows that somebody added to the sheet do not belong into tests
+    if not results:  # rows that a user added to the sheet do not belong in tests
         sheet = target / "config/scenes.tsv"
         rows = sheet.read_text().splitlines(keepends=True)
         sheet.write_text("".join(row for row in rows if not row.startswith("photos\t")))

@@ -1,4 +1,4 @@
-"""Bad input stops with a sentence that names the file and the way out; the rest goes on."""
+"""Bad input stops with a message that names the file and the fix; other scenes go on."""
 
 from pathlib import Path
 
@@ -68,7 +68,7 @@ def test_fewer_than_three_photographs_are_refused(plain: Project, tmp_path: Path
     assert "3" in result.stderr
 
 
-def test_new_tells_what_it_found_and_adds_the_scene(plain: Project, tmp_path: Path) -> None:
+def test_new_reports_what_it_found_and_adds_the_scene(plain: Project, tmp_path: Path) -> None:
     photos = noise_photos(tmp_path / "photos", 4)
     (photos / "broken.jpg").write_bytes(b"\xff\xd8\xff\xe0 truncated")
     sheet = plain.root / "config/scenes.tsv"
@@ -120,7 +120,7 @@ def test_a_broken_scene_fails_and_the_others_go_on(copy_of_finished: Project, tm
 
 
 @pytest.mark.parametrize("section", ["masks", "clip"])
-def test_a_missing_model_folder_is_told(copy_of_finished: Project, section: str) -> None:
+def test_a_missing_model_folder_is_reported(copy_of_finished: Project, section: str) -> None:
     copy_of_finished.edit(
         "config/config.yaml",
         f"model: models/{'sam' if section == 'masks' else 'clip'}-tiny",
@@ -134,7 +134,7 @@ def test_a_missing_model_folder_is_told(copy_of_finished: Project, section: str)
     assert (copy_of_finished.root / "results/synthetic/tiny/gaussians.ply").is_file()
 
 
-def test_a_model_folder_of_another_kind_is_told(copy_of_finished: Project) -> None:
+def test_a_model_folder_of_another_kind_is_reported(copy_of_finished: Project) -> None:
     copy_of_finished.edit("config/config.yaml", "model: models/sam-tiny", "model: models/clip-tiny")
     result = copy_of_finished.snakemake(check=False)
     assert result.returncode != 0

@@ -1,4 +1,4 @@
-"""A scene whose row names somebody's PLY is not fitted; its report says where the Gaussians are from."""
+"""A scene whose row names a PLY is not fitted; its report names the origin of the Gaussians."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,7 @@ SCENE = "results/synthetic/tiny"
 
 
 def three_gaussians(seed: int) -> Gaussians:
-    """Three round ones at random places."""
+    """Three round Gaussians at random places."""
     n = 3
     return Gaussians(
         torch.randn(n, 3, generator=torch.Generator().manual_seed(seed)),
@@ -27,7 +27,7 @@ def three_gaussians(seed: int) -> Gaussians:
 
 @pytest.fixture
 def brought(project: Path, tmp_path: Path) -> Project:
-    """A project whose tiny scene brings three Gaussians along."""
+    """A project whose tiny scene comes with three Gaussians."""
     copy = copy_project(project, tmp_path / "project", results=False)
     save_ply(copy.root / "their things" / "three.ply", three_gaussians(seed=0))
     sheet = copy.root / "config/scenes.tsv"

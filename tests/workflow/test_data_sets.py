@@ -1,4 +1,4 @@
-"""Published data sets in the workflow: absent ones are told, labels are inputs of evaluation alone."""
+"""Published data sets in the workflow: absent ones are reported, labels are inputs of evaluation alone."""
 
 import re
 import sys
@@ -23,7 +23,7 @@ def touch(*paths: Path) -> None:
 
 @pytest.fixture(scope="module")
 def planned(project, tmp_path_factory) -> str:
-    """Dry run of the paper's configuration where one scene of LERF, one of 3D-OVS and a scan are there."""
+    """Dry run of the paper's configuration with one scene of LERF, one of 3D-OVS and one scan present."""
     copy = copy_project(project, tmp_path_factory.mktemp("data") / "project", results=False)
     data = copy.root / "data"
     touch(
@@ -79,7 +79,7 @@ def test_what_is_absent_is_named_with_the_reason(planned):
     assert re.search(r"replica/room_0 is skipped: .*one level too deep", planned)
 
 
-def test_tables_tell_what_was_not_measured(planned):
+def test_tables_list_what_was_not_measured(planned):
     tables = [text for rule, text in blocks(planned) if rule == "table"]
     assert len(tables) == 14
 

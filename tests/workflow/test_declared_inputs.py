@@ -1,4 +1,4 @@
-"""Every rule reads of the results what it declares, no more, and gives the same bytes from that alone."""
+"""Every rule reads only the results that it declares, and gives the same bytes from those alone."""
 
 import shutil
 from collections.abc import Mapping
@@ -31,12 +31,12 @@ OUTPUTS = {
 }
 """One output of each rule that has inputs."""
 TIMED = {"results/synthetic/tiny/default/times.csv"}
-"""Outputs that hold times, which no two runs share."""
+"""Outputs that hold times, which differ from run to run."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """A job of a finished run, as Snakemake tells of it: what it may read, what it wrote, and its command."""
+    """A job of a finished run, as Snakemake reports it: what it may read, what it wrote, and its command."""
 
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]

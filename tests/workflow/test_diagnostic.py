@@ -1,4 +1,4 @@
-"""The diagnostic segmenter sees the truth when it is asked for, and no other segmenter does."""
+"""The diagnostic segmenter reads the truth when it is requested; no other segmenter does."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ def plain(project: Path, tmp_path: Path) -> Project:
 
 
 def masks_jobs(project: Project, *words: str) -> dict[str, str]:
-    """What a dry run says of each masks job, by variant."""
+    """What a dry run prints of each masks job, by variant."""
     text = project.snakemake("-n", "--printshellcmds", *words).stdout
     blocks = [block for block in text.split("\nrule ")[1:] if block.startswith("masks:")]
     return {block.split("variant=")[1].split()[0]: block.split("\n\n")[0] for block in blocks}

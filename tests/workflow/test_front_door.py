@@ -1,4 +1,4 @@
-"""The finished tiny scene, asked as its user asks it: from other folders, and after the results moved."""
+"""The finished tiny scene, queried as by a user: from other folders, and after the results moved."""
 
 import json
 import shutil
@@ -9,7 +9,7 @@ from tests.workflow.conftest import SCENE, Project, copy_project
 
 
 def hilsplat(project: Project, folder: Path, *words: str) -> str:
-    """What the copy's own command prints in some folder."""
+    """Output of the copy's own command, run in a folder."""
     command = "from hilsplat.cli.main import main; main()"
     there = Project(folder)
     result = there.run(sys.executable, "-c", command, *words, PYTHONPATH=str(project.root))
@@ -17,8 +17,8 @@ def hilsplat(project: Project, folder: Path, *words: str) -> str:
 
 
 def test_query_and_export_work_from_another_folder(finished: Project, tmp_path: Path) -> None:
-    told = hilsplat(finished, tmp_path, "query", str(finished.root / SCENE), "mug", "--out", "answer")
-    assert "to 'mug' in synthetic/tiny" in told
+    printed = hilsplat(finished, tmp_path, "query", str(finished.root / SCENE), "mug", "--out", "answer")
+    assert "to 'mug' in synthetic/tiny" in printed
     assert (tmp_path / "answer/panel.png").stat().st_size > 20_000
     assert "whole" in hilsplat(finished, tmp_path, "export", str(finished.root / SCENE), "--out", "tree")
     assert {path.name for path in (tmp_path / "tree").iterdir()} == {"tree.json", "tree.ply", "tree.png"}
@@ -26,13 +26,13 @@ def test_query_and_export_work_from_another_folder(finished: Project, tmp_path: 
 
 def test_moved_results_open_with_the_clip_of_the_checkout(finished: Project, tmp_path: Path) -> None:
     shutil.copytree(finished.root / "results/synthetic", tmp_path / "archive/synthetic")
-    told = hilsplat(
+    printed = hilsplat(
         finished, tmp_path, "query", "synthetic/tiny", "unicorn", "--results", "archive", "--out", "answer"
     )
     before = hilsplat(
         finished, finished.root, "query", "synthetic/tiny", "unicorn", "--out", str(tmp_path / "b")
     )
-    assert told.splitlines()[:-1] == before.splitlines()[:-1]
+    assert printed.splitlines()[:-1] == before.splitlines()[:-1]
 
 
 def test_another_clip_is_refused(finished: Project, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A killed stage goes on where it was and ends with the bytes of an undisturbed run."""
+"""A killed stage resumes where it stopped and ends with the bytes of an undisturbed run."""
 
 import json
 import re
@@ -14,12 +14,12 @@ from tests.workflow.conftest import SCENE, Project
 
 
 def finished_entries(cache: Path) -> list[Path]:
-    """Entries of a cache; hidden files are those that a killed writer left half done."""
+    """Entries of a cache; a hidden file is one that a killed writer left incomplete."""
     return [file for file in cache.rglob("*.npz") if not file.name.startswith(".")]
 
 
 def kill_when(project: Project, command: list[str], cache: Path, entries: int) -> None:
-    """Start a command and SIGKILL it once its cache holds so many finished entries."""
+    """Start a command and SIGKILL it once its cache holds the given number of finished entries."""
     process = subprocess.Popen(
         command,
         cwd=project.root,
@@ -70,7 +70,7 @@ def test_a_killed_stage_resumes(copy_of_finished: Project, name: str, entries: i
 
 
 def test_one_more_view_costs_one_view(copy_of_finished: Project) -> None:
-    """Masks and CLIP of the views that were there come from the cache when a view is added."""
+    """When a view is added, masks and CLIP of the other views come from the cache."""
     from hilsplat.scene.scene import Scene
 
     project = copy_of_finished

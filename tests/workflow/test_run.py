@@ -11,7 +11,7 @@ from tests.workflow.conftest import SCENE, Project
 
 TABLES = ("hierarchy", "lerf", "3dovs", "ablation", "theta", "omega", "frames-hi-lerf", "frames-hi-3dovs")
 TIMED = ("cost", "efficiency", "pruning")
-"""Tables of times, which no two runs share."""
+"""Tables of times, which differ from run to run."""
 POINTS = ("replica", "scannet", "waymo")
 """Tables in which the tiny scene has no row."""
 LAST_BEFORE_EVALUATE = (
@@ -74,7 +74,7 @@ def test_a_second_run_does_nothing(copy_of_finished: Project) -> None:
 
 
 def times_of(project: Project) -> dict[str, int]:
-    """When each file of the results was written, but for the summary of times that every run prints."""
+    """Time of writing of each file of the results, except for the summary of times that every run writes."""
     return {
         str(path): path.stat().st_mtime_ns
         for path in (project.root / "results").rglob("*")

@@ -60,7 +60,7 @@ def test_without_sweeps_every_stage_runs_once(base):
             "ablation_variants=[no-hierarchy,clustering,clustering-part,default,all-losses]",
             {"field": 4, "evaluate": 4},
         ),
-        # d = 3 needs a code of its own, which both share; baselines write the field by another rule
+        # d = 3 needs its own autoencoder, which both share; baselines write the field by another rule
         ("ablation_variants=[regression,paper]", {"autoencoder": 1, "field": 2, "evaluate": 2}),
         ("main_variants=[default,langsplat,lifted]", {"autoencoder": 2, "method": 2, "evaluate": 2}),
         # only what is random is repeated: PCA and our solver are not

@@ -1,4 +1,4 @@
-"""The similarity between two reconstructions that share cameras: true poses and those that were found."""
+"""The similarity between two reconstructions that share cameras: true poses and estimated ones."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -10,19 +10,19 @@ MIN_SHARED = 3
 
 
 def scene_from_true(true: Cameras, found: Cameras) -> Float64[np.ndarray, "4 4"]:
-    """Similarity that maps true coordinates to the scene's, from the cameras that both know by name.
+    """Similarity that maps true coordinates to the scene's, from the cameras that both name.
 
     The rotation is the mean of those between the cameras' orientations (orthogonal Procrustes), so that
-    cameras on a straight line leave nothing open; scale and offset are the least squares of the centres.
+    cameras on a straight line still fix it; scale and offset are least squares over the centres.
 
     Raises:
-        MisalignedArtifactError: fewer than three cameras are shared, or they stand in one place.
+        MisalignedArtifactError: fewer than three cameras are shared, or all are in one place.
     """
     shared = [name for name in found.names if name in set(true.names)]
     if len(shared) < MIN_SHARED:
         raise MisalignedArtifactError(
-            "true cameras and those of the scene are not of the same images",
-            expected=f"{MIN_SHARED} shared names or more",
+            "the true cameras and the scene's belong to different images",
+            expected=f"at least {MIN_SHARED} shared names",
             found=f"{len(shared)}",
             fix="evaluate the scene with its own truth folder",
         )
@@ -37,8 +37,8 @@ def scene_from_true(true: Cameras, found: Cameras) -> Float64[np.ndarray, "4 4"]
     scale = (turned * (there - there_mean)).sum() / spread if spread > 0 else 0.0
     if scale <= 0:
         raise MisalignedArtifactError(
-            "the scene's cameras cannot be laid over the true ones",
-            expected="camera centres that spread alike",
+            "no similarity maps the true cameras to the scene's",
+            expected="camera centres with the same arrangement",
             found="centres in one place, or mirrored",
             fix="look at registration.png; the poses have probably failed",
         )
@@ -49,7 +49,7 @@ def scene_from_true(true: Cameras, found: Cameras) -> Float64[np.ndarray, "4 4"]
 
 
 def camera_error(true: Cameras, found: Cameras, scene_from_true: Float64[np.ndarray, "4 4"]) -> float:
-    """Median distance of found camera centres from the true ones under a similarity, true units."""
+    """Median distance of estimated camera centres from the true ones under a similarity, true units."""
     scale = np.cbrt(np.linalg.det(scene_from_true[:3, :3]))
     known = set(true.names)
     apart = [

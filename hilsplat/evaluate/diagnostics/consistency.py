@@ -1,8 +1,8 @@
 """How often the same surface point gets different masks in neighbouring views.
 
-Whatever makes masks (a segmenter, rendered answers, the truth) is measured by the same functions: they see
+The same functions measure masks from any source (a segmenter, rendered answers, the truth): they take
 boolean masks of two views and the points that both views show. The points come from exact geometry or from
-any depth one trusts; nothing here knows of either.
+any trusted depth; nothing here depends on which.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -15,10 +15,10 @@ from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.scene.cameras import Camera, Cameras
 
 DEPTH_TOLERANCE = 0.01
-"""A point of one view is the one another view shows where their depths differ by less than this share."""
+"""Two views show the same point if their depths of it differ by at most this share."""
 
 MIN_POINTS = 16
-"""Masks that show fewer shared points are not compared."""
+"""Masks with fewer shared points are not compared."""
 
 MAX_POINTS = 50_000
 """Shared points of a pair of views beyond this number are thinned out evenly."""
@@ -49,10 +49,10 @@ class Agreement:
         points: shared points, all pairs together.
         masks: masks of A compared, all pairs together.
         best_iou: mean, over the masks of A and then over pairs, of the highest IoU of the mask with a mask
-            of B, counted in shared points; 0 where B has no mask. 1 is perfect.
+            of B, counted in shared points; 0 if B has no mask. 1 is perfect.
         disagreement: share of all pairs of shared points (p, q) that lie in the same mask in one view and
-            not in the other (1 minus the Rand index), mean over pairs of views. 0 is perfect. Where most
-            pairs of points lie in different masks in both views it is small whatever the masks are.
+            not in the other (1 minus the Rand index), mean over pairs of views. 0 is perfect. If most pairs
+            of points lie in different masks in both views, it is small whatever the masks.
         joined_disagreement: the same among the pairs of points that lie in the same mask in at least one
             of the two views (a Jaccard distance of the two relations). 0 is perfect, 1 means that the
             views have no joined pair in common.
@@ -75,17 +75,17 @@ def shared_points(
 ) -> SharedPoints:
     """Points of view A's pixel centres that view B shows too.
 
-    A point is lifted by A's depth and projected into B. It counts as visible there where the depth that B
-    shows at the projection equals its own up to `tolerance`. B's depth between pixel centres is
-    interpolated as inverse depth, which is exact on planes, however slanted; next to a jump of depth the
-    interpolated value belongs to neither side, so points at occluding borders drop out.
+    A point is lifted by A's depth and projected into B. It counts as visible there if B's depth at the
+    projection equals its own up to `tolerance`. B's depth between pixel centres is interpolated as inverse
+    depth, which is exact on planes, however slanted; next to a depth jump the interpolated value belongs to
+    neither side, so points at occluding borders drop out.
 
     Args:
-        camera_a: of view A.
-        depth_a: depth along A's optical axis at the pixel centres, scene units; inf where nothing is.
-        camera_b: of view B.
+        camera_a: camera of view A.
+        depth_a: depth along A's optical axis at the pixel centres, scene units; inf without a surface.
+        camera_b: camera of view B.
         depth_b: the same for B.
-        tolerance: largest relative difference of depth.
+        tolerance: largest relative difference in depth.
     """
     pixel = np.flatnonzero(np.isfinite(depth_a))
     depth = depth_a.reshape(-1)[pixel].astype(np.float64)
@@ -147,12 +147,12 @@ def pair_disagreement(
     """Share of pairs of points that are in one mask together in one view and not in the other.
 
     Args:
-        labels_a: mask of each point in A, -1 for none: such a point is together with no other.
+        labels_a: mask of each point in A, -1 for none: such a point shares its mask with no other.
         labels_b: the same for B.
 
     Returns:
-        the share among all pairs of points, and among those together in at least one view; nan where
-        there is no such pair. All pairs are counted, through the table of labels.
+        the share among all pairs of points, and among those together in at least one view; nan if there is
+        no such pair. All pairs count; the contingency table of the labels gives their number.
     """
     rows = np.unique(labels_a, return_inverse=True)[1]
     names, columns = np.unique(labels_b, return_inverse=True)
@@ -176,7 +176,7 @@ def _pairs(counts: Int[np.ndarray, " n"]) -> int:
 
 
 def painted(inside: Bool[np.ndarray, "M P"], area_px: Int[np.ndarray, " M"]) -> Int32[np.ndarray, " P"]:
-    """Mask at each point, -1 for none: masks are painted from large to small, as a label map is.
+    """Mask at each point, -1 for none: masks are painted from large to small, as in a label map.
 
     Of two equally large masks the lower row is painted last.
     """
@@ -195,10 +195,10 @@ def view_agreement(
     """How well the masks of one level agree between two views.
 
     Args:
-        masks_a: of view A; masks may overlap. `best_iou` takes them as they are, the disagreements take
+        masks_a: masks of view A, which may overlap. `best_iou` takes them as they are, the disagreements take
             the smallest mask at each point (`painted`), as the language field does.
-        masks_b: of view B.
-        points: what both views show.
+        masks_b: masks of view B.
+        points: points that both views show.
         min_points: masks of A with fewer shared points are not compared.
     """
     inside_a = masks_a.reshape(len(masks_a), np.prod(masks_a.shape[1:], dtype=int))[:, points.pixel_a]
@@ -230,9 +230,9 @@ def mean_agreement(parts: Sequence[Agreement]) -> Agreement:
 
 
 def neighbours(cameras: Cameras, views: Sequence[str], count: int) -> list[tuple[str, str]]:
-    """Ordered pairs (A, B): for each view the `count` other views whose cameras stand nearest.
+    """Ordered pairs (A, B): for each view the `count` other views whose cameras are nearest.
 
-    Of equally near ones the earlier in `views`.
+    Ties go to the earlier one in `views`.
     """
     centres = np.array([cameras[view].centre for view in views])
     pairs = []
@@ -251,12 +251,12 @@ def measure_consistency(
     masks_of: Callable[[str, Level], Bool[np.ndarray, "M H W"]],
     tolerance: float = DEPTH_TOLERANCE,
 ) -> dict[Level, Agreement]:
-    """Agreement of the masks of each level over some pairs of views.
+    """Agreement of the masks of each level over pairs of views.
 
     Args:
-        cameras: of the views, in the frame of the depths.
+        cameras: cameras of the views, in the frame of the depths.
         pairs: ordered pairs of view names (see `neighbours`).
-        depth_of: depth of a view at its pixel centres; inf where nothing is.
+        depth_of: depth of a view at its pixel centres; inf without a surface.
         masks_of: masks of a view at a level.
         tolerance: see `shared_points`.
     """

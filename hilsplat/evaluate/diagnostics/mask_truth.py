@@ -51,7 +51,7 @@ def fit_of_view(masks: HierarchicalMasks, truth: HierarchyAnnotations, view: str
     """Compare masks with the true regions, level by level.
 
     Raises:
-        MisalignedArtifactError: the masks are of another size than the labels.
+        MisalignedArtifactError: masks and labels differ in size.
     """
     found = {}
     for level in LEVELS:
@@ -79,14 +79,14 @@ def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, o
         scene_folder: scene artifact.
         truth_folder: truth of the synthetic scene.
         masks_folder: masks artifact of any segmenter.
-        out: PNG to write, a PDF beside it; the table goes there as CSV.
+        out: PNG to write; a PDF and the table as CSV are written beside it.
 
     Returns:
         the rows as a Markdown table.
 
     Raises:
         ArtifactError: an artifact is missing, or the scene is not synthetic.
-        MisalignedArtifactError: the masks are of another size than the labels.
+        MisalignedArtifactError: masks and labels differ in size.
     """
     scene, index = Scene.load(scene_folder), read_index(masks_folder)
     truth = HierarchyAnnotations.load(truth_folder)
@@ -184,7 +184,7 @@ def draw_fits(
 
 
 def paint_fits(image: np.ndarray, labels: np.ndarray, fit: ViewFit) -> np.ndarray:
-    """True regions coloured by the IoU of the best mask, outlined; what is not scored stays grey."""
+    """True regions coloured by the IoU of the best mask, outlined; regions that are not scored stay grey."""
     painted = 0.5 * grey(image)
     for node, value in zip(fit.ids, fit.best, strict=True):
         colour = np.array(colormaps[COLOURS](float(value))[:3]) * 255

@@ -39,10 +39,10 @@ class TreeMeasure:
 
     Attributes:
         nodes: nodes of the tree at the level.
-        true_nodes: true nodes that any Gaussian shows.
+        true_nodes: true nodes to which any Gaussian belongs.
         precision: share of nodes matched one to one with a true node at IoU 0.5.
         recall: share of true nodes matched.
-        mean_iou: mean over true nodes of the matched node's IoU, 0 where there is none.
+        mean_iou: mean over true nodes of the matched node's IoU, 0 if unmatched.
         purity: share of the nodes' mass that belongs to each one's main true node.
         parent_accuracy: share of matched nodes whose parent's main true node is the true parent, among
             those with a true parent; nan at level whole.
@@ -64,8 +64,8 @@ def measure_tree(
 ) -> dict[Level, TreeMeasure]:
     """Compare nodes with true nodes.
 
-    A Gaussian belongs to the true node of each level that most of its visible weight shows, and counts
-    with its weight in labelled pixels.
+    At each level a Gaussian belongs to the true node that gets most of its visible weight, and counts by
+    its weight in labelled pixels.
 
     Args:
         tree: the semantic tree.
@@ -84,7 +84,7 @@ def measure_tree(
         node_of = tree.node_of_gaussian[:, level.index]
         counted = (true_of != NONE) | (node_of != NONE)
         weight = np.where(mass > 0, mass, 0.0)[counted]
-        # a last row and column stand for "no node", so that what is missed counts in the unions
+        # the last row and column mean "no node", so that missed Gaussians count in the unions
         rows = np.where(node_of[counted] == NONE, len(tree), node_of[counted])
         columns = np.where(true_of[counted] == NONE, len(truth.nodes), true_of[counted])
         shape = (len(tree) + 1, len(truth.nodes) + 1)
@@ -149,7 +149,7 @@ def true_votes(
 def run_tree_truth(
     scene_folder: Path, gaussians_ply: Path, semantic_tree: Path, truth: Path, out: Path, threads: int
 ) -> str:
-    """Measure a tree; writes a CSV with one row per level and returns it as a Markdown table."""
+    """Measure a tree, write a CSV with one row per level and return it as a Markdown table."""
     scene, annotations = Scene.load(scene_folder), HierarchyAnnotations.load(truth)
     tree = SemanticTree.load(semantic_tree)
     votes = true_votes(scene, gaussians_ply, annotations, scene.views("train"), tree.min_weight, threads)

@@ -22,7 +22,7 @@ from hilsplat.world.mesh import TrueMesh
 
 METHODS = ("field", "tree")
 TEXTS_PER_LEVEL = 4
-"""Texts per level and view that are asked in two views."""
+"""Texts per level and view, each asked in two views."""
 MaskOf = Callable[[str, str, Query], Bool[np.ndarray, "H W"]]
 """(method, view, query) -> answer at the query's level."""
 
@@ -35,15 +35,15 @@ def measure_world_consistency(
     truth: Path,
     settings: EvaluateSettings,
 ) -> Iterator[tuple[str, Measured]]:
-    """Rows of `world/view-consistency`: each annotated view against the view that stands nearest to it.
+    """Rows of `world/view-consistency`: each annotated view against its nearest neighbour.
 
-    Nothing is measured without the true mesh (labels of a photographed scene).
+    Yields nothing without the true mesh (labels of a photographed scene).
 
     Args:
         answers: the scene.
-        selections: its chosen nodes.
+        selections: the nodes it selects.
         truths: annotated views.
-        answered: answers that were given in them (`views.measure_view`).
+        answered: answers already given in them (`views.measure_view`).
         truth: truth folder of a synthetic scene.
         settings: methods, the map rule.
     """
@@ -67,7 +67,7 @@ def measure_world_consistency(
 
 
 def spread(queries: Sequence[Query], per_level: int) -> list[Query]:
-    """At most so many texts per level, evenly from the largest region to the smallest."""
+    """At most `per_level` texts per level, spread evenly from the largest region to the smallest."""
     chosen = []
     for level in LEVELS:
         same = [query for query in queries if query.level is level]
@@ -85,7 +85,7 @@ def answers_of(
     queries: Sequence[Query],
     settings: EvaluateSettings,
 ) -> MaskOf:
-    """Answers to some texts in two views, level given; most of those in annotated views are known already."""
+    """Answers to texts in two views at given levels; most of those in annotated views are already known."""
 
     def is_kept(view: str, query: Query) -> bool:
         return view in answered and given_key("field", query, settings) in answered[view]
@@ -119,7 +119,7 @@ def consistency_rows(
 ) -> Iterator[Measured]:
     """IoU over shared points of the answers in two views.
 
-    Texts that neither view answers there are left out; `n` is the number of points in the union.
+    Texts that neither view answers are left out; `n` is the number of points in the union.
     """
     for method in METHODS:
         if method not in settings.methods:

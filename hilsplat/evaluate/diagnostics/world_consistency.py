@@ -21,7 +21,7 @@ from hilsplat.world.mesh import TrueMesh
 logger = logging.getLogger(__name__)
 
 TRUTH = "true regions"
-"""How the table names what no masks can beat: the labels themselves, one pixel of border off."""
+"""Name of the rows that no masks can beat: those of the labels, whose borders are off by up to a pixel."""
 
 COLUMNS = (
     "scene",
@@ -36,13 +36,13 @@ COLUMNS = (
 
 
 def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> str:
-    """Measure how consistently the masks of neighbouring views cut the same surface.
+    """Measure how consistently the masks of neighbouring views divide the same surface.
 
     Args:
         truth: truth folder of the scene: true cameras, mesh and labels.
         masks_folder: masks artifact of any segmenter.
-        out: CSV to write, one row per level for the masks and for the true regions, which give the
-            measure's floor (pixels at borders).
+        out: CSV to write, one row per level for the masks and for the true regions, whose rows are the best
+            that the measure allows (pixels at borders).
         count: neighbours of each view.
 
     Returns:
@@ -50,12 +50,12 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
 
     Raises:
         ArtifactError: a folder is missing or incomplete, or fewer than two views have masks.
-        MisalignedArtifactError: masks are of another size than the true cameras.
+        MisalignedArtifactError: masks and true cameras differ in size.
     """
     index = read_index(masks_folder)
     views = list(index["views"])
     if len(views) < 2:
-        raise ArtifactError(f"{masks_folder} has masks of {len(views)} view", expected="two views or more")
+        raise ArtifactError(f"{masks_folder} has masks of {len(views)} view(s)", expected="at least two")
     cameras = Cameras.load(Path(truth) / "cameras.npz")
     mesh = TrueMesh.load(Path(truth) / "mesh.ply")
     annotations = HierarchyAnnotations.load(truth)

@@ -1,7 +1,7 @@
 """Figures of the paper: queries by method, one query over four views, features at three levels."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,15 +28,15 @@ logger = logging.getLogger(__name__)
 
 WIDTH_IN = 13.0
 VIEWS = 4
-"""Views of the figure that shows one query over several."""
+"""Number of views in the figure of one query."""
 
 
 @dataclass(frozen=True)
 class Answerer:
-    """One method that is compared.
+    """One of the compared methods.
 
     Attributes:
-        title: as tables name its rows.
+        title: name of its rows in tables.
         method: "tree" or "field".
         scene: the variant's scene.
     """
@@ -72,16 +72,16 @@ def run_comparison(
 
     Args:
         folder: `results/<dataset>/<scene>`, finished under every variant.
-        variants: compared, each with the settings it was evaluated with; "default" answers by its tree and
-            its field, others by their field.
-        names: variant -> how tables name it.
+        variants: variants to compare, each with the settings it was evaluated with; "default" answers with
+            its tree and its field, others with their field.
+        names: variant -> its name in tables.
         out: PNG of the comparison; `views.png` and `features.png` are written beside it.
         settings: how much is shown.
         evaluate: which regions count as true, and how maps become masks.
         truth: truth folder of a synthetic scene.
-        labels: labels of a published data set in its place, such as "lerf_ovs/figurines".
+        labels: labels of a published data set instead, such as "lerf_ovs/figurines".
         data_root: folder of the data sets' folders.
-        queries: texts to show if there are neither.
+        queries: texts to show if there is neither truth nor labels.
         threads: threads for rendering.
 
     Raises:
@@ -89,7 +89,9 @@ def run_comparison(
         ArtifactError: the scene is not finished under a variant.
     """
     if not variants:
-        raise SettingsError("nothing is compared", expected="one variant or more", fix="name main_variants")
+        raise SettingsError(
+            "there are no variants to compare", expected="at least one", fix="name them in main_variants"
+        )
     scenes = open_variants(folder, variants, threads)
     scene = scenes[variants[0]].scene
     with stage_log("comparison", scene.name) as counts:
@@ -120,9 +122,9 @@ def open_variants(folder: Path, variants: Sequence[str], threads: int) -> dict[s
 
 
 def over_views(
-    scene: Scene, rows: Sequence[Shown], truths: Mapping[str, object], count: int = VIEWS
+    scene: Scene, rows: Sequence[Shown], truths: Mapping[str, Callable[[], ViewTruth]], count: int = VIEWS
 ) -> list[Shown]:
-    """One query in several views: the first part or subpart that is shown, else the first query.
+    """One query in several views: the first part or subpart shown, else the first query.
 
     Views with a known truth come first, in their order; then others, spread over the scene.
     """
@@ -134,7 +136,6 @@ def over_views(
     for view, truth_of in truths.items():
         if view != chosen.view and len(found) < count:
             known = truth_of()
-            assert isinstance(known, ViewTruth)
             for query in known.queries or known.categories:
                 if (query.text, query.level) == (chosen.text, chosen.level):
                     found.append(Shown(chosen.text, chosen.path, chosen.level, view, query.truth))
@@ -164,7 +165,7 @@ def draw_methods(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: E
 
 
 def draw_views(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: EvaluateSettings) -> Figure:
-    """One row per method, one column per view: does a method answer alike from everywhere?"""
+    """One row per method, one column per view: does a method give the same answer from every side?"""
     first = methods[0].scene
     scene = first.scene
     asked = f"“{rows[0].text}” over {len(rows)} views" if rows else "no query"
@@ -183,7 +184,7 @@ def draw_views(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: Eva
 
 
 def draw_features(methods: Sequence[Answerer], view: str) -> Figure:
-    """One row per field, one column per level; a tree shows the nodes as colours."""
+    """One row per method, one column per level; a tree shows its nodes as colours."""
     scene = methods[0].scene.scene
     figure, grid = _grid(scene, len(methods), len(LEVELS) + 1, f"{scene.name}: features at three levels")
     for axes, method in zip(grid, methods, strict=True):
@@ -200,7 +201,7 @@ def draw_features(methods: Sequence[Answerer], view: str) -> Figure:
 
 
 def node_image(scene: LanguageScene, view: str, level: Level) -> np.ndarray:
-    """The node of each pixel as a colour of its CLIP vector's three principal directions."""
+    """Colour each pixel by its node: the node's CLIP vector along the level's three principal directions."""
     vectors = scene.tree.clip.astype(np.float64)
     nodes = scene.tree.nodes_of(level)
     colours = np.zeros((len(vectors) + 1, 3))
@@ -220,7 +221,7 @@ def node_image(scene: LanguageScene, view: str, level: Level) -> np.ndarray:
 
 
 def _grid(scene: Scene, rows: int, columns: int, title: str) -> tuple[Figure, np.ndarray]:
-    """An empty grid of pictures of the scene's shape, axes off until something is shown."""
+    """An empty grid for pictures of the scene's shape, without ticks."""
     height, width = scene.cameras[scene.cameras.names[0]].size_hw
     row_in = WIDTH_IN / columns * height / width + 0.18
     figure = Figure(figsize=(WIDTH_IN, rows * row_in + 0.4), layout="constrained")

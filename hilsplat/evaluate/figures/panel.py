@@ -46,11 +46,11 @@ class Shown:
     """One row of the panel: a query in a view.
 
     Attributes:
-        text: what is asked; words separated by ">" are a path.
-        path: chain of texts from the whole down; without annotations the query's own.
+        text: the query; texts separated by ">" form a path.
+        path: texts from the whole down; without annotations, those of the query.
         level: the annotation's level; None if there is none.
         view: view name.
-        truth: true region; None if it is not known.
+        truth: true region; None if unknown.
     """
 
     text: str
@@ -60,15 +60,15 @@ class Shown:
     truth: Bool[np.ndarray, "H W"] | None
 
     def hits(self, answers: LanguageScene, *, by_path: bool = False) -> NodeHits:
-        """What the tree answers: to the text alone, or to the whole chain.
+        """The tree's answer to the text alone, or to the whole path.
 
-        A query without an annotated level is somebody's own and is asked as it was written.
+        A query without an annotated level is asked as written.
         """
         own = self.level is None or by_path
         return answers.select(self.path if own else self.path[-1:], level=self.level, view=self.view)
 
     def tree_mask(self, answers: LanguageScene, *, by_path: bool = False) -> Bool[np.ndarray, "H W"]:
-        """Its mask in the view."""
+        """Mask of the tree's answer in the view."""
         return answers.node_masks(self.view, self.hits(answers, by_path=by_path).ids)
 
 
@@ -92,11 +92,11 @@ def run_figures(
         out: PNG to write; `registration.png` and `fit.png` are copied into its folder.
         settings: how much is shown.
         evaluate: how answers are made.
-        fit: report folder of the fit; None: nothing is copied.
+        fit: report folder of the fit; None copies nothing.
         truth: annotations of a synthetic scene; they name the queries.
-        labels: labels of a published data set in their place, such as "lerf_ovs/figurines".
+        labels: labels of a published data set instead, such as "lerf_ovs/figurines".
         data_root: folder of the data sets' folders.
-        queries: texts to show if there are neither.
+        queries: texts to show if there is neither truth nor labels.
         threads: threads for rendering.
     """
     if fit is not None:
@@ -119,7 +119,7 @@ def copy_picture(source: Path, out: Path) -> None:
 def truths_of(
     scene: Scene, truth: Path | None, labels: str, data_root: Path, evaluate: EvaluateSettings
 ) -> Mapping[str, Callable[[], ViewTruth]]:
-    """What is true in the views of a scene; nothing if it has neither annotations nor labels."""
+    """True regions in the views of a scene; empty if it has neither annotations nor labels."""
     if labels:
         return labelled_truths(open_labelled(labels, data_root), scene)
     return annotated_truths(truth, scene, evaluate) if truth is not None else {}
@@ -128,7 +128,7 @@ def truths_of(
 def annotated_rows(truths: Mapping[str, Callable[[], ViewTruth]], settings: FiguresSettings) -> list[Shown]:
     """Texts of each level, from large to small regions, in the annotated views that show them best.
 
-    Labels without levels give texts of one kind.
+    Labels without levels form one group.
     """
     found: dict[Level | None, dict[str, list[tuple[int, Shown]]]] = {}
     for view, truth_of in truths.items():
@@ -180,7 +180,9 @@ def draw_panel(
     label = label_of_index(index)
     warning = ": a diagnostic, masks made from the true labels" if made_from_truth(label) else ""
     figure.suptitle(scene.name + warning, fontsize=12, fontweight="bold")
-    parts = figure.subfigures(2, 1, height_ratios=[overview_in, queries_in]) if rows else [figure]
+    parts: list[FigureBase] = [figure]
+    if rows:
+        parts = list(figure.subfigures(2, 1, squeeze=False, height_ratios=[overview_in, queries_in]).flat)
     grid = parts[0].subplots(2, 4, squeeze=False)
     image = answers.image(masked)
     masks = HierarchicalMasks.load(Path(masks_folder) / f"{masked}.npz")

@@ -14,7 +14,7 @@ from hilsplat.query.pictures import save_png_and_pdf
 KNOBS = {"theta": "coverage threshold theta", "omega": "similarity degree Omega"}
 COLUMNS = ("Hi-LERF mIoU", "Hi-LERF HC", "3D-OVS mIoU", "LERF mIoU")
 DEFAULTS = {"theta": 0.9, "omega": 10.0}
-"""What the default variant has, whose row names no value."""
+"""Values of the default variant, whose row does not name one."""
 
 
 @dataclass(frozen=True)
@@ -27,16 +27,16 @@ class Line:
 
 
 def run_sweep_plot(name: str, table: Path, out: Path, default: float | None = None) -> None:
-    """Draw a sweep as PNG and PDF: the paper's curves beside ours, each kind in a panel of its own.
+    """Draw a sweep as PNG and PDF: the paper's curves beside ours, each kind in its own panel.
 
     Args:
         name: "theta" or "omega".
         table: the finished CSV of that table.
         out: PNG; the PDF is written beside it.
-        default: value of the rows that name none, the default variant's.
+        default: value of the rows that do not name one: that of the default variant.
 
     Raises:
-        ArtifactError: there is no such sweep, or the table is missing.
+        ArtifactError: the sweep is unknown, or the table is missing.
     """
     if name not in KNOBS:
         raise ArtifactError(f"there is no sweep {name!r}", expected=f"one of {', '.join(KNOBS)}")
@@ -45,7 +45,7 @@ def run_sweep_plot(name: str, table: Path, out: Path, default: float | None = No
 
 
 def read_lines(table: Path, default: float) -> list[Line]:
-    """Curves of a table: one per kind of row and column that has two values or more."""
+    """Curves of a table: one per kind of row and column with at least two values."""
     try:
         with Path(table).open(encoding="utf-8", newline="") as stream:
             rows = list(csv.DictReader(stream))
@@ -66,7 +66,7 @@ def read_lines(table: Path, default: float) -> list[Line]:
 
 
 def draw_sweep(name: str, lines: Sequence[Line]) -> Figure:
-    """One panel per kind of row; axes are not shared, as the kinds are not comparable."""
+    """One panel per kind of row; axes are not shared because the kinds are not comparable."""
     kinds = list(dict.fromkeys(line.kind for line in lines)) or ["reported"]
     figure = Figure(figsize=(4.6 * len(kinds), 3.4), layout="constrained")
     for axes, kind in zip(figure.subplots(1, len(kinds), squeeze=False)[0], kinds, strict=True):

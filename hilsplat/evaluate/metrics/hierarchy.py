@@ -51,7 +51,7 @@ def hierarchical_consistency(
 
     Departs: the printed normaliser uses N_l outside the sum over l, where it is not defined; here
     it is the mean over the parents of each level, then over the L - 1 transitions. A transition
-    without parents contributes 0, as max(N_l, 1) has it.
+    without parents contributes 0, as max(N_l, 1) implies.
 
     Args:
         transitions: families per level of the parent: wholes first, then parts.

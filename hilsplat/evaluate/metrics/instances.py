@@ -1,7 +1,7 @@
 """Instance segmentation of points: AP, AP50 and AP25 of the ScanNet benchmark.
 
 Source: ScanNet/ScanNet `BenchmarkScripts/3d_evaluation/evaluate_semantic_instance.py`, which OpenMask3D
-uses too; the order of matching and the integration of the curve are that code's, quirks included.
+uses too; the order of matching and the integration of the curve follow that code, quirks included.
 """
 
 from collections.abc import Sequence
@@ -27,11 +27,11 @@ class InstanceScan:
     """Truth and predictions of one scan.
 
     Attributes:
-        truth: per point class * 1000 + instance; a value below 1000, or of a class that is not asked
-            for, is void.
+        truth: per point class * 1000 + instance; a value below 1000, or of a class that is not evaluated,
+            is void.
         masks: predicted instances over the same points; they may overlap.
         classes: class id of each prediction.
-        confidences: higher is surer; one value for all where a method has none.
+        confidences: higher is more certain; one value for all if the method has none.
     """
 
     truth: Int[np.ndarray, " P"]
@@ -44,7 +44,7 @@ class InstanceScan:
 class InstanceMatches:
     """What one scan adds to the precision-recall curves of K classes at T thresholds.
 
-    Scans are matched one by one and their curves are drawn together, so a workflow can keep these.
+    Scans are matched one by one but their curves are drawn together, so matches are stored in between.
 
     Attributes:
         class_index: entries of the curves: class, 0 .. K - 1.
@@ -68,18 +68,18 @@ def match_instances(
 ) -> InstanceMatches:
     """Match predictions to true instances, per class and threshold.
 
-    In the order of the instances, each prediction of the class that overlaps by more than the threshold
-    and is unused matches; of several, the surest stays the match and each other is a false positive
-    with the lower confidence. A prediction counts as used only by a first match. A prediction that
-    overlaps no true instance enough is a false positive, unless the share of its points in void or in
-    instances that are too small exceeds the threshold.
+    Instances are visited in order. Each unused prediction of the class that overlaps an instance by more
+    than the threshold matches it; of several, the most confident stays the match and every other one is a
+    false positive with the lower confidence. Only the first match of an instance marks its prediction as
+    used. A prediction that overlaps no true instance enough is a false positive, unless the share of its
+    points in void or in instances that are too small exceeds the threshold.
 
     Raises:
         MisalignedArtifactError: masks and truth have different numbers of points.
     """
     if scan.masks.shape[1] != len(scan.truth):
         raise MisalignedArtifactError(
-            "predicted instances are not of the scan's points",
+            "predicted instances do not belong to the scan's points",
             expected=f"{len(scan.truth)} points",
             found=scan.masks.shape[1],
             fix="predict on the vertices of the evaluated mesh",
@@ -152,8 +152,8 @@ def curve_area(confidence: Float[np.ndarray, " E"], is_match: Bool[np.ndarray, "
 
     For each distinct confidence s, precision P and recall R count the entries of at least s; recall
     misses the matches below s and the instances that nothing matched. The point (1, 0) ends the curve.
-    The area is the sum of P_k (R_(k-1) - R_(k+1)) / 2 with R_(-1) = R_0 and 0 after the last; there is
-    no interpolation envelope. No entry gives 0.
+    The area is the sum of P_k (R_(k-1) - R_(k+1)) / 2 with R_(-1) = R_0 and 0 after the last; there is no
+    interpolation envelope. Without entries the area is 0.
     """
     if not len(confidence):
         return 0.0
@@ -172,9 +172,9 @@ def curve_area(confidence: Float[np.ndarray, " E"], is_match: Bool[np.ndarray, "
 def average_precision(scans: Sequence[InstanceMatches]) -> Float64[np.ndarray, "K T"]:
     """Average precision per class and threshold of all scans together.
 
-    nan for a class without a true instance in any scan; 0 where there are instances and no prediction.
+    nan for a class without a true instance in any scan; 0 if it has instances but no prediction.
     """
-    result = np.full(scans[0].misses.shape, np.nan)
+    result = np.full_like(scans[0].misses, np.nan, dtype=np.float64)
     misses = np.sum([scan.misses for scan in scans], axis=0)
     has_truth = np.any([scan.has_truth for scan in scans], axis=0)
     classes, overlaps, confidence, is_match = (

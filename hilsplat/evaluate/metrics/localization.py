@@ -1,4 +1,4 @@
-"""Localization: does the most relevant point lie on the object that was asked for?"""
+"""Localization: does the most relevant point lie on the queried object?"""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -11,7 +11,7 @@ def peak_points(
 ) -> tuple[Int[np.ndarray, "P 2"], Level]:
     """All pixels (x, y) that hold the maximum of a filtered map.
 
-    Without a level, the one with the largest maximum; of equal ones the coarsest.
+    Without a level, the one with the largest maximum; ties go to the coarsest.
     """
     if level is None:
         level = LEVELS[int(filtered.max(axis=(1, 2)).argmax())]
@@ -21,14 +21,14 @@ def peak_points(
 
 
 def hits_a_box(points_xy: Int[np.ndarray, "P 2"], boxes_xyxy: Int[np.ndarray, "B 4"]) -> bool:
-    """True where any point lies in any box, borders included (x1 <= x <= x2): LERF's test."""
+    """True if any point lies in any box, borders included (x1 <= x <= x2): LERF's test."""
     x, y = points_xy[:, None, 0], points_xy[:, None, 1]
     x1, y1, x2, y2 = (boxes_xyxy[None, :, side] for side in range(4))
     return bool(((x1 <= x) & (x <= x2) & (y1 <= y) & (y <= y2)).any())
 
 
 def hits_the_mask(points_xy: Int[np.ndarray, "P 2"], truth: Bool[np.ndarray, "H W"]) -> bool:
-    """True where any point lies in the true region: stricter than the box."""
+    """True if any point lies in the true region: stricter than the box."""
     return bool(truth[points_xy[:, 1], points_xy[:, 0]].any())
 
 

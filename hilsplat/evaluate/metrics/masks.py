@@ -49,9 +49,9 @@ def boundary_iou(
 def best_threshold_iou(score: Float[np.ndarray, "H W"], truth: Bool[np.ndarray, "H W"]) -> float:
     """The largest IoU that any threshold on the score map could give.
 
-    A diagnostic that uses the truth: it tells a wrong ranking of pixels from a wrong threshold.
-    Exact: between two scores of true pixels a lower cut only adds false ones, so the scores of true
-    pixels are all the cuts that need a try.
+    A diagnostic that uses the truth: it separates a wrong ranking of pixels from a wrong threshold.
+    Exact: between two scores of true pixels a lower cut only adds false ones, so only the scores of true
+    pixels need trying.
     """
     inside, outside = np.sort(score[truth]), np.sort(score[~truth])
     cuts = np.unique(inside)
@@ -61,7 +61,7 @@ def best_threshold_iou(score: Float[np.ndarray, "H W"], truth: Bool[np.ndarray, 
 
 
 def exceeds(prediction: Bool[np.ndarray, "H W"], truth: Bool[np.ndarray, "H W"], threshold: float) -> float:
-    """1 where the IoU is greater than the threshold, else 0: a pair's part in Acc@0.25 and Acc@0.5.
+    """1 if the IoU is greater than the threshold, else 0: a pair's part in Acc@0.25 and Acc@0.5.
 
     Source: yanmin-wu/OpenGaussian `scripts/compute_lerf_iou.py`.
     """

@@ -1,7 +1,7 @@
 """Every pixel gets one of the scene's classes: the original protocol of 3D-OVS.
 
-Source: Kunhao-Liu/3D-OVS `renderer.py`. The IoU of a class is `masks.iou` of its pixels; a class that is
-absent in prediction and truth gives 0 there (scikit-learn's default, which that code relies on).
+Source: Kunhao-Liu/3D-OVS `renderer.py`. The IoU of a class is `masks.iou` of its pixels; a class absent
+from prediction and truth gives 0 there (scikit-learn's default, which that code relies on).
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 
 def argmax_masks(similarity: Float[np.ndarray, "K H W"]) -> Bool[np.ndarray, "K H W"]:
-    """One mask per class: pixels where its similarity is largest; of equal ones the first class.
+    """One mask per class: pixels where its similarity is largest; ties go to the first class.
 
     Args:
         similarity: cosine of each pixel's feature with each class text, no template, no canonical

@@ -1,8 +1,8 @@
 """Semantic segmentation of points: ScanNet, ScanNet200, Replica and Waymo.
 
 Labels are 1 .. K; 0 means none: ignored in the truth, a miss in the prediction. All benchmarks share the
-counts of a class and its IoU; they differ in what is added up before (one scene or all) and over which
-classes the mean goes, and that is what the functions are named after.
+counts of a class and its IoU; they differ in which counts are added up first (those of one scene or of all)
+and in which classes are averaged; the functions are named after that.
 """
 
 from collections.abc import Iterable
@@ -18,7 +18,7 @@ class ClassCounts:
     """Points per class, over all points whose truth is not 0.
 
     Attributes:
-        hits: points of the class that are predicted as it.
+        hits: points of the class predicted as such.
         truth: points of the class; those predicted 0 are among them.
         predicted: points predicted as the class.
     """
@@ -31,7 +31,7 @@ class ClassCounts:
     def of(
         truth: Int[np.ndarray, " P"], prediction: Int[np.ndarray, " P"], num_classes: int
     ) -> "ClassCounts":
-        """Count. Predictions on points whose truth is 0 are ignored."""
+        """Count points; predictions on points whose truth is 0 are ignored."""
         known = truth > 0
         truth, prediction = truth[known], prediction[known]
 
@@ -48,7 +48,7 @@ class ClassCounts:
 
     @property
     def union(self) -> Int64[np.ndarray, " K"]:
-        """Points that are of the class or predicted as it."""
+        """Points of the class or predicted as such."""
         return self.truth + self.predicted - self.hits
 
 
@@ -58,17 +58,17 @@ def pooled(counts: Iterable[ClassCounts]) -> ClassCounts:
 
 
 def class_iou(counts: ClassCounts) -> Float[np.ndarray, " K"]:
-    """TP / (TP + FP + FN) per class; nan where the class is neither in truth nor prediction."""
+    """TP / (TP + FP + FN) per class; nan if the class is neither in truth nor prediction."""
     return _ratio(counts.hits, counts.union)
 
 
 def class_accuracy(counts: ClassCounts) -> Float[np.ndarray, " K"]:
-    """TP / (TP + FN) per class; nan where the truth lacks the class."""
+    """TP / (TP + FN) per class; nan if the truth lacks the class."""
     return _ratio(counts.hits, counts.truth)
 
 
 def miou_over_present(counts: ClassCounts) -> float:
-    """Mean IoU over the classes of the truth; nan where it has none.
+    """Mean IoU over the classes of the truth; nan if it has none.
 
     A wrong prediction of an absent class hurts only the true class. Source: yanmin-wu/OpenGaussian
     `scripts/eval_scannet.py`, per scene.
@@ -77,12 +77,12 @@ def miou_over_present(counts: ClassCounts) -> float:
 
 
 def macc_over_present(counts: ClassCounts) -> float:
-    """Mean accuracy over the classes of the truth; nan where it has none (OpenGaussian, per scene)."""
+    """Mean accuracy over the classes of the truth; nan if it has none (OpenGaussian, per scene)."""
     return _mean(class_accuracy(counts)[counts.truth > 0])
 
 
 def miou_over_occurring(counts: ClassCounts, among: Bool[np.ndarray, " K"] | None = None) -> float:
-    """Mean IoU over the classes of truth or prediction; nan where there is none.
+    """Mean IoU over the classes of truth or prediction; nan if there is none.
 
     A class that is only predicted counts 0. Source: ScanNet/ScanNet `evaluate_semantic_label.py`, pooled
     over all scans.
@@ -96,17 +96,17 @@ def miou_over_occurring(counts: ClassCounts, among: Bool[np.ndarray, " K"] | Non
 
 
 def miou_over_all(counts: ClassCounts) -> float:
-    """Mean IoU over all K classes, where a class that occurs nowhere counts 0 (OpenScene, OpenNeRF)."""
+    """Mean IoU over all K classes; a class that occurs nowhere counts 0 (OpenScene, OpenNeRF)."""
     return _mean(np.nan_to_num(class_iou(counts), nan=0.0))
 
 
 def macc_over_all(counts: ClassCounts) -> float:
-    """Mean accuracy over all K classes, where a class without truth counts 0 (OpenNeRF)."""
+    """Mean accuracy over all K classes; a class without truth counts 0 (OpenNeRF)."""
     return _mean(np.nan_to_num(class_accuracy(counts), nan=0.0))
 
 
 def miou_absent_as_one(counts: ClassCounts) -> float:
-    """Mean IoU over all K classes, where a class that occurs nowhere counts 1 (Waymo).
+    """Mean IoU over all K classes; a class that occurs nowhere counts 1 (Waymo).
 
     Source: waymo-research/waymo-open-dataset `metrics/segmentation_metrics.cc`. It flatters subsets
     that lack classes; report `miou_over_present` beside it.
@@ -115,7 +115,7 @@ def miou_absent_as_one(counts: ClassCounts) -> float:
 
 
 def frequency_weighted_iou(counts: ClassCounts) -> float:
-    """Mean IoU over the classes of the truth, weighted by their points; nan where it has none."""
+    """Mean IoU over the classes of the truth, weighted by their points; nan if it has none."""
     points = counts.truth.sum()
     if not points:
         return float("nan")

@@ -9,11 +9,11 @@ class Metric:
     """What a metric's value means.
 
     Attributes:
-        function: module and name of what computes it, under `hilsplat.evaluate.metrics`.
-        symmetric: exchanging prediction and truth leaves it as it is.
+        function: module and name of the function that computes it, under `hilsplat.evaluate.metrics`.
+        symmetric: exchanging prediction and truth leaves it unchanged.
         bounds: smallest and largest value.
         averaging: how values of one scene become one number, before scenes are averaged.
-        perfect: value of a prediction that equals the truth; None where that depends on the truth.
+        perfect: value of a prediction that equals the truth; None if that depends on the truth.
         uses_truth_to_choose: a diagnostic that sees the truth before it answers.
     """
 

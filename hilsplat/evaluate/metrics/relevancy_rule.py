@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float32
 from hilsplat.base.levels import LEVELS, Level
 
 MAJORITY_REACH_PX = 3
-"""The majority window reaches so far up and left, and as far down and right: 7 x 7."""
+"""Pixels from the middle of the majority window to its sides: 7 x 7."""
 
 ThresholdOn = Literal["normalised_pm1", "raw"]
 LevelRule = Literal["max", "mean_in_mask"]
@@ -34,8 +34,8 @@ class RelevancyRule:
         level_rule: `max`: the level whose (mixed) map has the highest value; `mean_in_mask`: the
             highest mean inside its own mask (LangSplat's text on 3D-OVS).
         border: windows at the border. `langsplat`: the mean filter reflects, the majority filter
-            never looks at the last row and column; `inside`: both average what lies in the image
-            (LangSplatV2).
+            never looks at the last row and column; `inside`: both average the part of the window inside the
+            image (LangSplatV2).
         levels: levels among which one is chosen (LangSplatV2 on 3D-OVS: whole and part).
     """
 
@@ -49,7 +49,7 @@ class RelevancyRule:
     levels: tuple[Level, ...] = LEVELS
 
     def departures(self, reference: "RelevancyRule") -> tuple[str, ...]:
-        """What differs from another rule, a few words each, as names of protocols carry it."""
+        """Differences from another rule in a few words each, as protocol names carry them."""
         words = {
             "filter_px": f"filter {self.filter_px}" if self.filter_px else "filter scaled",
             "mix": "mix" if self.mix else "no mix",
@@ -69,7 +69,7 @@ class RelevancyRule:
 
 
 def filter_side_px(filter_px: int, height_px: int) -> int:
-    """Side of the mean filter; 0 stands for 30 px at a height of 730 px, scaled, at least 1."""
+    """Side of the mean filter; 0 means 30 px at a height of 730 px, scaled, at least 1."""
     return filter_px or max(1, round(30 * height_px / 730))
 
 
@@ -79,7 +79,7 @@ def mean_filter(
     """Mean over a square window.
 
     `langsplat`: as OpenCV does by default. Borders are reflected without repeating the edge pixel,
-    and the anchor of an even window stands right of its middle: for side 30, output y averages rows
+    and the anchor of an even window is right of its middle: for side 30, output y averages rows
     y - 15 .. y + 14. `inside`: the mean over those pixels of the window that lie in the image.
     """
     import cv2
@@ -132,7 +132,7 @@ class SmoothedRelevancy:
 
     Attributes:
         filtered: mean-filtered maps; localization reads these.
-        mixed: what masks are made from: the mean of map and filtered map, or the map itself.
+        mixed: source of the masks: the mean of map and filtered map, or the map itself.
     """
 
     filtered: Float32[np.ndarray, "3 H W"]
@@ -150,7 +150,7 @@ class SmoothedRelevancy:
 def relevancy_mask(
     smoothed: SmoothedRelevancy, level: Level | None, rule: RelevancyRule
 ) -> tuple[Bool[np.ndarray, "H W"], Level]:
-    """The mask of a level, or of the level that the rule chooses where `level` is None."""
+    """The mask of a level, or of the level that the rule chooses if `level` is None."""
 
     def mask_of(level: Level) -> np.ndarray:
         mask = threshold_mask(smoothed.mixed[level.index], rule.threshold, rule.threshold_on)

@@ -18,15 +18,15 @@ class QueryableScene(Protocol):
         """Relevancy of the node at each pixel, (T, 3, H, W)."""
 
     def select(self, path, *, level=None, view=None):
-        """Nodes that answer the last of one or more texts, at a level or at the one that is chosen. With a
-        view only nodes that it shows compete."""
+        """Nodes that answer the last of one or more texts, at a given or a chosen level. With a view, only
+        the nodes that it shows compete."""
 
     def node_masks(self, view, ids):
         """Union of the rendered nodes in a view, (H, W)."""
 
 
 class PackedMasks:
-    """Predicted masks of one view, one bit a pixel, kept for what is measured between levels and views."""
+    """Predicted masks of one view, one bit per pixel, kept for measures across levels and views."""
 
     def __init__(self, size_hw: tuple[int, int]) -> None:
         self.size_hw = size_hw
@@ -46,7 +46,7 @@ class PackedMasks:
 
 
 class Selections:
-    """Nodes chosen for texts and paths, once for a view or for the whole scene."""
+    """Nodes chosen for texts and paths, each found once per view or for the whole scene."""
 
     def __init__(self, scene: QueryableScene) -> None:
         self.scene = scene
@@ -57,8 +57,8 @@ class Selections:
 
         Args:
             path: one text, or several from coarse to fine.
-            level: of the last text; None: the one that the tree chooses.
-            view: nodes that it shows compete, as in maps; None: those of the whole scene.
+            level: level of the last text; None lets the tree choose.
+            view: only the nodes that it shows compete, as in maps; None: those of the whole scene.
         """
         key = (path, level, view)
         if key not in self._of:

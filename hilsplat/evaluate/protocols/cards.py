@@ -1,9 +1,9 @@
-"""Every protocol: its name, its version, and all that decides a number under it.
+"""Every protocol: its name, its version, and everything that decides a number under it.
 
 A number without its protocol is not a result: the same model scores 51.4 under `lerf/langsplat` and 9.66
 under `lerf/opengaussian`. A row of `scores.csv` carries the full name, such as `lerf/langsplat@1`, followed
-in brackets by whatever its settings change: `lerf/langsplat@1 (filter 20, raw)`. Whoever changes what a
-card decides raises its version; a test holds the two together.
+in brackets by whatever its settings change: `lerf/langsplat@1 (filter 20, raw)`. A change in what a card
+decides needs a new version; a test checks that.
 """
 
 from collections.abc import Iterable
@@ -21,15 +21,15 @@ RELEVANCY_SCALE = 10.0
 """Scale of the cosine in the relevancy (LERF, LangSplat)."""
 
 NODE_SELECT = 0.95
-"""Nodes answer a text that lie at most 1 less this of the range of the level's cosine margins below the best
-one that the view shows, and three times as far if they look like it.
+"""A node answers a text if its cosine margin is within 1 - NODE_SELECT of the range of the level's margins
+below that of the best node in the view, or within three times that if it looks like the best.
 
-`lerf/tree-nodes`, `hierarchy/level-given` and `-auto` took 0.85 of the range of the relevancies themselves in
-version 1. Up to version 3 of these, 2 of `hierarchy/path` and 1 of `world/view-consistency` looks did not
-count, and nodes of the whole scene competed in every view."""
+Version 1 of `lerf/tree-nodes`, `hierarchy/level-given` and `-auto` used 0.85 of the range of the
+relevancies themselves. Up to version 3 of these, 2 of `hierarchy/path` and 1 of `world/view-consistency`,
+looks did not count, and nodes of the whole scene competed in every view."""
 
 ANCESTORS = 0.2
-"""Share of the mean margin of a node's ancestors that is added to its own, but on paths; version 2 of
+"""Share of the mean margin of a node's ancestors that is added to its own, except on paths; version 2 of
 `lerf/tree-nodes`, `hierarchy/level-given` and `-auto` added nothing."""
 
 Averaging = Literal["pairs", "classes", "levels", "views", "scenes", "pooled"]
@@ -40,7 +40,7 @@ classes: mean over the views of a query, then over the queries of a scene, then 
 levels: as pairs for each level; Avg is the mean of the levels.
 views: mean over the views of a scene, then over scenes.
 scenes: one number per scene, mean over scenes.
-pooled: counts of all scenes are added first; scenes weigh by their points.
+pooled: counts of all scenes are added first, so scenes weigh by their points.
 """
 
 
@@ -59,9 +59,9 @@ class ProtocolCard:
         averaging: see `Averaging`.
         selection: how a prediction is chosen, threshold and level, in words.
         source: repository or text it follows.
-        rule: how relevancy maps become masks, where they do.
+        rule: how relevancy maps become masks, if they do.
         missing: see `Missing`. A point without a predicted class is a miss under every protocol.
-        classes: name of the `ClassSet` that is queried, where it is fixed.
+        classes: name of the `ClassSet` that is queried, if it is fixed.
     """
 
     name: str
@@ -80,7 +80,7 @@ class ProtocolCard:
         return f"{self.name}@{self.version}"
 
     def labelled(self, departures: Iterable[str] = ()) -> str:
-        """What a row carries: the full name, then what its settings change."""
+        """The name in a row: the full name, then what its settings change."""
         words = ", ".join(departures)
         return f"{self.full_name} ({words})" if words else self.full_name
 
@@ -226,10 +226,10 @@ def _points(
 
 
 def card_named(name: str) -> ProtocolCard:
-    """The protocol `benchmark/variant` in its present version.
+    """The protocol `benchmark/variant` in its current version.
 
     Raises:
-        ArtifactError: there is none of that name.
+        ArtifactError: no protocol has that name.
     """
     for card in CARDS:
         if card.name == name:
@@ -363,7 +363,7 @@ def card_of(label: str) -> ProtocolCard:
     """The protocol that a row names, whatever its settings change.
 
     Raises:
-        ArtifactError: there is none of that name and version.
+        ArtifactError: no protocol has that name and version.
     """
     full_name = label.split(" (")[0]
     if full_name not in PROTOCOLS:

@@ -7,8 +7,8 @@
 | `vote` | the vote of the k nearest within a radius, weighted by opacity; nothing beyond the radius |
 | `density` | the mean of the k nearest, weighted by opacity times Gaussian falloff at the point |
 
-The numbers differ by mode, so every row names its mode. Of Gaussians at equal distances the search tree
-decides, always alike for the same input and any number of threads.
+The numbers differ by mode, so every row names its mode. Between Gaussians at equal distances the search
+tree decides, always in the same way for the same input and any number of threads.
 """
 
 from dataclasses import dataclass
@@ -24,21 +24,21 @@ from hilsplat.base.rotations import rotation_matrices
 Mode = Literal["frozen", "nearest", "vote", "density"]
 
 OPACITY_MIN = 0.1
-"""Gaussians below are transparent: OpenGaussian takes them out of the evaluation."""
+"""Gaussians below this are transparent: OpenGaussian leaves them out of the evaluation."""
 
 CHUNK_POINTS = 65536
-"""Points that are worked on at once; bounds the memory."""
+"""Points processed at once; bounds the memory."""
 
 
 @dataclass(frozen=True)
 class CarriedPoints:
-    """Which Gaussians speak for each of P points, and how loudly.
+    """Which Gaussians speak for each of P points, and with what weight.
 
     Attributes:
-        mode: as rows name it, with what departs from the defaults.
-        index: Gaussians per point; it means nothing if the weight is 0.
-        weight: of each, not negative, summing to 1; all 0 if no Gaussian speaks for the point.
-        is_scored: False for points that the mode takes out of the evaluation.
+        mode: its name in rows, with departures from the defaults.
+        index: Gaussians of each point; without meaning if the weight is 0.
+        weight: weight of each, not negative, summing to 1; all 0 if no Gaussian speaks for the point.
+        is_scored: False for points that the mode leaves out of the evaluation.
     """
 
     mode: str
@@ -47,7 +47,7 @@ class CarriedPoints:
     is_scored: Bool[np.ndarray, " P"]
 
     def labels(self, of_gaussian: Int[np.ndarray, " N"]) -> Int32[np.ndarray, " P"]:
-        """The label with the largest weight among a point's Gaussians; of equal ones the smallest.
+        """The label with the largest weight among a point's Gaussians; ties go to the smallest.
 
         Label 0 means none and has no vote; a point whose Gaussians have no label gets 0.
         """
@@ -72,7 +72,7 @@ class CarriedPoints:
         return result
 
     def truth(self, labels: Int[np.ndarray, " P"]) -> Int[np.ndarray, " P"]:
-        """The truth with 0 (ignored) at points that the mode takes out of the evaluation."""
+        """The truth with 0 (ignored) at points that the mode leaves out of the evaluation."""
         return np.where(self.is_scored, labels, 0).astype(labels.dtype)
 
 
@@ -87,10 +87,10 @@ def frozen(opacities: Float[np.ndarray, " N"], num_points: int) -> CarriedPoints
     """
     if len(opacities) != num_points:
         raise MisalignedArtifactError(
-            "Gaussians are not the points of the ground truth",
+            "the Gaussians do not correspond to the points of the ground truth",
             expected=f"{num_points} Gaussians, one per point",
             found=len(opacities),
-            fix="fit with frozen points, or carry by mode nearest, vote or density",
+            fix="fit with frozen points, or use mode nearest, vote or density",
         )
     index = np.arange(num_points, dtype=np.int64)[:, None]
     return CarriedPoints("frozen", index, np.ones((num_points, 1)), opacities >= OPACITY_MIN)
@@ -124,12 +124,12 @@ def vote(
     A point without any has no prediction, which counts as a miss.
 
     Args:
-        points: what is labelled, scene units.
+        points: labelled points, scene units.
         means: centres of the Gaussians, scene units.
         opacities: peak alphas.
         radius: scene units; 0.1 is 10 cm if the unit is a metre.
         k: neighbours.
-        threads: threads of the search; they change nothing but the time.
+        threads: threads of the search; they change only the time.
 
     Raises:
         MisalignedArtifactError: no Gaussian is opaque enough.
@@ -153,17 +153,17 @@ def density(
     """The k nearest Gaussians, weighted by opacity * exp(-d**2 / 2) with d the Mahalanobis distance.
 
     This is the alpha that each has at the point, as 3DGS blends it. Candidates are the nearest centres:
-    a large Gaussian whose centre is far does not speak. Far from all Gaussians the relative weights still
+    a large Gaussian whose centre is far has no weight. Far from all Gaussians the relative weights still
     decide, so that every point has a prediction.
 
     Args:
-        points: what is labelled, scene units.
+        points: labelled points, scene units.
         means: centres of the Gaussians, scene units.
         opacities: peak alphas; below 0.1 a Gaussian is not a candidate.
         scales: standard deviations along the axes, scene units.
         quats: world-from-Gaussian rotation, wxyz, any non-zero length.
         k: neighbours.
-        threads: threads of the search; they change nothing but the time.
+        threads: threads of the search; they change only the time.
 
     Raises:
         MisalignedArtifactError: no Gaussian is opaque enough.
@@ -182,7 +182,7 @@ def density(
 
 
 def argmax_labels(scores: Float[np.ndarray, "P K"]) -> Int32[np.ndarray, " P"]:
-    """Labels 1 .. K of the largest score (cosine or relevancy); of equal scores the first class.
+    """Labels 1 .. K of the largest score (cosine or relevancy); ties go to the first class.
 
     A row that is all zero has no feature and gets 0, a miss. OpenGaussian's argmax gives such points its
     first class, wall.
@@ -215,7 +215,7 @@ def _neighbours(
             fix="look at gaussians.ply; the fit has probably failed",
         )
     tree = cKDTree(means[opaque].astype(float))
-    # Within the radius includes its border.
+    # The radius itself counts as within.
     bound = np.nextafter(radius, np.inf)
     distance, place = tree.query(
         points.astype(float), k=np.arange(1, k + 1), distance_upper_bound=bound, workers=threads

@@ -1,7 +1,8 @@
 """Protocols of images without levels, scored beside LangSplat's: 3D-OVS, LERF-Mask, other rules for maps.
 
 They read the relevancy maps that `views.measure_view` renders anyway. On a stand-in with levels only the
-texts of whole objects are asked, as those benchmarks name no parts; protocols then say `wholes`.
+texts of whole objects are asked, because those benchmarks do not name parts; the names of the protocols
+then carry `wholes`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -35,9 +36,9 @@ class FlatProtocols:
     """Scores one view under further protocols while its texts are answered one by one.
 
     Args:
-        cards: protocols; those with a rule for maps, LERF-Mask's and 3D-OVS' argmax.
+        cards: protocols with a rule for maps, those of LERF-Mask, and the argmax of 3D-OVS.
         level: only texts of this level are asked; None for data without levels.
-        words: what the settings change of the relevancy, for the protocols' names.
+        words: what the settings change in the relevancy, for the protocols' names.
     """
 
     def __init__(self, cards: Sequence[ProtocolCard], level: Level | None, words: Sequence[str] = ()) -> None:
@@ -73,6 +74,7 @@ class FlatProtocols:
                 mask = nodes_mask
                 if mask is None:
                     rule = LERF_LANGSPLAT.rule
+                    assert rule is not None
                     mask, _ = relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)
                 for row in measure_masks(card, method, {flat.text: mask}, {flat.text: flat.truth}):
                     yield replace(row, protocol=label)
@@ -92,7 +94,7 @@ class FlatProtocols:
             return
         truth = np.stack([self._truths[text] for text in texts])
         words = ["best level", *self.words]
-        if self.level is not None:  # nothing names what surrounds the objects
+        if self.level is not None:  # the surroundings of the objects have no text
             words = ["labelled pixels", *words]
             labelled = truth.any(axis=0)
             truth = truth[:, None, labelled]

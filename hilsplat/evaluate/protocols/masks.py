@@ -1,4 +1,4 @@
-"""Score masks or class maps that a method brings itself: LERF-Mask, LERF-OVS in 3D, 3D-OVS by argmax."""
+"""Score masks or class maps that a method supplies: LERF-Mask, LERF-OVS in 3D, 3D-OVS by argmax."""
 
 import difflib
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -31,22 +31,22 @@ def measure_masks(
     """Rows of one view, one per text of the truth and metric.
 
     Args:
-        card: such as `lerf-mask/gaussian-grouping`; its metrics and what a missing prediction counts.
+        card: such as `lerf-mask/gaussian-grouping`; decides the metrics and what a missing prediction counts.
         method: what made the masks.
         predictions: mask per text, at the size of the truth; a text that is absent or None has no
             prediction. Texts that the truth of this view lacks are ignored.
         truths: true region per text.
-        queries: all texts that are asked in the scene, in whatever view; a prediction for another one is
-            refused, as the misspelt text would count 0 silently. None: not checked.
+        queries: all texts asked in any view of the scene; a prediction for another text is refused, because
+            a misspelt text would silently count 0. None skips the check.
 
     Raises:
-        MisalignedArtifactError: a prediction is of another size than its truth, or for an unknown query.
+        MisalignedArtifactError: a prediction differs in size from its truth, or is for an unknown query.
     """
     for text in predictions:
         if queries is not None and text not in queries:
             near = difflib.get_close_matches(text, list(queries), n=1)
             raise MisalignedArtifactError(
-                f"there is a prediction for {text!r}, which nobody asks in this scene",
+                f"there is a prediction for {text!r}, which is not a query of this scene",
                 expected=f"one of {', '.join(sorted(queries))}",
                 found=text,
                 fix=f"rename it {near[0]!r}" if near else "remove it, or correct its name",
@@ -73,9 +73,9 @@ def measure_class_maps(
 
     Args:
         method: what made the maps.
-        similarity: cosine of each pixel with each text; None where the view has no prediction.
+        similarity: cosine of each pixel with each text; None if the view has no prediction.
         truth: one mask per text.
-        texts: sorted, as equal similarities go to the first.
+        texts: sorted, because ties go to the first.
 
     Raises:
         MisalignedArtifactError: maps and truth differ in size or number.
@@ -95,7 +95,7 @@ def measure_class_maps(
 def _require_same_size(what: str, found: tuple[int, ...], expected: tuple[int, ...]) -> None:
     if found != expected:
         raise MisalignedArtifactError(
-            f"prediction and truth of {what} are of different size",
+            f"prediction and truth of {what} differ in size",
             expected=" x ".join(map(str, expected)),
             found=" x ".join(map(str, found)),
             fix="resize the prediction to the labels by the nearest pixel",

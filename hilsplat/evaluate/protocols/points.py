@@ -1,7 +1,7 @@
 """Score classes and instances of points: ScanNet, ScanNet200, Replica, Waymo.
 
-Predictions per point come in, whoever made them; `carry` brings those of Gaussians to points, and its mode
-stands in every row.
+Predictions per point may come from any source; `carry` brings those of Gaussians to points, and every row
+names its mode.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -38,7 +38,7 @@ MEANS: dict[str, Callable[[ClassCounts], float]] = {
     "miou_absent_as_one": miou_absent_as_one,
     "frequency_weighted_iou": frequency_weighted_iou,
 }
-"""Metrics that are one number of a scene, or of all scenes where a protocol pools."""
+"""Metrics that give one number per scene, or one for all scenes if a protocol pools."""
 
 
 def point_label(card: ProtocolCard, carried: str) -> str:
@@ -54,7 +54,7 @@ def measure_points(
     classes: ClassSet,
     carried: str,
 ) -> Iterator[Measured]:
-    """Rows of one scene: IoU and accuracy of each class, and the scene's means where the card has them.
+    """Rows of one scene: IoU and accuracy of each class, and the scene's means if the card has them.
 
     `n` of a class row is the number of points its value is a share of, so that `pooled_points` can add
     scenes up. A class that is neither in truth nor prediction has no row; without any truth there is none.
@@ -63,9 +63,9 @@ def measure_points(
         card: a protocol of points; its classes are `classes`.
         method: what answered.
         truth: labels 1 .. K in the order of `classes`; 0 is ignored.
-        prediction: likewise; 0 is a miss. None where the scene has no prediction: all 0.
+        prediction: the same; 0 is a miss. None if the scene has no prediction: all 0.
         classes: what was queried.
-        carried: mode of `carry.CarriedPoints`, or what else brought predictions to the points.
+        carried: mode of `carry.CarriedPoints`, or another way by which predictions reached the points.
 
     Raises:
         MisalignedArtifactError: prediction and truth have different numbers of points, or the classes
@@ -79,7 +79,7 @@ def measure_points(
         prediction = np.zeros_like(truth)
     if len(prediction) != len(truth):
         raise MisalignedArtifactError(
-            "predictions are not of the scene's points",
+            "predictions do not belong to the scene's points",
             expected=f"{len(truth)} points",
             found=len(prediction),
             fix="carry the predictions to the points of the ground truth",
@@ -118,7 +118,7 @@ def pooled_points(
 
 
 def _counts_of(rows: Sequence[Measured], classes: ClassSet) -> ClassCounts:
-    """Counts from class rows. Values carry six decimals in a file: exact up to a million points a class."""
+    """Counts from class rows. Values carry six decimals in a file: exact up to a million points per class."""
     hits, truth, union = np.zeros((3, len(classes)), dtype=np.int64)
     place = {text: row for row, text in enumerate(classes.texts)}
     for row in rows:
@@ -135,8 +135,8 @@ def measure_instances(
 ) -> Iterator[Measured]:
     """AP, AP50 and AP25 of all scans together, one row each; `n` is the number of scans.
 
-    A scan without predictions belongs in: its instances are misses. Nothing is yielded where no scan has an
-    instance of any class.
+    Include scans without predictions: their instances are misses. Yields nothing if no scan has an instance
+    of any class.
     """
     precisions = average_precision(list(scans.values()))
     if np.isnan(precisions).all():

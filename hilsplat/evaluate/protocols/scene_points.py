@@ -33,7 +33,7 @@ LEVEL = Level.WHOLE
 
 @dataclass(frozen=True)
 class PointAnswers:
-    """A scene's answers at some points.
+    """A scene's answers at given points.
 
     Attributes:
         scene: what answers.
@@ -51,14 +51,14 @@ class PointAnswers:
         scene_units_per_metre: float,
         threads: int = 1,
     ) -> "PointAnswers":
-        """Carry by a mode (`carry`).
+        """Carry the scene's Gaussians to points (`carry`).
 
         Args:
             scene: what answers.
-            points: places, scene units.
+            points: positions, scene units.
             mode: how predictions come to points.
             scene_units_per_metre: for the radius of a vote.
-            threads: of the search.
+            threads: threads of the search.
         """
         gaussians = scene.gaussians
         means, opacities = (array.detach().numpy() for array in (gaussians.means, gaussians.opacities))
@@ -75,7 +75,7 @@ class PointAnswers:
         return PointAnswers(scene, carried)
 
     def classes(self, method: str, texts: Sequence[str]) -> Int32[np.ndarray, " P"]:
-        """Labels 1 .. K of the points; 0 where nothing speaks for a point."""
+        """Labels 1 .. K of the points; 0 if no Gaussian speaks for a point."""
         vectors = self.scene.text_vectors(texts)
         if method == "tree":
             node = self.scene.tree.node_of_gaussian[:, LEVEL.index]
@@ -91,7 +91,7 @@ class PointAnswers:
         return labels
 
     def instances(self, truth: LabelledPoints, classes: ClassSet) -> InstanceMatches:
-        """Match the nodes at level whole, each of its best class with that cosine as confidence."""
+        """Match the nodes at level whole, each with its best class and that cosine as confidence."""
         tree = self.scene.tree
         nodes = tree.nodes_of(LEVEL)
         cosines = tree.clip[nodes].astype(np.float32) @ self.scene.text_vectors(classes.texts).T
@@ -132,10 +132,10 @@ def measure_scene_points(
         scene: what answers.
         truth: labelled points by labelling, metres.
         scene_from_points: similarity from their frame to the scene's.
-        cards: protocols of points; those whose labelling is not there are passed over.
+        cards: protocols of points; those whose labelling is absent are skipped.
         methods: "tree" and "field"; others have no answer at points.
         mode: see `carry`.
-        threads: of the search for neighbours.
+        threads: threads of the search for neighbours.
     """
     scale = float(np.cbrt(np.linalg.det(scene_from_points[:3, :3])))
     answers: dict[int, PointAnswers] = {}  # labellings of a mesh share its vertices

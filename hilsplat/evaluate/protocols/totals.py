@@ -38,7 +38,7 @@ def scene_values(rows: "pd.DataFrame", metric: str, level: str | None = None) ->
 
 
 def table_value(rows: "pd.DataFrame", metric: str, level: str | None = None) -> float:
-    """Mean of the scenes' numbers, which weigh the same whatever their rows; nan without a row."""
+    """Mean of the scenes' numbers, each of the same weight whatever its rows; nan without a row."""
     return float(scene_values(rows, metric, level).mean())
 
 
@@ -53,7 +53,7 @@ def level_values(rows: "pd.DataFrame", metric: str) -> dict[Level, float]:
 
 
 def mean_over_levels(values: Iterable[float]) -> float:
-    """Plain mean of the levels that have a number: the column Avg; nan where none has."""
+    """Plain mean of the levels that have a number: the column Avg; nan if none has."""
     present = [value for value in values if value == value]
     return sum(present) / len(present) if present else float("nan")
 
@@ -61,10 +61,10 @@ def mean_over_levels(values: Iterable[float]) -> float:
 def level_averages_of_scenes(rows: "pd.DataFrame", metric: str) -> "pd.Series":
     """One number per scene over all seeds: mean over the rows of a level, over levels, then over seeds.
 
-    Differences of two table rows are paired by it.
+    It pairs two table rows by scene.
 
     Args:
-        rows: with seeds in a column of their own (`tables.measured.with_seeds`).
+        rows: with seeds in their own column (`tables.measured.with_seeds`).
     """
     kept = rows[rows["metric"] == metric]
     of_level = kept.groupby(["scene", "seed", "level"], sort=True)["value"].mean()

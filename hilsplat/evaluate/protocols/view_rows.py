@@ -1,4 +1,4 @@
-"""Numbers of one answer in one view."""
+"""Scores of one answer in one view."""
 
 from collections.abc import Iterator, Sequence
 
@@ -28,7 +28,7 @@ def mask_rows(
         protocol: full name, with departures.
         mask: the answer.
         points_xy: pixels of the highest relevancy.
-        metrics: which numbers.
+        metrics: metrics to compute.
     """
     level = query.level.label if query.level else ""
     values = {

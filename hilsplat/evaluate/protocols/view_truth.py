@@ -1,4 +1,4 @@
-"""What is true in one view: the queries that are scored there and their regions."""
+"""The truth of one view: the queries that are scored there and their regions."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ class Query:
 
     Attributes:
         text: what is asked.
-        level: level of its annotation; None where the protocol unites levels.
+        level: level of its annotation; None if the protocol unites levels.
         paths: chains of texts that lead to its nodes, each once.
         truth: true region.
         boxes_xyxy: box of each annotated node, borders included.
@@ -53,7 +53,7 @@ class ViewTruth:
         """Collect the regions of at least `min_px` pixels.
 
         Raises:
-            MisalignedArtifactError: the label images are of another size than the camera.
+            MisalignedArtifactError: label images and camera differ in size.
         """
         queries: list[Query] = []
         by_path: dict[tuple[str, ...], np.ndarray] = {}
@@ -87,9 +87,9 @@ class ViewTruth:
     def of_regions(regions: Iterable[LabelledRegion], size_hw: tuple[int, int]) -> "ViewTruth":
         """Truth of a view of a published data set, with or without levels.
 
-        Regions of one text and level are united, their boxes all kept. A region without a pixel (a class
-        of 3D-OVS that the view does not show) is no query. A region whose chain of parents is broken is
-        asked for, but belongs to no family.
+        Regions of one text and level are united; all their boxes are kept. A region without a pixel (a
+        class of 3D-OVS that the view does not show) is not a query. A region whose chain of parents is
+        broken is queried but belongs to no family.
 
         Args:
             regions: the labels of the view.
@@ -128,7 +128,7 @@ class ViewTruth:
 
         Args:
             truths: true region per text; objects of one text are united.
-            boxes_xyxy: annotated boxes per text, borders included; the box of the region where None.
+            boxes_xyxy: annotated boxes per text, borders included; None takes the boxes of the regions.
         """
         categories = tuple(
             Query(text, None, ((text,),), truth, boxes_xyxy[text] if boxes_xyxy else box_of(truth)[None])

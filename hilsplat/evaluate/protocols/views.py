@@ -10,12 +10,13 @@
 | `hierarchy/scene-wide` | every (text, level) | tree, at the annotation's level, one answer for all views |
 | `hierarchy/annotations` | - | the annotations themselves, HC only: what perfect masks would score |
 
-A path holds one more piece of information than a flat query and is not the paper's protocol. A missing
-or empty prediction counts 0. A field sees what a view shows, and so do the nodes that compete: all but
-`hierarchy/scene-wide` ask for what is in the picture.
+A path gives more information than a flat query and is not the paper's protocol. A missing or empty
+prediction counts 0. A field answers with what the view shows; likewise only nodes that the view shows
+compete, except under `hierarchy/scene-wide`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -53,14 +54,14 @@ from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
 from hilsplat.settings import EvaluateSettings
 
 NO_POINTS = np.zeros((0, 2), np.int64)
-"""Where nothing is localized."""
+"""For answers that are not localized."""
 
 RELEVANCY_CHUNK_MIB = 512
-"""Maps of so many texts are held at once: every chunk decodes the view anew."""
+"""Memory for relevancy maps held at once; each chunk of texts decodes the view again."""
 
 
 def rule_of(settings: EvaluateSettings) -> RelevancyRule:
-    """The map rule that the settings ask for."""
+    """The map rule that the settings describe."""
     return RelevancyRule(
         settings.filter_px,
         settings.mix,
@@ -72,11 +73,11 @@ def rule_of(settings: EvaluateSettings) -> RelevancyRule:
 
 
 def label_of(card: ProtocolCard, method: str, settings: EvaluateSettings) -> str:
-    """Protocol of a row: the card's name, then what the settings change of what this method does."""
+    """Protocol of a row: the card's name, then the settings that change what this method does."""
     if method == "truth":
         return card.labelled()
     rule = rule_of(settings)
-    words = []
+    words: list[str] = []
     if method == "field":
         words += rule.departures(RelevancyRule())
     else:  # nodes are selected, not thresholded; localization and diagnostics still read smoothed maps
@@ -89,12 +90,12 @@ def label_of(card: ProtocolCard, method: str, settings: EvaluateSettings) -> str
 
 
 def given_key(method: str, query: Query, settings: EvaluateSettings) -> tuple:
-    """Under which key the answer at the query's level is kept."""
+    """Key under which the answer at the query's level is kept."""
     return (method, label_of(LEVEL_GIVEN, method, settings), query.text, query.level)
 
 
 def relevancy_departures(settings: EvaluateSettings) -> list[str]:
-    """What the settings change of the relevancy itself, whatever is made of it."""
+    """What the settings change in the relevancy itself."""
     words = []
     if settings.canonical != CANONICAL:
         words.append(f"canonical {'+'.join(settings.canonical)}")
@@ -118,19 +119,22 @@ def measure_view(
     """All numbers of one view, in no particular order.
 
     Args:
-        scene: what answers.
-        selections: its chosen nodes.
-        truth: what is scored.
-        view: its view.
+        scene: scene that answers.
+        selections: the nodes it selects.
+        truth: queries to score, with their regions.
+        view: name of their view.
         size_hw: height and width of the view, px.
-        settings: methods, the map rule and what makes a relevancy.
+        settings: methods, the map rule and the settings of the relevancy.
         also: further protocols for texts without levels, such as `3d-ovs/langsplat`.
-        masks: keeps the answers, for what is measured between views.
+        masks: keeps the answers, for measures between views.
     """
     masks = PackedMasks(size_hw) if masks is None else masks
     rule = rule_of(settings)
 
-    def select(text: str, level: Level | None) -> np.ndarray:
+    def by_map(smoothed: SmoothedRelevancy, level: Level | None) -> np.ndarray:
+        return relevancy_mask(smoothed, level, rule)[0]
+
+    def by_nodes(text: str, level: Level | None) -> np.ndarray:
         return selections.mask(view, selections.nodes((text,), level, view), size_hw)
 
     texts = [query.text for query in truth.categories]
@@ -149,7 +153,7 @@ def measure_view(
                     "field",
                     LERF_LANGSPLAT,
                     smoothed,
-                    lambda _, level, smoothed=smoothed: relevancy_mask(smoothed, level, rule)[0],
+                    partial(by_map, smoothed),
                     category,
                     queries,
                     settings,
@@ -160,11 +164,11 @@ def measure_view(
             if nodes is not None and "tree" in settings.methods:
                 smoothed = SmoothedRelevancy.of(nodes[row], rule)
                 yield from _answer_rows(
-                    "tree", TREE_NODES, smoothed, select, category, queries, settings, masks
+                    "tree", TREE_NODES, smoothed, partial(by_nodes, text), category, queries, settings, masks
                 )
                 yield from _scene_wide_rows(queries, settings, selections, view, masks)
                 if also is not None:
-                    yield from also.add("tree", nodes[row], select(text, None), category, queries)
+                    yield from also.add("tree", nodes[row], by_nodes(text, None), category, queries)
             if nodes is not None and "tree-path" in settings.methods:
                 yield from _path_rows(nodes[row], queries, settings, selections, view, masks)
     if also is not None:
@@ -187,7 +191,7 @@ def _answer_rows(
     method: str,
     flat: ProtocolCard,
     smoothed: SmoothedRelevancy,
-    answer: Callable[[str, Level | None], np.ndarray],
+    answer: Callable[[Level | None], np.ndarray],
     category: Query,
     queries: Sequence[Query],
     settings: EvaluateSettings,
@@ -199,19 +203,19 @@ def _answer_rows(
         method: "field" or "tree".
         flat: protocol of texts whose levels are united.
         smoothed: the text's relevancy.
-        answer: (text, level or None for automatic) -> mask.
+        answer: level, or None for the method's own choice -> mask of the text.
         category: the text with all levels united.
         queries: the same per level.
         settings: as in `measure_view`.
         masks: keeps the answers.
     """
     united, given, auto = (label_of(card, method, settings) for card in (flat, LEVEL_GIVEN, LEVEL_AUTO))
-    auto_mask = answer(category.text, None)
+    auto_mask = answer(None)
     auto_points, _ = peak_points(smoothed.filtered, None)
     yield from mask_rows(method, category, united, auto_mask, auto_points)
     masks.put((method, auto, category.text), auto_mask)
     for query in queries:
-        given_mask = answer(query.text, query.level)
+        given_mask = answer(query.level)
         given_points, _ = peak_points(smoothed.filtered, query.level)
         yield from mask_rows(method, query, given, given_mask, given_points)
         yield from mask_rows(method, query, auto, auto_mask, auto_points)
@@ -226,7 +230,7 @@ def _scene_wide_rows(
     view: str,
     masks: PackedMasks,
 ) -> Iterator[Measured]:
-    """The tree's answer in 3D, which knows of no view; maps, and so localization, are as with a view."""
+    """Rows of the tree's answer for the whole scene; its maps, and so its localization, are the view's."""
     protocol = label_of(SCENE_WIDE, "tree", settings)
     for query in queries:
         mask = selections.mask(view, selections.nodes((query.text,), query.level, None), masks.size_hw)
@@ -242,7 +246,7 @@ def _path_rows(
     view: str,
     masks: PackedMasks,
 ) -> Iterator[Measured]:
-    """Localization looks inside the prediction for the parent, where there is one."""
+    """Rows of answers to paths; localization looks inside the prediction for the parent, if there is one."""
     protocol = label_of(PATH, "tree-path", settings)
     size_hw = masks.size_hw
     side_px = filter_side_px(settings.filter_px, size_hw[0])
@@ -270,21 +274,30 @@ def _consistency_rows(truth: ViewTruth, masks: PackedMasks, settings: EvaluateSe
     parents = sum(map(len, transitions))
     if not parents:
         return
-    lookups = {("truth", label_of(ANNOTATIONS, "truth", settings)): lambda path: truth.regions[path]}
+    # (method, protocol) -> function from a path to the rest of its answer's key
+    rest_of: dict[tuple[str, str], Callable[[tuple[str, ...]], tuple]] = {
+        ("truth", label_of(ANNOTATIONS, "truth", settings)): lambda path: (path,)
+    }
     for method in ("field", "tree"):
         if method in settings.methods:
-            auto = (method, label_of(LEVEL_AUTO, method, settings))
-            lookups[auto] = lambda path, key=auto: masks.get((*key, path[-1]))
+            rest_of[method, label_of(LEVEL_AUTO, method, settings)] = lambda path: path[-1:]
             for card in (LEVEL_GIVEN, *([SCENE_WIDE] if method == "tree" else [])):
-                given = (method, label_of(card, method, settings))
-                lookups[given] = lambda path, key=given: masks.get((*key, path[-1], Level(len(path))))
+                rest_of[method, label_of(card, method, settings)] = lambda path: (path[-1], Level(len(path)))
     if "tree-path" in settings.methods:
-        key = ("tree-path", label_of(PATH, "tree-path", settings))
-        lookups[key] = lambda path, key=key: masks.get((*key, path))
-    for (method, protocol), mask_of in lookups.items():
+        rest_of["tree-path", label_of(PATH, "tree-path", settings)] = lambda path: (path,)
+
+    def mask_of(answer: tuple[str, str], path: tuple[str, ...]) -> np.ndarray:
+        return truth.regions[path] if answer[0] == "truth" else masks.get((*answer, *rest_of[answer](path)))
+
+    for answer in rest_of:
+        method, protocol = answer
         families = [
             [
-                Family(mask_of(parent), tuple(mask_of(child) for child in children), truth.regions[parent])
+                Family(
+                    mask_of(answer, parent),
+                    tuple(mask_of(answer, child) for child in children),
+                    truth.regions[parent],
+                )
                 for parent, children in transition
             ]
             for transition in transitions

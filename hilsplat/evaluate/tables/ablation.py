@@ -2,11 +2,10 @@
 
 import math
 import statistics
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN, PATH, card_of
+from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN, PATH
 from hilsplat.evaluate.protocols.totals import level_averages_of_scenes, table_value
 from hilsplat.evaluate.tables.measured import level_cells, measured_blocks, same_row, with_seeds
 from hilsplat.evaluate.tables.reported import reported_block
@@ -72,7 +71,7 @@ def omega_table(sources: Sources) -> Table:
 
 
 def reported(sources: Sources, what: str) -> Block:
-    """The paper's rows of an ablation."""
+    """The rows that the paper reports for an ablation."""
     return reported_block(
         sources.published, "LERF, 3D-OVS, Hi-LERF", f"Reported in the paper: {what}", families=False
     )
@@ -86,14 +85,11 @@ def component_blocks(
         return []
     scores = with_seeds(sources.scores)
 
-    def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
-        return component_cells(scores, part)
-
     blocks = measured_blocks(
         sources.scores[sources.scores["method"].isin(methods)],
         sources.labels,
-        lambda protocol: card_of(protocol) in (LEVEL_GIVEN, PATH),
-        cells_of,
+        (f"{LEVEL_GIVEN.name}@", f"{PATH.name}@"),
+        lambda part: component_cells(scores, part),
         lambda _: COLUMNS,
         frozenset({"Avg, best threshold", AGAINST}),
         over_seeds=lambda part: {AGAINST: against_default(scores, part)},
@@ -101,7 +97,7 @@ def component_blocks(
     return [replace(block, columns=tuple(c for c in COLUMNS if filled(block, c))) for block in blocks]
 
 
-def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> Mapping[str, Cell]:
+def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
     """Numbers of one row from its scores under all protocols."""
     flat, ovs = same_row(scores, part, FLAT), same_row(scores, part, OVS)
     levels = level_cells(part)
@@ -119,7 +115,7 @@ def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> Mapping[str
 def against_default(scores: "pd.DataFrame", part: "pd.DataFrame") -> Cell:
     """How far a row's mIoU is above that of the default field, paired by scene.
 
-    Scenes differ by more than rows do; the spread of the differences tells whether one is better in general.
+    Scenes differ by more than rows do; the spread of the differences shows whether one is better in general.
 
     Args:
         scores: scores with seeds (`with_seeds`).

@@ -1,4 +1,4 @@
-"""Build any table by its name. Imports neither torch nor anything heavy: a table takes about a second."""
+"""Build any table by name. Imports neither torch nor anything heavy: a table takes about a second."""
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 
 
 LEVELLED = ("tabletop", "lerf_ovs", "3d_ovs")
-"""Where the ablations are measured: stand-in and images with labels at levels."""
+"""Data on which the ablations are measured: the stand-in, and images with labels at levels."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,10 @@ class TableKind:
     """How one table of the paper is built.
 
     Attributes:
-        build: the function.
-        data: what it is measured on: kinds of synthetic scenes, and published data sets.
-        variants: key of the configuration that lists its variants.
-        shows_costs: reads the times of jobs and queries too.
+        build: function that builds the table.
+        data: kinds of synthetic scenes and published data sets that it is measured on.
+        variants: configuration key that lists its variants.
+        shows_costs: whether it also reads the times of jobs and queries.
     """
 
     build: Callable[[Sources], Table]
@@ -48,7 +48,7 @@ class TableKind:
 
     @property
     def is_sweep(self) -> bool:
-        """Measured on the scenes of `sweep_scenes` alone."""
+        """Whether it is measured only on the scenes of `sweep_scenes`."""
         return self.variants != "main_variants"
 
 
@@ -85,9 +85,9 @@ def run_table(
         name: a key of `TABLES`.
         scores: `scores.csv` of every scene and variant that the table shows.
         published: the paper's values: `config/published/<name>.csv`.
-        labels: variant -> how the table names it; others keep their name.
+        labels: variant -> its name in the table; others keep their own.
         out: the CSV; `.md`, `.tex` and `.html` are written beside it.
-        absent: data sets that were not measured, and why, each a sentence.
+        absent: a sentence per data set that was not measured, with the reason.
 
     Raises:
         ArtifactError: the table is unknown, or a file is missing or has other columns.

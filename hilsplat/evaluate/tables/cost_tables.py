@@ -1,7 +1,7 @@
 """Time and memory: computational cost, efficiency, pruning.
 
-Measured rows tell what the jobs of this machine took. They differ from run to run, so these tables do not
-repeat to the byte as the others do.
+Measured rows report what the jobs took on this machine. They differ from run to run, so these tables,
+unlike the others, do not repeat byte for byte.
 """
 
 import statistics
@@ -66,7 +66,7 @@ def pruning_table(sources: Sources) -> Table:
 
 
 def reported(sources: Sources, what: str) -> Block:
-    """The paper's rows, small times and memories ranked best."""
+    """The paper's rows, with the smallest times and memories ranked best."""
     block = reported_block(
         sources.published, "LERF, 3D-OVS, Hi-LERF", f"Reported in the paper: {what}", families=False
     )
@@ -96,7 +96,7 @@ def quality_blocks(
 
 
 def given(scores: "pd.DataFrame", data: str, variant: str, method: str) -> "pd.DataFrame | None":
-    """Scores of one row with the level given; None where there are none."""
+    """Scores of one row with the level given; None if there are none."""
     if scores.empty:
         return None
     part = scores[
@@ -125,7 +125,7 @@ def timed(data: str, rows: list[Row], columns: list[str]) -> Block:
 
 
 def by_dataset(costs: Iterable[Cost]) -> dict[str, list[Cost]]:
-    """Costs by data set, names in order."""
+    """Costs by data set, sorted by name."""
     found: dict[str, list[Cost]] = {}
     for cost in sorted(costs, key=lambda cost: (cost.dataset, cost.scene)):
         found.setdefault(cost.dataset, []).append(cost)

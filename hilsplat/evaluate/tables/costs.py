@@ -1,6 +1,6 @@
 """What a scene and variant cost: seconds and memory of its jobs, seconds of a query.
 
-Times differ from run to run and stand apart from `scores.csv`, whose bytes must not change.
+Times differ from run to run and are kept apart from `scores.csv`, whose bytes must not change.
 """
 
 import math
@@ -31,9 +31,9 @@ class Cost:
         dataset: data set of the scene.
         scene: scene name.
         variant: named set of settings.
-        prepare_s: wall clock of masks, trees of the views and CLIP, s; nan where a job left no record.
-        train_s: of contributions, semantic tree, autoencoder and field, s; likewise.
-        peak_mib: largest resident memory of a training job, MiB; likewise.
+        prepare_s: wall clock of masks, trees of the views and CLIP, s; nan if a job left no record.
+        train_s: the same of contributions, semantic tree, autoencoder and field, s.
+        peak_mib: largest resident memory of a training job, MiB; nan if none left a record.
         query_s: per method, seconds from a text to a mask in a view.
     """
 
@@ -47,7 +47,7 @@ class Cost:
 
 
 def times_path(scores: Path) -> Path:
-    """Where the seconds per query of a score file lie."""
+    """Path of the seconds per query that belong to a score file."""
     return Path(scores).with_name("times.csv")
 
 
@@ -56,14 +56,14 @@ def time_queries(
 ) -> dict[str, float]:
     """Seconds of one query per method: text, weights of the view, relevancy and mask.
 
-    The weights of the view and the text's vector are timed once and added, as both are kept in memory
-    for later queries.
+    The weights of the view and the text's vector are timed once and added, because both stay in memory for
+    later queries.
 
     Args:
         answers: the scene.
         asks: per method a function from a text to its mask in `view`, with weights and vectors ready.
-        view: a view.
-        texts: texts whose vectors are known; the median over them is taken.
+        view: view name.
+        texts: texts whose vectors are known; the result is the median over them.
     """
     start = time.perf_counter()
     answers.encode_texts([texts[0]])
@@ -71,7 +71,7 @@ def time_queries(
     shared_s = time.perf_counter() - start
     seconds = {}
     for method, ask in asks.items():
-        ask(texts[0])  # compiles and fills memory
+        ask(texts[0])  # compiles and fills caches
         taken = []
         for text in texts:
             start = time.perf_counter()
@@ -97,7 +97,7 @@ def read_times(scores: Path) -> list[dict[str, str]]:
 
 
 def read_costs(scores: Iterable[Path]) -> list[Cost]:
-    """Costs of the scenes and variants of some score files, from records beside their artifacts.
+    """Costs of the scenes and variants of score files, from the records beside their artifacts.
 
     Raises:
         ArtifactError: a score file has no times, or a record cannot be read.
@@ -124,10 +124,10 @@ def read_costs(scores: Iterable[Path]) -> list[Cost]:
 
 
 def jobs_of(scores: Path) -> dict[str, Job | None]:
-    """The jobs behind a score file by stage, whichever variant ran them; None where one left no record.
+    """The jobs behind a score file by stage, whichever variant ran them; None if a job left no record.
 
-    Which artifacts were read stands in the provenance of the score file and, for those that `evaluate`
-    does not read, in that of the field. A stage that nothing read is not there: a baseline without trees.
+    The provenance of the score file names the artifacts that were read; that of the field names those that
+    `evaluate` does not read. A stage that nothing read is absent, as for a baseline without trees.
     """
     places = _inputs(scores)
     if "field" in places:
@@ -148,7 +148,7 @@ def _inputs(artifact: Path) -> dict[str, Path]:
 
 
 def _seconds(jobs: Mapping[str, Job | None], stages: tuple[str, ...]) -> float:
-    """Wall clock of the stages that were needed, s; nan where one left no record, or none is known."""
+    """Wall clock of the stages that were needed, s; nan if one left no record or none is known."""
     needed = [jobs[stage] for stage in stages if stage in jobs]
     if not needed:
         return math.nan

@@ -1,6 +1,6 @@
 """Where the time went: Snakemake's benchmark files as a table.
 
-Times differ from run to run, so this table stands apart from those that must not change.
+Times differ from run to run, so this table is kept apart from those that must not change.
 """
 
 import json
@@ -24,11 +24,11 @@ class Job:
     Attributes:
         stage: its rule.
         dataset: empty for a job that belongs to no scene, such as a table.
-        scene: likewise.
-        variant: empty where all variants share the stage.
+        scene: the same.
+        variant: empty if all variants share the stage.
         elapsed_s: wall clock, s.
-        cpu_s: CPU time of the job and its children, s; 0 where it was too short to be sampled.
-        peak_mib: largest resident memory, MiB; likewise.
+        cpu_s: CPU time of the job and its children, s; 0 if the job was too short to be sampled.
+        peak_mib: largest resident memory, MiB; the same.
     """
 
     stage: str
@@ -55,7 +55,7 @@ def run_efficiency(results: Path, out: Path) -> str:
     """
     files = sorted(Path(results).glob("**/benchmarks/*.jsonl"))
     if not files:
-        raise ArtifactError(f"{results} holds no benchmark file", fix="run the workflow first")
+        raise ArtifactError(f"{results} contains no benchmark files", fix="run the workflow first")
     jobs = [job for path in files for job in read_benchmark(path, Path(results))]
     jobs.sort(key=lambda job: (_order(job.stage), job.dataset, job.scene, job.variant))
     text = stage_table(jobs)
@@ -76,7 +76,7 @@ def read_benchmark(path: Path, results: Path) -> list[Job]:
     """Jobs of one file: `<dataset>/<scene>[/<variant>]/benchmarks/<stage>.jsonl`, one line each.
 
     Raises:
-        ArtifactError: a line is no JSON object with a time.
+        ArtifactError: a line is not a JSON object with a time.
     """
     place = path.relative_to(results).parts[:-2]
     dataset, scene, variant = (*place, "", "", "")[:3]
@@ -86,7 +86,7 @@ def read_benchmark(path: Path, results: Path) -> list[Job]:
             record = json.loads(line)
             elapsed_s = float(record["s"])
         except (ValueError, KeyError, TypeError) as error:
-            raise ArtifactError(f"{path} is no benchmark file: {error}", fix="delete it") from error
+            raise ArtifactError(f"{path} is not a valid benchmark file: {error}", fix="delete it") from error
         jobs.append(
             Job(
                 path.stem,
@@ -132,7 +132,7 @@ def _line(name: str, jobs: list[Job]) -> str:
 
 
 def _order(stage: str) -> tuple[int, str]:
-    """Order of the workflow; what is not in it comes last, by name."""
+    """Order of the workflow; other stages come last, by name."""
     return (STAGE_ORDER.index(stage) if stage in STAGE_ORDER else len(STAGE_ORDER), stage)
 
 

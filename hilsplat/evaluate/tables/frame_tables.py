@@ -18,7 +18,7 @@ def hi_3dovs_frames(sources: Sources) -> Table:
 
 
 def frames_table(sources: Sources, name: str, data: str) -> Table:
-    """The paper's list, and the views whose texts at levels were asked here, with how many they were."""
+    """The paper's list, and the views in which texts at levels were asked here, with their number."""
     blocks = [reported_block(sources.published, data, f"Reported in the paper: {data}", families=False)]
     for dataset, views in asked_views(sources).items():
         rows = [

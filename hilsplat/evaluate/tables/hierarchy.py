@@ -63,7 +63,7 @@ def hierarchy_table(sources: Sources) -> Table:
     blocks += measured_blocks(
         sources.scores,
         sources.labels,
-        lambda protocol: protocol.startswith("hierarchy/"),
+        ("hierarchy/",),
         cells_of,
         lambda _: COLUMNS,
         frozenset({"HC literal", "Avg, best threshold", "Pairs"}),

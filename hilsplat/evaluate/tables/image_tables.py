@@ -23,11 +23,11 @@ def lerf_table(sources: Sources) -> Table:
         return segmentation + [f"{scene} localization" for scene in scenes]
 
     blocks = [reported_block(sources.published, "LERF", "Reported in the paper: LERF")]
-    for prefixes in (("lerf/",), (LERF_MASK.name,)):
+    for prefix in ("lerf/", LERF_MASK.name):
         blocks += measured_blocks(
             sources.scores,
             sources.labels,
-            lambda protocol, prefixes=prefixes: protocol.startswith(prefixes),
+            (prefix,),
             lambda part: scene_cells(part, metrics),
             columns_of,
             ranked_by_protocol=False,
@@ -60,13 +60,7 @@ def ovs_table(sources: Sources) -> Table:
         return {**cells, "Overall mIoU": overall, "Overall accuracy": accuracy}
 
     blocks = [reported_block(sources.published, "3D-OVS", "Reported in the paper: 3D-OVS")]
-    blocks += measured_blocks(
-        sources.scores,
-        sources.labels,
-        lambda protocol: protocol.startswith("3d-ovs/"),
-        cells_of,
-        columns_of,
-    )
+    blocks += measured_blocks(sources.scores, sources.labels, ("3d-ovs/",), cells_of, columns_of)
     footnotes = (
         "mIoU in %: mean over (view, text) pairs of a scene; Overall is the mean of the scenes.",
         "3d-ovs/langsplat: min-max relevancy above 0.7, unfiltered, level of the highest mean in its mask "

@@ -1,6 +1,6 @@
 """A table as LaTeX: booktabs, best three marked.
 
-Not by pandas' Styler: it leaves < and ± as they are, and has no footnotes.
+Written without pandas' Styler, which does not escape < and ± and has no footnotes.
 """
 
 from hilsplat.evaluate.tables.rows import Cell, Table, shown_columns

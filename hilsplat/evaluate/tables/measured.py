@@ -3,6 +3,7 @@
 import re
 import statistics
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from hilsplat.evaluate.protocols.cards import ANNOTATIONS, LEVEL_AUTO, LEVEL_GIVEN, PATH, SCENE_WIDE
@@ -17,10 +18,10 @@ SYNTHETIC = "synthetic"
 """Data sets whose names begin with this are stand-ins."""
 
 SEED = re.compile(r"(?P<variant>.+)\.seed(?P<seed>[0-9]+)")
-"""A variant's name with another seed; rows of all seeds of a variant are one row."""
+"""A variant's name with a seed; all seeds of a variant share one row."""
 
 ANSWERS = {"field": "field", "tree": "tree", "tree-path": "tree, path", "truth": "annotations"}
-"""How rows name what answered, in their order."""
+"""Method -> its name in rows, in the order of rows."""
 
 PROTOCOLS = {
     LEVEL_GIVEN.full_name: "level given",
@@ -29,23 +30,23 @@ PROTOCOLS = {
     PATH.full_name: "path of texts",
     ANNOTATIONS.full_name: "reference",
 }
-"""How tables name protocols; others keep their name."""
+"""Protocol -> its name in tables; others keep their own."""
 
 STAND_INS = {
     "synthetic": "tables of the synthetic world",
     "synthetic-rooms": "rooms of the synthetic world",
     "synthetic-streets": "streets of the synthetic world",
 }
-"""Headings of the stand-ins."""
+"""Data set of a stand-in -> its description in headings."""
 
 TRUE_MASKS = "diagnostic, true masks: "
-"""Before the method's name in rows whose masks were made from true labels."""
+"""Prefix of the method's name in rows whose masks were made from true labels."""
 
 
 def measured_blocks(
     scores: "pd.DataFrame",
     labels: Mapping[str, str],
-    protocols: Callable[[str], bool],
+    protocols: tuple[str, ...],
     cells_of: Callable[["pd.DataFrame"], dict[str, Cell]],
     columns_of: Callable[["pd.DataFrame"], Sequence[str]],
     unranked: frozenset[str] = frozenset(),
@@ -57,8 +58,8 @@ def measured_blocks(
 
     Args:
         scores: rows of `scores.csv`.
-        labels: variant -> name.
-        protocols: says which protocols make a row.
+        labels: variant -> its name in the table.
+        protocols: prefixes of the protocols that make a row.
         cells_of: values of a row, from the scores of one variant, method, masks, protocol and seed.
         columns_of: value columns, from the scores of a data set.
         unranked: columns in which nothing is best.
@@ -69,39 +70,16 @@ def measured_blocks(
     if scores.empty:
         return []
     blocks = []
-    order = ["default", *labels]
     scores = with_seeds(scores)
     for data, of_data in scores.groupby("dataset", sort=True):
         rows = []
-        wanted = of_data[of_data["protocol"].map(protocols)]
+        wanted = of_data[of_data["protocol"].str.startswith(protocols)]
         keys = ["variant", "masks", "method", "protocol"]
         for (variant, masks, method, protocol), part in wanted.groupby(keys, sort=True):
-            names = {
-                "Method": row_name(variant, method, labels),
-                "Masks": masks if method != "truth" else "-",
-                "Protocol": PROTOCOLS.get(protocol, protocol),
-            }
-            if method != "truth" and made_from_truth(masks):
-                names["Method"] = TRUE_MASKS + names["Method"]
-            seeds = [cells_of(of_seed) for _, of_seed in part.groupby("seed", sort=True)]
-            if method == "truth":
-                seeds = seeds[:1]  # annotations are the same under every seed
-            if len(seeds) > 1:
-                names["Seeds"] = str(len(seeds))
-            place = (
-                made_from_truth(masks),
-                list(PROTOCOLS).index(protocol) if protocol in PROTOCOLS else -1,
-                order.index(variant) if variant in order else len(order),
-                variant,
-                list(ANSWERS).index(method) if method in ANSWERS else len(ANSWERS),
-                masks,
-                protocol,
-            )
             group = protocol if ranked_by_protocol else ""
-            ranked = method != "truth" and not made_from_truth(masks)
-            cells = {**mean_over_seeds(seeds), **over_seeds(part)}
-            rows.append((place, Row(names, cells, group if ranked else None)))
-        distinct = without_repeats([row for _, row in sorted(rows, key=lambda item: item[0])])
+            place, row = placed_row(variant, masks, method, protocol, part, labels, cells_of, group)
+            rows.append((place, replace(row, cells={**row.cells, **over_seeds(part)})))
+        distinct = without_repeats(in_order(rows))
         if distinct:
             columns = tuple(columns_of(wanted))
             blocks.append(
@@ -110,20 +88,73 @@ def measured_blocks(
     return blocks
 
 
+def placed_row(
+    variant: str,
+    masks: str,
+    method: str,
+    protocol: str,
+    part: "pd.DataFrame",
+    labels: Mapping[str, str],
+    cells_of: Callable[["pd.DataFrame"], Mapping[str, Cell]],
+    group: str,
+) -> tuple[tuple, Row]:
+    """One row, and its place among the rows of a block (`in_order`).
+
+    Args:
+        variant: named set of settings.
+        masks: what made the masks.
+        method: what answered.
+        protocol: full name of the protocol, or what else tells the row from its neighbours.
+        part: the scores of the row under all its seeds.
+        labels: variant -> its name in the table.
+        cells_of: values of the row, from the scores of one seed.
+        group: rows of a group are ranked together; annotations and true masks are not ranked.
+    """
+    is_diagnostic = method != "truth" and made_from_truth(masks)
+    title = row_name(variant, method, labels)
+    names = {
+        "Method": TRUE_MASKS + title if is_diagnostic else title,
+        "Masks": masks if method != "truth" else "-",
+        "Protocol": PROTOCOLS.get(protocol, protocol),
+    }
+    seeds = [cells_of(of_seed) for _, of_seed in part.groupby("seed", sort=True)]
+    if method == "truth":
+        seeds = seeds[:1]  # annotations are the same under every seed
+    if len(seeds) > 1:
+        names["Seeds"] = str(len(seeds))
+    order = ["default", *labels]
+    place = (
+        made_from_truth(masks),
+        list(PROTOCOLS).index(protocol) if protocol in PROTOCOLS else -1,
+        order.index(variant) if variant in order else len(order),
+        variant,
+        list(ANSWERS).index(method) if method in ANSWERS else len(ANSWERS),
+        masks,
+        protocol,
+    )
+    ranked_with = None if method == "truth" or is_diagnostic else group
+    return place, Row(names, mean_over_seeds(seeds), ranked_with)
+
+
+def in_order(rows: Sequence[tuple[tuple, Row]]) -> list[Row]:
+    """Rows sorted by their places."""
+    return [row for _, row in sorted(rows, key=lambda placed: placed[0])]
+
+
 def with_seeds(scores: "pd.DataFrame") -> "pd.DataFrame":
-    """The seed in a column of its own; the first seed is "0"."""
+    """Move the seed into its own column; the first seed is "0"."""
     parts = scores["variant"].str.extract(f"^{SEED.pattern}$")
     variant = parts["variant"].fillna(scores["variant"])
     return scores.assign(variant=variant, seed=parts["seed"].fillna("0"))
 
 
 def mean_over_seeds(seeds: Sequence[Mapping[str, Cell]]) -> dict[str, Cell]:
-    """Mean of each cell and its standard deviation (n - 1) over seeds; one seed as it is."""
+    """Mean of each cell and its standard deviation (n - 1) over seeds; one seed stays unchanged."""
     if len(seeds) == 1:
         return dict(seeds[0])
     cells = {}
     for column, first in seeds[0].items():
-        values = [cells[column].value for cells in seeds if cells.get(column, Cell()).value is not None]
+        values = [value for cells in seeds if (value := cells.get(column, Cell()).value) is not None]
         if len(values) < 2 or first.text.isdigit():  # counts do not depend on the seed
             cells[column] = first
             continue
@@ -133,7 +164,7 @@ def mean_over_seeds(seeds: Sequence[Mapping[str, Cell]]) -> dict[str, Cell]:
 
 
 def without_repeats(rows: Sequence[Row]) -> tuple[Row, ...]:
-    """Keep one of the rows that show the same: the annotations' row is the same for every variant."""
+    """Keep one of each set of equal rows: the annotations' row is the same for every variant."""
     seen: dict[tuple, Row] = {}
     for row in rows:
         key = (*row.names.values(), *(cell.text for cell in row.cells.values()))
@@ -142,7 +173,7 @@ def without_repeats(rows: Sequence[Row]) -> tuple[Row, ...]:
 
 
 def row_name(variant: str, method: str, labels: Mapping[str, str]) -> str:
-    """Name of a row by what answered.
+    """Name of a row, from its variant and method.
 
     The default variant answers by field and tree, `hilsplat (field)` and `hilsplat (tree)`; another
     variant's label is that of its field.
@@ -171,7 +202,7 @@ def scene_cells(
     Args:
         part: the scores of one row.
         metrics: name in the column -> metric.
-        average: begins the name of the mean's column.
+        average: prefix of the mean's column.
     """
     cells = {}
     for name, metric in metrics.items():
@@ -195,7 +226,7 @@ def same_row(scores: "pd.DataFrame", part: "pd.DataFrame", protocols: tuple[str,
     Args:
         scores: scores with seeds (`with_seeds`).
         part: the scores of one row.
-        protocols: how the protocols' names begin.
+        protocols: prefixes of the protocols' names.
     """
     first = part.iloc[0]
     keys = ("dataset", "variant", "seed", "masks", "method")

@@ -7,19 +7,16 @@ from hilsplat.evaluate.protocols.cards import INSTANCES, card_of
 from hilsplat.evaluate.protocols.measured import Measured
 from hilsplat.evaluate.protocols.totals import table_value
 from hilsplat.evaluate.tables.measured import (
-    ANSWERS,
-    TRUE_MASKS,
+    in_order,
     kind_and_title,
-    mean_over_seeds,
     measured_blocks,
-    row_name,
+    placed_row,
     scene_cells,
     with_seeds,
 )
 from hilsplat.evaluate.tables.reported import reported_block
-from hilsplat.evaluate.tables.rows import Block, Cell, Row, Table
+from hilsplat.evaluate.tables.rows import Block, Cell, Table
 from hilsplat.evaluate.tables.sources import Sources
-from hilsplat.segment.origin import made_from_truth
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -53,7 +50,7 @@ def replica_table(sources: Sources) -> Table:
     blocks += measured_blocks(
         sources.scores,
         sources.labels,
-        lambda protocol: protocol.startswith("replica/per-scene"),
+        ("replica/per-scene",),
         lambda part: scene_cells(part, {"mIoU": "miou_present", "mAcc": "macc_present"}, "Mean"),
         columns_of,
     )
@@ -67,42 +64,27 @@ def replica_table(sources: Sources) -> Table:
 
 
 def scannet_table(sources: Sources) -> Table:
-    """ScanNet with 19, 15 and 10 classes, ScanNet200 with 200, instances of ScanNet200: one row a method."""
+    """ScanNet with 19, 15, 10 classes, ScanNet200 with 200, instances of ScanNet200: one row per method."""
     blocks = [reported_block(sources.published, "ScanNet", "Reported in the paper: ScanNet, ScanNet200")]
     scores = with_seeds(sources.scores)
     names = tuple(SCANNET_COLUMNS)
     wanted = scores[scores["protocol"].str.startswith(names)] if len(scores) else scores
-    order = ["default", *sources.labels]
     columns = [f"{name} {metric}" for name in SCANNET_COLUMNS.values() for metric in ("mIoU", "mAcc")]
     columns += AP_COLUMNS.values()
+
+    def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
+        return {**semantic_cells(part), **instance_cells(sources, part)}
+
     for data, of_data in wanted.groupby("dataset", sort=True):
         rows = []
         for (variant, masks, method), part in of_data.groupby(["variant", "masks", "method"], sort=True):
             modes = {label.partition("(")[2].rstrip(")") for label in part["protocol"]}
             for mode in sorted(modes):
                 of_mode = part[part["protocol"].str.endswith(f"({mode})")]
-                title = row_name(variant, method, sources.labels)
-                if made_from_truth(masks):
-                    title = TRUE_MASKS + title
-                seeds = [
-                    {**semantic_cells(of_seed), **instance_cells(sources, of_seed)}
-                    for _, of_seed in of_mode.groupby("seed", sort=True)
-                ]
-                shown = {"Method": title, "Masks": masks, "Protocol": mode}
-                if len(seeds) > 1:
-                    shown["Seeds"] = str(len(seeds))
-                place = (
-                    made_from_truth(masks),
-                    order.index(variant) if variant in order else len(order),
-                    variant,
-                    list(ANSWERS).index(method) if method in ANSWERS else len(ANSWERS),
-                    masks,
-                    mode,
+                rows.append(
+                    placed_row(variant, masks, method, mode, of_mode, sources.labels, cells_of, group=mode)
                 )
-                ranked = None if made_from_truth(masks) else mode
-                rows.append((place, Row(shown, mean_over_seeds(seeds), ranked)))
-        ordered = tuple(row for _, row in sorted(rows, key=lambda item: item[0]))
-        blocks.append(Block(*kind_and_title(str(data)), ordered, tuple(columns)))
+        blocks.append(Block(*kind_and_title(str(data)), tuple(in_order(rows)), tuple(columns)))
     footnotes = (
         "All in %. 19, 15 and 10 classes and ScanNet200 follow OpenGaussian's code: mean over the classes "
         "present in a scene, then over scenes; vertices of other classes are ignored.",
@@ -144,7 +126,7 @@ def instance_cells(sources: Sources, part: "pd.DataFrame") -> dict[str, Cell]:
 
 
 def waymo_table(sources: Sources) -> Table:
-    """mIoU over 22 classes, counts of all scenes pooled (paper: Waymo)."""
+    """mIoU over 22 classes, with the counts of all scenes pooled (paper: Waymo)."""
 
     def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
         from hilsplat.datasets.classes.waymo import WAYMO_22
@@ -162,7 +144,7 @@ def waymo_table(sources: Sources) -> Table:
     blocks += measured_blocks(
         sources.scores,
         sources.labels,
-        lambda protocol: protocol.startswith("waymo/"),
+        ("waymo/",),
         cells_of,
         lambda _: ("mIoU", "mIoU, present classes", "Classes present"),
         unranked=frozenset({"Classes present"}),
@@ -177,7 +159,7 @@ def waymo_table(sources: Sources) -> Table:
 
 
 def measured_scenes(part: "pd.DataFrame") -> list[list[Measured]]:
-    """Score rows as measured ones, one list per scene."""
+    """Score rows as `Measured`, one list per scene."""
     return [
         [
             Measured(row.method, row.query, row.level, row.metric, row.protocol, row.value, row.n)

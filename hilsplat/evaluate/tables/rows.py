@@ -10,10 +10,10 @@ class Cell:
     """One value of a table.
 
     Attributes:
-        text: as it is shown.
-        value: as a number, where it is one; ranking needs it.
-        note: footnote, empty where there is none.
-        spread: what stands behind ±, mostly the standard deviation over seeds; None where nothing does.
+        text: as shown.
+        value: the number, if it is one; ranking needs it.
+        note: footnote, or empty.
+        spread: what follows ±, usually the standard deviation over seeds; None without one.
     """
 
     text: str = "-"
@@ -40,7 +40,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """One method: names on the left, values by column, and what it may be ranked with."""
+    """One method: names on the left, values by column, and the group it is ranked in, if any."""
 
     names: Mapping[str, str]
     cells: Mapping[str, Cell]
@@ -82,7 +82,7 @@ class Block:
             for number, row in enumerate(self.rows):
                 cell = row.cells.get(column, Cell())
                 if row.ranked_with is not None and cell.value is not None:
-                    # What is shown is what is compared, so equal texts get equal marks.
+                    # Compare the displayed values, so that equal texts get equal marks.
                     shown = float(cell.text.partition(" ")[0])
                     groups.setdefault(row.ranked_with, {})[number] = shown
             for values in groups.values():
@@ -105,7 +105,7 @@ class Table:
     footnotes: tuple[str, ...] = field(default=())
 
     def numbered_notes(self) -> dict[str, int]:
-        """Cell notes, numbered in the order of reading."""
+        """Cell notes, numbered in reading order."""
         notes: dict[str, int] = {}
         for block in self.blocks:
             for row in block.rows:
@@ -117,7 +117,7 @@ class Table:
 
 
 def shown_columns(block: Block) -> tuple[list[str], list[str]]:
-    """Name and value columns of a block; those without any entry are left out."""
+    """Name and value columns of a block; value columns without any entry are left out."""
     names = list(dict.fromkeys(name for row in block.rows for name in row.names))
     values = [
         column

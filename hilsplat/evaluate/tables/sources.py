@@ -1,4 +1,4 @@
-"""What a table is built from, and what is said below it."""
+"""What a table is built from, and the warnings below it."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -30,15 +30,15 @@ SEEDS_NOTE = "Values with ± are mean and standard deviation over seeds; rows wi
 
 @dataclass(frozen=True)
 class Sources:
-    """Everything that some table reads.
+    """Everything that tables read.
 
     Attributes:
         published: the paper's values (`reported.read_published`).
         scores: rows of all score files.
-        labels: variant -> how tables name it.
-        costs: time and memory of scenes and variants, where the table shows them.
-        instances: matches per (data set, scene, variant, masks, method), where scans have instances.
-        absent: data sets that were not measured, and why, each a sentence.
+        labels: variant -> its name in tables.
+        costs: time and memory of scenes and variants, if the table shows them.
+        instances: matches per (data set, scene, variant, masks, method), if scans have instances.
+        absent: a sentence per data set that was not measured, with the reason.
     """
 
     published: Sequence[Mapping[str, str]]

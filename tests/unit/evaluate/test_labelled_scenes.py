@@ -107,11 +107,11 @@ def test_regions_of_one_text_unite_and_keep_their_boxes():
     assert paw.boxes_xyxy.tolist() == [[0, 1, 1, 2], [4, 0, 5, 3]]  # extent, and as annotated
 
 
-def test_regions_without_a_pixel_are_no_query():
+def test_regions_without_a_pixel_are_not_queries():
     assert ViewTruth.of_regions([region_of(np.zeros((4, 6), bool), "ring")], (4, 6)).categories == ()
 
 
-def test_a_region_with_a_broken_chain_is_asked_but_belongs_to_no_family():
+def test_a_region_with_a_broken_chain_is_queried_but_belongs_to_no_family():
     mask = np.ones((4, 6), bool)
     bear = region_of(mask, "bear", Level.WHOLE)
     head = region_of(mask, "head", Level.PART, ("bear", "head"))

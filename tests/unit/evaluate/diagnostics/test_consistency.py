@@ -68,7 +68,7 @@ def test_a_slanted_wall_keeps_its_points():
 
 
 def test_hidden_points_are_no_evidence():
-    # in B something nearer (depth 2) stands in columns 3 to 5 and hides the wall there
+    # in B something nearer (depth 2) covers columns 3 to 5 and hides the wall there
     hidden = WALL.copy()
     hidden[:, 3:6] = 2.0
     points = shared_points(A, WALL, B, hidden)
@@ -256,7 +256,7 @@ def test_depth_of_the_table_and_the_box_from_above(world):
     depth = mesh.depth(Camera("above", above, pinhole(SIDE, 90.0), (SIDE, SIDE)))
     assert depth[32, 32] == pytest.approx(4.0)
     assert depth[32, 55] == pytest.approx(5.0)  # 23.5 px of 32 from the middle: 3.7 to the right
-    assert np.isinf(depth[32, 60])  # 28.5 px: 4.5 to the right, where the table has ended
+    assert np.isinf(depth[32, 60])  # 28.5 px: 4.5 to the right, beyond the end of the table
 
 
 def interior(labels: np.ndarray) -> np.ndarray:
@@ -315,5 +315,5 @@ def test_masks_of_another_size_are_refused(world, tmp_path):
 
 def test_one_view_has_no_neighbour(world, tmp_path):
     write_index(tmp_path, {"000.png": {}}, scene="s", segmenter="graph", model=None)
-    with pytest.raises(ArtifactError, match="two views or more"):
+    with pytest.raises(ArtifactError, match="at least two"):
         run_consistency(world / "truth", tmp_path, tmp_path / "out.csv", 1)

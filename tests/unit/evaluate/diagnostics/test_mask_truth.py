@@ -28,7 +28,7 @@ def box(rows, columns) -> np.ndarray:
 
 
 def found_masks() -> HierarchicalMasks:
-    """The bear whole, the lower half of the chest and nothing of it elsewhere; three quarters of the head."""
+    """The bear whole, the lower half of the chest and none of it elsewhere; three quarters of the head."""
     return masks_of(
         {
             Level.WHOLE: [box((8, 56), (8, 40)), box((44, 56), (44, 60)), box((0, 4), (0, 4))],

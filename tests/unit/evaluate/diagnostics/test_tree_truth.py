@@ -27,7 +27,7 @@ VOTES = np.array([BEAR_HEAD] * 2 + [BEAR] * 2 + [CHEST_LID] * 2 + [CHEST] * 2, f
 
 
 def tree_of(node_of_gaussian, level, parent) -> SemanticTree:
-    """A tree of which only what is measured is set."""
+    """A tree with only the measured parts set."""
     num, nodes = len(level), np.array(node_of_gaussian, np.int32)
     return SemanticTree(
         level=np.array(level, np.uint8),

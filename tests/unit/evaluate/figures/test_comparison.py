@@ -1,4 +1,4 @@
-"""Figures of the paper: which methods and queries are shown, and that answers are drawn where they are."""
+"""Figures of the paper: which methods and queries are shown, and that answers are drawn in place."""
 
 from pathlib import Path
 
@@ -97,8 +97,8 @@ def test_scenes_without_labels_show_the_queries_of_the_configuration(block_world
     assert drawn[0][0].truth is None
 
 
-def test_nothing_to_compare_is_told(block_world, tmp_path):
-    with pytest.raises(SettingsError, match="nothing is compared"):
+def test_comparing_no_variants_is_refused(block_world, tmp_path):
+    with pytest.raises(SettingsError, match="there are no variants to compare"):
         run_comparison(block_world.folder, [], {}, tmp_path / "c.png", FiguresSettings(), EVALUATE)
 
 

@@ -1,4 +1,4 @@
-"""Pictures are drawn for scenes with and without annotations, and show what they say."""
+"""Pictures are drawn for scenes with and without annotations, and show what they claim."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -114,7 +114,7 @@ def test_prediction_is_ignored_only_where_more_than_the_threshold_lies_in_void()
 
 
 def test_small_instances_are_neither_matched_nor_missed():
-    # B has 3 points, fewer than 4. Its prediction lies in what is left out: ignored.
+    # B has 3 points, fewer than 4. Its prediction lies in an instance left out: ignored.
     scan = scan_of(EXAMPLE, [(0, 4, 0.9), (4, 8, 0.8)])
     assert precisions(scan, min_points=4).tolist() == [[1.0] * 10]
 
@@ -129,7 +129,7 @@ def test_prediction_on_an_object_of_another_class_is_a_false_positive():
     result = precisions(scan_of(truth, [(0, 4, 0.5), (4, 8, 0.9)]), class_ids=(CLASS, 9))
     # the surer one is wrong: precision 1/2 at recall 1, R = 1, 0, 0 over P = 1/2, 0, 1
     assert ap50(result[:1]) == pytest.approx(1 / 2 * 1 / 2 + 0 * 1 / 2 + 0)
-    # the same object is void where class 9 is not asked for
+    # the same object is void if class 9 is not evaluated
     assert ap50(precisions(scan_of(truth, [(0, 4, 0.5), (4, 8, 0.9)]))) == 1
 
 

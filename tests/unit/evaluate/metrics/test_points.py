@@ -124,7 +124,7 @@ def test_ious_equal_those_of_the_masks_of_each_class(pairs):
 
 
 # --- Waymo's regression test ----------------------------------------------------------------------
-# The protocol buffers are decoded here from their public layout; a reader of real frames is no part of it.
+# The protocol buffers are decoded here from their public layout; reading real frames is out of scope.
 
 
 def varint(data, place):

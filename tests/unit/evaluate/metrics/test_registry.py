@@ -1,4 +1,4 @@
-"""What every metric must hold to; a metric that is listed nowhere fails."""
+"""Properties of every metric; a metric that is not listed fails."""
 
 import importlib
 import inspect
@@ -65,7 +65,7 @@ def of_instances(function):
 
 def of_families(reading, pooled):
     def value(prediction, truth):
-        child = (prediction == 2) | ((prediction == 3) & (truth != 3))  # what is wrongly 3 spills over
+        child = (prediction == 2) | ((prediction == 3) & (truth != 3))  # pixels wrongly labelled 3 spill over
         family = Family(np.isin(prediction, (1, 2)), (child,), np.isin(truth, (1, 2)))
         return hierarchical_consistency([[family]], reading, pooled)
 
@@ -148,7 +148,7 @@ BUILDING_BLOCKS = frozenset(
         "point_classes.pooled",
     }
 )
-"""Public functions of the metrics that are no metric of a row."""
+"""Public functions of the metrics that are not themselves a metric of a row."""
 
 
 def public_functions():
@@ -227,13 +227,13 @@ def test_others_have_a_pair_that_shows_they_are_not():
             differing = (
                 pair for pair in pairs if not np.isclose(CASES[name](*pair), CASES[name](*pair[::-1]))
             )
-            assert next(differing, None) is not None, f"{name} looks symmetric: list it so"
+            assert next(differing, None) is not None, f"{name} looks symmetric: list it as such"
 
 
 @few
 @given(prediction=label_images, truth=truths)
 def test_mirrored_scenes_score_alike(prediction, truth):
     for name in METRICS:
-        if not name.startswith("localization"):  # the middle pixel of a mirrored mask is another one
+        if not name.startswith("localization"):  # mirroring a mask moves its middle pixel
             mirrored = CASES[name](prediction[:, ::-1], truth[:, ::-1])
             assert CASES[name](prediction, truth) == pytest.approx(mirrored), name

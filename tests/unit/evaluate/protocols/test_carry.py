@@ -1,4 +1,4 @@
-"""What Gaussians know, at points: who speaks, how loudly, and who is not asked."""
+"""What Gaussians know, at points: which ones speak, with what weight, and which are ignored."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Masks and class maps that a method brings itself."""
+"""Masks and class maps that a method supplies."""
 
 import numpy as np
 import pytest
@@ -126,10 +126,10 @@ def test_flat_truth_has_categories_and_no_levels():
 
 def test_a_prediction_for_an_unknown_query_is_refused_with_the_nearest_name():
     truth, queries = np.ones((2, 2), bool), {"green apple", "jake"}
-    message = r"'gren apple', which nobody asks(.|\n)*rename it 'green apple'"
+    message = r"'gren apple', which is not a query of this scene(.|\n)*rename it 'green apple'"
     with pytest.raises(MisalignedArtifactError, match=message):
         list(measure_masks(LERF_MASK, "m", {"gren apple": truth}, {"green apple": truth}, queries))
-    # a text of the scene that this view does not show is no mistake
+    # a text of the scene that this view does not show is not a mistake
     answers = {"jake": truth, "green apple": truth}
     rows = list(measure_masks(LERF_MASK, "m", answers, {"green apple": truth}, queries))
     assert {row.query for row in rows} == {"green apple"}

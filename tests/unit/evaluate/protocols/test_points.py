@@ -1,4 +1,4 @@
-"""Rows of points, pooled and per scene, and how what Gaussians know comes to points."""
+"""Rows of points, pooled and per scene, and how predictions of Gaussians reach points."""
 
 from dataclasses import fields
 

@@ -1,4 +1,4 @@
-"""What is asked, what counts, and what a missing answer is worth."""
+"""What is queried, what counts, and what a missing answer scores."""
 
 from types import SimpleNamespace
 
@@ -37,7 +37,7 @@ def mask_of(rows, columns):
 
 
 class HandMade:
-    """Answers that are written down: node i of `masks` answers the texts that name it.
+    """Answers that are given: node i of `masks` answers the texts that name it.
 
     `scene_wide` has those that differ where not this view is given.
     """
@@ -124,7 +124,7 @@ def test_missing_answer_counts_zero_and_breaks_consistency(tmp_path):
     assert values["tree", "hierarchy/level-given@4", "", "", "hc_containment"] == pytest.approx(0.4375)
 
 
-def test_scene_wide_answers_know_of_no_view(tmp_path):
+def test_scene_wide_answers_do_not_depend_on_the_view(tmp_path):
     scene, truth = worked_example(tmp_path)
     scene.scene_wide = {
         ("x", Level.SUBPART): [4],
@@ -135,7 +135,7 @@ def test_scene_wide_answers_know_of_no_view(tmp_path):
     assert values["tree", "hierarchy/level-given@4", "x", "subpart", "iou"] == 1
     assert values["tree", "hierarchy/scene-wide@1", "x", "subpart", "iou"] == 0
     assert values["tree", "hierarchy/scene-wide@1", "A", "whole", "iou"] == 1
-    # as if x had no answer: of its mask none lies inside a1
+    # as if x had no answer: no pixel of its mask lies inside a1
     assert values["tree", "hierarchy/scene-wide@1", "", "", "hc_containment"] == pytest.approx(0.4375)
 
 

@@ -137,7 +137,7 @@ def test_orders_are_not_mixed_and_pooled_protocols_have_no_number_per_scene():
                 table_value(rows_of(card, PAIRS), "iou")
 
 
-def test_rows_of_a_protocol_that_is_no_more_are_refused():
+def test_rows_of_a_protocol_that_no_longer_exists_are_refused():
     stale = rows_of(LERF_LANGSPLAT, PAIRS, protocol="lerf/langsplat@0")
     with pytest.raises(ArtifactError, match="there is no protocol 'lerf/langsplat@0'"):
         table_value(stale, "iou")

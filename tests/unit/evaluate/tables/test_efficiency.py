@@ -12,7 +12,7 @@ def write(folder, stage, text):
     path.write_text(text)
 
 
-def test_stages_stand_in_the_order_of_the_workflow_with_a_total(tmp_path):
+def test_stages_follow_the_order_of_the_workflow_with_a_total(tmp_path):
     results = tmp_path / "results"
     write(
         results / "synthetic" / "one" / "default",
@@ -46,5 +46,5 @@ def test_no_benchmarks_says_to_run_first(tmp_path):
 
 def test_damaged_benchmark_is_named(tmp_path):
     write(tmp_path, "masks", "no json\n")
-    with pytest.raises(ArtifactError, match=r"masks\.jsonl is no benchmark file"):
+    with pytest.raises(ArtifactError, match=r"masks\.jsonl is not a valid benchmark file"):
         run_efficiency(tmp_path, tmp_path / "x.csv")

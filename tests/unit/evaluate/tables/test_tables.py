@@ -152,9 +152,9 @@ def test_ablation_rows_are_held_against_the_default_field_scene_by_scene(tmp_pat
         if value is not None
     ]
     rows, forms = built(tmp_path, "ablation", scores)
-    told = {row["method"]: row["against default field"] for row in rows if row["kind"] != "reported"}
+    differences = {row["method"]: row["against default field"] for row in rows if row["kind"] != "reported"}
     # scene one: (0.5 + 0.7) / 2 - 0.4 = 0.2; scene two: (0.7 + 0.9) / 2 - 0.8 = 0
-    assert told == {"hilsplat (field)": "", "d-8": "10.00 ± 10.00", "paper": "-10.00"}
+    assert differences == {"hilsplat (field)": "", "d-8": "10.00 ± 10.00", "paper": "-10.00"}
     assert "+10.0 ± 10.0" in forms[".md"]
 
 
@@ -204,7 +204,7 @@ def test_latex_and_html_hold_every_reported_value(tmp_path):
     assert forms[".html"].count("<table>") == forms[".html"].count("</table>") == 2
 
 
-def test_notes_stand_below_the_table(tmp_path):
+def test_notes_are_listed_below_the_table(tmp_path):
     _, forms = built(tmp_path, "lerf")
     assert "The printed scenes average to 70.7." in forms[".md"]
     assert "<sup>" in forms[".html"]

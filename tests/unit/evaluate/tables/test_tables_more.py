@@ -87,7 +87,7 @@ def test_annotations_are_one_row_whatever_the_seeds(tmp_path):
     assert len([row for row in rows if row["method"] == "annotations"]) == 1
 
 
-def test_view_consistency_stands_beside_the_level_given_rows(tmp_path):
+def test_view_consistency_is_shown_beside_the_level_given_rows(tmp_path):
     scores = [
         score("iou", 0.5),
         score("iou", 0.5, protocol="hierarchy/level-auto@4"),
@@ -116,7 +116,7 @@ def test_frames_are_the_views_that_were_asked_at_levels(tmp_path):
 
 
 @pytest.mark.parametrize("name", sorted(TABLES))
-def test_what_was_not_measured_stands_below_every_table(tmp_path, name):
+def test_every_table_lists_below_what_was_not_measured(tmp_path, name):
     out = tmp_path / f"{name}.csv"
     run_table(name, [], PUBLISHED / f"{name}.csv", {}, out, ["replica (room_0): data_root is not set."])
     for suffix in (".md", ".tex", ".html"):
