@@ -27,7 +27,7 @@ def test_prose_and_what_no_stage_reaches_rerun_nothing(copy_of_finished: Project
         file = copy_of_finished.root / path
         file.write_text(file.read_text() + "\n# a comment\nUNUSED = 1\n")
     copy_of_finished.edit("hilsplat/base/images.py", '"""Reading and', '"""Edited. Reading and')
-    copy_of_finished.edit("hilsplat/settings.py", '"coverage threshold"', '"the coverage threshold"')
+    copy_of_finished.edit("hilsplat/settings.py", '"a mask becomes the child', '"a mask is the child')
     assert copy_of_finished.planned() == set()
 
 
@@ -37,7 +37,7 @@ def test_prose_and_what_no_stage_reaches_rerun_nothing(copy_of_finished: Project
         ("hilsplat/field/field.py", "run_field", AFTER_FIELD),
         ("hilsplat/embed/stage.py", "run_clip", VARIANT_STAGES - {"masks", "coverage_tree", "contributions"}),
         ("hilsplat/evaluate/tables/hierarchy.py", "hierarchy_table", {"table", "sweep_plot"}),
-        ("hilsplat/methods/lifted.py", "fit", {"method", "evaluate", "table", "sweep_plot", "comparison"}),
+        ("hilsplat/methods/lifted.py", "fit", {"method", "evaluate", "table", "comparison"}),
         ("hilsplat/datasets/images/lerf_ovs.py", "open_scene", set()),
     ],
 )
