@@ -1,10 +1,10 @@
 """Scenes whose images carry labels: what every reader of such a data set returns.
 
-Views are named after the image file without its suffix ("frame_00041"), so that a label finds its image
-and its camera whatever else is missing.
+Labels, images and poses of a view are keyed by its name in the scene ("frame_00041.png", see
+`scene.features.view_name`), so that a label finds its image and its camera whatever else is missing.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from hilsplat.base.errors import ImageError, SceneError
 from hilsplat.base.files import list_images
 from hilsplat.base.levels import Level
 from hilsplat.datasets.dataset import SceneReport
+from hilsplat.scene.features import view_name
 from hilsplat.scene.known_poses import KnownView, find_known_poses
 from hilsplat.scene.known_views import known_views
 
@@ -95,22 +96,20 @@ class LabelledScene:
         """Pairs of view and text."""
         return sum(len({region.text for region in regions}) for regions in self.views.values())
 
-    def posed_views(self, names: Iterable[str]) -> dict[str, str]:
-        """Labelled view to name of the posed view of the same stem ("frame_00041" to "frame_00041.png").
+    def check_posed(self, names: Collection[str]) -> None:
+        """Check that every labelled view is among the posed ones.
 
         Raises:
             SceneError: labelled views without a pose, by name.
         """
-        by_stem = {Path(name).stem: name for name in names}
-        missing = [view for view in self.views if view not in by_stem]
+        missing = [view for view in self.views if view not in names]
         if missing:
             raise SceneError(
                 f"labelled views of {self.dataset}/{self.scene} have no pose: {', '.join(missing)}",
                 expected=f"all {len(self.views)} labelled views among the posed ones",
-                found=f"{len(by_stem)} posed views, {_some(sorted(by_stem))}",
+                found=f"{len(names)} posed views, {_some(sorted(names))}",
                 fix="use the poses that come with the data set, or register those images",
             )
-        return {view: by_stem[view] for view in self.views}
 
     def report(self) -> SceneReport:
         """Read every mask of the scene, and its poses, and say what is there."""
@@ -135,7 +134,7 @@ class LabelledScene:
         else:
             posed = posed_images(self.poses, self.dataset)
             facts["posed views"] = len(posed)
-            self.posed_views(posed)
+            self.check_posed(posed)
         return SceneReport(facts, tuple(warnings))
 
 
@@ -150,8 +149,8 @@ def resize_nearest(mask: Bool[np.ndarray, "H W"], size_hw: tuple[int, int]) -> B
     return mask[rows[:, None], columns[None, :]]
 
 
-def images_by_stem(folder: Path) -> dict[str, Path]:
-    """Image files of a folder by their name without suffix, sorted by it.
+def images_by_view(folder: Path) -> dict[str, Path]:
+    """Image files of a folder by view, sorted by stem.
 
     Raises:
         SceneError: the folder is missing or empty, or two images share a stem.
@@ -164,16 +163,17 @@ def images_by_stem(folder: Path) -> dict[str, Path]:
             expected="the images of the scene, .jpg or .png",
             fix="unpack the whole archive again",
         )
-    by_stem: dict[str, Path] = {}
+    images: dict[str, Path] = {}
     for path in sorted(files, key=lambda path: path.stem):
-        if path.stem in by_stem:
+        view = view_name(path.stem)
+        if view in images:
             raise SceneError(
                 f"two images of {folder} have the same name but for the suffix",
-                found=f"{by_stem[path.stem].name}, {path.name}",
+                found=f"{images[view].name}, {path.name}",
                 fix="remove one of them: labels are matched by the name without suffix",
             )
-        by_stem[path.stem] = path
-    return by_stem
+        images[view] = path
+    return images
 
 
 def image_size_hw(path: Path) -> tuple[int, int]:
@@ -255,7 +255,7 @@ def missing_frames(what: str, listed: Iterable[str], present: Iterable[str]) -> 
 
 
 def posed_images(folder: Path, dataset: str) -> dict[str, KnownView]:
-    """Posed views of a scene folder by image stem, sorted by it.
+    """Posed views of a scene folder by view name, sorted by stem.
 
     Raises:
         SceneError: the folder has no poses, they cannot be read, or their lenses are distorted, which
@@ -277,7 +277,8 @@ def posed_images(folder: Path, dataset: str) -> dict[str, KnownView]:
             found=", ".join(bent),
             fix="take the model of the undistorted images, or undistort images and labels",
         )
-    return {Path(view.name).stem: view for view in sorted(views, key=lambda view: Path(view.name).stem)}
+    by_stem = {Path(view.name).stem: view for view in views}
+    return {view_name(stem): by_stem[stem] for stem in sorted(by_stem)}
 
 
 def _some(names: list[str]) -> str:

@@ -23,7 +23,7 @@ from hilsplat.datasets.labelled import (
     LabelledScene,
     check_label_size,
     image_size_hw,
-    images_by_stem,
+    images_by_view,
     missing_frames,
 )
 from hilsplat.datasets.published import FRAMES
@@ -49,7 +49,7 @@ def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
     root = Path(root)
     HI_DATASETS[dataset].require(root, scene)
     source = root.parent / IMAGES_OF[dataset] / scene
-    images = images_by_stem(source / "images")
+    images = images_by_view(source / "images")
     warnings: list[str] = []
     views: dict[str, tuple[LabelledRegion, ...]] = {}
     files = label_files(root / "label" / scene)

@@ -13,7 +13,7 @@ from hilsplat.datasets.labelled import (
     LabelledScene,
     check_label_size,
     image_size_hw,
-    images_by_stem,
+    images_by_view,
     posed_images,
     read_mask_file,
     unlisted_texts,
@@ -48,7 +48,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     root = Path(root)
     DATASET.require(root, scene)
     folder = root / scene
-    images = images_by_stem(folder / "images")
+    images = images_by_view(folder / "images")
     test = held_out_views(folder)
     masks = _mask_folders(folder / "test_mask", test)
     warnings: list[str] = []
@@ -81,12 +81,12 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
 
 
 def held_out_views(folder: Path) -> tuple[str, ...]:
-    """Posed images that are not in `images_train`, by stem, sorted.
+    """Posed images that are not in `images_train`, by view name, sorted by stem.
 
     Raises:
         SceneError: there is none.
     """
-    train = images_by_stem(folder / "images_train")
+    train = images_by_view(folder / "images_train")
     posed = posed_images(folder, "LERF-Mask")
     test = tuple(view for view in posed if view not in train)
     if not test:

@@ -19,11 +19,12 @@ from hilsplat.datasets.labelled import (
     LabelledScene,
     check_label_size,
     image_size_hw,
-    images_by_stem,
+    images_by_view,
     missing_frames,
     unlisted_texts,
 )
 from hilsplat.datasets.published import FRAMES, PAIRS, PROMPTS
+from hilsplat.scene.features import view_name
 
 LAYOUT = """\
 lerf_ovs/
@@ -48,7 +49,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     """
     root = Path(root)
     DATASET.require(root, scene)
-    images = images_by_stem(root / scene / "images")
+    images = images_by_view(root / scene / "images")
     files = label_files(root / "label" / scene)
     orphans = sorted(set(files) - set(images))
     if orphans:
@@ -83,12 +84,13 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
 
 
 def label_files(folder: Path) -> dict[str, Path]:
-    """Label files of a folder by frame.
+    """Label files of a folder by view.
 
     Raises:
         SceneError: there is none.
     """
-    files = {path.stem: path for path in sorted(Path(folder).glob("*.json")) if path.name[0] != "."}
+    paths = sorted(path for path in Path(folder).glob("*.json") if path.name[0] != ".")
+    files = {view_name(path.stem): path for path in paths}
     if not files:
         raise SceneError(
             f"{folder} has no label file",

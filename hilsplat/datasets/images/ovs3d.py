@@ -13,12 +13,13 @@ from hilsplat.datasets.labelled import (
     LabelledScene,
     check_label_size,
     image_size_hw,
-    images_by_stem,
+    images_by_view,
     missing_frames,
     read_mask_file,
     unlisted_texts,
 )
 from hilsplat.datasets.published import FRAMES, PROMPTS
+from hilsplat.scene.features import view_name
 from hilsplat.scene.llff import POSES_BOUNDS
 
 FOREGROUND = 255
@@ -52,19 +53,20 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     root = Path(root)
     DATASET.require(root, scene)
     folder = root / scene
-    images = images_by_stem(folder / "images")
+    images = images_by_view(folder / "images")
     prompts = read_classes(folder / "segmentations" / "classes.txt")
     warnings: list[str] = []
     views: dict[str, tuple[LabelledRegion, ...]] = {}
     for place in _view_folders(folder / "segmentations"):
-        if place.name not in images:
+        view = view_name(place.name)
+        if view not in images:
             raise SceneError(
                 f"view {place.name} of {scene} is segmented but has no image",
                 expected=f"{place.name}.jpg or {place.name}.png in {folder / 'images'}",
                 found=f"{len(images)} images, {next(iter(images))} to {list(images)[-1]}",
                 fix="unpack the images again",
             )
-        views[place.name] = _regions(place, prompts, image_size_hw(images[place.name]), warnings)
+        views[view] = _regions(place, prompts, image_size_hw(images[view]), warnings)
     poses = folder
     if not (folder / "sparse").is_dir() and not (folder / POSES_BOUNDS).is_file():
         poses = None
