@@ -59,14 +59,13 @@ def check(dataset: Dataset, data_root: Path, scenes: Sequence[str] = ()) -> tupl
         SceneError: the data set's folder is not there.
     """
     root = dataset.locate(data_root)
-    known = dataset.scenes or dataset.found(root)  # where the paper names none, those that are there
+    known = dict.fromkeys((*dataset.scenes, *dataset.found(root)))
     absent = [
         scene
         for scene in known
         if not scenes and set(dataset.missing(root, scene)) >= set(_own(dataset, scene))
     ]
     lines, num_failed = [], 0
-    known = dict.fromkeys((*dataset.scenes, *dataset.found(root)))
     for scene in scenes or [scene for scene in known if scene not in absent]:
         try:
             report = dataset.check(root, scene)

@@ -13,6 +13,16 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.scene.cameras import Camera
 
 
+def ray_caster(triangles: Float32[np.ndarray, "F 3 3"]) -> Any:
+    """Embree's structure for casting rays at triangles (embreex has no types)."""
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    scene = EmbreeScene()
+    TriangleMesh(scene, triangles)
+    return scene
+
+
 @dataclass(frozen=True, eq=False)
 class TrueMesh:
     """The triangles of a scene, in the frame of its true cameras.
@@ -45,12 +55,7 @@ class TrueMesh:
     @cached_property
     def embree(self) -> Any:
         """Ray-casting structure, built on first use."""
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-
-        scene = EmbreeScene()
-        TriangleMesh(scene, self.triangles)
-        return scene
+        return ray_caster(self.triangles)
 
     def depth(self, camera: Camera) -> Float32[np.ndarray, "H W"]:
         """Depth along the optical axis at each pixel's centre, scene units; inf where nothing is."""

@@ -116,7 +116,7 @@ def _box_corners(bevelled: bool) -> tuple[Float[np.ndarray, "T 3 3"], Float[np.n
         b, c = (axis + 1) % 3, (axis + 2) % 3
         for sign in (-1.0, 1.0):
             quad = []
-            for sb, sc in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+            for sb, sc in ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)):
                 signs = np.empty(3)
                 signs[axis], signs[b], signs[c] = sign, sb, sc
                 quad.append(corner(signs, axis))

@@ -9,6 +9,7 @@ A frame without image or label, a parent that is none, a child outside its paren
 """
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -69,7 +70,7 @@ def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
             LabelledRegion(
                 thing.category,
                 labels.size_hw,
-                lambda thing=thing, size_hw=labels.size_hw: thing.mask(size_hw),
+                partial(thing.mask, labels.size_hw),
                 thing.box_xyxy[None],
                 Level(thing.keys["level"]),
                 path_of(number, objects, parents),

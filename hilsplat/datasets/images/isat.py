@@ -83,15 +83,17 @@ def read_isat(path: Path) -> IsatFile:
             fix="labels of other tools (labelme, COCO) must be converted",
         )
     info = content.get("info")
-    size = [info.get(key) for key in ("height", "width")] if isinstance(info, dict) else [None, None]
-    if not all(isinstance(side, int) and side > 0 for side in size):
+    if not isinstance(info, dict):
+        info = {}
+    height, width = info.get("height"), info.get("width")
+    if not (isinstance(height, int) and isinstance(width, int) and height > 0 and width > 0):
         raise SceneError(
             f"label file {path} does not say how large its image is",
             expected="info.width and info.height, px",
-            found=f"height {size[0]!r}, width {size[1]!r}",
+            found=f"height {height!r}, width {width!r}",
             fix="export the labels again",
         )
-    size_hw = (int(size[0]), int(size[1]))
+    size_hw = (height, width)
     warnings: list[str] = []
     name = info.get("name")
     if isinstance(name, str) and name and Path(name).stem != path.stem:

@@ -4,6 +4,7 @@ Test views are the posed images that `images_train` lacks, sorted by name; the f
 to the first of them, `test_mask/1` to the second. Every mask file there is one prompt, named after it.
 """
 
+from functools import partial
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
@@ -68,7 +69,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
             sentence = check_label_size(f"mask {path}", size_hw, image_hw)
             if sentence:
                 warnings.append(sentence)
-            read = lambda path=path: read_mask_file(path, FOREGROUND)  # noqa: E731
+            read = partial(read_mask_file, path, FOREGROUND)
             regions.append(LabelledRegion(text, size_hw, read, path=(text,)))
         if not regions:
             raise SceneError(f"{place} has no mask", expected="<prompt>.png", fix="unpack test_mask again")

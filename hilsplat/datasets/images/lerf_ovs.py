@@ -7,6 +7,7 @@ shifts when an image before was not registered.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -110,7 +111,7 @@ def merged_regions(labels: IsatFile) -> tuple[LabelledRegion, ...]:
         LabelledRegion(
             category,
             labels.size_hw,
-            lambda same=same: union_mask(same, labels.size_hw),
+            partial(union_mask, same, labels.size_hw),
             np.stack([thing.box_xyxy for thing in same]),
             None,
             (category,),

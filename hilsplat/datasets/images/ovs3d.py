@@ -4,6 +4,7 @@
 test view is a folder with one mask per class. Only the value 255 is foreground.
 """
 
+from functools import partial
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
@@ -67,16 +68,14 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
                 fix="unpack the images again",
             )
         views[view] = _regions(place, prompts, image_size_hw(images[view]), warnings)
-    poses = folder
-    if not (folder / "sparse").is_dir() and not (folder / POSES_BOUNDS).is_file():
-        poses = None
+    posed = (folder / "sparse").is_dir() or (folder / POSES_BOUNDS).is_file()
     for sentence in (
         missing_frames("segmentation", FRAMES["3d_ovs"].get(scene, ()), views),
         unlisted_texts(prompts, PROMPTS["3d_ovs"].get(scene, ())),
     ):
         if sentence:
             warnings.append(sentence)
-    return LabelledScene("3d_ovs", scene, images, poses, views, prompts, tuple(warnings))
+    return LabelledScene("3d_ovs", scene, images, folder if posed else None, views, prompts, tuple(warnings))
 
 
 def read_classes(path: Path) -> tuple[str, ...]:
@@ -134,7 +133,7 @@ def _regions(
         sentence = check_label_size(f"mask {path}", size_hw, image_hw, SHAPE_TOLERANCE)
         if sentence:
             warnings.append(sentence)
-        read = lambda path=path: read_mask_file(path, FOREGROUND)  # noqa: E731
+        read = partial(read_mask_file, path, FOREGROUND)
         regions.append(LabelledRegion(prompt, size_hw, read, path=(prompt,)))
     return tuple(regions)
 

@@ -320,11 +320,11 @@ def _scores(
     quality: float, draws: Draws, settings: PerturbSettings, name: tuple[str | int, ...]
 ) -> tuple[float, float]:
     """Predicted IoU and stability of a mask whose true IoU is `quality`."""
-    noise = (0.0, 0.0)
+    predicted, stability = quality, (1 + quality) / 2
     if settings.score_noise:
         noise = settings.score_noise * draws.generator("scores", *name).standard_normal(2)
-    scores = (quality + noise[0], (1 + quality) / 2 + noise[1])
-    return min(1.0, max(0.0, scores[0])), min(1.0, max(0.0, scores[1]))
+        predicted, stability = predicted + noise[0], stability + noise[1]
+    return min(1.0, max(0.0, predicted)), min(1.0, max(0.0, stability))
 
 
 def _iou(mask: Bool[np.ndarray, "H W"], region: Bool[np.ndarray, "H W"]) -> float:

@@ -69,8 +69,8 @@ def read_component(
                 fix="download the component again",
             )
         keep = None
-        for name, values in (only or {}).items():
-            condition = dataset.field(name).isin(values)
+        for name, allowed in (only or {}).items():
+            condition = dataset.field(name).isin(allowed)
             keep = condition if keep is None else keep & condition
         table = dataset.dataset(path, format="parquet").to_table(columns=columns, filter=keep)
     except (pa.ArrowInvalid, OSError) as error:

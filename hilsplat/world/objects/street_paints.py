@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from hilsplat.world.objects.builder import Builder
-from hilsplat.world.paints import COLOURS, Paint
+from hilsplat.world.paints import COLOURS, Colour, Paint, each_channel
 from hilsplat.world.shapes import Mesh, Number, box, cylinder, sweep
 
 PASTELS = {
@@ -28,8 +28,8 @@ FOLIAGE = {
 """sRGB of leaves, in shade and in light, by colour word."""
 
 
-def _faded(colour: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
-    return tuple(factor * value for value in colour)
+def _faded(colour: Colour, factor: float) -> Colour:
+    return each_channel(colour, lambda value: factor * value)
 
 
 def lacquer(b: Builder, *colours: str) -> Paint:

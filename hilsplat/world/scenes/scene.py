@@ -3,12 +3,14 @@
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
 from hilsplat.base.levels import NONE
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
+from hilsplat.world.mesh import ray_caster
 from hilsplat.world.objects.builder import ObjectModel
 from hilsplat.world.paints import Paint
 from hilsplat.world.shapes import Mesh, rotation_about
@@ -116,14 +118,9 @@ class WorldScene:
     style: Style
 
     @cached_property
-    def embree(self) -> object:
+    def embree(self) -> Any:
         """Ray-casting structure, built on first use."""
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-
-        scene = EmbreeScene()
-        TriangleMesh(scene, self.triangles)
-        return scene
+        return ray_caster(self.triangles)
 
 
 class Assembly:
@@ -169,7 +166,7 @@ class Assembly:
             self.coords.append(mesh.triangles / self.scale)
             self.triangles.append(mesh.triangles)
             self.normals.append(mesh.normals)
-            self.node_ids.append(np.tile(np.int32([node, NONE, NONE]), (len(mesh), 1)))
+            self.node_ids.append(np.tile(np.array([node, NONE, NONE], np.int32), (len(mesh), 1)))
             self.material_ids.append(np.full(len(mesh), sum(len(rows) for rows in self.materials), np.int32))
             self.materials.append(paint.row()[None])
         return node

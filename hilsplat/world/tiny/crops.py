@@ -14,9 +14,18 @@ from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.world.tiny.clip import CANONICAL, CROP_PX
 from hilsplat.world.tiny.data import LabelledViews
 
-FRAMES = ("{}", "{}", "{}", "the {}", "a {}", "a photo of a {}", "a photo of the {}", "a picture of a {}")
+FRAMES: tuple[str, ...] = (
+    "{}",
+    "{}",
+    "{}",
+    "the {}",
+    "a {}",
+    "a photo of a {}",
+    "a photo of the {}",
+    "a picture of a {}",
+)
 """Sentence frames around a phrase; the bare phrase is the usual one."""
-GENERIC_FRAMES = ("{}", "{}", "a photo of {}", "a photo of a {}", "the {}", "a {}")
+GENERIC_FRAMES: tuple[str, ...] = ("{}", "{}", "a photo of {}", "a photo of a {}", "the {}", "a {}")
 LEAST_PX = 24
 """Smaller regions are not cut."""
 SHOWS, SHOWS_NOTHING = 0.5, 0.2
@@ -101,7 +110,7 @@ def roughen(rng: np.random.Generator, mask: Bool[np.ndarray, "H W"]) -> Bool[np.
     area = float(mask.sum())
     sigma = float(np.clip(0.06 * area**0.5 * rng.uniform(0.2, 2.0), 0.4, 6.0))
     noise = cv2.GaussianBlur(rng.normal(0, 1, mask.shape).astype(np.float32), (0, 0), 2 + sigma)
-    noise /= noise.std() + 1e-6
+    noise = noise / (noise.std() + 1e-6)
     blurred = cv2.GaussianBlur(rough, (0, 0), sigma)
     found = blurred + rng.uniform(0.05, 0.3) * noise * (blurred > 0.02) > rng.uniform(0.25, 0.65)
     for chance, value in ((0.25, False), (0.2, True)):
@@ -151,7 +160,7 @@ def list_crops(
         least_px: smaller regions are left out.
     """
     rows: list[tuple[int, ...]] = []
-    boxes: list[tuple[int, int, int, int]] = []
+    boxes: list[Sequence[int]] = []
     sets: dict[tuple[str, ...], int] = {}
     for view in range(len(views)):
         labels, nodes = views.labels[view], views.nodes[view]
@@ -166,8 +175,10 @@ def list_crops(
                 caption = sets.setdefault(nodes[node].phrases, len(sets))
                 rows.append((view, node, nodes[node].level, root[node], -1, caption))
                 boxes.append((box[1].start, box[0].start, box[1].stop, box[0].stop))
-        found = masks[view] if view < len(masks) else None
-        for index in range(len(found) if found is not None else 0):
+        if view >= len(masks):
+            continue
+        found = masks[view]
+        for index in range(len(found)):
             mask = found.dense(np.array([index]))[0]
             node, iou = best_node(mask, int(found.level[index]), labels, len(nodes))
             if iou > SHOWS and nodes[node].phrases:
@@ -177,11 +188,13 @@ def list_crops(
                 rows.append((view, NONE, 0, NONE, index, NONE))
             else:
                 continue
-            boxes.append(tuple(int(edge) for edge in found.box_xyxy[index]))
+            boxes.append(found.box_xyxy[index].tolist())
     columns = np.array(rows, np.int64).reshape(-1, 6).T
-    view, node, level, thing, segmented, caption = (np.ascontiguousarray(column) for column in columns)
-    box = np.array(boxes, np.int64).reshape(-1, 4)
-    return CropTable(views, masks, view, node, level, thing, segmented, box, caption, tuple(sets))
+    of_view, of_node, levels, things, segmented, captions = map(np.ascontiguousarray, columns)
+    box_xyxy = np.array(boxes, np.int64).reshape(-1, 4)
+    return CropTable(
+        views, masks, of_view, of_node, levels, things, segmented, box_xyxy, captions, tuple(sets)
+    )
 
 
 def list_segmented(views: LabelledViews, masks: Sequence[HierarchicalMasks]) -> CropTable:

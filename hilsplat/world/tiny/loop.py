@@ -125,7 +125,8 @@ class Training:
             budget: how long.
         """
         self._resume(budget)
-        curve, sums, since = Curve(self.progress.rows), {}, 0
+        curve, since = Curve(self.progress.rows), 0
+        sums: dict[str, float] = {}
         progress, clock = self.progress, time.monotonic()
         steps = prefetched(make, progress.step)
         while not progress.is_finished:

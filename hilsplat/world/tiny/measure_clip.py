@@ -88,7 +88,7 @@ def measure_clip(
     of_set = np.array([texts.index(phrases[0]) for phrases in crops.phrase_sets], np.int64)
     coloured = [coloured_text(phrases) for phrases in crops.phrase_sets]
     hues = sorted({phrase for phrase in coloured if phrase})
-    hue_row = {phrase: row for row, phrase in enumerate(hues)}
+    hue_row: dict[str | None, int] = {phrase: row for row, phrase in enumerate(hues)}
     hue_of_set = np.array([hue_row.get(phrase, -1) for phrase in coloured], np.int64)
     vectors = embedded_crops(vision, crops, rows, background)
     similarity = vectors @ embedded_texts(text, tokenizer, texts).T

@@ -185,7 +185,8 @@ def measure_everything(masks: list[HierarchicalMasks], views: LabelledViews) -> 
     """
     report = {}
     for level in LEVELS:
-        best, fits, count = [], 0, 0
+        best: list[float] = []
+        fits = count = 0
         for view, found in enumerate(masks):
             rows = found.rows_of(level)
             _, areas, iou = region_ious(views.labels[view][level.index], found.dense(rows))

@@ -1,7 +1,7 @@
 """What both trainings share: budget, learning rate, batches prepared ahead, learning curve."""
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import count
@@ -68,7 +68,7 @@ def learning_rate(step: int, peak: float, warmup: int, decay_from: int = -1, dec
     return rate
 
 
-def prefetched(make: Callable[[int], Batch], first: int = 0) -> Iterator[Batch]:
+def prefetched(make: Callable[[int], Batch], first: int = 0) -> Generator[Batch, None, None]:
     """Yield make(first), make(first + 1), ..., each prepared while its predecessor is worked on."""
     with ThreadPoolExecutor(1) as pool:
         upcoming = pool.submit(make, first)

@@ -124,7 +124,7 @@ def train_clip(
     frames = [frame.format("") for frame in (*FRAMES, *GENERIC_FRAMES)]
     tokenizer = word_tokenizer([*captioner.phrases, *CANONICAL, *frames])
     vision, text = ClipVision(), ClipText(tokenizer.get_vocab_size())
-    vision.to(memory_format=torch.channels_last)
+    nn.utils.convert_conv2d_weight_memory_format(vision, torch.channels_last)
     scale = Scale()
     training = Training({"vision": vision, "text": text, "scale": scale}, tuning, state, name, where)
     drawer = CropDraw(crops, batch)

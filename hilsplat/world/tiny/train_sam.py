@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.world.tiny.batches import CropStage, SamBatch, class_rows, draw_batch
@@ -72,7 +72,7 @@ def train_sam(
     where = torch.device(device)
     half = has_fast_half(where)
     rows, classes = class_rows(views)
-    encoder = SamEncoder().to(memory_format=torch.channels_last)
+    encoder = nn.utils.convert_conv2d_weight_memory_format(SamEncoder(), torch.channels_last)
     decoder, teacher = SamDecoder(), Teacher(len(rows) + 1)
     modules = {"encoder": encoder, "decoder": decoder, "teacher": teacher}
     training = Training(modules, tuning, state, name, where)
