@@ -1,6 +1,6 @@
 """Frames and prompts of the image-labelled data sets, as far as they are published.
 
-Labels on disk always win: these lists tell what is missing, misspelt or of another release.
+Labels on disk always win: these lists serve to report what is missing, misspelt or from another release.
 
 Sources. `FRAMES`: LERF-OVS from the released labels (minghanqin/LangSplat); 3D-OVS from third-party
 loaders, bed, bench and lawn from a second repository too; Hi-LERF and Hi-3DOVS from the table of the

@@ -38,7 +38,7 @@ class TrueMesh:
         """Read `truth/mesh.ply`.
 
         Raises:
-            ArtifactError: it is missing or no mesh.
+            ArtifactError: it is missing or not a mesh.
         """
         try:
             record = PlyData.read(path)
@@ -58,12 +58,12 @@ class TrueMesh:
         return ray_caster(self.triangles)
 
     def depth(self, camera: Camera) -> Float32[np.ndarray, "H W"]:
-        """Depth along the optical axis at each pixel's centre, scene units; inf where nothing is."""
+        """Depth along the optical axis at each pixel's centre, scene units; inf where there is nothing."""
         height, width = camera.size_hw
         y, x = np.mgrid[:height, :width] + 0.5
         pixels = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
         rotation = camera.cam_from_world[:3, :3]
-        # directions of depth 1: the distance that Embree returns then is the depth
+        # directions of depth 1, so the distance that Embree returns is the depth
         directions = (pixels @ np.linalg.inv(camera.K).T @ rotation).astype(np.float32)
         origins = np.ascontiguousarray(np.broadcast_to(camera.centre.astype(np.float32), directions.shape))
         hit = self.embree.run(origins, directions, query="INTERSECT", output=True)

@@ -1,4 +1,4 @@
-"""Colours and solid materials that the objects of the synthetic world are made of."""
+"""Colours and solid materials of the objects of the synthetic world."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ KINDS = (
     "fur",
     "tiles",
 )
-"""Solid textures, by the number that the shader knows them under."""
+"""Solid textures, in the order of the shader's numbers."""
 
 COLOURS: dict[str, Colour] = {
     "red": (0.78, 0.14, 0.12),
@@ -54,7 +54,7 @@ ADJECTIVES: dict[str, str] = {
     "fur": "furry",
     "tiles": "tiled",
 }
-"""How a text calls a thing with such a texture; a kind that is not here has no word."""
+"""Word in a text for a thing with such a texture; other kinds have none."""
 
 SECOND_SHARE: dict[str, float] = {
     "mottled": 0.47,
@@ -89,7 +89,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], float, float]] = {
 }
 
 PATTERNS = ("stripes", "checks", "spots")
-"""Kinds whose second colour may be another than a shade of the first."""
+"""Kinds whose second colour may be something other than a shade of the first."""
 
 PATTERN_CONTRAST = 22.0
 """Least distance between the two colours of a pattern, in L*a*b*."""
@@ -111,7 +111,7 @@ class Paint:
         shininess: Blinn-Phong exponent.
         grain: relative amplitude of the fine grain (structure from motion needs it).
         offset: shift of the texture, scene units; keeps cell borders off object faces.
-        choices: colour words that the thing may have; none: any.
+        choices: colour words that the thing may have; empty for any.
     """
 
     colour: str
@@ -127,7 +127,7 @@ class Paint:
 
     @property
     def adjective(self) -> str | None:
-        """Word for the texture, where there is one."""
+        """Word for the texture, if there is one."""
         return ADJECTIVES.get(self.kind)
 
     @property
@@ -259,7 +259,7 @@ class PaintBox:
 
         Args:
             group: one of `GROUPS`.
-            colours: colour words to choose from; none: any that was not used yet.
+            colours: colour words to choose from; by default any not used yet.
             scale: factor on the pattern's number of cells per unit.
         """
         rng = self._rng
@@ -298,9 +298,9 @@ class PaintBox:
         return self._left
 
     def _patterned(self, paint: Paint) -> Paint:
-        """The paint with a second colour that shows, yet leaves its prevailing colour the same word.
+        """The paint with a visible second colour that does not change the word for its prevailing colour.
 
-        Another word would be a lie of the texts: "red mug" for what looks brown from afar.
+        A changed word would make the texts wrong: "red mug" for what looks brown from afar.
         """
         first = np.array(paint.first)
         for word in self._rng.permutation(list(COLOURS)):

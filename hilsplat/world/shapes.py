@@ -68,7 +68,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def _flat(triangles: np.ndarray) -> Mesh:
-    """Flat-shaded mesh: each corner takes the normal of its triangle; degenerate triangles go."""
+    """Flat-shaded mesh: each corner takes the normal of its triangle; degenerate triangles are dropped."""
     triangles = np.asarray(triangles, dtype=np.float64)
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     keep = np.linalg.norm(normal, axis=1) > 1e-12

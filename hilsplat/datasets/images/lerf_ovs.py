@@ -1,9 +1,9 @@
 """LERF-OVS: four scenes of LERF with the labels of LangSplat.
 
-Polygons per labelled image; objects of one category in one image are one region with several boxes, and a
-view is asked only for the categories that are labelled there. Labels lie in `label/<scene>`, beside the
-scenes. Images are found by name, never by position: LangSplat's own evaluation counts renderings, which
-shifts when an image before was not registered.
+Labels are polygons. Objects of one category in one image form one region with several boxes, and a view is
+queried only for the categories labelled in it. Labels are in `label/<scene>`, beside the scenes. Images are
+found by name, never by position: LangSplat's own evaluation counts renderings, and the count shifts if an
+earlier image was not registered.
 """
 
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ lerf_ovs/
 
 
 def open_scene(root: Path, scene: str) -> LabelledScene:
-    """Read the labels of a scene; masks are rasterised when asked for.
+    """Read the labels of a scene; masks are rasterised when needed.
 
     Args:
         root: the folder `lerf_ovs`.
@@ -58,7 +58,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
             f"labelled frames of {scene} have no image: {', '.join(orphans)}",
             expected=f"an image of that name in {root / scene / 'images'}",
             found=f"{len(images)} images, {next(iter(images))} to {list(images)[-1]}",
-            fix="unpack the images again; those of another release are numbered otherwise",
+            fix="unpack the images again; those of another release are numbered differently",
         )
     warnings: list[str] = []
     views: dict[str, tuple[LabelledRegion, ...]] = {}
@@ -88,7 +88,7 @@ def label_files(folder: Path) -> dict[str, Path]:
     """Label files of a folder by view.
 
     Raises:
-        SceneError: there is none.
+        SceneError: there are none.
     """
     paths = sorted(path for path in Path(folder).glob("*.json") if path.name[0] != ".")
     files = {view_name(path.stem): path for path in paths}
@@ -97,7 +97,7 @@ def label_files(folder: Path) -> dict[str, Path]:
             f"{folder} has no label file",
             expected="one .json per labelled frame",
             found=", ".join(sorted(path.name for path in Path(folder).glob("*"))[:5]) or "nothing",
-            fix="unpack the labels again, or move them up if they lie in a folder below",
+            fix="unpack the labels again, or move them up if they are in a subfolder",
         )
     return files
 
@@ -132,7 +132,7 @@ DATASET = Dataset(
     folder="lerf_ovs",
     scenes=("figurines", "ramen", "teatime", "waldo_kitchen"),
     licence="none stated for images and labels",
-    terms="Take it for research use only, and do not redistribute.",
+    terms="For research use only; do not redistribute.",
     citation="images: Kerr et al., LERF, ICCV 2023; labels: Qin et al., LangSplat, CVPR 2024",
     layout=LAYOUT,
     required=lambda scene: (f"{scene}/images", f"{scene}/sparse", f"label/{scene}"),

@@ -27,7 +27,7 @@ FOREGROUND = 255
 """The original loader computes int8(value / 255)."""
 
 SHAPE_TOLERANCE = 0.01
-"""Masks and photographs of one view come in sizes whose shapes differ a little."""
+"""The mask and the photograph of a view differ slightly in aspect ratio."""
 
 LAYOUT = """\
 3d_ovs/
@@ -40,9 +40,9 @@ LAYOUT = """\
 
 
 def open_scene(root: Path, scene: str) -> LabelledScene:
-    """Read the segmentations of a scene; pixels are read when asked for.
+    """Read the segmentations of a scene; pixels are read when needed.
 
-    Regions of a view stand in the order of the sorted prompts; one of them may have no pixel.
+    Regions of a view are in the order of the sorted prompts; some may have no pixels.
 
     Args:
         root: the folder `3d_ovs`.
@@ -82,7 +82,7 @@ def read_classes(path: Path) -> tuple[str, ...]:
     """Prompts of `classes.txt`: stripped, without empty lines, sorted (capitals first).
 
     Raises:
-        SceneError: it is missing, empty, no text, or names a class twice.
+        SceneError: it is missing, empty, not a text file, or names a class twice.
     """
     try:
         lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
@@ -145,7 +145,7 @@ DATASET = Dataset(
     folder="3d_ovs",
     scenes=tuple(FRAMES["3d_ovs"]),
     licence="none stated for images and masks (the authors' code: MIT)",
-    terms="Take it for research use only, and do not redistribute.",
+    terms="For research use only; do not redistribute.",
     citation="Liu et al., Weakly Supervised 3D Open-vocabulary Segmentation, NeurIPS 2023",
     layout=LAYOUT,
     required=lambda scene: (f"{scene}/images", f"{scene}/segmentations/classes.txt"),

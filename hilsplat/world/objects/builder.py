@@ -99,14 +99,14 @@ class Builder:
         self._pieces.append((node, joined(*meshes), paint))
 
     def shift(self, nodes: tuple[int, ...], x: float | int, y: float | int, z: float | int) -> None:
-        """Move what was put on these nodes so far."""
+        """Move everything added to these nodes so far."""
         self._pieces = [
             (node, mesh.moved(x, y, z) if node in nodes else mesh, paint)
             for node, mesh, paint in self._pieces
         ]
 
     def turn(self, degrees: float | int) -> None:
-        """Turn all that was put so far about the vertical axis."""
+        """Turn everything added so far about the vertical axis."""
         self._pieces = [(node, mesh.turned("z", degrees), paint) for node, mesh, paint in self._pieces]
 
     def build(self) -> ObjectModel:
@@ -230,10 +230,10 @@ def _touch(first: np.ndarray, second: np.ndarray, reach: float) -> bool:
 
 
 def _distinct(paint: Paint, rivals: list[tuple[Paint, float]]) -> Paint:
-    """The paint, or what is nearest to it that differs from all rivals by their distance."""
+    """The paint, or the nearest one that differs from every rival by its distance."""
 
     def short(candidate: Paint) -> float:
-        """By how much the worst rival is missed; 0 where none is."""
+        """By how much the distance to the worst rival falls short; 0 if none does."""
         return max([0.0, *(least - difference(candidate, rival) for rival, least in rivals)])
 
     shades = [paint if factor == 1 else paint.shaded(factor) for factor in _SHADES]
@@ -241,7 +241,7 @@ def _distinct(paint: Paint, rivals: list[tuple[Paint, float]]) -> Paint:
     tried = [shade for shade in shades if shade.colour in allowed]
     tried += [paint.recoloured(word) for word in allowed if word != paint.colour]
     tried = tried or [paint]
-    return min(tried, key=short)  # the first of equals: the least change that will do
+    return min(tried, key=short)  # the first of equals: the smallest sufficient change
 
 
 def _prevailing(

@@ -1,4 +1,4 @@
-"""What belongs to the walls of a room, at its real size, in metres: its back is x = 0, its front faces +x."""
+"""Fixtures on the walls of a room at their real size, in metres: backs are at x = 0, fronts face +x."""
 
 import numpy as np
 

@@ -39,7 +39,7 @@ def lacquer(b: Builder, *colours: str) -> Paint:
 
 
 def glass(b: Builder) -> Paint:
-    """Dark, glossy and a little cloudy: a window pane that has something to see on it."""
+    """Dark, glossy and a little cloudy: a window pane with some visible detail."""
     paint = b.paints.draw("plain", "black")
     first, second = ((0.15, 0.19, 0.26), (0.36, 0.45, 0.55))
     choices = ("black", "grey", "blue", "teal")
@@ -54,7 +54,7 @@ def rubber(b: Builder) -> Paint:
 
 
 def lit(paint: Paint) -> Paint:
-    """The same colour, shining by itself (the shader's rule: no shininess, no shading)."""
+    """The same colour, self-luminous (the shader's rule: no shininess, no shading)."""
     return replace(paint, specular=0.0, shininess=0.0)
 
 
@@ -75,7 +75,7 @@ def foliage(b: Builder, *colours: str) -> Paint:
 
 
 def plain(b: Builder, colour: str) -> Paint:
-    """A colour as it is in the list of colours."""
+    """A plain paint in exactly the listed colour."""
     return replace(b.paints.draw("plain", colour), first=COLOURS[colour])
 
 

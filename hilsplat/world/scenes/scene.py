@@ -1,4 +1,4 @@
-"""A scene of the synthetic world: triangles, each of which knows what it belongs to."""
+"""A scene of the synthetic world: triangles with the nodes they belong to."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -29,8 +29,8 @@ class Style:
         exposure: factor on everything.
         scale: how much larger than a tabletop the scene is; grain, hidden sky and the hash that moves rays
             follow it (1 for a table, 4 for a street).
-        shadow_reach: farther things throw no shadow, scene units; keeps the dome of the sky from
-            hiding the sun.
+        shadow_reach: farther things cast no shadow, scene units; keeps the dome of the sky from hiding the
+            sun.
     """
 
     light_position: tuple[float, float, float] = (1.3, 1.0, 3.6)
@@ -84,12 +84,12 @@ class PlacedObject:
 
 @dataclass(frozen=True, eq=False)
 class WorldScene:
-    """A scene as triangles, each of which knows what it belongs to. z is up.
+    """A scene as triangles with the nodes they belong to. z is up.
 
     Attributes:
-        kind: what sort of scene.
+        kind: kind of scene.
         seed: everything random in it follows from this and from the number of objects.
-        asked: number of objects asked for.
+        asked: number of requested objects.
         placed: the objects that found a place.
         triangles: corner positions, scene units.
         normals: shading normals at the corners.
@@ -98,8 +98,8 @@ class WorldScene:
         material_ids: row of `materials` of each triangle.
         materials: numbers for the shader, `Paint.row`.
         nodes: all nodes by id. Those of the surroundings (table, floor, wall) are wholes without parts.
-        background: ids of the surroundings. They are labelled but never scored: large easy regions
-            would lift every mean.
+        background: ids of the surroundings. They are labelled but never scored: large easy regions would
+            raise every mean.
         style: light of this scene.
     """
 

@@ -29,16 +29,17 @@ GENERIC_FRAMES: tuple[str, ...] = ("{}", "{}", "a photo of {}", "a photo of a {}
 LEAST_PX = 24
 """Smaller regions are not cut."""
 SHOWS, SHOWS_NOTHING = 0.5, 0.2
-"""A segmented mask shows the node with which its IoU is above the first; below the second, nothing."""
+"""A segmented mask shows the node with which its IoU is above the first value; below the second it shows
+nothing."""
 
 
 @dataclass(frozen=True)
 class CropTable:
-    """N masks that can be cut out of labelled views, and what may be said of each.
+    """N masks that can be cut out of labelled views, with their captions.
 
     Attributes:
         views: the views.
-        masks: segmented masks per view; empty where none were asked for.
+        masks: segmented masks per view; empty if none were requested.
         view: row of the view.
         node: id of the node that the mask shows, -1 for nothing in particular.
         level: `Level` of that node, 0 for nothing.
@@ -65,7 +66,7 @@ class CropTable:
 
     @property
     def rough(self) -> Bool[np.ndarray, " N"]:
-        """Which masks are the segmenter's."""
+        """Whether each mask came from the segmenter."""
         return self.segmented >= 0
 
     def cut(
@@ -105,7 +106,7 @@ def _shrunk(
 
 
 def roughen(rng: np.random.Generator, mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """A mask as a segmenter might have drawn it: grown, rounded, a bite taken out, a piece too much."""
+    """A mask as a segmenter might have drawn it: grown, rounded, with a piece missing or added."""
     rough = mask.astype(np.float32)
     area = float(mask.sum())
     sigma = float(np.clip(0.06 * area**0.5 * rng.uniform(0.2, 2.0), 0.4, 6.0))
@@ -121,7 +122,7 @@ def roughen(rng: np.random.Generator, mask: Bool[np.ndarray, "H W"]) -> Bool[np.
             radius = int(area**0.5 * rng.uniform(0.12, 0.35)) + 1
             cv2.circle(blob, (int(columns[pick]), int(rows[pick])), radius, 1, -1)
             found = np.where(blob > 0, value, found)
-    # One that lost its region is no example of it.
+    # A mask that lost its region is not an example of it.
     return found if (found & mask).sum() > 0.5 * (found | mask).sum() else mask
 
 
@@ -130,7 +131,7 @@ def best_node(
 ) -> tuple[int, float]:
     """Node whose region has the highest IoU with a mask, over all levels, and that IoU.
 
-    Of equally good nodes the one of the given level wins: a part may be all that is seen of a whole.
+    Ties go to the node of the given level: a part may be all that is visible of a whole.
     """
     best, best_iou = NONE, 0.0
     area = int(mask.sum())
@@ -152,7 +153,7 @@ def best_node(
 def list_crops(
     views: LabelledViews, masks: Sequence[HierarchicalMasks] = (), least_px: int = LEAST_PX
 ) -> CropTable:
-    """All masks of labelled views: the true regions, and the segmented masks where there are some.
+    """All masks of labelled views: the true regions, and the segmented masks, if any.
 
     Args:
         views: labelled views.
@@ -198,7 +199,7 @@ def list_crops(
 
 
 def list_segmented(views: LabelledViews, masks: Sequence[HierarchicalMasks]) -> CropTable:
-    """All segmented masks in their order, whatever they show; nothing is said of them."""
+    """All segmented masks in their order, whatever they show, without captions."""
     view = np.repeat(np.arange(len(masks)), [len(found) for found in masks])
     segmented = np.concatenate([np.arange(len(found)) for found in masks] + [np.zeros(0, np.int64)])
     box = np.concatenate([found.box_xyxy for found in masks] + [np.zeros((0, 4), np.int32)])
@@ -215,8 +216,8 @@ class Captioner:
     draw does not look at the crop, so a canonical phrase comes to mean nothing in particular: the
     yardstick that relevancy needs.
 
-    Every query of the vocabulary and some further phrases stand beside the captions of a batch: texts cost
-    little, and against them a crop learns at once what else it is and is not.
+    Every query of the vocabulary and some further phrases are added to the captions of a batch: texts cost
+    little, and they teach a crop at once what else it is and is not.
 
     Args:
         phrase_sets: distinct sets of phrases; the first of each is the query.

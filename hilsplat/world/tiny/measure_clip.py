@@ -17,7 +17,7 @@ from hilsplat.world.tiny.data import LabelledViews, normalised
 
 CHUNK = 256
 COMMON = 20
-"""Of each level so many texts, the commonest, compete in the smaller of the two questions."""
+"""This many of the commonest texts of each level compete in the smaller of the two questions."""
 
 
 def tokenised(tokenizer: Tokenizer, texts: Sequence[str]) -> tuple[Tensor, Tensor]:
@@ -160,7 +160,7 @@ def measure_queries(
         views: labelled views.
         masks: automatic masks of each.
         crops: from `list_segmented` of the same views and masks.
-        least_px: regions below are not asked for.
+        least_px: smaller regions are not queried.
 
     Returns:
         per level: mean `iou` of the mask most similar to the text with the union of all regions that the

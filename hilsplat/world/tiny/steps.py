@@ -47,7 +47,7 @@ class Budget:
         return by_steps or (self.minutes > 0 and minutes >= (1 - DECAY_SHARE) * self.minutes)
 
     def decay_steps(self, step: int, minutes: float) -> int:
-        """Steps over which it falls when it begins now: what is left, or a quarter where that is less.
+        """Steps over which it falls when it begins now: what is left, or a quarter, whichever is less.
 
         A state that is already past the budget (trained with a larger one before) decays over a quarter.
         """
@@ -69,7 +69,7 @@ def learning_rate(step: int, peak: float, warmup: int, decay_from: int = -1, dec
 
 
 def prefetched(make: Callable[[int], Batch], first: int = 0) -> Generator[Batch, None, None]:
-    """Yield make(first), make(first + 1), ..., each prepared while its predecessor is worked on."""
+    """Yield make(first), make(first + 1), ..., each prepared while its predecessor is being used."""
     with ThreadPoolExecutor(1) as pool:
         upcoming = pool.submit(make, first)
         for step in count(first + 1):

@@ -1,4 +1,4 @@
-"""The data set of docs/extending.md reads as it is written there."""
+"""The data set of docs/extending.md can be read as documented."""
 
 import re
 import types

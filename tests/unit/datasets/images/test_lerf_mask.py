@@ -42,13 +42,13 @@ def test_test_views_are_posed_images_that_images_train_lacks(root):
     assert not scene.views["frame_00004.png"][0].mask().any()
 
 
-def test_an_image_without_a_pose_is_no_test_view(true_world, root):
+def test_an_image_without_a_pose_is_not_a_test_view(true_world, root):
     write_png(root / "teatime" / "images" / "frame_00000.png", np.zeros((24, 40, 3), np.uint8))
     assert list(open_scene(root, "teatime").views) == ["frame_00002.png", "frame_00004.png"]
     cameras = [true_world.cameras[name] for name in true_world.cameras.names[:3]]
     names = [f"frame_0000{n}.jpg" for n in (1, 2, 3)]
     write_sparse(root / "teatime" / "sparse" / "0", cameras, names, np.zeros((0, 3)))
-    with pytest.raises(SceneError, match=r"do not fit the test views\n.*0 to 0, for frame_00002.png\n.*0, 1"):
+    with pytest.raises(SceneError, match=r"not match the test views\n.*0 to 0, for frame_00002.png\n.*0, 1"):
         open_scene(root, "teatime")
 
 

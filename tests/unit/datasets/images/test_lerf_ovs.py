@@ -138,13 +138,13 @@ def test_labelled_frames_without_image_or_pose_are_named(root):
         open_scene(root, "figurines")
 
 
-def test_a_polygon_outside_the_image_is_clipped_and_told_or_refused(tmp_path):
+def test_a_polygon_outside_the_image_is_clipped_and_reported_or_refused(tmp_path):
     path = label_file(tmp_path, [thing(segmentation=[[15, 2], [25, 2], [25, 4], [15, 4]])])
     labels = read_isat(path)
     assert labels.objects[0].mask((10, 20)).sum() == 3 * 5  # columns 15 to 19
     assert len(labels.warnings) == 1 and "reaches 5 px outside the image; clipped" in labels.warnings[0]
     path = label_file(tmp_path, [thing(segmentation=[[30, 2], [35, 2], [35, 4]])])
-    with pytest.raises(SceneError, match=r"object 0 \(knife\): a polygon lies outside the image"):
+    with pytest.raises(SceneError, match=r"object 0 \(knife\): a polygon is outside the image"):
         read_isat(path)
 
 
@@ -154,7 +154,7 @@ def test_a_polygon_outside_the_image_is_clipped_and_told_or_refused(tmp_path):
         ('{"info": ', "cannot be read"),
         ("[]", "has no list `objects`"),
         ('{"shapes": []}', "has no list `objects`"),
-        ('{"info": {}, "objects": []}', "does not say how large"),
+        ('{"info": {}, "objects": []}', "does not give the size"),
     ],
 )
 def test_malformed_label_files_are_refused_by_name(tmp_path, text, message):
@@ -168,9 +168,9 @@ def test_malformed_label_files_are_refused_by_name(tmp_path, text, message):
     ("entry", "message"),
     [
         (thing(category=None), "object 0 has no category"),
-        (thing(segmentation=[[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]]), "segmentation is no polygon"),
-        (thing(segmentation=[]), "segmentation is no polygon"),
-        (thing(segmentation="x"), "segmentation is no polygon"),
+        (thing(segmentation=[[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]]), "segmentation is not a polygon"),
+        (thing(segmentation=[]), "segmentation is not a polygon"),
+        (thing(segmentation="x"), "segmentation is not a polygon"),
         (thing(bbox=[1, 2, 3]), "bbox cannot be used"),
     ],
 )
@@ -179,7 +179,7 @@ def test_malformed_objects_are_refused_by_number(tmp_path, entry, message):
         read_isat(label_file(tmp_path, [entry]))
 
 
-def test_a_label_of_a_scaled_copy_is_resized_and_told(root):
+def test_a_label_of_a_scaled_copy_is_resized_and_reported(root):
     for name in ("frame_00002", "frame_00004"):
         (root / "figurines" / "images" / f"{name}.jpg").unlink()
         write_png(root / "figurines" / "images" / f"{name}.png", np.zeros((12, 20, 3), np.uint8))
@@ -198,16 +198,16 @@ def test_a_label_of_another_release_is_refused(root):
         open_scene(root, "figurines")
 
 
-def test_unlisted_texts_and_missing_frames_are_told(root):
-    told = "; ".join(open_scene(root, "figurines").report().warnings)
+def test_unlisted_texts_and_missing_frames_are_reported(root):
+    reported = "; ".join(open_scene(root, "figurines").report().warnings)
     assert (
         "published frames without label: frame_00041.png, frame_00105.png, frame_00152.png, frame_00195.png"
-        in told
+        in reported
     )
-    assert "texts that the published list lacks: Ring, bear, head, nose, paw" in told
+    assert "texts that the published list lacks: Ring, bear, head, nose, paw" in reported
 
 
-def test_a_wrong_count_of_pairs_is_told_for_whole_published_scenes(tmp_path, true_world):
+def test_a_wrong_count_of_pairs_is_reported_for_whole_published_scenes(tmp_path, true_world):
     root = tmp_path / "lerf_ovs"
     write_lerf_ovs(true_world, root, "figurines", [])
     for frame in (41, 105, 152, 195):

@@ -49,7 +49,7 @@ def test_poses_of_llff_are_read_back_equal(true_world, root):
 
 def test_a_camera_that_looks_along_minus_z_of_its_llff_frame(tmp_path):
     # World axes as LLFF's camera: its columns (down, right, back) are -y, x, z of the world, so the
-    # camera stands at (1, 2, 3), looks along -z, and has world x on its right and -y below it.
+    # camera is at (1, 2, 3), looks along -z, and has world x on its right and -y below it.
     matrix = np.array([[0, 1, 0, 1, 30], [-1, 0, 0, 2, 40], [0, 0, 1, 3, 50]], float)
     np.save(tmp_path / "poses_bounds.npy", np.concatenate([matrix.ravel(), [0.5, 9.0]])[None])
     poses, sizes, bounds = read_poses_bounds(tmp_path / "poses_bounds.npy")
@@ -134,7 +134,7 @@ def test_one_name_with_two_suffixes_is_refused(root):
         open_scene(root, "bed")
 
 
-def test_a_mask_of_another_size_is_resized_to_nearest_and_told(root):
+def test_a_mask_of_another_size_is_resized_to_nearest_and_reported(root):
     small = np.zeros((12, 20), np.uint8)
     small[1, 2] = 255
     write_png(root / "bed" / "segmentations" / "00" / "bear.png", small)
@@ -150,14 +150,14 @@ def test_a_mask_of_another_shape_is_refused(root):
         open_scene(root, "bed")
 
 
-def test_a_missing_mask_is_refused_and_tells_misspelt_ones(root):
+def test_a_missing_mask_is_refused_and_misspelt_ones_are_named(root):
     place = root / "bed" / "segmentations" / "03"
     (place / "bear.png").rename(place / "Bear.png")
     with pytest.raises(SceneError, match=r"lacks the masks of: bear\n.*\n.*classes.txt lacks: Bear"):
         open_scene(root, "bed")
 
 
-def test_a_mask_of_an_unknown_class_is_told(root):
+def test_a_mask_of_an_unknown_class_is_reported(root):
     place = root / "bed" / "segmentations" / "03"
     (place / "wood.png").write_bytes((place / "bear.png").read_bytes())
     assert "03: masks of unknown classes are not read: wood" in open_scene(root, "bed").warnings
@@ -175,6 +175,6 @@ def test_a_scene_without_any_pose_says_so(root):
     assert any("no poses" in line for line in open_scene(root, "bed").report().warnings)
 
 
-def test_missing_views_are_told(root):
+def test_missing_views_are_reported(root):
     warnings = open_scene(root, "bed").warnings
     assert "published frames without segmentation: 04.png, 10.png, 23.png, 30.png" in warnings
