@@ -1,4 +1,4 @@
-"""What is known of a data set before one of its files is read: scenes, layout, licence, and who reads it."""
+"""What is known about a data set before any of its files is read: scenes, layout, licence and reader."""
 
 import os
 from collections.abc import Callable
@@ -15,7 +15,7 @@ class SceneReport:
 
     Attributes:
         facts: what was read, in words and numbers: {"labelled views": 4, "texts": 21}.
-        warnings: what was read otherwise than written, or could not be used, each a sentence.
+        warnings: one sentence for each thing that was reinterpreted or could not be used.
     """
 
     facts: dict[str, object]
@@ -29,19 +29,20 @@ class Dataset:
     Attributes:
         name: key in the registry, and data set in rows and paths.
         title: as papers write it.
-        labels: what carries labels: pixels of "images", or "points" of a mesh or a scan.
+        labels: "images" if their pixels are labelled, "points" if the points of a mesh or a scan are.
         folder: the data set's folder below `data_root`.
-        scenes: scenes that the paper's tables use.
+        scenes: scenes in the paper's tables.
         licence: in one line.
         terms: what the licence asks of a user, in one sentence.
         citation: authors, title, venue, year.
-        layout: the expected tree, from `folder` down, for people.
-        required: places below `folder` that a scene cannot do without, relative.
-        open: reads a scene: (the data set's folder, scene) to a `LabelledScene` or `PointScene`.
-        open_part: the same with a part of the images, which is enough for a check; None: `open`.
-        protocols: names of the protocols that it is scored under (`evaluate.protocols.cards`), beside
-            those of every labelled image.
-        label_places: glob patterns below `folder` of the files of a scene that only evaluation reads.
+        layout: the expected file tree from `folder` down, for people to read.
+        required: paths that a scene needs, relative to `folder`.
+        open: reads a scene, given the data set's folder and the scene's name; returns a `LabelledScene` or a
+            `PointScene`.
+        open_part: the same with only some of the images, which is enough for a check; None to use `open`.
+        protocols: names of the protocols it is scored under (`evaluate.protocols.cards`), in addition to
+            those for every labelled image.
+        label_places: glob patterns, below `folder`, of those files of a scene that only evaluation reads.
     """
 
     name: str
@@ -60,22 +61,22 @@ class Dataset:
     label_places: Callable[[str], tuple[str, ...]] = lambda scene: ()
 
     def check(self, root: Path, scene: str) -> SceneReport:
-        """Read everything of a scene and say what was found."""
+        """Read a whole scene and report what was found."""
         return (self.open_part or self.open)(root, scene).report()
 
     def missing(self, root: Path, scene: str) -> tuple[str, ...]:
-        """Required places of a scene that are not below the data set's folder `root`."""
+        """Required paths of a scene that are missing below the data set's folder `root`."""
         return tuple(place for place in self.required(scene) if not _at(root, place).exists())
 
     def found(self, root: Path) -> tuple[str, ...]:
-        """Known scenes of which nothing required is missing."""
+        """Known scenes with every required path present."""
         return tuple(scene for scene in self.scenes if not self.missing(root, scene))
 
     def locate(self, data_root: Path) -> Path:
         """The data set's folder below `data_root`.
 
         Raises:
-            SceneError: it is not there, or it is one level higher or deeper.
+            SceneError: it is missing, or it is one level too high or too deep.
         """
         data_root = Path(data_root).expanduser()
         root = data_root / self.folder
@@ -111,10 +112,10 @@ class Dataset:
         )
 
     def require(self, root: Path, scene: str) -> None:
-        """Refuse a scene of which something required is missing.
+        """Refuse a scene that lacks a required path.
 
         Raises:
-            SceneError: naming what is missing; as after an archive was unpacked in part.
+            SceneError: something is missing, for instance because an archive was unpacked only in part.
         """
         missing = self.missing(root, scene)
         if missing:
@@ -127,7 +128,7 @@ class Dataset:
             )
 
     def _has_begun(self, root: Path) -> bool:
-        """Whether anything of any known scene is in a folder."""
+        """Whether a folder contains a required path of any known scene."""
         return any(
             _at(root, place).exists()
             for scene in self.scenes
@@ -137,17 +138,17 @@ class Dataset:
 
 
 def _at(root: Path, place: str) -> Path:
-    """A place from a folder, which need not exist for `..` to lead out of it."""
+    """A path relative to a folder, which need not exist for `..` to lead out of it."""
     return Path(os.path.normpath(Path(root) / place))
 
 
 def _folders(folder: Path) -> list[Path]:
-    """Folders in a folder, by name; none where it is missing."""
+    """Subfolders by name; none if the folder is missing."""
     return sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
 
 
 def _listing(folder: Path) -> str:
-    """First names of a folder, for messages."""
+    """The first names in a folder, for messages."""
     if not folder.is_dir():
         return f"no folder {folder}"
     names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))

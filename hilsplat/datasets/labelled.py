@@ -1,10 +1,10 @@
-"""Scenes whose images carry labels: what every reader of such a data set returns.
+"""Scenes with labelled images: what every reader of such a data set returns.
 
-Views are named after the image file without its suffix ("frame_00041"), so that a label finds its image
-and its camera whatever else is missing.
+Labels, images and poses of a view are keyed by its name in the scene ("frame_00041.png", see
+`scene.features.view_name`), so that a label finds its image and its camera whatever else is missing.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,24 +16,25 @@ from hilsplat.base.errors import ImageError, SceneError
 from hilsplat.base.files import list_images
 from hilsplat.base.levels import Level
 from hilsplat.datasets.dataset import SceneReport
+from hilsplat.scene.features import view_name
 from hilsplat.scene.known_poses import KnownView, find_known_poses
 from hilsplat.scene.known_views import known_views
 
 ROUNDING_PX = 1.0
-"""A label is a scaled copy of its image where the sides differ by no more than rounding."""
+"""A label counts as a scaled copy of its image if their sides differ by no more than rounding."""
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledRegion:
-    """One region of one view, with the text that asks for it.
+    """One region of one view, with the text of its query.
 
     Attributes:
         text: the query, as the labels spell it.
         size_hw: height and width of the label, px.
-        pixels: reads the region at the label's size; called whenever the mask is asked for.
-        boxes_xyxy: annotated boxes, borders included, label px; None where the data set has none.
-        level: None where the data set has no levels.
-        path: texts from the whole down to this region; the text alone without levels.
+        pixels: reads the region at the label's size; called each time the mask is needed.
+        boxes_xyxy: annotated boxes, borders included, label px; None if the data set has none.
+        level: None if the data set has no levels.
+        path: texts from the whole down to this region; just its text if there are no levels.
     """
 
     text: str
@@ -49,10 +50,10 @@ class LabelledRegion:
         return mask if size_hw is None else resize_nearest(mask, size_hw)
 
     def boxes(self, size_hw: tuple[int, int] | None = None) -> Int[np.ndarray, "B 4"]:
-        """Boxes with borders included; the region's own extent where none is annotated.
+        """Boxes with borders included; the region's own extent if none is annotated.
 
-        At another size each side is scaled and rounded to the pixel that holds it. A region without a
-        pixel and without annotated boxes has none.
+        At another size each side is scaled and rounded to the pixel that holds it. A region with neither
+        pixels nor annotated boxes has none.
         """
         boxes = self.boxes_xyxy
         if boxes is None:
@@ -75,11 +76,11 @@ class LabelledScene:
     Attributes:
         dataset: name of the data set.
         scene: name of the scene.
-        images: image file by view, all images of the scene.
-        poses: folder that `scene.known_poses` finds poses in; None where the scene has none.
-        views: labelled regions by view, in order of the labels.
+        images: image file of each view, for all images of the scene.
+        poses: folder in which `scene.known_poses` finds poses; None if the scene has none.
+        views: labelled regions by view, in the order of the labels.
         prompts: all texts of the scene, sorted.
-        warnings: what was read otherwise than written, each a sentence.
+        warnings: one sentence for each thing that was reinterpreted.
     """
 
     dataset: str
@@ -92,28 +93,26 @@ class LabelledScene:
 
     @property
     def num_pairs(self) -> int:
-        """Pairs of view and text."""
+        """Number of pairs of view and text."""
         return sum(len({region.text for region in regions}) for regions in self.views.values())
 
-    def posed_views(self, names: Iterable[str]) -> dict[str, str]:
-        """Labelled view to name of the posed view of the same stem ("frame_00041" to "frame_00041.png").
+    def check_posed(self, names: Collection[str]) -> None:
+        """Check that every labelled view is among the posed ones.
 
         Raises:
             SceneError: labelled views without a pose, by name.
         """
-        by_stem = {Path(name).stem: name for name in names}
-        missing = [view for view in self.views if view not in by_stem]
+        missing = [view for view in self.views if view not in names]
         if missing:
             raise SceneError(
                 f"labelled views of {self.dataset}/{self.scene} have no pose: {', '.join(missing)}",
                 expected=f"all {len(self.views)} labelled views among the posed ones",
-                found=f"{len(by_stem)} posed views, {_some(sorted(by_stem))}",
+                found=f"{len(names)} posed views, {_some(sorted(names))}",
                 fix="use the poses that come with the data set, or register those images",
             )
-        return {view: by_stem[view] for view in self.views}
 
     def report(self) -> SceneReport:
-        """Read every mask of the scene, and its poses, and say what is there."""
+        """Read every mask and the poses of the scene, and report what is there."""
         warnings = list(self.warnings)
         empty = [
             f"{view}: {region.text}"
@@ -135,7 +134,7 @@ class LabelledScene:
         else:
             posed = posed_images(self.poses, self.dataset)
             facts["posed views"] = len(posed)
-            self.posed_views(posed)
+            self.check_posed(posed)
         return SceneReport(facts, tuple(warnings))
 
 
@@ -150,8 +149,8 @@ def resize_nearest(mask: Bool[np.ndarray, "H W"], size_hw: tuple[int, int]) -> B
     return mask[rows[:, None], columns[None, :]]
 
 
-def images_by_stem(folder: Path) -> dict[str, Path]:
-    """Image files of a folder by their name without suffix, sorted by it.
+def images_by_view(folder: Path) -> dict[str, Path]:
+    """Image files of a folder by view, sorted by stem.
 
     Raises:
         SceneError: the folder is missing or empty, or two images share a stem.
@@ -164,23 +163,24 @@ def images_by_stem(folder: Path) -> dict[str, Path]:
             expected="the images of the scene, .jpg or .png",
             fix="unpack the whole archive again",
         )
-    by_stem: dict[str, Path] = {}
+    images: dict[str, Path] = {}
     for path in sorted(files, key=lambda path: path.stem):
-        if path.stem in by_stem:
+        view = view_name(path.stem)
+        if view in images:
             raise SceneError(
-                f"two images of {folder} have the same name but for the suffix",
-                found=f"{by_stem[path.stem].name}, {path.name}",
+                f"two images in {folder} differ only in their suffix",
+                found=f"{images[view].name}, {path.name}",
                 fix="remove one of them: labels are matched by the name without suffix",
             )
-        by_stem[path.stem] = path
-    return by_stem
+        images[view] = path
+    return images
 
 
 def image_size_hw(path: Path) -> tuple[int, int]:
     """Height and width of an image as stored, without reading its pixels.
 
     Raises:
-        ImageError: it is missing or no image.
+        ImageError: it is missing or not an image.
     """
     try:
         with Image.open(path) as image:
@@ -188,14 +188,16 @@ def image_size_hw(path: Path) -> tuple[int, int]:
     except FileNotFoundError as error:
         raise ImageError(f"image {path} is missing") from error
     except (UnidentifiedImageError, OSError) as error:
-        raise ImageError(f"image {path} cannot be read: {error}", fix="replace it by a whole copy") from error
+        raise ImageError(
+            f"image {path} cannot be read: {error}", fix="replace it with an intact copy"
+        ) from error
 
 
 def read_mask_file(path: Path, least: int) -> Bool[np.ndarray, "H W"]:
     """Foreground of a grey mask file: values of at least `least`.
 
     Raises:
-        ImageError: it is missing, cut off or no image.
+        ImageError: it is missing, truncated or not an image.
     """
     try:
         with Image.open(path) as image:
@@ -203,7 +205,9 @@ def read_mask_file(path: Path, least: int) -> Bool[np.ndarray, "H W"]:
     except FileNotFoundError as error:
         raise ImageError(f"mask {path} is missing") from error
     except (UnidentifiedImageError, OSError, SyntaxError) as error:
-        raise ImageError(f"mask {path} cannot be read: {error}", fix="replace it by a whole copy") from error
+        raise ImageError(
+            f"mask {path} cannot be read: {error}", fix="replace it with an intact copy"
+        ) from error
 
 
 def check_label_size(
@@ -212,13 +216,13 @@ def check_label_size(
     """Compare the size of a label with that of its image.
 
     Args:
-        where: the label, as a sentence begins.
+        where: the label, as the beginning of a sentence.
         label_hw: its height and width, px.
         image_hw: those of its image, px.
-        share: how far heights may differ at equal widths, beyond rounding, as a share.
+        share: how much heights may differ at equal widths, beyond rounding, as a share of the image's height.
 
     Returns:
-        None where they are equal, else the sentence that says that the label is resized.
+        None if they are equal, otherwise a sentence saying that the label is resized.
 
     Raises:
         SceneError: one is not a scaled copy of the other.
@@ -240,7 +244,8 @@ def check_label_size(
 
 
 def unlisted_texts(found: Iterable[str], published: Iterable[str]) -> str | None:
-    """A sentence on texts that the published list of the scene lacks, or None; an empty list says nothing."""
+    """A sentence naming texts missing from the scene's published list; None without any, or if the list is
+    empty."""
     published = set(published)
     new = sorted(set(found) - published)
     if not published or not new:
@@ -249,16 +254,16 @@ def unlisted_texts(found: Iterable[str], published: Iterable[str]) -> str | None
 
 
 def missing_frames(what: str, listed: Iterable[str], present: Iterable[str]) -> str | None:
-    """A sentence that names published frames without `what`, or None."""
+    """A sentence naming published frames without `what`, or None."""
     gone = sorted(set(listed) - set(present))
     return f"published frames without {what}: {', '.join(gone)}" if gone else None
 
 
 def posed_images(folder: Path, dataset: str) -> dict[str, KnownView]:
-    """Posed views of a scene folder by image stem, sorted by it.
+    """Posed views of a scene folder by view name, sorted by stem.
 
     Raises:
-        SceneError: the folder has no poses, they cannot be read, or their lenses are distorted, which
+        SceneError: the folder has no poses, they cannot be read, or their lenses are distorted, so that
             labels of undistorted images would not fit.
     """
     known = find_known_poses(folder)
@@ -277,7 +282,8 @@ def posed_images(folder: Path, dataset: str) -> dict[str, KnownView]:
             found=", ".join(bent),
             fix="take the model of the undistorted images, or undistort images and labels",
         )
-    return {Path(view.name).stem: view for view in sorted(views, key=lambda view: Path(view.name).stem)}
+    by_stem = {Path(view.name).stem: view for view in views}
+    return {view_name(stem): by_stem[stem] for stem in sorted(by_stem)}
 
 
 def _some(names: list[str]) -> str:

@@ -1,5 +1,5 @@
-"""What the `hilsplat datasets` command says: which data sets there are, which scenes are there, and whether
-they can be read."""
+"""What `hilsplat datasets` prints: the known data sets, the scenes that are present, and whether they can be
+read."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,18 +10,19 @@ from hilsplat.datasets.registry import DATASETS
 
 
 def overview(data_root: Path | None) -> str:
-    """All data sets with licence, citation and layout and, below a folder, the scenes that are there."""
+    """All data sets with licence, citation and layout, and the scenes present below a folder if one is
+    given."""
     return "\n\n".join(describe(dataset, data_root) for dataset in DATASETS.values())
 
 
 def describe(dataset: Dataset, data_root: Path | None) -> str:
-    """One data set, in lines."""
+    """Several lines that describe one data set."""
     lines = [
         f"{dataset.name}: {dataset.title}, labels on {dataset.labels}",
         f"  citation  {dataset.citation}",
         f"  licence   {dataset.licence}",
         f"  terms     {dataset.terms}",
-        f"  scenes    {', '.join(dataset.scenes) or 'all that are there'}",
+        f"  scenes    {', '.join(dataset.scenes) or 'all that are present'}",
     ]
     if data_root is not None:
         lines.extend(f"  {line}" for line in _presence(dataset, data_root))
@@ -31,12 +32,12 @@ def describe(dataset: Dataset, data_root: Path | None) -> str:
 
 
 def _presence(dataset: Dataset, data_root: Path) -> list[str]:
-    """What is there of a data set, and what of its scenes is missing."""
+    """The complete scenes of a data set, and what is missing from the others."""
     try:
         root = dataset.locate(data_root)
     except SceneError as error:
         return ["found     no scene", *(f"          {line}" for line in str(error).splitlines())]
-    lines = [f"found     {', '.join(dataset.found(root)) or 'no whole scene'} (in {root})"]
+    lines = [f"found     {', '.join(dataset.found(root)) or 'no complete scene'} (in {root})"]
     for scene in dataset.scenes:
         missing = dataset.missing(root, scene)
         if missing:
@@ -45,28 +46,27 @@ def _presence(dataset: Dataset, data_root: Path) -> list[str]:
 
 
 def check(dataset: Dataset, data_root: Path, scenes: Sequence[str] = ()) -> tuple[str, int]:
-    """Read scenes of a data set whole and tell what was found.
+    """Read whole scenes of a data set and report what was found.
 
     Args:
         dataset: the data set.
         data_root: folder that holds its folder.
-        scenes: scenes to read; where none is named, those of which anything is there.
+        scenes: scenes to read; by default those that are at least partly present.
 
     Returns:
         The report, and the number of scenes that cannot be read.
 
     Raises:
-        SceneError: the data set's folder is not there.
+        SceneError: the data set's folder is missing.
     """
     root = dataset.locate(data_root)
-    known = dataset.scenes or dataset.found(root)  # where the paper names none, those that are there
+    known = dict.fromkeys((*dataset.scenes, *dataset.found(root)))
     absent = [
         scene
         for scene in known
         if not scenes and set(dataset.missing(root, scene)) >= set(_own(dataset, scene))
     ]
     lines, num_failed = [], 0
-    known = dict.fromkeys((*dataset.scenes, *dataset.found(root)))
     for scene in scenes or [scene for scene in known if scene not in absent]:
         try:
             report = dataset.check(root, scene)
@@ -79,7 +79,7 @@ def check(dataset: Dataset, data_root: Path, scenes: Sequence[str] = ()) -> tupl
         lines.append(f"{dataset.name}/{scene}: {facts}")
         lines.extend(f"  warning   {sentence}" for sentence in report.warnings)
     if absent:
-        lines.append(f"{dataset.name}: not there: {', '.join(absent)}")
+        lines.append(f"{dataset.name}: missing: {', '.join(absent)}")
     return "\n".join(lines), num_failed
 
 

@@ -1,6 +1,6 @@
 """Frames and prompts of the image-labelled data sets, as far as they are published.
 
-Labels on disk always win: these lists tell what is missing, misspelt or of another release.
+Labels on disk always win: these lists serve to report what is missing, misspelt or from another release.
 
 Sources. `FRAMES`: LERF-OVS from the released labels (minghanqin/LangSplat); 3D-OVS from third-party
 loaders, bed, bench and lawn from a second repository too; Hi-LERF and Hi-3DOVS from the table of the
@@ -10,45 +10,56 @@ code; those of blue_sofa, snacks and office_desk from figure captions of the Lan
 incomplete; covered_desk and table: none.
 """
 
+from hilsplat.scene.features import view_name
+
+
+def _lerf(*numbers: int) -> tuple[str, ...]:
+    return tuple(view_name(f"frame_{number:05d}") for number in numbers)
+
+
+def _ovs(*numbers: int) -> tuple[str, ...]:
+    return tuple(view_name(f"{number:02d}") for number in numbers)
+
+
 FRAMES: dict[str, dict[str, tuple[str, ...]]] = {
     "lerf_ovs": {
-        "figurines": tuple(f"frame_{n:05d}" for n in (41, 105, 152, 195)),
-        "ramen": tuple(f"frame_{n:05d}" for n in (6, 24, 60, 65, 81, 119, 128)),
-        "teatime": tuple(f"frame_{n:05d}" for n in (2, 25, 43, 107, 129, 140)),
-        "waldo_kitchen": tuple(f"frame_{n:05d}" for n in (53, 66, 89, 140, 154)),
+        "figurines": _lerf(41, 105, 152, 195),
+        "ramen": _lerf(6, 24, 60, 65, 81, 119, 128),
+        "teatime": _lerf(2, 25, 43, 107, 129, 140),
+        "waldo_kitchen": _lerf(53, 66, 89, 140, 154),
     },
     "3d_ovs": {
-        "bed": tuple(f"{n:02d}" for n in (0, 4, 10, 23, 30)),
-        "bench": tuple(f"{n:02d}" for n in (2, 5, 25, 27, 32)),
-        "blue_sofa": tuple(f"{n:02d}" for n in (3, 5, 13, 24, 27)),
-        "covered_desk": tuple(f"{n:02d}" for n in (0, 1, 11, 26, 29)),
-        "lawn": tuple(f"{n:02d}" for n in (1, 3, 9, 13, 29)),
-        "office_desk": tuple(f"{n:02d}" for n in (3, 7, 12, 14, 20)),
-        "room": tuple(f"{n:02d}" for n in (0, 4, 19, 25, 30)),
-        "snacks": tuple(f"{n:02d}" for n in (4, 8, 18, 26, 40)),
-        "sofa": tuple(f"{n:02d}" for n in (2, 4, 10, 15, 22)),
-        "table": tuple(f"{n:02d}" for n in (0, 2, 14, 26, 30)),
+        "bed": _ovs(0, 4, 10, 23, 30),
+        "bench": _ovs(2, 5, 25, 27, 32),
+        "blue_sofa": _ovs(3, 5, 13, 24, 27),
+        "covered_desk": _ovs(0, 1, 11, 26, 29),
+        "lawn": _ovs(1, 3, 9, 13, 29),
+        "office_desk": _ovs(3, 7, 12, 14, 20),
+        "room": _ovs(0, 4, 19, 25, 30),
+        "snacks": _ovs(4, 8, 18, 26, 40),
+        "sofa": _ovs(2, 4, 10, 15, 22),
+        "table": _ovs(0, 2, 14, 26, 30),
     },
     "hi_lerf": {
-        "figurines": tuple(f"frame_{n:05d}" for n in (16, 41, 60, 105, 122, 152, 176, 195, 226, 260)),
-        "ramen": tuple(f"frame_{n:05d}" for n in (6, 24, 42, 60, 65, 81, 94, 104, 119, 128)),
-        "teatime": tuple(f"frame_{n:05d}" for n in (2, 25, 43, 107, 116, 125, 129, 140, 158, 180)),
-        "waldo_kitchen": tuple(f"frame_{n:05d}" for n in (10, 20, 33, 53, 66, 89, 125, 140, 154, 186)),
+        "figurines": _lerf(16, 41, 60, 105, 122, 152, 176, 195, 226, 260),
+        "ramen": _lerf(6, 24, 42, 60, 65, 81, 94, 104, 119, 128),
+        "teatime": _lerf(2, 25, 43, 107, 116, 125, 129, 140, 158, 180),
+        "waldo_kitchen": _lerf(10, 20, 33, 53, 66, 89, 125, 140, 154, 186),
     },
     "hi_3dovs": {
-        "bed": tuple(f"{n:02d}" for n in (1, 6, 11, 20, 28, 36)),
-        "bench": tuple(f"{n:02d}" for n in (2, 5, 25, 27, 32, 35)),
-        "blue_sofa": tuple(f"{n:02d}" for n in (3, 5, 13, 24, 27, 29)),
-        "covered_desk": tuple(f"{n:02d}" for n in (0, 11, 15, 21, 26, 30)),
-        "lawn": tuple(f"{n:02d}" for n in (1, 3, 9, 13, 29, 35)),
-        "office_desk": tuple(f"{n:02d}" for n in (3, 7, 12, 14, 20, 26)),
-        "room": tuple(f"{n:02d}" for n in (0, 4, 10, 19, 25, 30)),
-        "snacks": tuple(f"{n:02d}" for n in (4, 8, 16, 26, 36, 40)),
-        "sofa": tuple(f"{n:02d}" for n in (2, 4, 10, 15, 22, 27)),
-        "table": tuple(f"{n:02d}" for n in (0, 2, 14, 26, 30, 31)),
+        "bed": _ovs(1, 6, 11, 20, 28, 36),
+        "bench": _ovs(2, 5, 25, 27, 32, 35),
+        "blue_sofa": _ovs(3, 5, 13, 24, 27, 29),
+        "covered_desk": _ovs(0, 11, 15, 21, 26, 30),
+        "lawn": _ovs(1, 3, 9, 13, 29, 35),
+        "office_desk": _ovs(3, 7, 12, 14, 20, 26),
+        "room": _ovs(0, 4, 10, 19, 25, 30),
+        "snacks": _ovs(4, 8, 16, 26, 36, 40),
+        "sofa": _ovs(2, 4, 10, 15, 22, 27),
+        "table": _ovs(0, 2, 14, 26, 30, 31),
     },
 }
-"""Labelled frames by data set and scene, as stems of image files."""
+"""Labelled frames by data set and scene, as names of views."""
 
 PROMPTS: dict[str, dict[str, tuple[str, ...]]] = {
     "lerf_ovs": {

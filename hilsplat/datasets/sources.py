@@ -1,6 +1,7 @@
-"""Rows of the scene sheet that name a published data set: what is there of it, which files label it.
+"""Rows of the scene sheet that name a published data set: what is present of it, and which files hold its
+labels.
 
-The workflow asks this module at start-up, so it reads no data and imports nothing heavy at its top.
+The workflow uses this module at start-up, so it reads no data and imports nothing heavy at the top.
 """
 
 from pathlib import Path
@@ -10,7 +11,7 @@ from hilsplat.base.errors import SceneError
 DATA_PREFIX = "data:"
 
 LABELS_ON: dict[str, tuple[str, ...]] = {"lerf_ovs": ("hi_lerf",), "3d_ovs": ("hi_3dovs",)}
-"""Data sets that label the images of another one, beside its own labels."""
+"""Data sets that label the images of another one, in addition to its own labels."""
 
 
 def published(source: str) -> tuple[str, str] | None:
@@ -22,11 +23,11 @@ def published(source: str) -> tuple[str, str] | None:
 
 
 def absence(source: str, data_root: str) -> str | None:
-    """Why a `data:` source cannot be used, as one sentence; None where it can.
+    """Why a `data:` source cannot be used, as one sentence; None if it can.
 
     Args:
         source: of a row of the scene sheet.
-        data_root: folder of the data sets; empty where it is not set.
+        data_root: folder of the data sets; empty if not set.
     """
     if not source.startswith(DATA_PREFIX):
         return None
@@ -48,7 +49,8 @@ def absence(source: str, data_root: str) -> str | None:
 
 
 def label_sets(source: str, data_root: str) -> tuple[str, ...]:
-    """Labels that a scene can be scored against, as `data set/scene`, its own first; none without data."""
+    """Labels that a scene can be scored against, as `data set/scene`, its own first; none if the data is
+    missing."""
     place = published(source)
     if place is None or absence(source, data_root) is not None:
         return ()
@@ -65,7 +67,7 @@ def label_sets(source: str, data_root: str) -> tuple[str, ...]:
 
 
 def label_files(labels: str, data_root: str) -> tuple[Path, ...]:
-    """Files of `data set/scene` that only evaluation reads, sorted: an edited one reruns nothing else."""
+    """Files of `data set/scene` that only evaluation reads, sorted: editing one reruns nothing else."""
     from hilsplat.datasets.registry import dataset_of
 
     name, _, scene = labels.partition("/")
@@ -78,7 +80,8 @@ def label_files(labels: str, data_root: str) -> tuple[Path, ...]:
 
 
 def image_files(source: str, data_root: str) -> tuple[Path, ...]:
-    """Files that images and poses of an exported scene are read from, as far as the data set names them."""
+    """Files from which the images and poses of an exported scene are read, as far as the data set names
+    them."""
     from hilsplat.datasets.registry import dataset_of
 
     place = published(source)
@@ -95,7 +98,8 @@ def image_files(source: str, data_root: str) -> tuple[Path, ...]:
 
 
 def is_exported(source: str) -> bool:
-    """Whether images and poses are first written out of the data set's own files: labels are on points."""
+    """Whether images and poses must first be exported from the data set's own files, as with labels on
+    points."""
     place = published(source)
     if place is None:
         return False
@@ -107,8 +111,8 @@ def is_exported(source: str) -> bool:
 def export_images(name: str, data_root: Path, out: Path) -> int:
     """Write images and poses of a scene with labelled points as a folder that `poses` imports.
 
-    The vertices of a labelled mesh go with them, without their labels: Gaussians start there, and may be
-    frozen there. Lidar points do not, as the sky and all that is far has none.
+    The vertices of a labelled mesh are written too, without their labels: Gaussians start there, and may be
+    frozen there. Lidar points are not written, since the sky and everything far away has none.
 
     Args:
         name: `data set/scene`.
@@ -128,7 +132,7 @@ def export_images(name: str, data_root: Path, out: Path) -> int:
     scene = open_labels(name, data_root)
     if not isinstance(scene, PointScene):
         raise SceneError(
-            f"{name} needs no export: its images lie in a folder",
+            f"{name} needs no export: its images are already in a folder",
             fix="name the folder as source in the scene sheet",
         )
     meshes = [points for points in scene.truth.values() if points.faces is not None]
@@ -137,5 +141,5 @@ def export_images(name: str, data_root: Path, out: Path) -> int:
 
 
 def _one_line(error: SceneError) -> str:
-    """First line of a message and what was found, as one sentence for a log or a footnote."""
+    """A message as one line, for a log or a footnote."""
     return "; ".join(" ".join(line.split()) for line in str(error).splitlines())

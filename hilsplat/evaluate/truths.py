@@ -38,8 +38,9 @@ def labelled_truths(labels: LabelledScene, posed: Scene) -> dict[str, Callable[[
     for sentence in labels.warnings:
         logger.warning("%s/%s: %s", labels.dataset, labels.scene, sentence)
     truths: dict[str, Callable[[], ViewTruth]] = {}
-    for stem, view in labels.posed_views(posed.cameras.names).items():
-        size_hw, regions = posed.cameras[view].size_hw, labels.views[stem]
+    labels.check_posed(posed.cameras.names)
+    for view, regions in labels.views.items():
+        size_hw = posed.cameras[view].size_hw
         for label_hw in sorted({region.size_hw for region in regions}):
             departure = check_label_size(f"a label of view {view}", label_hw, size_hw, SHAPE_TOLERANCE)
             if departure:

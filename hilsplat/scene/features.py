@@ -53,6 +53,11 @@ class WorkImage:
     focal_px: float | None
 
 
+def view_name(stem: str) -> str:
+    """Name of the view made from an image file of this stem ("DSC_1" -> "DSC_1.png")."""
+    return f"{stem}.png"
+
+
 def view_names(sources: Sequence[Path]) -> list[str]:
     """View names of image files: the file name with the suffix .png ("DSC_1.jpg" -> "DSC_1.png").
 
@@ -69,7 +74,7 @@ def view_names(sources: Sequence[Path]) -> list[str]:
     owners: dict[str, list[Path]] = defaultdict(list)
     for source in sources:
         apart = source.stem in by_folder and same_folder[source.parent, source.stem] == 1
-        name = f"{source.parent.name}_{source.stem}.png" if apart else f"{source.stem}.png"
+        name = view_name(f"{source.parent.name}_{source.stem}" if apart else source.stem)
         owners[name].append(source)
         names.append(name)
     for name, files in owners.items():

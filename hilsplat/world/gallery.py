@@ -35,7 +35,7 @@ OBJECTS = 7
 AZIMUTH_DEG = 25.0
 ELEVATION_DEG = 30.0
 RADIUS = 0.36
-"""Radius that a class is scaled to on its picture; one that is tall is scaled by its height."""
+"""Radius to which a class is scaled in its picture; tall ones are scaled by their height."""
 
 _GROUND = Paint(
     "grey", "mottled", (0.66, 0.66, 0.64), (0.63, 0.63, 0.61), 3.0, 0.0, 10.0, 0.1, (5.0, 6.0, 7.0)
@@ -60,7 +60,7 @@ def draw_classes(out: Path, names: Sequence[str] = TABLETOP, seed: int = 0) -> N
 
 
 def _alone(model: ObjectModel) -> tuple[WorldScene, Camera]:
-    """A scene that holds one object on a plain ground, and a camera that the object fills."""
+    """A scene with one object on plain ground, and a camera whose view it fills."""
     centre, radius = footprint_of(model.triangles)
     height = float(model.triangles[..., 2].max())
     scale = min(RADIUS / radius, 2.7 * RADIUS / height)
@@ -120,7 +120,7 @@ def draw_scenes(kind: str, seeds: Sequence[int], out: Path) -> None:
 
 
 def _filled(labels: Int32[np.ndarray, "3 H W"], level: Level) -> Int32[np.ndarray, "H W"]:
-    """Node per pixel at a level; where it has none, that of the level above."""
+    """Node per pixel at a level; if it has none, that of the level above."""
     image = labels[0]
     for finer in range(1, level.index + 1):
         image = np.where(labels[finer] >= 0, labels[finer], image)
@@ -128,7 +128,7 @@ def _filled(labels: Int32[np.ndarray, "3 H W"], level: Level) -> Int32[np.ndarra
 
 
 def _write(figure: "Figure", out: Path) -> None:
-    """Write a figure as PNG with a dithered palette of 256 colours: half the size, for pages that show it."""
+    """Write a figure as PNG with a dithered palette of 256 colours: half the size, for web pages."""
     from PIL import Image
 
     full = BytesIO()

@@ -1,8 +1,8 @@
 """A scan of a synthetic street by a spinning laser scanner on the roof of the car (metres).
 
-It stands in for the top lidar of the Waymo data: 64 beams between 17.6 degrees below the horizon and
-2.4 above. Rays are cast exactly; then each range gets noise, and some returns are lost. Points keep the
-true place of the scanner, as a logged drive does: its poses are not estimated from the images.
+It stands in for the top lidar of the Waymo data: 64 beams between 17.6 degrees below the horizon and 2.4
+above. Rays are cast exactly; then each range gets noise, and some returns are lost. The scanner's true
+positions are kept, as in a logged drive: they are not estimated from the images.
 """
 
 from dataclasses import dataclass
@@ -17,29 +17,29 @@ from hilsplat.world.scenes.scene import WorldScene
 
 BEAMS = 64
 INCLINATION_DEG = (-17.6, 2.4)
-"""Lowest and highest beam, as of Waymo's top lidar."""
+"""Lowest and highest beam, as in Waymo's top lidar."""
 AZIMUTH_STEPS = 400
 """Directions per turn; Waymo has 2650."""
 POSES = 5
-"""Places along the drive where a turn is recorded."""
+"""Positions along the drive at which a turn is recorded."""
 ABOVE_CAMERA_M = 0.35
 MAX_RANGE_M = 75.0
 RANGE_NOISE_M = 0.015
 """Standard deviation of a range."""
 LOST_SHARE = 0.05
-"""Returns that are missing for no reason."""
+"""Share of returns that are lost at random."""
 GLANCING_COSINE = 0.03
-"""A beam that meets a surface more flatly is not returned."""
+"""A beam that meets a surface at a flatter angle is not returned."""
 
 
 @dataclass(frozen=True, eq=False)
 class LidarScan:
-    """P points that a scanner measured, and what is true of each.
+    """P measured points, with the truth about each.
 
     Attributes:
-        points: places in the world of the true cameras, noise included, metres.
+        points: positions in the world of the true cameras, noise included, metres.
         node_ids: nodes that were hit (whole, part, subpart; -1 none).
-        pose_index: row of `origins` that each point was measured from.
+        pose_index: row of `origins` from which each point was measured.
         range_m: measured distance to that origin.
         beam: which of the 64 beams, 0 the lowest.
         origins: where the scanner was.
@@ -81,10 +81,10 @@ def scan_street(
     range_noise_m: float = RANGE_NOISE_M,
     lost_share: float = LOST_SHARE,
 ) -> LidarScan:
-    """Scan a scene from some of the places where its views were taken.
+    """Scan a scene from some of the positions of its views.
 
     Args:
-        scene: its seed is that of noise and losses; the sky returns nothing.
+        scene: its seed also determines noise and losses; the sky returns nothing.
         camera_centres: along the drive, in order; the scanner is above evenly chosen ones.
         azimuth_steps: directions per turn of each beam.
         poses: number of turns recorded.

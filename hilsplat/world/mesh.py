@@ -13,6 +13,16 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.scene.cameras import Camera
 
 
+def ray_caster(triangles: Float32[np.ndarray, "F 3 3"]) -> Any:
+    """Embree's structure for casting rays at triangles (embreex has no types)."""
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    scene = EmbreeScene()
+    TriangleMesh(scene, triangles)
+    return scene
+
+
 @dataclass(frozen=True, eq=False)
 class TrueMesh:
     """The triangles of a scene, in the frame of its true cameras.
@@ -28,7 +38,7 @@ class TrueMesh:
         """Read `truth/mesh.ply`.
 
         Raises:
-            ArtifactError: it is missing or no mesh.
+            ArtifactError: it is missing or not a mesh.
         """
         try:
             record = PlyData.read(path)
@@ -45,20 +55,15 @@ class TrueMesh:
     @cached_property
     def embree(self) -> Any:
         """Ray-casting structure, built on first use."""
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-
-        scene = EmbreeScene()
-        TriangleMesh(scene, self.triangles)
-        return scene
+        return ray_caster(self.triangles)
 
     def depth(self, camera: Camera) -> Float32[np.ndarray, "H W"]:
-        """Depth along the optical axis at each pixel's centre, scene units; inf where nothing is."""
+        """Depth along the optical axis at each pixel's centre, scene units; inf where there is nothing."""
         height, width = camera.size_hw
         y, x = np.mgrid[:height, :width] + 0.5
         pixels = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
         rotation = camera.cam_from_world[:3, :3]
-        # directions of depth 1: the distance that Embree returns then is the depth
+        # directions of depth 1, so the distance that Embree returns is the depth
         directions = (pixels @ np.linalg.inv(camera.K).T @ rotation).astype(np.float32)
         origins = np.ascontiguousarray(np.broadcast_to(camera.centre.astype(np.float32), directions.shape))
         hit = self.embree.run(origins, directions, query="INTERSECT", output=True)

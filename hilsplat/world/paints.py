@@ -1,10 +1,13 @@
-"""Colours and solid materials that the objects of the synthetic world are made of."""
+"""Colours and solid materials of the objects of the synthetic world."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
+
+Colour = tuple[float, float, float]
 
 KINDS = (
     "mottled",
@@ -20,9 +23,9 @@ KINDS = (
     "fur",
     "tiles",
 )
-"""Solid textures, by the number that the shader knows them under."""
+"""Solid textures, in the order of the shader's numbers."""
 
-COLOURS: dict[str, tuple[float, float, float]] = {
+COLOURS: dict[str, Colour] = {
     "red": (0.78, 0.14, 0.12),
     "orange": (0.90, 0.47, 0.10),
     "yellow": (0.92, 0.77, 0.18),
@@ -51,7 +54,7 @@ ADJECTIVES: dict[str, str] = {
     "fur": "furry",
     "tiles": "tiled",
 }
-"""How a text calls a thing with such a texture; a kind that is not here has no word."""
+"""Word in a text for a thing with such a texture; other kinds have none."""
 
 SECOND_SHARE: dict[str, float] = {
     "mottled": 0.47,
@@ -86,7 +89,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], float, float]] = {
 }
 
 PATTERNS = ("stripes", "checks", "spots")
-"""Kinds whose second colour may be another than a shade of the first."""
+"""Kinds whose second colour may be something other than a shade of the first."""
 
 PATTERN_CONTRAST = 22.0
 """Least distance between the two colours of a pattern, in L*a*b*."""
@@ -108,13 +111,13 @@ class Paint:
         shininess: Blinn-Phong exponent.
         grain: relative amplitude of the fine grain (structure from motion needs it).
         offset: shift of the texture, scene units; keeps cell borders off object faces.
-        choices: colour words that the thing may have; none: any.
+        choices: colour words that the thing may have; empty for any.
     """
 
     colour: str
     kind: str
-    first: tuple[float, float, float]
-    second: tuple[float, float, float]
+    first: Colour
+    second: Colour
     scale: float
     specular: float
     shininess: float
@@ -124,7 +127,7 @@ class Paint:
 
     @property
     def adjective(self) -> str | None:
-        """Word for the texture, where there is one."""
+        """Word for the texture, if there is one."""
         return ADJECTIVES.get(self.kind)
 
     @property
@@ -137,20 +140,18 @@ class Paint:
     def paled(self, share: float) -> "Paint":
         """The same paint with both colours mixed with a light grey by `share`, and its word."""
 
-        def mixed(colour: tuple[float, float, float]) -> tuple[float, float, float]:
-            return tuple((1 - share) * value + share * 0.68 for value in colour)
+        def mixed(value: float) -> float:
+            return (1 - share) * value + share * 0.68
 
-        return self._called(replace(self, first=mixed(self.first), second=mixed(self.second)))
+        return self._changed(mixed)
 
     def shaded(self, factor: float) -> "Paint":
         """The same paint darker (factor below 1) or nearer to white (above 1), and its word."""
 
-        def moved(colour: tuple[float, float, float]) -> tuple[float, float, float]:
-            if factor <= 1:
-                return tuple(max(0.03, factor * value) for value in colour)
-            return tuple(value + (factor - 1) * (0.95 - value) for value in colour)
+        def moved(value: float) -> float:
+            return max(0.03, factor * value) if factor <= 1 else value + (factor - 1) * (0.95 - value)
 
-        return self._called(replace(self, first=moved(self.first), second=moved(self.second)))
+        return self._changed(moved)
 
     def recoloured(self, word: str) -> "Paint":
         """The same texture in another colour, with a second colour a shade away from it."""
@@ -158,8 +159,10 @@ class Paint:
         second = _relative(first)
         return replace(self, colour=word, first=tuple(first.tolist()), second=tuple(second.tolist()))
 
-    @staticmethod
-    def _called(paint: "Paint") -> "Paint":
+    def _changed(self, change: Callable[[float], float]) -> "Paint":
+        """The paint with a change of each channel of both colours, and its word."""
+        first, second = each_channel(self.first, change), each_channel(self.second, change)
+        paint = replace(self, first=first, second=second)
         return replace(paint, colour=colour_word(paint.seen))
 
     def row(self) -> Float[np.ndarray, " 14"]:
@@ -182,6 +185,12 @@ class Paint:
             ],
             dtype=np.float32,
         )
+
+
+def each_channel(colour: Colour, change: Callable[[float], float]) -> Colour:
+    """The colour with a change made to each channel."""
+    red, green, blue = colour
+    return change(red), change(green), change(blue)
 
 
 def linear_from_srgb(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -250,7 +259,7 @@ class PaintBox:
 
         Args:
             group: one of `GROUPS`.
-            colours: colour words to choose from; none: any that was not used yet.
+            colours: colour words to choose from; by default any not used yet.
             scale: factor on the pattern's number of cells per unit.
         """
         rng = self._rng
@@ -289,9 +298,9 @@ class PaintBox:
         return self._left
 
     def _patterned(self, paint: Paint) -> Paint:
-        """The paint with a second colour that shows, yet leaves its prevailing colour the same word.
+        """The paint with a visible second colour that does not change the word for its prevailing colour.
 
-        Another word would be a lie of the texts: "red mug" for what looks brown from afar.
+        A changed word would make the texts wrong: "red mug" for what looks brown from afar.
         """
         first = np.array(paint.first)
         for word in self._rng.permutation(list(COLOURS)):

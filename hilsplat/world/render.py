@@ -3,7 +3,7 @@
 Soft shadows and ambient occlusion take fixed directions: sub-sample k of every pixel looks at
 stratum k of the light and of the hemisphere, moved a little by a hash of the surface point. A point
 therefore looks the same in every view; random rays would put grain into the shadows that differs
-from view to view, and the Gaussians would average it to mud.
+from view to view, and the Gaussians would average it to a blur.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Which scene seeds train the small models, which are for development, which are the benchmark."""
+"""Which scene seeds are for training the small models, which for development, and which for the benchmark."""
 
 from hilsplat.base.errors import SceneError
 
@@ -18,7 +18,7 @@ def split_of_seed(seed: int) -> str:
     """Name of the split a scene seed belongs to.
 
     Returns:
-        "training", "development", "benchmark", or "free" for a seed of no split.
+        "training", "development", "benchmark", or "free" for a seed in no split.
     """
     for split, seeds in SPLITS.items():
         if seed in seeds:
@@ -27,7 +27,7 @@ def split_of_seed(seed: int) -> str:
 
 
 def require_split(seed: int, split: str) -> None:
-    """Refuse a scene seed that is not of the split.
+    """Refuse a scene seed that is not in the split.
 
     Raises:
         SceneError: the seed belongs to another split, or the split is unknown.
@@ -37,7 +37,7 @@ def require_split(seed: int, split: str) -> None:
     if seed not in SPLITS[split]:
         seeds = SPLITS[split]
         raise SceneError(
-            f"scene seed {seed} is not of the {split} split",
+            f"scene seed {seed} is not in the {split} split",
             expected=f"{seeds.start} to {seeds.stop - 1}",
             found=f"{seed}, split {split_of_seed(seed)}",
             fix="take a seed of the split: trained-on scenes must not be evaluated, nor the reverse",

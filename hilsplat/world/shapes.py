@@ -68,7 +68,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def _flat(triangles: np.ndarray) -> Mesh:
-    """Flat-shaded mesh: each corner takes the normal of its triangle; degenerate triangles go."""
+    """Flat-shaded mesh: each corner takes the normal of its triangle; degenerate triangles are dropped."""
     triangles = np.asarray(triangles, dtype=np.float64)
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     keep = np.linalg.norm(normal, axis=1) > 1e-12
@@ -116,7 +116,7 @@ def _box_corners(bevelled: bool) -> tuple[Float[np.ndarray, "T 3 3"], Float[np.n
         b, c = (axis + 1) % 3, (axis + 2) % 3
         for sign in (-1.0, 1.0):
             quad = []
-            for sb, sc in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+            for sb, sc in ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)):
                 signs = np.empty(3)
                 signs[axis], signs[b], signs[c] = sign, sb, sc
                 quad.append(corner(signs, axis))

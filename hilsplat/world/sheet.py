@@ -92,7 +92,7 @@ def contact_sheet(truth_folder: Path, images_folder: Path, path: Path) -> None:
 def _panel(
     truth: HierarchyAnnotations, view: str, level: Level, colours: UInt8[np.ndarray, "N 3"]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Labels of a level as colours; where it has no node, the whole is hinted at in dark grey."""
+    """Labels of a level as colours; if it has no node, the whole is shown in dark grey."""
     labels = truth.label_image(view, level)
     panel = coloured(labels, colours)
     whole = coloured(truth.label_image(view, Level.WHOLE), colours).mean(axis=-1, keepdims=True)

@@ -27,8 +27,8 @@ from hilsplat.world.truth import annotated_nodes, smallest_areas, write_mesh
 logger = logging.getLogger(__name__)
 
 MESH_EDGE: dict[str, float] = {"room": 0.08}
-"""Longest edge of the true mesh, scene units, for kinds of scene whose vertices are scored; others keep
-the triangles they were built of."""
+"""Longest edge of the true mesh, scene units, for kinds of scene whose vertices are scored; other kinds keep
+their original triangles."""
 
 
 def parse_source(source: str) -> tuple[str, int]:
@@ -38,13 +38,13 @@ def parse_source(source: str) -> tuple[str, int]:
         Kind of scene and its seed.
 
     Raises:
-        SceneError: it is written otherwise, the kind is unknown, or the seed is one that the small
-            models were trained on.
+        SceneError: it has a different form, the kind is unknown, or the seed is one that the small models
+            were trained on.
     """
     words = source.split(":")
     if len(words) != 3 or words[0] != "world" or words[1] not in KINDS or not words[2].isdecimal():
         raise SceneError(
-            f"source {source!r} names no synthetic scene",
+            f"source {source!r} does not name a synthetic scene",
             expected=f"world:<kind>:<seed>, where kind is one of: {', '.join(KINDS)}",
             fix="correct the source in the scene sheet, as in world:tabletop:201",
         )
@@ -61,13 +61,13 @@ def parse_source(source: str) -> tuple[str, int]:
 def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> None:
     """Render a synthetic scene and write what is true of it.
 
-    Writes two folders, each whole or absent: `out/images` (000.png, 001.png, ...), which is all that
-    the next stages see, and `out/truth` (annotations.json and labels/ in the hierarchy format,
-    cameras.npz, mesh.ply, scene.json, of a street also lidar.npz), which only `evaluate` may read. The
-    bytes depend on source and settings, not on `threads`.
+    Writes two folders, each complete or absent: `out/images` (000.png, 001.png, ...), which is all that the
+    next stages see, and `out/truth` (annotations.json and labels/ in the hierarchy format, cameras.npz,
+    mesh.ply, scene.json, of a street also lidar.npz), which only `evaluate` may read. The bytes depend on
+    source and settings, not on `threads`.
 
     Raises:
-        SceneError: the source names no scene, or nothing found a place in it.
+        SceneError: the source does not name a scene, or no object found a place in it.
         DiskSpaceError: the disk is too full.
     """
     kind, seed = parse_source(source)

@@ -1,4 +1,4 @@
-"""What is true of a synthetic scene: annotated regions per view, and its mesh with node ids."""
+"""The truth about a synthetic scene: annotated regions per view, and its mesh with node ids."""
 
 from collections import defaultdict
 from collections.abc import Collection
@@ -17,7 +17,7 @@ MIN_SUBPART_AREA = 100 / 384**2
 """Subparts with a smaller visible region, as a share of the view, are not scored: 100 px of 384 x 384."""
 
 HIDDEN_BY = 2e-3
-"""A point counts as hidden where something is nearer to the camera by this share of its distance."""
+"""A point counts as hidden if something is nearer to the camera by this share of its distance."""
 
 
 def smallest_areas(image_px: int, min_area_px: int) -> dict[Level, float | int]:
@@ -42,9 +42,9 @@ def annotated_nodes(
 ) -> tuple[int, ...]:
     """Nodes that are scored in a view.
 
-    Nodes that share a text (four legs) answer one query, so their regions are judged together: where
-    the union is large enough all that are visible are annotated, else none. A single large leg with
-    three small ones left out would make the true region wrong.
+    Nodes that share a text (four legs) answer one query, so their regions are judged together: if the union
+    is large enough, all visible ones are annotated, otherwise none. A single large leg with three small ones
+    left out would make the true region wrong.
 
     Args:
         labels: node id per level and pixel, -1 for none.
@@ -73,11 +73,10 @@ def annotated_nodes(
 def write_mesh(path: Path, scene: WorldScene, cameras: Cameras, longest_edge: float | None = None) -> None:
     """Write the scene as binary PLY, with node ids of faces and of vertices.
 
-    Vertices have x, y, z, the ids `whole`, `part` and `subpart` (-1 none) and `views`, the number of
-    cameras that see them (at most 255); faces have the same three ids. Corners at the same place are
-    one vertex where their faces agree in all ids: at a border each side has its own. Protocols that
-    score vertices, as ScanNet's does, need vertices of even density that a camera saw: a wall of two
-    triangles has four.
+    Vertices have x, y, z, the ids `whole`, `part` and `subpart` (-1 none) and `views`, the number of cameras
+    that see them (at most 255); faces have the same three ids. Corners at the same position are one vertex if
+    their faces agree in all ids: at a border each side has its own. Protocols that score vertices, as
+    ScanNet's does, need vertices of even density that a camera saw: a wall of two triangles has four.
 
     Args:
         path: file to write.
@@ -89,7 +88,7 @@ def write_mesh(path: Path, scene: WorldScene, cameras: Cameras, longest_edge: fl
     if longest_edge is not None:
         triangles, owner = refined(triangles, longest_edge)
     ids = scene.node_ids[owner]
-    # Ids in front of the place: float32 holds them exactly up to 2**24.
+    # Ids before the position: float32 holds them exactly up to 2**24.
     rows = np.concatenate([np.repeat(ids, 3, axis=0).astype(np.float32), triangles.reshape(-1, 3)], axis=1)
     unique, index = np.unique(rows, axis=0, return_inverse=True)
     vertices = np.empty(

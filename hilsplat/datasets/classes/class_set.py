@@ -1,4 +1,4 @@
-"""Sets of classes that points are labelled with."""
+"""Sets of classes for labelled points."""
 
 from dataclasses import dataclass
 
@@ -26,7 +26,7 @@ class ClassSet:
         return len(self.ids)
 
     def labels(self, file_labels: Int[np.ndarray, " P"]) -> Int32[np.ndarray, " P"]:
-        """Labels 1 .. K of points, from the data set's labels; 0 where the set lacks the class."""
+        """Labels 1 .. K of points, from the data set's labels; 0 if the set lacks the class."""
         order = np.argsort(self.ids)
         known = np.asarray(self.ids)[order]
         place = np.minimum(np.searchsorted(known, file_labels), len(known) - 1)

@@ -1,14 +1,16 @@
 """Hi-LERF and Hi-3DOVS: labels at three levels on images of LERF-OVS and 3D-OVS.
 
-The paper publishes frames and levels but no labels and no format. Ours is the label file of LERF-OVS with
-three more keys per object: `id`, unique in the file; `level`, 1 whole, 2 part, 3 subpart; `parent`, the id
-of an object one level up, or null. `segmentation` may be a list of polygons. Images are those of the other
-data set, in its folder beside this one.
+The paper publishes frames and levels but no labels and no format. Our format is the label file of LERF-OVS
+with three more keys per object: `id`, unique in the file; `level`, 1 whole, 2 part, 3 subpart; `parent`, the
+id of an object one level up, or null. `segmentation` may be a list of polygons. The images are those of the
+other data set, whose folder is beside this one.
 
-A frame without image or label, a parent that is none, a child outside its parent: reported, never fatal.
+A frame without an image or a label, an invalid parent, or a child outside its parent is reported, never
+fatal.
 """
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,24 +25,24 @@ from hilsplat.datasets.labelled import (
     LabelledScene,
     check_label_size,
     image_size_hw,
-    images_by_stem,
+    images_by_view,
     missing_frames,
 )
 from hilsplat.datasets.published import FRAMES
 
 IMAGES_OF = {"hi_lerf": "lerf_ovs", "hi_3dovs": "3d_ovs"}
-"""Folder of the images of each, beside its own."""
+"""Folder with the images of each data set, beside its own."""
 
 OUTSIDE_SHARE = 0.01
-"""So much of a child may lie outside its parent: rasterised borders."""
+"""This share of a child may be outside its parent, because borders are rasterised."""
 
 
 def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
-    """Read the labels of a scene: one region per object, several may share a text.
+    """Read the labels of a scene: one region per object; several may share a text.
 
     Args:
         dataset: "hi_lerf" or "hi_3dovs".
-        root: the folder of that name; the images' data set lies beside it.
+        root: the folder of that name; the images' data set is beside it.
         scene: such as "figurines".
 
     Raises:
@@ -49,7 +51,7 @@ def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
     root = Path(root)
     HI_DATASETS[dataset].require(root, scene)
     source = root.parent / IMAGES_OF[dataset] / scene
-    images = images_by_stem(source / "images")
+    images = images_by_view(source / "images")
     warnings: list[str] = []
     views: dict[str, tuple[LabelledRegion, ...]] = {}
     files = label_files(root / "label" / scene)
@@ -69,7 +71,7 @@ def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
             LabelledRegion(
                 thing.category,
                 labels.size_hw,
-                lambda thing=thing, size_hw=labels.size_hw: thing.mask(size_hw),
+                partial(thing.mask, labels.size_hw),
                 thing.box_xyxy[None],
                 Level(thing.keys["level"]),
                 path_of(number, objects, parents),
@@ -89,7 +91,7 @@ def by_id(labels: IsatFile) -> dict[int, IsatObject]:
     """Objects of a file by `id`.
 
     Raises:
-        SceneError: an id is missing or taken, or a level is not 1, 2 or 3.
+        SceneError: an id is missing or repeated, or a level is not 1, 2 or 3.
     """
     objects: dict[int, IsatObject] = {}
     for row, thing in enumerate(labels.objects):
@@ -98,7 +100,7 @@ def by_id(labels: IsatFile) -> dict[int, IsatObject]:
         if type(number) is not int or number in objects:
             raise SceneError(
                 f"{where}: id cannot be used",
-                expected="a whole number that no other object of the file has",
+                expected="a whole number, unique in the file",
                 found=repr(number),
                 fix="number the objects of the file",
             )
@@ -116,7 +118,7 @@ def by_id(labels: IsatFile) -> dict[int, IsatObject]:
 def parents_of(
     labels: IsatFile, objects: Mapping[int, IsatObject], warnings: list[str]
 ) -> dict[int, int | None]:
-    """Parent id of every object; None where it has none or names one that cannot be its parent."""
+    """Parent id of every object; None if it has none or names one that cannot be its parent."""
     parents: dict[int, int | None] = {}
     for number, thing in objects.items():
         parent, level = thing.keys.get("parent"), thing.keys["level"]
@@ -137,7 +139,7 @@ def parents_of(
 def nesting_violations(
     labels: IsatFile, objects: Mapping[int, IsatObject], parents: Mapping[int, int | None]
 ) -> list[str]:
-    """A sentence for every child of which more than `OUTSIDE_SHARE` lies outside its parent."""
+    """A sentence for every child of which more than `OUTSIDE_SHARE` is outside its parent."""
     masks = {number: thing.mask(labels.size_hw) for number, thing in objects.items()}
     sentences = []
     for number, parent in parents.items():
@@ -156,7 +158,8 @@ def nesting_violations(
 def path_of(
     number: int, objects: Mapping[int, IsatObject], parents: Mapping[int, int | None]
 ) -> tuple[str, ...]:
-    """Texts from the outermost known ancestor down to an object; parents lie a level higher, so it ends."""
+    """Texts from the outermost known ancestor down to an object; each parent is one level higher, so the walk
+    ends."""
     texts = []
     step: int | None = number
     while step is not None:
@@ -175,7 +178,7 @@ def _layout(folder: str, images: str, frame: str) -> str:
 
 
 def _dataset(name: str, title: str, frame: str) -> Dataset:
-    """Both share everything but names."""
+    """The two data sets differ in names only."""
 
     def open_scene(root: Path, scene: str) -> LabelledScene:
         return open_hi(name, root, scene)
@@ -187,8 +190,8 @@ def _dataset(name: str, title: str, frame: str) -> Dataset:
         labels="images",
         folder=name,
         scenes=tuple(FRAMES[name]),
-        licence="labels unpublished; images as of the data set they come from",
-        terms="Write your own labels in our format; the images' own terms hold.",
+        licence="labels unpublished; images under the licence of their data set",
+        terms="Write your own labels in our format; the terms of the images apply.",
         citation="Hi-LSplat (frames and levels)",
         layout=_layout(name, images, frame),
         required=lambda scene: (f"label/{scene}", f"../{images}/{scene}/images"),

@@ -1,8 +1,8 @@
-"""Label files of the ISAT annotation tool, which the labels of LERF-OVS come in.
+"""Label files of the ISAT annotation tool, the format of LERF-OVS's labels.
 
-`objects` is a list; of each object `category` is the text, `segmentation` one polygon as a list of [x, y]
-(we also read a list of polygons), `bbox` [x1, y1, x2, y2]. `group` is no key: it restarts and repeats.
-Unknown keys are passed over.
+`objects` is a list; of each object `category` is the text, `segmentation` one polygon as a list of [x, y] (we
+also read a list of polygons), `bbox` [x1, y1, x2, y2]. `group` does not identify an object: its numbers
+restart and repeat. Unknown keys are ignored.
 """
 
 import json
@@ -18,7 +18,8 @@ from hilsplat.base.errors import SceneError
 from hilsplat.datasets.images.polygons import fill_polygon, outside_px
 
 SLACK_PX = 1.0
-"""Vertices may lie this far outside, and boxes differ from their polygons by this much, unsaid."""
+"""Without a warning, vertices may be this far outside the image and boxes may differ this much from their
+polygons."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +51,7 @@ class IsatFile:
         path: the file.
         size_hw: size of the image that was annotated, px.
         objects: in the order of the file.
-        warnings: oddities, each a sentence that names file and object.
+        warnings: one sentence for each irregularity, naming file and object.
     """
 
     path: Path
@@ -63,7 +64,7 @@ def read_isat(path: Path) -> IsatFile:
     """Read and check one label file.
 
     Raises:
-        SceneError: it is no JSON, a key is missing or of another kind, a polygon lies wholly outside the
+        SceneError: it is not JSON, a key is missing or has the wrong type, a polygon is entirely outside the
             image, or a box is [x, y, width, height].
     """
     path = Path(path)
@@ -83,19 +84,21 @@ def read_isat(path: Path) -> IsatFile:
             fix="labels of other tools (labelme, COCO) must be converted",
         )
     info = content.get("info")
-    size = [info.get(key) for key in ("height", "width")] if isinstance(info, dict) else [None, None]
-    if not all(isinstance(side, int) and side > 0 for side in size):
+    if not isinstance(info, dict):
+        info = {}
+    height, width = info.get("height"), info.get("width")
+    if not (isinstance(height, int) and isinstance(width, int) and height > 0 and width > 0):
         raise SceneError(
-            f"label file {path} does not say how large its image is",
+            f"label file {path} does not give the size of its image",
             expected="info.width and info.height, px",
-            found=f"height {size[0]!r}, width {size[1]!r}",
+            found=f"height {height!r}, width {width!r}",
             fix="export the labels again",
         )
-    size_hw = (int(size[0]), int(size[1]))
+    size_hw = (height, width)
     warnings: list[str] = []
     name = info.get("name")
     if isinstance(name, str) and name and Path(name).stem != path.stem:
-        warnings.append(f"{path.name} says that it belongs to {name}; taken for {path.stem}")
+        warnings.append(f"{path.name} names {name} as its image; used for {path.stem}")
     objects = tuple(
         _read_object(f"{path}, object {number}", entry, size_hw, warnings)
         for number, entry in enumerate(content["objects"])
@@ -105,7 +108,7 @@ def read_isat(path: Path) -> IsatFile:
 
 def _read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: list[str]) -> IsatObject:
     if not isinstance(entry, dict):
-        raise SceneError(f"{where} is no object", found=repr(entry)[:80], fix="export the labels again")
+        raise SceneError(f"{where} is not an object", found=repr(entry)[:80], fix="export the labels again")
     category = entry.get("category")
     if not isinstance(category, str) or not category.strip():
         raise SceneError(
@@ -113,14 +116,16 @@ def _read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: lis
         )
     where = f"{where} ({category})"
     if not isinstance(entry.get("iscrowd", 0), bool | int):  # 0 in some files, false in others
-        raise SceneError(f"{where}: iscrowd is no number", found=repr(entry["iscrowd"]), fix="write 0 or 1")
+        raise SceneError(
+            f"{where}: iscrowd is not a number", found=repr(entry["iscrowd"]), fix="write 0 or 1"
+        )
     polygons = _polygons(where, entry.get("segmentation"))
     height, width = size_hw
     for polygon in polygons:
         low, high = polygon.min(axis=0), polygon.max(axis=0)
         if high[0] < 0 or high[1] < 0 or low[0] >= width or low[1] >= height:
             raise SceneError(
-                f"{where}: a polygon lies outside the image",
+                f"{where}: a polygon is outside the image",
                 expected=f"x below {width}, y below {height}",
                 found=f"x {low[0]:g} to {high[0]:g}, y {low[1]:g} to {high[1]:g}",
                 fix="use labels and images of one size and release",
@@ -140,15 +145,15 @@ def _polygons(where: str, value: Any) -> tuple[Float[np.ndarray, "_ 2"], ...]:
         polygons = tuple(np.array(points, dtype=np.float64) for points in (value if nested else [value]))
     except (TypeError, IndexError, KeyError, ValueError) as error:
         raise SceneError(
-            f"{where}: segmentation is no polygon",
+            f"{where}: segmentation is not a polygon",
             expected=expected,
             found=repr(value)[:80],
-            fix="export the labels again; flat COCO lists x1, y1, x2, ... are another format",
+            fix="export the labels again; flat COCO lists x1, y1, x2, ... are a different format",
         ) from error
     for polygon in polygons:
         if polygon.ndim != 2 or polygon.shape[1] != 2 or not np.isfinite(polygon).all():
             raise SceneError(
-                f"{where}: segmentation is no polygon",
+                f"{where}: segmentation is not a polygon",
                 expected=expected,
                 found=f"numbers of shape {polygon.shape}",
                 fix="export the labels again",
@@ -159,7 +164,7 @@ def _polygons(where: str, value: Any) -> tuple[Float[np.ndarray, "_ 2"], ...]:
 def _box(
     where: str, value: Any, polygons: tuple[Float[np.ndarray, "_ 2"], ...], warnings: list[str]
 ) -> Int64[np.ndarray, " 4"]:
-    """Whole pixels of the annotated box [x1, y1, x2, y2]; of the polygon's extent where there is none."""
+    """Whole pixels of the annotated box [x1, y1, x2, y2]; of the polygon's extent if there is none."""
     points = np.concatenate(polygons)
     extent = np.concatenate([points.min(axis=0), points.max(axis=0)])
     try:
@@ -181,5 +186,5 @@ def _box(
                 fix="convert the boxes, or remove bbox: the polygon's extent then takes its place",
             )
         warnings.append(f"{where}: bbox {box.tolist()} differs from the polygon's extent {extent.tolist()}")
-    # Tests ask x1 <= x <= x2 of whole numbers x: rounding inwards keeps every answer.
+    # Evaluation tests x1 <= x <= x2 for whole numbers x, so rounding inwards changes no answer.
     return np.concatenate([np.ceil(box[:2]), np.floor(box[2:])]).astype(np.int64)

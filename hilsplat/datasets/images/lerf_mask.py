@@ -1,9 +1,10 @@
 """LERF-Mask: three scenes of LERF with the masks of Gaussian Grouping.
 
-Test views are the posed images that `images_train` lacks, sorted by name; the folder `test_mask/0` belongs
-to the first of them, `test_mask/1` to the second. Every mask file there is one prompt, named after it.
+Test views are the posed images missing from `images_train`, sorted by name; the folder `test_mask/0` belongs
+to the first of them, `test_mask/1` to the second. Every mask file is named after its prompt.
 """
 
+from functools import partial
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
@@ -13,7 +14,7 @@ from hilsplat.datasets.labelled import (
     LabelledScene,
     check_label_size,
     image_size_hw,
-    images_by_stem,
+    images_by_view,
     posed_images,
     read_mask_file,
     unlisted_texts,
@@ -21,7 +22,7 @@ from hilsplat.datasets.labelled import (
 from hilsplat.datasets.published import PROMPTS
 
 FOREGROUND = 129
-"""Least grey value of the foreground: the evaluation takes what is above 128."""
+"""Lowest grey value of the foreground: the published evaluation takes values above 128."""
 
 LAYOUT = """\
 lerf_mask/
@@ -35,20 +36,20 @@ lerf_mask/
 
 
 def open_scene(root: Path, scene: str) -> LabelledScene:
-    """Read the test masks of a scene; pixels are read when asked for.
+    """Read the test masks of a scene; pixels are read when needed.
 
     Args:
         root: the folder `lerf_mask`.
         scene: such as "figurines".
 
     Raises:
-        SceneError: a part of the scene is missing, the folders of masks do not fit the test views, or
-            a prompt has a dot.
+        SceneError: a part of the scene is missing, the folders of masks do not match the test views, or a
+            prompt has a dot.
     """
     root = Path(root)
     DATASET.require(root, scene)
     folder = root / scene
-    images = images_by_stem(folder / "images")
+    images = images_by_view(folder / "images")
     test = held_out_views(folder)
     masks = _mask_folders(folder / "test_mask", test)
     warnings: list[str] = []
@@ -68,7 +69,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
             sentence = check_label_size(f"mask {path}", size_hw, image_hw)
             if sentence:
                 warnings.append(sentence)
-            read = lambda path=path: read_mask_file(path, FOREGROUND)  # noqa: E731
+            read = partial(read_mask_file, path, FOREGROUND)
             regions.append(LabelledRegion(text, size_hw, read, path=(text,)))
         if not regions:
             raise SceneError(f"{place} has no mask", expected="<prompt>.png", fix="unpack test_mask again")
@@ -81,20 +82,20 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
 
 
 def held_out_views(folder: Path) -> tuple[str, ...]:
-    """Posed images that are not in `images_train`, by stem, sorted.
+    """Posed images that are not in `images_train`, by view name, sorted by stem.
 
     Raises:
-        SceneError: there is none.
+        SceneError: there are none.
     """
-    train = images_by_stem(folder / "images_train")
+    train = images_by_view(folder / "images_train")
     posed = posed_images(folder, "LERF-Mask")
     test = tuple(view for view in posed if view not in train)
     if not test:
         raise SceneError(
             f"{folder} has no test view",
-            expected="posed images that images_train lacks",
+            expected="posed images that are not in images_train",
             found=f"{len(posed)} posed images, all of them in images_train",
-            fix="unpack images_train again; it is no copy of images",
+            fix="unpack images_train again; it is not a copy of images",
         )
     return test
 
@@ -103,7 +104,7 @@ def prompt_of(path: Path) -> str:
     """Prompt of a mask file: its name without `.png`.
 
     Raises:
-        SceneError: the prompt has a dot; the published evaluation would cut it there.
+        SceneError: the prompt has a dot; the published evaluation would cut the prompt there.
     """
     if "." in path.stem:
         raise SceneError(
@@ -122,7 +123,7 @@ def _mask_folders(folder: Path, test: tuple[str, ...]) -> dict[str, Path]:
     strange = sorted(place.name for place in places if not place.name.isdecimal())
     if strange or [number for number, _ in numbers] != list(range(len(test))):
         raise SceneError(
-            f"the folders of {folder} do not fit the test views",
+            f"the folders of {folder} do not match the test views",
             expected=f"0 to {len(test) - 1}, for {', '.join(test[:10])}{', ...' if len(test) > 10 else ''}",
             found=", ".join([place.name for _, place in numbers] + strange) or "no folder",
             fix="unpack test_mask, images_train and sparse again: they belong together",
@@ -137,7 +138,7 @@ DATASET = Dataset(
     folder="lerf_mask",
     scenes=("figurines", "ramen", "teatime"),
     licence="none stated for images and masks (the authors' code: Apache-2.0)",
-    terms="Take it for research use only, and do not redistribute.",
+    terms="For research use only; do not redistribute.",
     citation="images: Kerr et al., LERF, ICCV 2023; masks: Ye et al., Gaussian Grouping, ECCV 2024",
     layout=LAYOUT,
     required=lambda scene: tuple(

@@ -1,12 +1,13 @@
 """LERF-OVS: four scenes of LERF with the labels of LangSplat.
 
-Polygons per labelled image; objects of one category in one image are one region with several boxes, and a
-view is asked only for the categories that are labelled there. Labels lie in `label/<scene>`, beside the
-scenes. Images are found by name, never by position: LangSplat's own evaluation counts renderings, which
-shifts when an image before was not registered.
+Labels are polygons. Objects of one category in one image form one region with several boxes, and a view is
+queried only for the categories labelled in it. Labels are in `label/<scene>`, beside the scenes. Images are
+found by name, never by position: LangSplat's own evaluation counts renderings, and the count shifts if an
+earlier image was not registered.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +20,12 @@ from hilsplat.datasets.labelled import (
     LabelledScene,
     check_label_size,
     image_size_hw,
-    images_by_stem,
+    images_by_view,
     missing_frames,
     unlisted_texts,
 )
 from hilsplat.datasets.published import FRAMES, PAIRS, PROMPTS
+from hilsplat.scene.features import view_name
 
 LAYOUT = """\
 lerf_ovs/
@@ -36,7 +38,7 @@ lerf_ovs/
 
 
 def open_scene(root: Path, scene: str) -> LabelledScene:
-    """Read the labels of a scene; masks are rasterised when asked for.
+    """Read the labels of a scene; masks are rasterised when needed.
 
     Args:
         root: the folder `lerf_ovs`.
@@ -48,7 +50,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     """
     root = Path(root)
     DATASET.require(root, scene)
-    images = images_by_stem(root / scene / "images")
+    images = images_by_view(root / scene / "images")
     files = label_files(root / "label" / scene)
     orphans = sorted(set(files) - set(images))
     if orphans:
@@ -56,7 +58,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
             f"labelled frames of {scene} have no image: {', '.join(orphans)}",
             expected=f"an image of that name in {root / scene / 'images'}",
             found=f"{len(images)} images, {next(iter(images))} to {list(images)[-1]}",
-            fix="unpack the images again; those of another release are numbered otherwise",
+            fix="unpack the images again; those of another release are numbered differently",
         )
     warnings: list[str] = []
     views: dict[str, tuple[LabelledRegion, ...]] = {}
@@ -83,18 +85,19 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
 
 
 def label_files(folder: Path) -> dict[str, Path]:
-    """Label files of a folder by frame.
+    """Label files of a folder by view.
 
     Raises:
-        SceneError: there is none.
+        SceneError: there are none.
     """
-    files = {path.stem: path for path in sorted(Path(folder).glob("*.json")) if path.name[0] != "."}
+    paths = sorted(path for path in Path(folder).glob("*.json") if path.name[0] != ".")
+    files = {view_name(path.stem): path for path in paths}
     if not files:
         raise SceneError(
             f"{folder} has no label file",
             expected="one .json per labelled frame",
             found=", ".join(sorted(path.name for path in Path(folder).glob("*"))[:5]) or "nothing",
-            fix="unpack the labels again, or move them up if they lie in a folder below",
+            fix="unpack the labels again, or move them up if they are in a subfolder",
         )
     return files
 
@@ -108,7 +111,7 @@ def merged_regions(labels: IsatFile) -> tuple[LabelledRegion, ...]:
         LabelledRegion(
             category,
             labels.size_hw,
-            lambda same=same: union_mask(same, labels.size_hw),
+            partial(union_mask, same, labels.size_hw),
             np.stack([thing.box_xyxy for thing in same]),
             None,
             (category,),
@@ -129,7 +132,7 @@ DATASET = Dataset(
     folder="lerf_ovs",
     scenes=("figurines", "ramen", "teatime", "waldo_kitchen"),
     licence="none stated for images and labels",
-    terms="Take it for research use only, and do not redistribute.",
+    terms="For research use only; do not redistribute.",
     citation="images: Kerr et al., LERF, ICCV 2023; labels: Qin et al., LangSplat, CVPR 2024",
     layout=LAYOUT,
     required=lambda scene: (f"{scene}/images", f"{scene}/sparse", f"label/{scene}"),

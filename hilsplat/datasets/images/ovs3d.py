@@ -4,6 +4,7 @@
 test view is a folder with one mask per class. Only the value 255 is foreground.
 """
 
+from functools import partial
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
@@ -13,19 +14,20 @@ from hilsplat.datasets.labelled import (
     LabelledScene,
     check_label_size,
     image_size_hw,
-    images_by_stem,
+    images_by_view,
     missing_frames,
     read_mask_file,
     unlisted_texts,
 )
 from hilsplat.datasets.published import FRAMES, PROMPTS
+from hilsplat.scene.features import view_name
 from hilsplat.scene.llff import POSES_BOUNDS
 
 FOREGROUND = 255
 """The original loader computes int8(value / 255)."""
 
 SHAPE_TOLERANCE = 0.01
-"""Masks and photographs of one view come in sizes whose shapes differ a little."""
+"""The mask and the photograph of a view differ slightly in aspect ratio."""
 
 LAYOUT = """\
 3d_ovs/
@@ -38,9 +40,9 @@ LAYOUT = """\
 
 
 def open_scene(root: Path, scene: str) -> LabelledScene:
-    """Read the segmentations of a scene; pixels are read when asked for.
+    """Read the segmentations of a scene; pixels are read when needed.
 
-    Regions of a view stand in the order of the sorted prompts; one of them may have no pixel.
+    Regions of a view are in the order of the sorted prompts; some may have no pixels.
 
     Args:
         root: the folder `3d_ovs`.
@@ -52,36 +54,35 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     root = Path(root)
     DATASET.require(root, scene)
     folder = root / scene
-    images = images_by_stem(folder / "images")
+    images = images_by_view(folder / "images")
     prompts = read_classes(folder / "segmentations" / "classes.txt")
     warnings: list[str] = []
     views: dict[str, tuple[LabelledRegion, ...]] = {}
     for place in _view_folders(folder / "segmentations"):
-        if place.name not in images:
+        view = view_name(place.name)
+        if view not in images:
             raise SceneError(
                 f"view {place.name} of {scene} is segmented but has no image",
                 expected=f"{place.name}.jpg or {place.name}.png in {folder / 'images'}",
                 found=f"{len(images)} images, {next(iter(images))} to {list(images)[-1]}",
                 fix="unpack the images again",
             )
-        views[place.name] = _regions(place, prompts, image_size_hw(images[place.name]), warnings)
-    poses = folder
-    if not (folder / "sparse").is_dir() and not (folder / POSES_BOUNDS).is_file():
-        poses = None
+        views[view] = _regions(place, prompts, image_size_hw(images[view]), warnings)
+    posed = (folder / "sparse").is_dir() or (folder / POSES_BOUNDS).is_file()
     for sentence in (
         missing_frames("segmentation", FRAMES["3d_ovs"].get(scene, ()), views),
         unlisted_texts(prompts, PROMPTS["3d_ovs"].get(scene, ())),
     ):
         if sentence:
             warnings.append(sentence)
-    return LabelledScene("3d_ovs", scene, images, poses, views, prompts, tuple(warnings))
+    return LabelledScene("3d_ovs", scene, images, folder if posed else None, views, prompts, tuple(warnings))
 
 
 def read_classes(path: Path) -> tuple[str, ...]:
     """Prompts of `classes.txt`: stripped, without empty lines, sorted (capitals first).
 
     Raises:
-        SceneError: it is missing, empty, no text, or names a class twice.
+        SceneError: it is missing, empty, not a text file, or names a class twice.
     """
     try:
         lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
@@ -132,7 +133,7 @@ def _regions(
         sentence = check_label_size(f"mask {path}", size_hw, image_hw, SHAPE_TOLERANCE)
         if sentence:
             warnings.append(sentence)
-        read = lambda path=path: read_mask_file(path, FOREGROUND)  # noqa: E731
+        read = partial(read_mask_file, path, FOREGROUND)
         regions.append(LabelledRegion(prompt, size_hw, read, path=(prompt,)))
     return tuple(regions)
 
@@ -144,7 +145,7 @@ DATASET = Dataset(
     folder="3d_ovs",
     scenes=tuple(FRAMES["3d_ovs"]),
     licence="none stated for images and masks (the authors' code: MIT)",
-    terms="Take it for research use only, and do not redistribute.",
+    terms="For research use only; do not redistribute.",
     citation="Liu et al., Weakly Supervised 3D Open-vocabulary Segmentation, NeurIPS 2023",
     layout=LAYOUT,
     required=lambda scene: (f"{scene}/images", f"{scene}/segmentations/classes.txt"),

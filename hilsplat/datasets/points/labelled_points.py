@@ -1,4 +1,4 @@
-"""Points that a benchmark labels: vertices of a mesh, returns of a lidar."""
+"""Points labelled by a benchmark: vertices of a mesh, or returns of a lidar."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,11 +30,11 @@ class LabelledPoints:
 
     Attributes:
         xyz: places, metres.
-        class_id: class as the data set's files number it; 0 where undefined.
-        instance_id: from 1; 0 for none. Means nothing across files.
+        class_id: class number in the data set's files; 0 if undefined.
+        instance_id: from 1; 0 for none. Not comparable between files.
         labelling: what `class_id` means, a key of `LABELLINGS`.
-        faces: corners of triangles, rows of `xyz`; None where the points are no mesh.
-        visible: whether a camera sees the point; None where the files do not tell.
+        faces: corners of triangles, rows of `xyz`; None if the points are not a mesh.
+        visible: whether a camera sees the point; None if the files do not say.
     """
 
     xyz: Float[np.ndarray, "P 3"]
@@ -48,7 +48,7 @@ class LabelledPoints:
         return len(self.xyz)
 
     def labels(self, classes: ClassSet) -> Int32[np.ndarray, " P"]:
-        """Labels 1 .. K in the order of a set of classes, 0 where it lacks the class.
+        """Labels 1 .. K in the order of a set of classes, 0 for classes that the set lacks.
 
         Raises:
             MisalignedArtifactError: the set is not defined on this data set's ids.
@@ -59,7 +59,7 @@ class LabelledPoints:
                 f"classes {classes.name} are not defined on {self.labelling} labels",
                 expected=" or ".join(each.name for each in fitting),
                 found=classes.name,
-                fix="take the protocol of this data set",
+                fix="use a protocol of this data set",
             )
         return classes.labels(self.class_id)
 
@@ -69,10 +69,10 @@ class PointScene:
     """A scene of a data set whose points are labelled.
 
     Attributes:
-        name: as the data set writes it.
-        images: posed images; what cannot be used (frames without a pose) is not among them.
-        truth: per labelling, the labelled points. Reading it is for `evaluate` alone.
-        warnings: what was passed over or read otherwise than written, each a sentence.
+        name: as spelt in the data set.
+        images: posed images, without those that cannot be used (frames without a pose).
+        truth: labelled points per labelling. Only `evaluate` may read them.
+        warnings: one sentence for each thing that was skipped or reinterpreted.
     """
 
     name: str

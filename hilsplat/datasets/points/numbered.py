@@ -1,4 +1,4 @@
-"""Images that are named by a frame number without leading zeros."""
+"""Images named by a frame number without leading zeros."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,17 +10,17 @@ from hilsplat.datasets.points.point_files import UNPACK_AGAIN
 
 
 def by_number(paths: Sequence[Path], prefix: str = "") -> list[tuple[int, Path]]:
-    """Files sorted by the number that their stem is, after a prefix: 2 comes before 10.
+    """Files sorted by the number in their stem, after a prefix: 2 comes before 10.
 
     Raises:
-        SceneError: a stem is no number.
+        SceneError: a stem is not a number.
     """
     numbered = []
     for path in paths:
         stem = path.stem.removeprefix(prefix)
         if not (stem.isascii() and stem.isdecimal()):
             raise SceneError(
-                f"{path} is not named as a frame",
+                f"{path} is not named like a frame",
                 expected=f"{prefix}<number>{path.suffix}",
                 fix="keep other images out of this folder",
             )
@@ -32,7 +32,7 @@ def size_of_image(image: Path) -> tuple[int, int]:
     """Height and width of an image file, without decoding it.
 
     Raises:
-        ImageError: it is no image.
+        ImageError: it is not an image.
     """
     try:
         with Image.open(image) as opened:

@@ -1,4 +1,4 @@
-"""Reading the kinds of file that labelled points come in, with messages that say what to do."""
+"""Readers for the file formats of labelled points, with messages that say what to do."""
 
 import json
 from pathlib import Path
@@ -8,14 +8,14 @@ from plyfile import PlyData, PlyParseError
 
 from hilsplat.base.errors import SceneError
 
-UNPACK_AGAIN = "unpack or download it again; the copy is not whole"
+UNPACK_AGAIN = "unpack or download it again; the copy is incomplete"
 
 
 def require_file(path: Path, fix: str = UNPACK_AGAIN) -> Path:
-    """The path of a file that must be there.
+    """The path of a file that must exist.
 
     Raises:
-        SceneError: it is missing; lists what is there instead.
+        SceneError: it is missing; the message lists what is there instead.
     """
     if not path.is_file():
         raise SceneError(f"{path} is missing", found=listing(path.parent), fix=fix)
@@ -23,7 +23,7 @@ def require_file(path: Path, fix: str = UNPACK_AGAIN) -> Path:
 
 
 def listing(folder: Path) -> str:
-    """First names of a folder, for messages."""
+    """The first names in a folder, for messages."""
     if not folder.is_dir():
         return f"no folder {folder}"
     names = sorted(path.name for path in folder.iterdir())
@@ -35,7 +35,7 @@ def read_json_object(path: Path, keys: tuple[str, ...]) -> dict:
     """Read a JSON object that must have some keys.
 
     Raises:
-        SceneError: missing, no JSON, no object, or without a key.
+        SceneError: it is missing, not JSON, not an object, or lacks a key.
     """
     require_file(path)
     try:
@@ -46,7 +46,7 @@ def read_json_object(path: Path, keys: tuple[str, ...]) -> dict:
     if lacking:
         found = sorted(content) if isinstance(content, dict) else [type(content).__name__]
         raise SceneError(
-            f"{path} is not what it should be",
+            f"{path} does not have the expected content",
             expected=f"an object with {', '.join(keys)}",
             found=", ".join(found[:12]) or "an empty object",
             fix=UNPACK_AGAIN,
@@ -58,7 +58,7 @@ def read_numbers(path: Path, columns: int) -> np.ndarray:
     """Read a text file of numbers, `columns` per line (inf and nan are allowed).
 
     Raises:
-        SceneError: missing, or a line has no or other numbers.
+        SceneError: it is missing, or a line does not hold exactly that many numbers.
     """
     require_file(path)
     rows = []
@@ -84,11 +84,13 @@ def read_matrix(path: Path) -> np.ndarray:
     """Read a 4 x 4 matrix from text.
 
     Raises:
-        SceneError: it has another shape.
+        SceneError: it has a different shape.
     """
     matrix = read_numbers(path, 4)
     if matrix.shape != (4, 4):
-        raise SceneError(f"{path} is no matrix", expected="4 lines", found=f"{len(matrix)}", fix=UNPACK_AGAIN)
+        raise SceneError(
+            f"{path} is not a matrix", expected="4 lines", found=f"{len(matrix)}", fix=UNPACK_AGAIN
+        )
     return matrix
 
 
@@ -96,14 +98,14 @@ def read_ply(path: Path, corners: int) -> PlyData:
     """Read a mesh whose faces have `corners` corners each.
 
     Raises:
-        SceneError: missing, truncated, no PLY, or with other faces.
+        SceneError: it is missing, truncated, not a PLY file, or has other faces.
     """
     require_file(path)
     lists = {"face": {"vertex_indices": corners}}
     try:
         content = PlyData.read(path, known_list_len=lists)
         for element in ("vertex", "face"):
-            content[element]  # a KeyError where it is not there
+            content[element]  # KeyError if there is none
     except (PlyParseError, KeyError, ValueError, OSError) as error:
         raise SceneError(
             f"{path} cannot be read: {error}",
@@ -141,13 +143,13 @@ def ply_faces(path: Path, content: PlyData) -> np.ndarray:
     """Corners of all faces, int32 (F, corners).
 
     Raises:
-        SceneError: a corner is no vertex.
+        SceneError: a corner is not a vertex.
     """
     faces = ply_column(path, content, "face", "vertex_indices").astype(np.int32)
     count = len(content["vertex"].data)
     if faces.size and (faces.min() < 0 or faces.max() >= count):
         raise SceneError(
-            f"{path}: a face has a corner that is no vertex",
+            f"{path}: a face has a corner that is not a vertex",
             expected=f"0 to {count - 1}",
             found=f"{faces.min()} to {faces.max()}",
             fix=UNPACK_AGAIN,

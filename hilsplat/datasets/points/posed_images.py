@@ -1,4 +1,4 @@
-"""Images with the pose and lens that a data set gives them, and the folder that `poses` imports them from."""
+"""Images with the pose and lens given by a data set, and the folder from which `poses` imports them."""
 
 import json
 import shutil
@@ -49,12 +49,12 @@ def cam_from_world_of(world_from_cam: Float[np.ndarray, "4 4"], where: str) -> F
     """Invert a camera-to-world matrix.
 
     Raises:
-        SceneError: the matrix is not a rotation and a translation; `where` begins the message.
+        SceneError: it is not a rotation and translation; `where` begins the message.
     """
     rigid = are_rotations(world_from_cam[:3, :3], RIGID_TOLERANCE)
     if not rigid or not np.allclose(world_from_cam[3], [0, 0, 0, 1]):
         raise SceneError(
-            f"{where}: the pose is not a rotation and a translation",
+            f"{where}: the pose is not a rotation and translation",
             expected="a 4 x 4 camera-to-world matrix, row by row, last row 0 0 0 1",
             found=np.array2string(world_from_cam, precision=4, suppress_small=True).replace("\n", ""),
             fix="export the poses again",
@@ -67,23 +67,23 @@ def write_posed_images(
 ) -> None:
     """Write `images/` and `transforms.json` (OpenGL axes, intrinsics per frame): a source for `poses`.
 
-    Images are copied byte by byte; lenses stay as they are, `poses` undistorts. Points, if there are
-    any, go to `points.ply`: the sparse points of the scene, in their order.
+    Images are copied byte for byte; lenses are kept, because `poses` undistorts. Points, if any, are written
+    to `points.ply` and become the scene's sparse points, in their order.
 
     Args:
-        folder: written whole or not at all; what was there is replaced.
+        folder: written completely or not at all; an existing one is replaced.
         images: at least one, names all different.
-        points: places that the data set knows, metres.
+        points: positions known from the data set, metres.
 
     Raises:
-        SceneError: two images share a name, or there is none.
+        SceneError: two images share a name, or there are none.
     """
     names = [image.name for image in images]
     twice = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
     if twice or not images:
         raise SceneError(
-            f"no folder of posed images can be made at {folder}",
-            expected="at least one image, each with a name of its own",
+            f"posed images cannot be written to {folder}",
+            expected="at least one image, each with a unique name",
             found=f"{len(images)} images, twice: {', '.join(twice) or 'none'}",
         )
     with atomic_folder(folder) as temporary:

@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Layout:
-    """How a sequence keeps its frames.
+    """How a sequence stores its frames.
 
     Attributes:
         colour: folder of the images and prefix of their names.
@@ -48,20 +48,20 @@ SEMANTIC_NERF = Layout(("rgb", "rgb_"), "traj_w_c.txt")
 
 
 def layout_of(folder: Path) -> Layout:
-    """Which layout a sequence has, by its file of poses.
+    """The layout of a sequence, recognised by its file of poses.
 
     Raises:
-        SceneError: it has none.
+        SceneError: it has neither layout.
     """
     for layout in (NICE_SLAM, SEMANTIC_NERF):
         if (folder / layout.poses).is_file() and (folder / layout.colour[0]).is_dir():
             return layout
     inner = sorted(path.parent for name in ("traj.txt", "traj_w_c.txt") for path in folder.glob(f"*/{name}"))
     raise SceneError(
-        f"{folder} holds no rendered sequence",
+        f"{folder} does not hold a rendered sequence",
         expected="traj.txt with results/, or traj_w_c.txt with rgb/",
         found=listing(folder),
-        fix=f"name the folder {inner[0]}" if inner else "unpack the rendered sequences there",
+        fix=f"use the folder {inner[0]} instead" if inner else "unpack the rendered sequences there",
     )
 
 
@@ -75,7 +75,7 @@ def intrinsics(size_hw: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
 
 
 def read_lens(folder: Path, image: Path) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
-    """K and the size it is for: of `cam_params.json` beside a NICE-SLAM sequence, else Replica's own.
+    """K and the size it is for: from `cam_params.json` beside a NICE-SLAM sequence, otherwise Replica's own.
 
     Raises:
         SceneError: the file is damaged.
@@ -98,7 +98,8 @@ def read_lens(folder: Path, image: Path) -> tuple[Float[np.ndarray, "3 3"], tupl
 
 
 def frames_of(folder: Path, part: tuple[str, str]) -> list[tuple[int, Path]]:
-    """Numbered images with exactly the prefix, by number; colour visualisations beside them are not."""
+    """Images with exactly the prefix and a number, by number; this leaves out colour visualisations beside
+    them."""
     place, prefix = part
     paths = [
         path
@@ -111,13 +112,13 @@ def frames_of(folder: Path, part: tuple[str, str]) -> list[tuple[int, Path]]:
 def read_images(folder: Path, every: int = 1) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
     """Posed images of a rendered sequence, by frame number.
 
-    Line n of the poses is frame n; lines without an image are passed over.
+    Line n of the poses is frame n; lines without an image are skipped.
 
     Returns:
-        The images and a sentence for each thing that was passed over.
+        The images and a sentence for each thing that was skipped.
 
     Raises:
-        SceneError: no layout fits, there are frames beyond the last pose, or no frame at all.
+        SceneError: no layout fits, there are frames beyond the last pose, or there are no frames.
     """
     layout = layout_of(folder)
     path = folder / layout.poses
@@ -126,7 +127,7 @@ def read_images(folder: Path, every: int = 1) -> tuple[tuple[PosedImage, ...], t
     beyond = [number for number, _ in frames if number >= len(poses)]
     if beyond or not frames:
         raise SceneError(
-            f"{path} does not fit the images in {folder / layout.colour[0]}",
+            f"{path} does not match the images in {folder / layout.colour[0]}",
             expected="one line per frame, or more",
             found=f"{len(poses)} lines, {len(frames)} images"
             + (f", the first without a line is frame {beyond[0]}" if beyond else ""),
@@ -140,14 +141,14 @@ def read_images(folder: Path, every: int = 1) -> tuple[tuple[PosedImage, ...], t
         for number, image in frames[::every]
     )
     more = len(poses) - len(frames)
-    return images, (f"{more} poses have no image and are passed over",) if more else ()
+    return images, (f"{more} poses have no image and are skipped",) if more else ()
 
 
 def sequence_folder(root: Path, scene: str) -> Path:
     """The rendered sequence of a scene: `room0/` (NICE-SLAM), `room_0/imap/00` (vMAP) or `room_0/Sequence_1`.
 
     Raises:
-        SceneError: none of them is there.
+        SceneError: none of them exists.
     """
     places = (scene.replace("_", ""), f"{scene}/imap/00", f"{scene}/Sequence_1")
     for place in places:
@@ -166,8 +167,8 @@ def open_scene(root: Path, scene: str, every: int = 1) -> PointScene:
 
     Args:
         root: the data set's folder.
-        scene: as the release writes it, such as room_0.
-        every: take each n-th frame.
+        scene: as spelt in the release, such as room_0.
+        every: take every n-th frame.
 
     Raises:
         SceneError: something is missing, damaged or does not fit together.

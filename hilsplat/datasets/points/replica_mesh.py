@@ -21,14 +21,14 @@ from hilsplat.datasets.points.point_files import (
 )
 
 INSTANCES_PER_CLASS = 1000
-"""In instance files a value is class * 1000 + instance; below 1000 it is no object."""
+"""In instance files a value is class * 1000 + instance; values below 1000 are not objects."""
 
 
 def class_of_objects(path: Path) -> Int32[np.ndarray, " O"]:
     """Class of each object id, from `info_semantic.json`; negative ids (undefined, none) become 0.
 
     Raises:
-        SceneError: the file is damaged, names a class otherwise than the release, or has an unknown id.
+        SceneError: the file is damaged, names a class differently from the release, or has an unknown id.
     """
     content = read_json_object(path, ("classes", "id_to_label"))
     try:
@@ -55,7 +55,7 @@ def class_of_objects(path: Path) -> Int32[np.ndarray, " O"]:
 def object_of_vertices(
     faces: Int[np.ndarray, "F c"], object_of_face: Int[np.ndarray, " F"], num_vertices: int
 ) -> Int32[np.ndarray, " P"]:
-    """Object that most faces at each vertex belong to; of equally many the smallest id; -1 without a face."""
+    """Object to which most faces at each vertex belong; ties go to the smallest id; -1 without a face."""
     corners, owners = faces.reshape(-1).astype(np.int64), np.repeat(object_of_face, faces.shape[1])
     pairs, votes = np.unique(np.stack([corners, owners]), axis=1, return_counts=True)
     # Last of each vertex after sorting: most votes, then the smallest id.
@@ -68,7 +68,7 @@ def object_of_vertices(
 
 
 def triangles_of(quads: Int32[np.ndarray, "F 4"]) -> Int32[np.ndarray, "T 3"]:
-    """Two triangles per quad, corners 0 1 2 and 0 2 3; one where corners coincide."""
+    """Two triangles per quad, corners 0 1 2 and 0 2 3; one if corners coincide."""
     triangles = quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
     return triangles[(triangles != triangles[:, [1, 2, 0]]).all(axis=1)]
 
@@ -76,7 +76,7 @@ def triangles_of(quads: Int32[np.ndarray, "F 4"]) -> Int32[np.ndarray, "T 3"]:
 def read_semantic_mesh(habitat: Path) -> LabelledPoints:
     """Vertices of `mesh_semantic.ply` with the class and instance of most of their faces.
 
-    The file numbers objects from 0; `instance_id` is that number + 1, and 0 where the class is undefined.
+    The file numbers objects from 0; `instance_id` is that number + 1, and 0 if the class is undefined.
 
     Raises:
         SceneError: a file is missing or damaged, or they do not belong together.
@@ -104,13 +104,13 @@ def read_vertex_labels(path: Path, num_vertices: int) -> Int32[np.ndarray, " P"]
     """Read `semantic_labels_<scene>.txt`: a class id per line, negative ones become 0.
 
     Raises:
-        SceneError: other than one known whole number for each vertex.
+        SceneError: it does not hold exactly one known whole number for each vertex.
     """
     require_file(path)
     try:
         labels = np.array(path.read_text(encoding="utf-8").split(), dtype=np.int32)
     except ValueError as error:
-        raise SceneError(f"{path} holds no whole numbers: {error}", fix=UNPACK_AGAIN) from error
+        raise SceneError(f"{path} does not hold whole numbers: {error}", fix=UNPACK_AGAIN) from error
     if len(labels) != num_vertices:
         raise SceneError(
             f"{path} does not label the vertices of its mesh",
@@ -135,7 +135,7 @@ def read_labelled_mesh(mesh_path: Path, labels: Path, instances: Path | None = N
     Args:
         mesh_path: `<scene>_mesh.ply`, quads or triangles.
         labels: `semantic_labels_<scene>.txt`.
-        instances: `instance_labels_<scene>.txt` (class * 1000 + instance), where there is one.
+        instances: `instance_labels_<scene>.txt` (class * 1000 + instance), if there is one.
 
     Raises:
         SceneError: a file is missing or damaged, or they do not belong together.

@@ -44,8 +44,8 @@ class LabelTable:
     """Meaning of raw categories.
 
     Attributes:
-        nyu40: raw category -> NYU40 id, 0 where the table gives none.
-        scannet200: raw category -> id, 0 where it is none of the 200.
+        nyu40: raw category -> NYU40 id, 0 if the table gives none.
+        scannet200: raw category -> id, 0 if it is not one of the 200.
     """
 
     nyu40: dict[str, int]
@@ -56,13 +56,13 @@ def scan_folder(root: Path, scan: str) -> Path:
     """The folder of a scan, `scans/<scan>` below the data set's folder.
 
     Raises:
-        SceneError: it is not there, one level too deep, or holds an archive of frames not yet exported.
+        SceneError: it is missing, one level too deep, or holds an archive of frames not yet exported.
     """
     folder = Path(root) / "scans" / scan
     for wrong in (folder / scan, Path(root) / scan, Path(root) / "scans" / "scans" / scan):
         if not (folder / f"{scan}_vh_clean_2.ply").is_file() and wrong.is_dir():
             raise SceneError(
-                f"scan {scan} lies in the wrong place",
+                f"scan {scan} is in the wrong place",
                 expected=folder,
                 found=wrong,
                 fix=f"move {wrong} to {folder}",
@@ -83,7 +83,7 @@ def read_label_table(path: Path) -> LabelTable:
     `nyu40id` follows from the raw category, not from the id: ids 107 and 188 have rows with two.
 
     Raises:
-        SceneError: missing, without one of the three columns, or with an id that is no number.
+        SceneError: it is missing, lacks one of the three columns, or has an id that is not a number.
     """
     require_file(path, f"download {LABEL_TABLE} of ScanNet's release into the data set's folder")
     nyu40, scannet200 = {}, {}
@@ -92,7 +92,7 @@ def read_label_table(path: Path) -> LabelTable:
         needed = {"id", "raw_category", "nyu40id"}
         if not needed <= set(rows.fieldnames or ()):
             raise SceneError(
-                f"{path} is no table of ScanNet's labels",
+                f"{path} is not the table of ScanNet's labels",
                 expected="tab-separated columns id, raw_category, nyu40id",
                 found=", ".join(rows.fieldnames or ())[:120] or "an empty file",
                 fix="download the latest table of the release again",
@@ -133,7 +133,7 @@ def axis_alignment(info: dict[str, str], where: str) -> Float[np.ndarray, "4 4"]
 
 
 def read_images(folder: Path, scan: str, every: int = 1) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
-    """Posed colour images, by frame number; frames that tracking lost are passed over.
+    """Posed colour images, by frame number; frames that tracking lost are skipped.
 
     ScanNet counts pixel centres from 0 (the depth camera's centre is 319.5 of 640), hence half a pixel
     is added to the centre of K.
@@ -141,13 +141,13 @@ def read_images(folder: Path, scan: str, every: int = 1) -> tuple[tuple[PosedIma
     Args:
         folder: of the scan.
         scan: its name.
-        every: take each n-th frame in the order of their numbers, lost ones included in the count.
+        every: take every n-th frame in the order of their numbers, lost ones included in the count.
 
     Returns:
-        The images and a sentence for each thing that was passed over.
+        The images and a sentence for each thing that was skipped.
 
     Raises:
-        SceneError: a folder is missing, a name is no number, or no frame has a pose.
+        SceneError: a folder is missing, a name is not a number, or no frame has a pose.
     """
     if not (folder / "color").is_dir():
         raise SceneError(
@@ -179,16 +179,14 @@ def read_images(folder: Path, scan: str, every: int = 1) -> tuple[tuple[PosedIma
         )
     warnings = []
     if lost:
-        warnings.append(f"{len(lost)} frames were lost by tracking (infinite poses) and are passed over")
+        warnings.append(f"{len(lost)} frames were lost by tracking (infinite poses) and are skipped")
     if without:
-        warnings.append(
-            f"{len(without)} images have no file in pose/ and are passed over, first {without[0]}"
-        )
+        warnings.append(f"{len(without)} images have no file in pose/ and are skipped, first {without[0]}")
     return tuple(images), tuple(warnings)
 
 
 def _stated_size(folder: Path, scan: str, image: Path) -> tuple[int, int]:
-    """Size that the intrinsics are for: of the scan's text file, else of its first image."""
+    """Size that the intrinsics are for: from the scan's text file, or else that of its first image."""
     if (folder / f"{scan}.txt").is_file():
         info = read_scan_info(folder / f"{scan}.txt")
         if "colorHeight" in info and "colorWidth" in info:
@@ -217,11 +215,13 @@ def read_truth(
         raise SceneError(
             f"{label_path.name} does not belong to {mesh_path.name} of {scan}",
             expected=f"the same {len(xyz)} vertices in the same order",
-            found=f"{len(nyu40)} vertices" if len(nyu40) != len(xyz) else "vertices elsewhere",
+            found=f"{len(nyu40)} vertices" if len(nyu40) != len(xyz) else "vertices in other positions",
             fix="take both files from the same release",
         )
     if nyu40.size and nyu40.max() > 40:
-        raise SceneError(f"{label_path} holds no NYU40 labels", expected="0 to 40", found=int(nyu40.max()))
+        raise SceneError(
+            f"{label_path} does not hold NYU40 labels", expected="0 to 40", found=int(nyu40.max())
+        )
     fine, instance, unknown = _from_aggregation(folder, scan, table, len(xyz))
     warnings = []
     if unknown:
@@ -277,8 +277,8 @@ def open_scan(root: Path, scan: str, every: int = 1, aligned: bool = False) -> P
     Args:
         root: folder with `scans/` and the table of labels.
         scan: such as scene0000_00.
-        every: take each n-th frame.
-        aligned: turn mesh and poses together by the scan's axisAlignment. Neither is by default.
+        every: take every n-th frame.
+        aligned: turn mesh and poses together by the scan's axisAlignment. By default neither is turned.
 
     Raises:
         SceneError: something is missing, damaged or does not fit together.

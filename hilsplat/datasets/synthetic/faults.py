@@ -1,6 +1,6 @@
-"""Faults put into true masks: what a segmenter does wrong, one knob per kind of mistake.
+"""Faults added to true masks: what a segmenter does wrong, one setting for each kind of mistake.
 
-Every decision is a random number that belongs to a name (seed, scene, kind of fault, view, node), so it
+Every decision uses a random number derived from a name (seed, scene, kind of fault, view, node), so it
 depends neither on the order of views nor on other kinds of faults, and a higher probability adds faults of
 its kind to those of a lower one: sweeps over a knob compare like with like.
 """
@@ -23,7 +23,7 @@ REACH = 3.0
 """A boundary moves at most this many standard deviations."""
 
 WAVES = 48
-"""Plane waves that a boundary's displacement is the sum of."""
+"""Number of plane waves that add up to a boundary's displacement."""
 
 Borders = dict[int, dict[int, int]]
 """Node -> touching sibling -> length of their common border, px."""
@@ -42,24 +42,24 @@ class Draws:
     scene: str
 
     def generator(self, *name: str | int) -> np.random.Generator:
-        """Generator that belongs to a name."""
+        """Generator derived from a name."""
         digest = sha256_of_json([self.seed, self.scene, *name])
         return np.random.default_rng(int(digest[:32], 16))
 
     def chance(self, *name: str | int) -> float:
-        """Number in [0, 1) that belongs to a name; an event of probability p happens where it is below p."""
+        """Number in [0, 1) derived from a name; an event of probability p happens if it is below p."""
         return int(sha256_of_json([self.seed, self.scene, *name])[:13], 16) / 16**13
 
 
 @dataclass(frozen=True)
 class TrueNodes:
-    """What the faults need to know of a scene as a whole.
+    """What the faults need to know about a scene as a whole.
 
     Attributes:
         nodes: all nodes by id.
         background: ids of the surroundings, which are never merged.
-        partner: per node the sibling with which it shares the longest border over all views: the one
-            that a systematic merge joins it with. Nodes without a touching sibling are absent.
+        partner: for each node, the sibling with which it shares the longest border over all views: a
+            systematic merge joins the two. Nodes without a touching sibling are absent.
     """
 
     nodes: tuple[AnnotatedNode, ...]
@@ -107,7 +107,7 @@ def sibling_borders(labels: Int32[np.ndarray, "H W"], truth: TrueNodes) -> Borde
 
 
 def longest_border(around: Mapping[int, int]) -> int:
-    """The neighbour with the longest border; of equal ones the lower id."""
+    """The neighbour with the longest border; ties go to the lower id."""
     return min(around, key=lambda other: (-around[other], other))
 
 
@@ -116,7 +116,7 @@ def merged_groups(
 ) -> list[tuple[int, ...]]:
     """Nodes of one level that a view shows as one mask, each group ascending.
 
-    A node starts a merge of its own with probability `merge`, with the touching sibling of the longest
+    With probability `merge` a node starts a merge with the touching sibling with which it shares the longest
     border. A node drawn for a systematic merge joins its `partner` in `systematic_share` of the views in
     which the two touch.
     """
@@ -160,7 +160,7 @@ def cut_in_two(
     """Both sides of a straight line that leaves 30 to 70 % of the mask on either side.
 
     Returns:
-        the two pieces; the mask alone where it is too small to be cut.
+        the two pieces; the mask alone if it is too small to cut.
     """
     angle, share = generator.uniform(0, np.pi), generator.uniform(0.3, 0.7)
     y, x = np.nonzero(mask)
@@ -181,10 +181,10 @@ def displaced(
 ) -> Bool[np.ndarray, "H W"]:
     """Move a mask's boundary along its normal by a smooth random amount.
 
-    A pixel stays or becomes inside where its signed distance to the boundary (positive inside, half a
-    pixel next to it) exceeds `amplitude_px` times a random field of unit variance. The field is a sum of
-    plane waves, so it depends on the place alone and not on the amplitude: with the same generator a
-    larger amplitude changes all pixels that a smaller one changes, and more.
+    A pixel stays or becomes inside if its signed distance to the boundary (positive inside, half a pixel next
+    to it) exceeds `amplitude_px` times a random field of unit variance. The field is a sum of plane waves, so
+    it depends on the position alone and not on the amplitude: with the same generator a larger amplitude
+    changes all pixels that a smaller one changes, and more.
 
     Args:
         mask: not empty.
@@ -194,7 +194,7 @@ def displaced(
 
     Returns:
         the new mask, never empty: inwards the boundary moves at most half the way to the innermost
-        pixel, so thin things become thinner and do not vanish. Image borders are no boundary.
+        pixel, so thin things become thinner and do not vanish. Image borders are not boundaries.
     """
     if amplitude_px == 0:
         return mask
@@ -225,7 +225,7 @@ def _distance(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 
 
 def beside(level: Level, up: bool) -> Level:
-    """The level next to a level; part has one on either side."""
+    """An adjacent level; part has one on either side."""
     if level is not Level.PART:
         return Level.PART
     return Level.WHOLE if up else Level.SUBPART
@@ -248,10 +248,10 @@ def faulty_masks(
        overlap and to leave gaps.
     5. Wrong levels: whole becomes part, subpart becomes part, part becomes either.
 
-    `predicted_iou` is the IoU of the mask with the true region it covers best among its nodes', plus
-    noise; `stability` is the middle of that IoU and 1, plus noise; both are clipped to [0, 1]. A
-    systematic merge is thus doubted as much as any other; a mask at the wrong level is not doubted.
-    SAM's thresholds and suppressions are not applied: what is asked for is what is written.
+    `predicted_iou` is the IoU of the mask with the true region it covers best among its nodes', plus noise;
+    `stability` is the mean of that IoU and 1, plus noise; both are clipped to [0, 1]. A systematic merge is
+    thus doubted as much as any other; a mask at the wrong level is not doubted. SAM's thresholds and
+    suppressions are not applied: the masks are written exactly as specified.
 
     Args:
         labels: node id per level and pixel, -1 for none.
@@ -259,7 +259,7 @@ def faulty_masks(
         view: view name.
         draws: random numbers of the scene.
         settings: the faults.
-        min_area_px: true regions that are smaller give no mask.
+        min_area_px: smaller true regions give no mask.
 
     Returns:
         the masks in `content_order`, and how many of each fault were put in.
@@ -320,11 +320,11 @@ def _scores(
     quality: float, draws: Draws, settings: PerturbSettings, name: tuple[str | int, ...]
 ) -> tuple[float, float]:
     """Predicted IoU and stability of a mask whose true IoU is `quality`."""
-    noise = (0.0, 0.0)
+    predicted, stability = quality, (1 + quality) / 2
     if settings.score_noise:
         noise = settings.score_noise * draws.generator("scores", *name).standard_normal(2)
-    scores = (quality + noise[0], (1 + quality) / 2 + noise[1])
-    return min(1.0, max(0.0, scores[0])), min(1.0, max(0.0, scores[1]))
+        predicted, stability = predicted + noise[0], stability + noise[1]
+    return min(1.0, max(0.0, predicted)), min(1.0, max(0.0, stability))
 
 
 def _iou(mask: Bool[np.ndarray, "H W"], region: Bool[np.ndarray, "H W"]) -> float:

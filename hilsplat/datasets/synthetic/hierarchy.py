@@ -1,11 +1,11 @@
-"""Hierarchical annotations: who is what, at which level, inside whom, and where in each view.
+"""Hierarchical annotations: what each node is, its level, its parent, and its region in each view.
 
-The format of our own for Hi-LERF-like benchmarks (theirs is unpublished). A folder holds
+Our own format for benchmarks like Hi-LERF, whose format is unpublished. A folder holds
 
     annotations.json          nodes (the tree) and, per view, the nodes that are annotated there
     labels/<view>.<level>.png 16-bit label images: node id + 1, 0 where there is none
 
-Only `evaluate` reads it; no stage before may, but for the diagnostic segmenter (`truth_masks`).
+Only `evaluate` reads it; no earlier stage may, except the diagnostic segmenter (`truth_masks`).
 """
 
 from collections.abc import Iterable, Mapping
@@ -48,7 +48,7 @@ class HierarchyAnnotations:
     """The annotations of one scene.
 
     Attributes:
-        folder: where label images lie.
+        folder: folder with the label images.
         nodes: all nodes, by id.
         views: annotated node ids per view name (large enough to be scored there).
     """
@@ -58,7 +58,7 @@ class HierarchyAnnotations:
     views: Mapping[str, tuple[int, ...]]
 
     def label_image(self, view: str, level: Level) -> Int32[np.ndarray, "H W"]:
-        """Node id per pixel, -1 where the level has none.
+        """Node id per pixel, -1 if the level has none.
 
         Raises:
             ArtifactError: the label image is missing.
@@ -97,13 +97,13 @@ class HierarchyAnnotations:
         """Read the folder.
 
         Raises:
-            ArtifactError: annotations.json is missing or of another format.
+            ArtifactError: annotations.json is missing or in a different format.
         """
         folder = Path(folder)
         record = read_json(folder / "annotations.json")
         if record.get("format") != FORMAT:
             raise ArtifactError(
-                f"{folder}/annotations.json has another format",
+                f"{folder}/annotations.json has a different format",
                 expected=FORMAT,
                 found=record.get("format"),
             )
@@ -132,7 +132,7 @@ def write_hierarchy(
     """Write annotations: label images first, `annotations.json` last.
 
     Args:
-        folder: created where missing.
+        folder: created if missing.
         nodes: ids must be 0, 1, 2, ... in order.
         labels: per view and level, node id per pixel, -1 for none.
         views: annotated node ids per view.

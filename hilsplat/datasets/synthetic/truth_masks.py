@@ -1,9 +1,9 @@
 """The diagnostic segmenter `truth-perturbed`: masks from the true labels of a synthetic scene.
 
-It tells errors of the method from errors of the small segmenter. It is the one place before `evaluate`
-where annotations are read, and never a default: the rule and the command hand the truth over only where
-the settings ask for it, the index says what was done, and every row built on such masks carries
-`SEGMENTER` in its column of masks.
+It separates errors of the method from errors of the small segmenter. It is the only code before `evaluate`
+that reads annotations, and never a default: the rule and the command pass the truth on only if the settings
+ask for it, the index records what was done, and every row built on such masks has `SEGMENTER` in its column
+of masks.
 """
 
 import logging
@@ -28,7 +28,7 @@ from hilsplat.settings import PerturbSettings
 logger = logging.getLogger(__name__)
 
 SEGMENTER = "truth-perturbed"
-"""Name of the segmenter, with which the label of its masks begins."""
+"""Name of the segmenter; the label of its masks begins with it."""
 
 FAULTS = (
     "boundary_px",
@@ -41,7 +41,7 @@ FAULTS = (
     "systematic_merge",
     "systematic_missing",
 )
-"""Knobs of `PerturbSettings` that change masks; where all are 0 the masks are the truth."""
+"""Knobs of `PerturbSettings` that change masks; if all are 0, the masks are the truth."""
 
 
 def run_truth_masks(
@@ -58,14 +58,14 @@ def run_truth_masks(
         scene_folder: the `Scene` artifact.
         truth: the truth folder of a synthetic scene: annotations, and `scene.json`, which names the
             surroundings.
-        out: folder to write: `<view>.npz` (`HierarchicalMasks`) and `index.json`, as the masks stage
-            does; the index also holds the faults asked for and, per view, how many were put in.
+        out: folder to write: `<view>.npz` (`HierarchicalMasks`) and `index.json`, as the masks stage does;
+            the index also holds the requested faults and, per view, how many were put in.
         settings: the faults.
-        min_area_px: true regions that are smaller give no mask (`masks.min_area_px`).
-        threads: views worked on at once; the result does not depend on it.
+        min_area_px: smaller true regions give no mask (`masks.min_area_px`).
+        threads: views processed at once; the result does not depend on it.
 
     Raises:
-        MisalignedArtifactError: label images are of another size than the cameras.
+        MisalignedArtifactError: label images differ in size from the cameras.
         ArtifactError: the truth folder is missing or incomplete.
     """
     scene = Scene.load(scene_folder)
@@ -79,14 +79,16 @@ def run_truth_masks(
     draws = Draws(settings.seed, scene.name)
     label = faults_label(settings)
     with stage_log("masks", scene.name) as counts:
-        logger.warning("masks %s: %s, made from the TRUE labels: a diagnostic, no result", scene.name, label)
+        logger.warning(
+            "masks %s: %s, made from the TRUE labels: a diagnostic, not a result", scene.name, label
+        )
 
         def segment(view: str) -> tuple[HierarchicalMasks, dict[str, int]]:
             labels = true_labels(annotations, view)
             expected = scene.cameras[view].size_hw
             if labels.shape[1:] != expected:
                 raise MisalignedArtifactError(
-                    f"label image of view {view} does not fit its camera",
+                    f"label image of view {view} does not match its camera",
                     expected=f"{expected[0]} x {expected[1]} (height x width)",
                     found=f"{labels.shape[1]} x {labels.shape[2]}",
                     fix="run poses without shrinking the images (poses.max_side_px)",
@@ -117,7 +119,7 @@ def run_truth_masks(
 
 
 def true_labels(annotations: HierarchyAnnotations, view: str) -> Int32[np.ndarray, "3 H W"]:
-    """Node id per level and pixel, -1 where the level has none."""
+    """Node id per level and pixel, -1 if the level has none."""
     return np.stack([annotations.label_image(view, level) for level in LEVELS])
 
 

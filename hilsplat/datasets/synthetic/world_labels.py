@@ -23,7 +23,7 @@ def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
             labellings nyu40, scannet200 and replica. "street": returns of the lidar; labelling waymo.
 
     Raises:
-        SceneError: the world is of another kind.
+        SceneError: the world is of a different kind.
         ArtifactError: a file is missing or damaged.
     """
     world = Path(world)
@@ -52,7 +52,7 @@ def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
 
 
 def _of_nodes(class_of_node: list[int], node: Int32[np.ndarray, " P"]) -> Int32[np.ndarray, " P"]:
-    """Class of each point's node; 0 for points of none."""
+    """Class of each point's node; 0 for points without a node."""
     return np.array([*class_of_node, 0], dtype=np.int32)[node]
 
 

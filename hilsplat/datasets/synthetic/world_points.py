@@ -1,4 +1,4 @@
-"""What ScanNet, Replica and Waymo call the things of a synthetic room or street."""
+"""What ScanNet, Replica and Waymo call the objects of a synthetic room or street."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from jaxtyping import Int32
 from hilsplat.datasets.classes import replica, scannet, scannet200, waymo
 
 OTHERPROP = 40
-"""NYU40's class of small things that have none of their own."""
+"""NYU40's class for small things without a class of their own."""
 SCANNET200_NAMES = {"sofa": "couch", "television": "tv", "bear": "stuffed animal", "mug": "cup"}
 REPLICA_NAMES = {
     "bookshelf": "shelf",
@@ -19,7 +19,8 @@ REPLICA_NAMES = {
     "tv stand": "tv-stand",
     "mug": "cup",
 }
-"""Classes of the world -> names in the data set, where those differ. What neither has is undefined there."""
+"""Classes of the world -> names in the data set, if they differ. Classes that a data set lacks are undefined
+there."""
 
 WAYMO_CLASSES: dict[str, str] = {
     "car": "car",
@@ -46,7 +47,7 @@ WAYMO_CLASSES: dict[str, str] = {
 undefined: Waymo has no class for them."""
 
 COUNTABLE = frozenset({"car", "truck", "bus", "bicyclist", "pedestrian"})
-"""Classes whose instances are told apart."""
+"""Classes with separate instances."""
 
 
 def scannet_ids(text: str) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""What Waymo records of one moment, whichever kind of file it came from."""
+"""What Waymo records of one moment, whatever kind of file it came from."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -25,9 +25,9 @@ class LidarReturn:
     """One return of the top lidar.
 
     Attributes:
-        image: range (metres, not positive where there is no return), intensity, elongation, no-label zone.
-        labels: instance and class; None where the frame is not labelled.
-        projection: first camera, x, y, second camera, x, y; camera 0 is none. None where not stored.
+        image: range (metres, not positive without a return), intensity, elongation, no-label zone.
+        labels: instance and class; None if the frame is not labelled.
+        projection: first camera, x, y, second camera, x, y; camera 0 is none. None if not stored.
     """
 
     image: Float32[np.ndarray, "H W 4"]
@@ -45,7 +45,7 @@ class LidarFrame:
         vehicle_from_lidar: pose of the lidar on the vehicle.
         inclinations: of the rows, radian, highest first.
         pixel_pose: roll, pitch, yaw, x, y, z of the vehicle in the world at each pixel, of both returns.
-        returns: first and, where there is one, second return.
+        returns: first and, if there is one, second return.
     """
 
     timestamp_micros: int
@@ -125,7 +125,7 @@ def frame_points(frame: LidarFrame, segment_from_world: Float[np.ndarray, "4 4"]
 
 
 def joined_points(frames: Iterable[LabelledPoints]) -> LabelledPoints:
-    """Points of several frames as one; visibility stays where every frame tells it."""
+    """Points of several frames combined; visibility is kept if every frame has it."""
     parts = list(frames)
     seen = [part.visible for part in parts if part.visible is not None]
     return LabelledPoints(

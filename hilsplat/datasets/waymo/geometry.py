@@ -1,6 +1,6 @@
 """Waymo's range images as points, and its cameras (waymo-research/waymo-open-dataset, Apache-2.0).
 
-The formulas are those of `utils/range_image_utils.py` and `wdl_limited/camera`, written anew. Vehicle and
+The formulas are those of `utils/range_image_utils.py` and `wdl_limited/camera`, reimplemented. Vehicle and
 camera axes are x forward, y left, z up.
 """
 
@@ -24,7 +24,7 @@ def beam_inclinations(
     """Inclination of each row of a range image, radian; row 0 is the highest beam.
 
     Args:
-        values: of the calibration, ascending; None where beams are evenly spaced.
+        values: of the calibration, ascending; None if beams are evenly spaced.
         lowest: border of the lowest beam, for evenly spaced ones.
         highest: border of the highest.
         height: rows.
@@ -64,9 +64,9 @@ def range_image_points(
     inclinations: Float[np.ndarray, " H"],
     vehicle_from_lidar: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "H W 3"]:
-    """Places of all pixels in the vehicle's frame at the time of each pixel, metres.
+    """Positions of all pixels in the vehicle's frame at the time of each pixel, metres.
 
-    Pixels whose range is not positive have no point; their places mean nothing.
+    Pixels whose range is not positive have no point; their positions are meaningless.
     """
     azimuth = column_azimuths(range_m.shape[1], vehicle_from_lidar)[None]
     up = inclinations[:, None]
@@ -123,7 +123,7 @@ class WaymoCamera:
         """World-to-camera transform in OpenCV axes.
 
         Args:
-            world_from_vehicle: the pose stored with the image; the frame's is of another moment.
+            world_from_vehicle: the pose stored with the image; the frame's pose belongs to another moment.
         """
         return CV_FROM_WAYMO @ np.linalg.inv(world_from_vehicle @ self.vehicle_from_cam)
 

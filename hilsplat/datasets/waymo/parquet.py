@@ -21,7 +21,7 @@ COMPONENTS = (
     "lidar_segmentation",
     "vehicle_pose",
 )
-"""Tags that are needed; `lidar_camera_projection` is read where it is there."""
+"""Required tags; `lidar_camera_projection` is read if it is present."""
 INTRINSIC = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
 FRAME, LASER, CAMERA = "key.frame_timestamp_micros", "key.laser_name", "key.camera_name"
 
@@ -34,7 +34,7 @@ def component_path(split: Path, tag: str, segment: str) -> Path:
 def read_component(
     split: Path, tag: str, segment: str, columns: list[str], only: dict[str, list[int]] | None = None
 ) -> list[dict[str, Any]]:
-    """Rows of a component in the order of the file: lists as arrays, other values as they are.
+    """Rows of a component in the order of the file: lists as arrays, other values unchanged.
 
     Args:
         split: folder such as `validation`.
@@ -69,8 +69,8 @@ def read_component(
                 fix="download the component again",
             )
         keep = None
-        for name, values in (only or {}).items():
-            condition = dataset.field(name).isin(values)
+        for name, allowed in (only or {}).items():
+            condition = dataset.field(name).isin(allowed)
             keep = condition if keep is None else keep & condition
         table = dataset.dataset(path, format="parquet").to_table(columns=columns, filter=keep)
     except (pa.ArrowInvalid, OSError) as error:
@@ -92,7 +92,7 @@ def _plain(value: Any) -> Any:
 
 
 def _image(row: dict[str, Any], name: str, depth: int, where: str) -> np.ndarray | None:
-    """A range image of H x W x depth; None where it is null."""
+    """A range image of H x W x depth; None if it is null."""
     values, shape = row[f"{name}.values"], row[f"{name}.shape"]
     if values is None or shape is None:
         return None
@@ -188,7 +188,7 @@ def _top(split: Path, segment: str, tag: str, component: str, time: int, returns
     rows = read_component(split, tag, segment, [FRAME, LASER, *columns], {FRAME: [time], LASER: [TOP]})
     if len(rows) != 1:
         raise SceneError(
-            f"component {tag} of segment {segment} does not fit lidar_segmentation",
+            f"component {tag} of segment {segment} does not match lidar_segmentation",
             expected=f"one row of the top lidar at {time}",
             found=f"{len(rows)}",
             fix="download all components of the segment from the same release",

@@ -1,7 +1,7 @@
 """Waymo v1 (1.4.3): TFRecord files of Frame messages, read without TensorFlow.
 
 protobuf decodes the messages. The records around them are read here, in a few lines: the package `tfrecord`
-would bring two more dependencies, and reserve as much memory as a damaged length says.
+would add two dependencies, and allocate as much memory as a damaged length asks for.
 """
 
 import struct
@@ -38,8 +38,8 @@ CameraImage: required int32 name 1, required bytes image 2, required Transform p
 Frame: required Context context 1, required int64 timestamp_micros 2, required Transform pose 3, \
     repeated CameraImage images 4, repeated Laser lasers 5
 """
-"""What is read of waymo-research/waymo-open-dataset `dataset.proto`, by its names and numbers; what cannot
-be missing is required."""
+"""The fields that are read of waymo-research/waymo-open-dataset `dataset.proto`, with its names and numbers;
+those that are never missing are marked required."""
 
 
 def message_classes(fields: str) -> dict[str, Any]:
@@ -121,7 +121,7 @@ def first_pose(path: Path) -> Float[np.ndarray, "4 4"]:
     """The vehicle's pose in the world at the first frame."""
     for where, frame in frames(path):
         return _transform(frame.pose, where)
-    raise SceneError(f"{path} holds no frame", fix=UNPACK_AGAIN)
+    raise SceneError(f"{path} does not hold any frame", fix=UNPACK_AGAIN)
 
 
 def _transform(message: Any, where: str) -> np.ndarray:
@@ -153,7 +153,7 @@ def lidar_frames(path: Path) -> Iterator[LidarFrame]:
             if all(part.labels is None for part in returns):
                 continue
             if pixel_pose is None:
-                raise SceneError(f"{where} has labels but no poses of pixels", fix=UNPACK_AGAIN)
+                raise SceneError(f"{where} has labels but no pixel poses", fix=UNPACK_AGAIN)
             inclinations = beam_inclinations(
                 np.array(calibration.beam_inclinations) if calibration.beam_inclinations else None,
                 calibration.beam_inclination_min,
@@ -177,7 +177,7 @@ def _named(messages: Iterable[Any], name: int) -> Any:
     for message in messages:
         if message.name == name:
             return message
-    raise ValueError(f"it has nothing of sensor {name}")
+    raise ValueError(f"it has no data of sensor {name}")
 
 
 def camera_shots(path: Path, every: int = 1) -> Iterator[CameraShot]:
@@ -185,7 +185,7 @@ def camera_shots(path: Path, every: int = 1) -> Iterator[CameraShot]:
 
     Args:
         path: the file.
-        every: take each n-th frame, all its cameras.
+        every: take every n-th frame, with all its cameras.
 
     Raises:
         SceneError: the file is damaged.

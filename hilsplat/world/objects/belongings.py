@@ -254,7 +254,7 @@ def _chest(b: Builder) -> None:
     )
     bands = b.subpart(chest, "bands", "straps", "iron bands")
     for side in (-1, 1):
-        for x in (-1, 1):
+        for x in (-1.0, 1.0):
             b.put(
                 bands,
                 metal,

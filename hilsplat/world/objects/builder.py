@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int32
@@ -11,6 +11,8 @@ from jaxtyping import Float, Int32
 from hilsplat.base.levels import NONE
 from hilsplat.world.paints import COLOURS, Paint, PaintBox, difference
 from hilsplat.world.shapes import Mesh, joined
+
+Word = TypeVar("Word", bound="str | None")
 
 PARENT_CONTRAST = 24.0
 """Least distance in L*a*b* between a subpart and the part it sits on."""
@@ -97,24 +99,25 @@ class Builder:
         self._pieces.append((node, joined(*meshes), paint))
 
     def shift(self, nodes: tuple[int, ...], x: float | int, y: float | int, z: float | int) -> None:
-        """Move what was put on these nodes so far."""
+        """Move everything added to these nodes so far."""
         self._pieces = [
             (node, mesh.moved(x, y, z) if node in nodes else mesh, paint)
             for node, mesh, paint in self._pieces
         ]
 
     def turn(self, degrees: float | int) -> None:
-        """Turn all that was put so far about the vertical axis."""
+        """Turn everything added so far about the vertical axis."""
         self._pieces = [(node, mesh.turned("z", degrees), paint) for node, mesh, paint in self._pieces]
 
     def build(self) -> ObjectModel:
         """The finished object: it stands on z = 0, and parts that touch differ in colour."""
-        triples = []
+        triples: list[tuple[int, int, int]] = []
         for level, parent, *_ in self._nodes:
             row = len(triples)
             triples.append(
                 (0, NONE, NONE) if level == 1 else (0, row, NONE) if level == 2 else (0, parent, row)
             )
+        node_ids = np.array(triples, np.int32)
         pieces = self._contrasted()
         paints = list(dict.fromkeys(paint for _, _, paint in pieces))
         area: dict[int, dict[Paint, float]] = defaultdict(lambda: defaultdict(float))
@@ -129,7 +132,7 @@ class Builder:
             tuple(self._described(row, area[row]) for row in range(len(self._nodes))),
             triangles,
             np.concatenate([mesh.normals for _, mesh, _ in pieces]),
-            np.concatenate([np.tile(np.int32(triples[node]), (len(mesh), 1)) for node, mesh, _ in pieces]),
+            np.concatenate([np.tile(node_ids[node], (len(mesh), 1)) for node, mesh, _ in pieces]),
             np.concatenate([np.full(len(mesh), paints.index(paint), np.int32) for _, mesh, paint in pieces]),
             np.stack([paint.row() for paint in paints]),
         )
@@ -165,7 +168,7 @@ class Builder:
             for row in rows:
                 for paint, size in surface[row].items():
                     own[paint] += size
-            main = max(own, key=own.get)
+            main = max(own, key=own.__getitem__)
             parents = {self._nodes[row].parent for row in rows}
             rivals = []
             for other, paint in settled.items():
@@ -227,10 +230,10 @@ def _touch(first: np.ndarray, second: np.ndarray, reach: float) -> bool:
 
 
 def _distinct(paint: Paint, rivals: list[tuple[Paint, float]]) -> Paint:
-    """The paint, or what is nearest to it that differs from all rivals by their distance."""
+    """The paint, or the nearest one that differs from every rival by its distance."""
 
     def short(candidate: Paint) -> float:
-        """By how much the worst rival is missed; 0 where none is."""
+        """By how much the distance to the worst rival falls short; 0 if none does."""
         return max([0.0, *(least - difference(candidate, rival) for rival, least in rivals)])
 
     shades = [paint if factor == 1 else paint.shaded(factor) for factor in _SHADES]
@@ -238,17 +241,17 @@ def _distinct(paint: Paint, rivals: list[tuple[Paint, float]]) -> Paint:
     tried = [shade for shade in shades if shade.colour in allowed]
     tried += [paint.recoloured(word) for word in allowed if word != paint.colour]
     tried = tried or [paint]
-    return min(tried, key=short)  # the first of equals: the least change that will do
+    return min(tried, key=short)  # the first of equals: the smallest sufficient change
 
 
 def _prevailing(
-    area: dict[Paint, float], least: float, word_of: Callable[[Paint], str | None]
-) -> tuple[str | None, bool]:
+    area: dict[Paint, float], least: float, word_of: Callable[[Paint], Word]
+) -> tuple[Word, bool]:
     """The word of most of a surface, and whether that is at least the given share of it."""
-    per_word: dict[str | None, float] = defaultdict(float)
+    per_word: dict[Word, float] = defaultdict(float)
     for paint, size in area.items():
         per_word[word_of(paint)] += size
-    word = max(per_word, key=per_word.get)
+    word = max(per_word, key=per_word.__getitem__)
     return word, per_word[word] >= least * sum(per_word.values())
 
 

@@ -21,8 +21,8 @@ from hilsplat.world.objects import (
 from hilsplat.world.objects.builder import Builder, Maker, ObjectModel
 
 GENERATOR_VERSION = 2
-"""Changes whenever the same seed would give another scene or other texts; small models trained on another
-version do not fit."""
+"""Changes whenever the same seed would give a different scene or different texts; small models trained on
+another version do not fit."""
 
 _MAKERS: dict[str, Maker] = {
     **toys.MAKERS,
@@ -37,7 +37,7 @@ _MAKERS: dict[str, Maker] = {
 }
 
 TABLETOP: tuple[str, ...] = tuple(_MAKERS)
-"""Classes that stand on a table; all are about as large there."""
+"""Classes that stand on a table; all have about the same size there."""
 
 FURNITURE: dict[str, Maker] = {
     **furniture.MAKERS,
@@ -56,7 +56,7 @@ ROOM_THINGS: tuple[str, ...] = (
 """Classes of the table that stand on furniture in a room; the small chairs and cabinets do not."""
 
 STREET: dict[str, Maker] = street.MAKERS
-"""Classes of a street at their real size, in metres; a `car` is no toy there."""
+"""Classes of a street at their real size, in metres; a `car` is not a toy there."""
 
 
 def build_object(name: str, rng: np.random.Generator) -> ObjectModel:

@@ -1,4 +1,4 @@
-"""What belongs to the walls of a room, at its real size, in metres: its back is x = 0, its front faces +x."""
+"""Fixtures on the walls of a room at their real size, in metres: backs are at x = 0, fronts face +x."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ def _door(b: Builder) -> None:
     leaf = b.part("leaf", "wing")
     b.put(leaf, leaf_paint, box((0.04, width, height - 0.005), (0.02, 0, height / 2)))
     panel_paint = b.paints.draw("plain")
-    for y in (-1, 1):
+    for y in (-1.0, 1.0):
         for low, high in ((0.14, 0.44), (0.5, 0.94)):
             panel = b.subpart(leaf, "panel", "inlay")
             b.put(
@@ -120,7 +120,7 @@ def _picture(b: Builder) -> None:
     width, height = b.between(0.6, 0.85), b.between(0.48, 0.62)
     border = 0.055
     frame = b.part("frame", "border")
-    for side in (-1, 1):
+    for side in (-1.0, 1.0):
         b.put(
             frame, wood, box((0.04, border, height), (0.02, side * (width - border) / 2, height / 2), 0.012)
         )

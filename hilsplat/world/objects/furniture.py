@@ -89,7 +89,7 @@ def _sofa(b: Builder) -> None:
     inner, arm_w = seats * b.between(0.54, 0.62), b.between(0.14, 0.2)
     width, seat_z, top = inner + 2 * arm_w, b.between(0.28, 0.32), b.between(0.78, 0.88)
     for x in (-1, 1):
-        for y in (-1, 1):
+        for y in (-1.0, 1.0):
             leg = b.part("leg", "foot")
             b.put(
                 leg,

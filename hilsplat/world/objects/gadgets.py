@@ -333,7 +333,7 @@ def _headphones(b: Builder) -> None:
             metal,
             cylinder(0.125, -0.025, 0.025, 24, 0.01).turned("x", 90).moved(0, side * (r + 0.12), z - 0.18),
         )
-    b.turn(b.between(35, 60))  # seen from in front both cups show their outside or inside
+    b.turn(b.between(35, 60))  # from the front both cups show their outside or inside
 
 
 MAKERS: dict[str, Maker] = {

@@ -220,7 +220,7 @@ def _tv_stand(b: Builder) -> None:
     feet = b.subpart(body, "feet", "legs")
     foot_paint = b.paints.draw("metal")
     for x in (-1, 1):
-        for y in (-1, 1):
+        for y in (-1.0, 1.0):
             b.put(
                 feet,
                 foot_paint,

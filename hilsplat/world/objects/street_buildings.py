@@ -9,7 +9,7 @@ DEPTH = 6.0
 
 
 def _wall(b: Builder, *avoid: str) -> Paint:
-    """A wall that differs from the colours to avoid."""
+    """A wall paint that differs from the colours to avoid."""
     if b.chance(0.35):
         return b.paints.draw(
             "brick", *(c for c in ("red", "brown", "beige", "orange", "grey") if c not in avoid), scale=1.9
@@ -18,7 +18,7 @@ def _wall(b: Builder, *avoid: str) -> Paint:
 
 
 def _block(w: float, bottom: float, top: float, out: float = 0.0) -> Mesh:
-    """A storey of the house; `out` is how far its front stands before x = 0."""
+    """A storey of the house; `out` is how far its front projects beyond x = 0."""
     return box((DEPTH + out, w, top - bottom), ((out - DEPTH) / 2, 0, (bottom + top) / 2))
 
 

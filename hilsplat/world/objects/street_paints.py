@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from hilsplat.world.objects.builder import Builder
-from hilsplat.world.paints import COLOURS, Paint
+from hilsplat.world.paints import COLOURS, Colour, Paint, each_channel
 from hilsplat.world.shapes import Mesh, Number, box, cylinder, sweep
 
 PASTELS = {
@@ -28,8 +28,8 @@ FOLIAGE = {
 """sRGB of leaves, in shade and in light, by colour word."""
 
 
-def _faded(colour: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
-    return tuple(factor * value for value in colour)
+def _faded(colour: Colour, factor: float) -> Colour:
+    return each_channel(colour, lambda value: factor * value)
 
 
 def lacquer(b: Builder, *colours: str) -> Paint:
@@ -39,7 +39,7 @@ def lacquer(b: Builder, *colours: str) -> Paint:
 
 
 def glass(b: Builder) -> Paint:
-    """Dark, glossy and a little cloudy: a window pane that has something to see on it."""
+    """Dark, glossy and a little cloudy: a window pane with some visible detail."""
     paint = b.paints.draw("plain", "black")
     first, second = ((0.15, 0.19, 0.26), (0.36, 0.45, 0.55))
     choices = ("black", "grey", "blue", "teal")
@@ -54,7 +54,7 @@ def rubber(b: Builder) -> Paint:
 
 
 def lit(paint: Paint) -> Paint:
-    """The same colour, shining by itself (the shader's rule: no shininess, no shading)."""
+    """The same colour, self-luminous (the shader's rule: no shininess, no shading)."""
     return replace(paint, specular=0.0, shininess=0.0)
 
 
@@ -75,7 +75,7 @@ def foliage(b: Builder, *colours: str) -> Paint:
 
 
 def plain(b: Builder, colour: str) -> Paint:
-    """A colour as it is in the list of colours."""
+    """A plain paint in exactly the listed colour."""
     return replace(b.paints.draw("plain", colour), first=COLOURS[colour])
 
 

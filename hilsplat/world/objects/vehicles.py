@@ -184,7 +184,7 @@ def _sailboat(b: Builder) -> None:
         .turned("x", 90)
         .moved(mast_x + 0.05 + foot * 0.28, 0, low - 0.10 + tall * 0.30),
     )
-    b.turn(55)  # seen from in front the sails are broad
+    b.turn(55)  # from the front the sails are broad
 
 
 def _airplane(b: Builder) -> None:

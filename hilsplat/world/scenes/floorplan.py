@@ -1,4 +1,5 @@
-"""Where the furniture of a room goes: boxes along the walls that leave each other and the way free."""
+"""Placement of furniture in a room: boxes along the walls that keep clear of each other and of the cameras'
+path."""
 
 from dataclasses import dataclass
 
@@ -19,7 +20,7 @@ TRIES = 120
 
 @dataclass(frozen=True)
 class Room:
-    """The inside of a room, its floor's middle at the origin; walls 0 to 3 face +x, +y, -x, -y.
+    """The inside of a room, with the middle of its floor at the origin; walls 0 to 3 face +x, +y, -x, -y.
 
     Attributes:
         width: length along x, m.
@@ -42,13 +43,13 @@ class Room:
 
 
 def yaw_of_wall(wall: int) -> float:
-    """Turn by which the front of a thing with its back to the wall faces the room, degree."""
+    """Rotation with which a thing with its back to the wall faces the room, degrees."""
     return 90.0 * wall
 
 
 @dataclass(frozen=True)
 class Space:
-    """An upright box of space that is taken, m.
+    """An axis-aligned box of occupied space, m.
 
     Attributes:
         low: its lowest corner.
@@ -69,7 +70,7 @@ class Space:
         return sides and self.low[2] < other.high[2] and other.low[2] < self.high[2]
 
     def beyond(self, room: Room, gap: float) -> bool:
-        """Whether the box leaves the room, less `gap` at the walls."""
+        """Whether the box extends beyond the room, less a margin of `gap` at the walls."""
         half = (room.width / 2 - gap, room.depth / 2 - gap)
         return any(self.low[a] < -half[a] or self.high[a] > half[a] for a in range(2))
 
@@ -80,20 +81,20 @@ class Space:
 
 
 class FloorPlan:
-    """What is taken of a room, while it is furnished."""
+    """The occupied space of a room while it is being furnished."""
 
     def __init__(self, room: Room, path: Float[np.ndarray, "N 2"]) -> None:
         self.room, self.path = room, path
         self.taken: list[Space] = []
 
     def free(self, space: Space, gap: float = PIECE_GAP) -> bool:
-        """Whether a box of space is inside the room, off what is taken, and off the cameras' path."""
+        """Whether a box of space is inside the room and clear of occupied space and of the cameras' path."""
         if space.beyond(self.room, 0.0) or any(space.meets(other, gap) for other in self.taken):
             return False
         return space.high[2] <= PATH_LOW or space.distance_xy(self.path) >= PATH_GAP
 
     def take(self, space: Space) -> None:
-        """Nothing else may go there."""
+        """Mark a box of space as occupied."""
         self.taken.append(space)
 
     def wall_spot(
@@ -112,11 +113,11 @@ class FloorPlan:
             size: of the thing in its own frame: depth, width, height, m.
             base_z: height of its lowest point, m.
             clear: room to leave free before it, m; not taken from others afterwards.
-            walls: those allowed.
+            walls: allowed walls.
             gap: between it and the wall, m.
 
         Returns:
-            The wall, the middle of the thing from above, and the space it takes; None if none was found.
+            The wall, the middle of the thing from above, and the space it takes; None if there is none.
         """
         for _ in range(TRIES):
             wall = int(rng.choice(walls))

@@ -12,11 +12,11 @@ from hilsplat.world.scenes.scene import WorldScene
 
 
 class SceneKind(NamedTuple):
-    """What a kind of scene is.
+    """One kind of scene.
 
     Attributes:
         build: the scene of a seed with a number of objects.
-        cameras: views of a scene, (scene, views, image_px, arc_deg); neighbours are near enough for
+        cameras: views of a scene, (scene, views, image_px, arc_deg); neighbours are close enough for
             structure from motion.
         training_camera: a random camera for the small models, (scene, random, image_px).
     """
@@ -31,7 +31,7 @@ KINDS: dict[str, SceneKind] = {
     "room": SceneKind(room.build_room, room_cameras.loop_cameras, room_cameras.training_camera),
     "street": SceneKind(street.build_street, street.drive_cameras, street.training_camera),
 }
-"""By the word that names the kind in the scene sheet."""
+"""Kinds by their name in the scene sheet."""
 
 
 def build_scene(kind: str, seed: int, objects: int) -> WorldScene:
@@ -39,7 +39,7 @@ def build_scene(kind: str, seed: int, objects: int) -> WorldScene:
 
     Args:
         kind: one of `KINDS`.
-        seed: not negative; same seed and number of objects, same scene.
+        seed: not negative; the same seed and number of objects give the same scene.
         objects: how many to place.
 
     Raises:

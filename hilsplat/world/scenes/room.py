@@ -19,9 +19,9 @@ from hilsplat.world.shapes import rotation_about
 logger = logging.getLogger(__name__)
 
 FURNITURE_SHARE = 0.65
-"""Of the objects asked for, how many are furniture; the others are things that stand on it."""
+"""Share of the requested objects that are furniture; the others are things that stand on it."""
 PATTERN_FACTOR = 2.0
-"""Things are drawn at half a metre and stand here at half of that: their patterns shrink with them."""
+"""Things are drawn about half a metre in size and placed at half that: their patterns shrink with them."""
 
 
 class Piece(NamedTuple):
@@ -31,7 +31,7 @@ class Piece(NamedTuple):
         name: its class.
         above: height kept free above it for what stands on it, m.
         clear: room kept free before it, m.
-        partners: what comes with it, if that finds a place too: class and where ("before", "beside", "on").
+        partners: what is placed with it if there is room: class and where ("before", "beside", "on").
     """
 
     name: str
@@ -50,7 +50,7 @@ LARGE: tuple[Piece, ...] = (
     Piece("refrigerator", 0.0, 0.4),
     Piece("cabinet", 0.45, 0.3),
 )
-"""Pieces that stand at a wall; drawn in a random order, each once before any comes again."""
+"""Pieces that stand at a wall; drawn in random order, each once before any is repeated."""
 
 SUPPORTS: dict[str, str] = {
     "table": "table top",
@@ -60,7 +60,7 @@ SUPPORTS: dict[str, str] = {
     "counter": "counter top",
     "tv stand": "tv stand top",
 }
-"""Furniture that things stand on, and the node whose upper side carries them."""
+"""Furniture that things stand on, and the node whose top carries them."""
 
 THING_SIZES: dict[str, tuple[float, float]] = {
     "mug": (0.15, 0.2), "kettle": (0.24, 0.3), "bottle": (0.3, 0.36), "cake": (0.22, 0.28),
@@ -72,13 +72,13 @@ TOY_SIZE = (0.34, 0.44)
 """Heights of all other things, m."""
 MAX_THING_RADIUS = 0.21
 EDGE = 0.03
-"""Things stay so far off the edge of what carries them, m; also off the wall of a counter."""
+"""Distance that things keep from the edge of what carries them, and from the wall behind a counter, m."""
 MAX_FLAT = 0.05
-"""What lies on a board and is no higher carries things too, m."""
+"""Whatever lies on a board and is no higher than this carries things too, m."""
 
 
 class _Furnishing:
-    """A room while it is furnished: the scene so far, what is taken, what can carry things."""
+    """A room while it is being furnished: the scene so far, occupied space, and what can carry things."""
 
     def __init__(self, seed: int, room: Room, path: np.ndarray) -> None:
         self.seed, self.plan = seed, FloorPlan(room, path)
@@ -127,12 +127,12 @@ class _Furnishing:
 
 
 class Support(NamedTuple):
-    """The upper side of a piece of furniture.
+    """The top of a piece of furniture.
 
     Attributes:
         top: the space of its board.
         flat: spaces of what lies on it, such as a table runner.
-        stand: middle and radius of the footprints that are on it already.
+        stand: middle and radius of the footprints already on it.
     """
 
     top: Space
@@ -168,10 +168,9 @@ def size_of(model: ObjectModel) -> Float[np.ndarray, " 3"]:
 def build_room(seed: int, objects: int) -> WorldScene:
     """A room of about 4 x 5 m with furniture at its walls; the unit is the metre, the floor z = 0.
 
-    A door, a window with a curtain and two pictures (or a mirror) come with every room. Of `objects`,
-    about two thirds are furniture, the others things that stand on it (or on the floor, where nothing
-    carries them); what finds no place is left out. More objects fill the room: the loop of the cameras
-    stays free.
+    A door, a window with a curtain and two pictures (or a mirror) come with every room. Of `objects`, about
+    two thirds are furniture, the others things that stand on it (or on the floor if nothing can carry them);
+    objects without a place are left out. More objects fill the room, but the loop of the cameras stays free.
 
     Args:
         seed: not negative; same seed and number of objects, same scene.
@@ -218,11 +217,11 @@ def _add_fixtures(work: _Furnishing, rng: np.random.Generator) -> int:
 
 
 def _furnish(work: _Furnishing, rng: np.random.Generator, count: int) -> int:
-    """Large pieces at the walls with what belongs to them, a table in the middle; returns how many."""
+    """Place large pieces at the walls with their partners, and a table in the middle; returns how many."""
     done, failures = 0, 0
     queue: list[Piece] = []
     with_rug = count >= 4 and bool(rng.random() < 0.5)
-    # A table goes where the others leave it place; lamp and stool come once so many pieces are there.
+    # A table goes where the others leave room; lamp and stool come once there are enough pieces.
     extras = [(5, "lamp"), (7, "stool")]
     table_at = count - 1 - with_rug if count >= 3 else count
     while done < count and failures < 2 * len(LARGE):
@@ -262,11 +261,11 @@ def _put_at_wall(work: _Furnishing, rng: np.random.Generator, piece: Piece) -> b
 
 
 ON_TOP: dict[str, float] = {"television": -0.03, "monitor": -0.12, "sink": 0.0}
-"""How far before the middle of what carries it a thing stands that has its place there, m."""
+"""How far in front of the middle of its support a partner placed on it stands, m."""
 
 
 def _put_partner(work: _Furnishing, rng: np.random.Generator, owner_row: int, name: str, where: str) -> bool:
-    """Put what belongs to a piece before it, beside it or on it; tells whether there was place."""
+    """Place a partner of a piece before it, beside it or on it; returns whether there was room."""
     model = work.model(name)
     size = size_of(model)
     owner = work.placed[owner_row]
@@ -297,7 +296,7 @@ def _put_partner(work: _Furnishing, rng: np.random.Generator, owner_row: int, na
 
 
 def _put_table(work: _Furnishing, rng: np.random.Generator, with_rug: bool) -> int:
-    """A table near the middle of the room, perhaps on a rug; returns how many pieces that were."""
+    """A table near the middle of the room, perhaps on a rug; returns the number of pieces."""
     model, rug = work.model("table"), work.model("rug")
     size = size_of(rug) if with_rug else size_of(model)
     base_z = float(size_of(rug)[2]) if with_rug else 0.0
@@ -315,7 +314,7 @@ def _put_table(work: _Furnishing, rng: np.random.Generator, with_rug: bool) -> i
 
 
 def _hang_pictures(work: _Furnishing, rng: np.random.Generator) -> int:
-    """A picture, and another or a mirror, where walls are free at eye height; returns how many."""
+    """Hang a picture, and another or a mirror, where walls are free at eye height; returns how many."""
     hung = 0
     for name in ("picture", str(rng.choice(["picture", "mirror"]))):
         model = work.model(name)

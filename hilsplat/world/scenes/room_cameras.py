@@ -1,4 +1,4 @@
-"""Cameras of room scenes: a loop that structure from motion holds, and random ones for training."""
+"""Cameras of room scenes: a loop that structure from motion can reconstruct, and random ones for training."""
 
 from collections.abc import Sequence
 
@@ -12,9 +12,9 @@ from hilsplat.world.views import looking_at, numbered_cameras, pinhole
 
 FOV_DEG = 62.0
 EYE_HEIGHTS = (1.34, 1.7)
-"""Heights of the cameras, by turns, m; the difference gives parallax that the loop alone lacks."""
+"""Heights of the cameras, alternating, m; the difference gives parallax that the loop alone lacks."""
 PATH_SHARE = 0.27
-"""Half axes of the cameras' loop, share of the room's width and depth."""
+"""Semi-axes of the cameras' loop, as shares of the room's width and depth."""
 LOOK_AT_Z = 0.78
 
 
@@ -32,13 +32,13 @@ def room_of(scene: WorldScene) -> Room:
 
 
 def loop_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int = 360.0) -> Cameras:
-    """Cameras on a loop through the room, at two heights by turns, that look across its middle.
+    """Cameras on a loop through the room, alternating between two heights, that look across its middle.
 
-    Looking across sees the far wall with all that stands there, and the middle from all sides; a
-    camera that turns on the spot and looks outwards would give no parallax.
+    Looking across shows the far wall with everything in front of it, and the middle from all sides; a camera
+    that turns on the spot and looks outwards would give no parallax.
 
     Args:
-        scene: its seed is that of the jitter.
+        scene: its seed also determines the jitter.
         views: number of cameras, named 000.png, 001.png, ...
         image_px: height and width.
         arc_deg: azimuth of the loop that is used, about +x; a full ring does not repeat its first.
@@ -92,7 +92,7 @@ def _free_centre(
     size: float,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """A place in the room, outside all objects, from which something of a size fills much of a view."""
+    """A position in the room, outside all objects, from which something of this size fills much of a view."""
     half = np.array([room.width, room.depth]) / 2 - 0.2
     for _ in range(200):
         azimuth, distance = rng.uniform(0, 2 * np.pi), size * rng.uniform(1.7, 3.2) + 0.35
@@ -102,6 +102,6 @@ def _free_centre(
             ((centre < low - 0.12) | (centre > high + 0.12)).any() for low, high in boxes
         ):
             return centre
-    # In a corner that furniture encloses only the loop is surely free.
+    # In a corner enclosed by furniture only the loop is certain to be free.
     spot = path_points(room, np.array([rng.uniform(0, 360)]))[0]
     return np.array([*spot, rng.uniform(1.3, 1.75)])

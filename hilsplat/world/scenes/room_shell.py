@@ -8,7 +8,7 @@ from hilsplat.world.scenes.scene import Assembly, Style
 from hilsplat.world.shapes import Mesh, box
 
 WALL_PALE, FLOOR_PALE, CEILING_PALE = 0.6, 0.4, 0.2
-"""Shares of grey in the colours of walls, floor and ceiling, so that the things stand out."""
+"""Shares of grey in the colours of walls, floor and ceiling, so that the objects stand out."""
 
 
 def add_shell(assembly: Assembly, room: Room, rng: np.random.Generator) -> list[int]:

@@ -1,14 +1,16 @@
-"""A scene of the synthetic world: triangles, each of which knows what it belongs to."""
+"""A scene of the synthetic world: triangles with the nodes they belong to."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
 from hilsplat.base.levels import NONE
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
+from hilsplat.world.mesh import ray_caster
 from hilsplat.world.objects.builder import ObjectModel
 from hilsplat.world.paints import Paint
 from hilsplat.world.shapes import Mesh, rotation_about
@@ -27,8 +29,8 @@ class Style:
         exposure: factor on everything.
         scale: how much larger than a tabletop the scene is; grain, hidden sky and the hash that moves rays
             follow it (1 for a table, 4 for a street).
-        shadow_reach: farther things throw no shadow, scene units; keeps the dome of the sky from
-            hiding the sun.
+        shadow_reach: farther things cast no shadow, scene units; keeps the dome of the sky from hiding the
+            sun.
     """
 
     light_position: tuple[float, float, float] = (1.3, 1.0, 3.6)
@@ -82,12 +84,12 @@ class PlacedObject:
 
 @dataclass(frozen=True, eq=False)
 class WorldScene:
-    """A scene as triangles, each of which knows what it belongs to. z is up.
+    """A scene as triangles with the nodes they belong to. z is up.
 
     Attributes:
-        kind: what sort of scene.
+        kind: kind of scene.
         seed: everything random in it follows from this and from the number of objects.
-        asked: number of objects asked for.
+        asked: number of requested objects.
         placed: the objects that found a place.
         triangles: corner positions, scene units.
         normals: shading normals at the corners.
@@ -96,8 +98,8 @@ class WorldScene:
         material_ids: row of `materials` of each triangle.
         materials: numbers for the shader, `Paint.row`.
         nodes: all nodes by id. Those of the surroundings (table, floor, wall) are wholes without parts.
-        background: ids of the surroundings. They are labelled but never scored: large easy regions
-            would lift every mean.
+        background: ids of the surroundings. They are labelled but never scored: large easy regions would
+            raise every mean.
         style: light of this scene.
     """
 
@@ -116,14 +118,9 @@ class WorldScene:
     style: Style
 
     @cached_property
-    def embree(self) -> object:
+    def embree(self) -> Any:
         """Ray-casting structure, built on first use."""
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-
-        scene = EmbreeScene()
-        TriangleMesh(scene, self.triangles)
-        return scene
+        return ray_caster(self.triangles)
 
 
 class Assembly:
@@ -169,7 +166,7 @@ class Assembly:
             self.coords.append(mesh.triangles / self.scale)
             self.triangles.append(mesh.triangles)
             self.normals.append(mesh.normals)
-            self.node_ids.append(np.tile(np.int32([node, NONE, NONE]), (len(mesh), 1)))
+            self.node_ids.append(np.tile(np.array([node, NONE, NONE], np.int32), (len(mesh), 1)))
             self.material_ids.append(np.full(len(mesh), sum(len(rows) for rows in self.materials), np.int32))
             self.materials.append(paint.row()[None])
         return node

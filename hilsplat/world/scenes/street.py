@@ -21,12 +21,12 @@ from hilsplat.world.views import looking_at, numbered_cameras, pinhole
 logger = logging.getLogger(__name__)
 
 COUNTED = ("car", "pedestrian", "heavy", "cyclist", "car", "pedestrian", "car")
-"""What is asked for: vehicles and people, in this mixture; "heavy" is a truck or a bus."""
+"""Mixture of the requested vehicles and people; "heavy" is a truck or a bus."""
 FURNITURE = (
     "traffic light", "traffic sign", "tree", "street lamp", "tree", "bush", "fence", "tree", "traffic sign",
     "bush", "street lamp", "tree", "fence", "bush",
 )  # fmt: skip
-"""What comes with every street, as far as it finds a place."""
+"""What is added to every street, as far as there is room."""
 STREET_X = (-26.0, 42.0)
 """The rows of buildings; both ends of the street are closed by buildings across."""
 THINGS_X = (-9.0, 25.0)
@@ -39,28 +39,28 @@ LANE_Y = -LANE / 2
 DRIVE_X = (-13.0, 10.5)
 CAMERA_Z = 1.8
 MAX_STEP = 0.51
-"""Farthest two neighbouring views are apart along the street, m."""
+"""Largest distance between neighbouring views along the street, m."""
 SWEEP_VIEWS = 16
-"""Views in which the camera looks from the left to the right and back."""
+"""Number of views in which the camera swings from left to right and back."""
 SWEEP_DEG = 36.0
 """How far it looks to either side of straight ahead."""
 SWAY_M = 0.8
-"""How far it moves to either side of the lane's middle in one sweep. Without it, structure from motion
-measured 2.5 m off instead of 0.04 m: views that turn while they move straight ahead have hardly any
-parallax in common, and the two sides of the street came out at different scales."""
+"""How far it moves to either side of the lane's middle in one sweep. Without it, structure from motion was
+off by 2.5 m instead of 0.04 m: views that turn while they move straight ahead have hardly any parallax in
+common, and the two sides of the street came out at different scales."""
 FOV_DEG = 62.0
 SUN_DISTANCE = 1000.0
 
 
 class _Boxes:
-    """Axis-aligned boxes that are taken, one per part of each thing placed so far."""
+    """Occupied axis-aligned boxes, one per part of each thing placed so far."""
 
     def __init__(self) -> None:
         self.low = np.zeros((0, 3))
         self.high = np.zeros((0, 3))
 
     def free(self, low: Float[np.ndarray, "P 3"], high: Float[np.ndarray, "P 3"]) -> bool:
-        """Whether boxes, grown by the gap, meet none that is taken."""
+        """Whether boxes, grown by the gap, intersect no occupied one."""
         apart = (low[:, None] - GAP > self.high) | (high[:, None] + GAP < self.low)
         return bool(apart.any(axis=2).all())
 
@@ -70,7 +70,7 @@ class _Boxes:
 
 
 class _Spot(NamedTuple):
-    """A place for a thing: (x, y), the height it stands on, and its turn."""
+    """A place for a thing: (x, y), the height it stands on, and its rotation."""
 
     x: float
     y: float
@@ -87,7 +87,7 @@ def part_boxes(
 
 
 class _Street:
-    """A street while things are put into it."""
+    """A street while it is being filled."""
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
@@ -97,12 +97,12 @@ class _Street:
         self.drawn = 0
 
     def draw(self, name: str) -> ObjectModel:
-        """The next thing of a class; its looks depend on the seed and on how many were drawn before."""
+        """The next thing of a class; its appearance depends on the seed and on how many were drawn before."""
         self.drawn += 1
         return build_street_object(name, np.random.default_rng([self.seed, 22, self.drawn]))
 
     def put(self, model: ObjectModel, spot: _Spot) -> PlacedObject | None:
-        """Place a thing where the spot says, unless it meets another."""
+        """Place a thing at a spot, unless it would intersect another."""
         turned = model.triangles @ rotation_about("z", spot.yaw_deg).T + np.array([spot.x, spot.y, spot.z])
         low, high = part_boxes(turned, model.node_ids[:, 1])
         if not self.boxes.free(low, high):
@@ -176,13 +176,13 @@ class _Street:
 def build_street(seed: int, objects: int) -> WorldScene:
     """A stretch of street. `objects` counts vehicles and people; houses and furniture come with it.
 
-    Vehicles stand in the lanes or park at the kerbs, people walk on the sidewalks, trees, lamps, signs
-    and fences stand beside the kerb. The box around each part of a thing meets no box of another thing;
-    one that finds no place is left out. `placed` lists the counted ones.
+    Vehicles stand in the lanes or park at the kerbs, people walk on the sidewalks, trees, lamps, signs and
+    fences stand beside the kerb. The box around each part of a thing intersects no box of another thing;
+    things without a place are left out. `placed` lists the vehicles and people.
 
     Args:
-        seed: not negative; same seed and number of objects, same scene.
-        objects: how many vehicles and people to place; beyond 16 or so they find no place.
+        seed: not negative; the same seed and number of objects give the same scene.
+        objects: how many vehicles and people to place; there is room for about 16.
     """
     street = _Street(seed)
     rng = street.rng
@@ -284,10 +284,10 @@ def drive_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float |
     """Cameras of a drive along the street; take the global mapper for them (`docs/world.md`).
 
     Args:
-        scene: its seed is that of the jitter.
+        scene: its seed also determines the jitter.
         views: number of cameras, named 000.png, 001.png, ...
         image_px: height and width.
-        arc_deg: not used: a drive is no ring.
+        arc_deg: not used: a drive is not a ring.
     """
     rng = np.random.default_rng([scene.seed, 26])
     transforms = []
@@ -303,7 +303,7 @@ def _heading(yaw_deg: float, pitch_deg: float) -> Float[np.ndarray, " 3"]:
 
 
 def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int = 256) -> Camera:
-    """A random camera for training: views from the road, and close ones of one thing that is in sight."""
+    """A random camera for training: views from the road, and close ones of one visible thing."""
     intrinsics = pinhole(image_px, float(rng.uniform(56, 66)))
     pose = _close_up(scene, rng) if rng.random() < 0.5 else None
     if pose is None:
@@ -319,7 +319,7 @@ def _close_up(scene: WorldScene, rng: np.random.Generator) -> Float[np.ndarray, 
     for _ in range(30):
         node = wholes[int(rng.integers(len(wholes)))]
         if scene.nodes[node].text == "building" and rng.random() < 0.6:
-            continue  # houses are many
+            continue  # there are many houses
         corners = scene.triangles[scene.node_ids[:, 0] == node].reshape(-1, 3).astype(np.float64)
         low, high = corners.min(axis=0), corners.max(axis=0)
         if low[0] > 30 or high[0] < -16:
@@ -341,7 +341,7 @@ def _close_up(scene: WorldScene, rng: np.random.Generator) -> Float[np.ndarray, 
 def _sees(
     scene: WorldScene, centre: np.ndarray, corners: np.ndarray, node: int, rng: np.random.Generator
 ) -> bool:
-    """Whether most of a thing's corners that face a point are seen from it, or what hides them is itself."""
+    """Whether most of a thing's corners are visible from a point, or hidden only by the thing itself."""
     chosen = corners[rng.integers(len(corners), size=40)]
     directions = chosen - centre
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilsplat.world.paints import Paint
+from hilsplat.world.paints import Colour, Paint
 from hilsplat.world.scenes.scene import Assembly
 from hilsplat.world.shapes import Mesh, box, joined, lathe
 
@@ -72,18 +72,18 @@ def add_ground(assembly: Assembly, rng: np.random.Generator) -> list[int]:
 def _paint(
     colour: str,
     kind: str,
-    first: tuple[float, ...],
-    second: tuple[float, ...],
+    first: Colour,
+    second: Colour,
     scale: float,
     rng: np.random.Generator,
 ) -> Paint:
-    """A dull paint with strong grain: large plain surfaces must give structure from motion something."""
+    """A dull paint with strong grain: structure from motion needs detail on large plain surfaces."""
     offset = tuple(rng.uniform(3.0, 17.0, 3).tolist())
-    return Paint(colour, kind, tuple(first), tuple(second), scale, 0.03, 8.0, 0.34, offset)
+    return Paint(colour, kind, first, second, scale, 0.03, 8.0, 0.34, offset)
 
 
 def _patches(rng: np.random.Generator) -> Mesh:
-    """Mended spots and manhole covers of the road."""
+    """Repaired patches and manhole covers of the road."""
     pieces = []
     for _ in range(14):
         size = (float(rng.uniform(0.6, 2.2)), float(rng.uniform(0.5, 1.6)), 0.02)

@@ -20,7 +20,7 @@ ROOM_HALF = 3.0
 FLOOR_Z = -0.75
 WALL_HEIGHT = 3.4
 COVERED_SHARE = 0.58
-"""Share of the table top that the objects' footprints would cover, were all of them placed."""
+"""Share of the table top that the objects' footprints would cover if all were placed."""
 MAX_FOOTPRINT = 0.36
 MAX_HEIGHT_TO_FOOTPRINT = 2.7
 GAP = 0.015
@@ -33,17 +33,17 @@ DISTANCE = 2.15 * TABLE_RADIUS
 LOOK_AT_Z = 0.16
 TRIES = 150
 LAYOUTS = 25
-"""Layouts tried before an object is left out; the first that holds all is taken, else the fullest."""
+"""Layouts tried before an object is left out; the first that holds all is taken, otherwise the fullest."""
 
 
 def build_tabletop(seed: int, objects: int) -> WorldScene:
-    """Objects on a table whose top is z = 0. The more are asked for, the smaller each is.
+    """Objects on a table whose top is z = 0. The more are requested, the smaller each is.
 
     Objects are of different classes while there are enough classes. Each is put at a random place
-    where its footprint meets no other; one that finds no place is left out.
+    where its footprint overlaps no other; objects without a place are left out.
 
     Args:
-        seed: not negative; same seed and number of objects, same scene.
+        seed: not negative; the same seed and number of objects give the same scene.
         objects: how many to place.
     """
     rng = np.random.default_rng([seed, 1])
@@ -79,7 +79,7 @@ def build_tabletop(seed: int, objects: int) -> WorldScene:
 def _layout(rng: np.random.Generator, radii: list[float]) -> list[Float[np.ndarray, " 2"] | None]:
     """Random places on the table for footprints, given largest first; None for those left out.
 
-    Each is drawn until it meets no earlier one, at most `TRIES` times; at most `LAYOUTS` layouts.
+    Each is redrawn until it overlaps no earlier one, at most `TRIES` times; at most `LAYOUTS` layouts.
     """
     best: list[np.ndarray | None] = []
     most = -1
@@ -104,7 +104,8 @@ def _layout(rng: np.random.Generator, radii: list[float]) -> list[Float[np.ndarr
 
 
 def _add_room(assembly: Assembly, rng: np.random.Generator) -> list[int]:
-    """Table, floor, walls, on some a cloth, a rug, pictures; rich textures, for structure from motion."""
+    """Table, floor and walls, sometimes a cloth, a rug or pictures; rich textures, for structure from
+    motion."""
     paints = PaintBox(rng)
     nodes = _add_table(assembly, rng, paints)
     half = ROOM_HALF
@@ -145,7 +146,7 @@ def _add_room(assembly: Assembly, rng: np.random.Generator) -> list[int]:
 
 
 def _add_table(assembly: Assembly, rng: np.random.Generator, paints: PaintBox) -> list[int]:
-    """A round, square or eight-sided table around `TABLE_RADIUS`, with a cloth on some."""
+    """A round, square or eight-sided table around `TABLE_RADIUS`, sometimes with a cloth."""
     top = paints.draw(
         str(rng.choice(["wood", "wood", "stone", "collage", "plain", "tiles"])), scale=0.6
     ).paled(0.45)
@@ -178,7 +179,7 @@ def _add_table(assembly: Assembly, rng: np.random.Generator, paints: PaintBox) -
     if cloth:
         fabric = _fabric(paints, 0.5).paled(0.35)
         draped = [(slab(1.012, -0.30, 0.0), fabric)]
-        if rng.random() < 0.5:  # laid on only, smaller than the table
+        if rng.random() < 0.5:  # only laid on, so smaller than the table
             draped = [(slab(0.86, -0.015, 0.0), fabric)]
         nodes.append(
             assembly.add_surroundings("tablecloth", (f"{fabric.colour} tablecloth", "cloth"), draped)
@@ -198,7 +199,7 @@ def ring_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | 
     Neighbours should be at most 9 degrees apart, or structure from motion fails (measured).
 
     Args:
-        scene: its seed is that of the jitter.
+        scene: its seed also determines the jitter.
         views: number of cameras, named 000.png, 001.png, ...
         image_px: height and width.
         arc_deg: azimuth covered, centred on +x, where the objects' fronts tend to face; a full ring
@@ -219,7 +220,7 @@ def ring_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | 
 def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int = 256) -> Camera:
     """A random camera for training: like those of `ring_cameras`, and closer ones on one object.
 
-    Half of them see the whole table, half look at an object from nearer by; lenses are from wide to long.
+    Half of them see the whole table, half look at an object from closer; lenses range from wide to long.
     """
     azimuth, elevation, fov_deg = rng.uniform(0, 360), rng.uniform(16, 60), rng.uniform(42, 64)
     nearer = np.tan(np.radians(FOV_DEG / 2)) / np.tan(np.radians(fov_deg / 2))  # things keep their size

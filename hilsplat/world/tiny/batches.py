@@ -20,7 +20,7 @@ from hilsplat.world.tiny.data import (
 from hilsplat.world.tiny.sam import HEADS, MASK_STRIDE, STRIDE, positional_embeddings
 
 MARGIN = 4
-"""Mask pixels around a region's box that belong to what is compared closely."""
+"""Margin around a region's box that is compared closely too, mask px."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ def draw_level_prompts(
 ) -> Int64[np.ndarray, "count 2"]:
     """Pixels (x, y) to prompt: for a share of them first a level is drawn, then a region, then its pixel.
 
-    The region's chance grows with the fourth root of its area: specks count, but less than what a
-    grid of prompts would meet. The other prompts are uniform, like that grid.
+    The region's chance grows with the fourth root of its area: specks are drawn too, but less often than what
+    a grid of prompts would hit. The other prompts are uniform, like that grid.
 
     Args:
         rng: source of all choices.
@@ -135,8 +135,8 @@ def compared_pixels(
 ) -> tuple[Int64[np.ndarray, "P K"], Float32[np.ndarray, "P K"], Float32[np.ndarray, "P 3 K"]]:
     """Mask pixels per prompt: a quarter anywhere, a quarter in the box of each head's region.
 
-    A mask of thousands of pixels is compared at some hundred of them (as PointRend and Mask2Former do),
-    with weights that make sums over them estimate sums over all.
+    A mask of thousands of pixels is compared at a few hundred of them (as PointRend and Mask2Former do), with
+    weights that make sums over them estimate sums over all.
 
     Args:
         rng: source of all choices.
@@ -177,7 +177,7 @@ def compared_pixels(
 
 
 def region_edges(blocks: np.ndarray) -> Float32[np.ndarray, "heads h w"]:
-    """1 where the region to the right or below is another one, and on that other side, per head."""
+    """1 on both sides of a border with another region to the right or below, per head."""
     first = blocks[..., 0]
     edges = np.zeros(first.shape, np.float32)
     right = first[:, :, 1:] != first[:, :, :-1]
@@ -190,7 +190,7 @@ def region_edges(blocks: np.ndarray) -> Float32[np.ndarray, "heads h w"]:
 
 
 def _strange(rng: np.random.Generator, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    """Now and then an image in other or no colours: regions must not hang on the hues of this world."""
+    """Occasionally an image in other colours or none: regions must not depend on the hues of this world."""
     draw = rng.random()
     if draw < 0.08:
         return np.ascontiguousarray(image[..., rng.permutation(3)])

@@ -25,7 +25,7 @@ LEVEL_COLOURS = {"whole": "#1b6ca8", "part": "#d1791e", "subpart": "#3d8f4f"}
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """SHA-256 of each file of a model that is not about the model."""
+    """SHA-256 of each file of a model, except those that describe it."""
     folder = Path(folder)
     about = {RECORD, CARD, *PICTURES}
     return {

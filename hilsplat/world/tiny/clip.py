@@ -56,7 +56,7 @@ class ClipVision(nn.Module):
         return self.projected(self.layers(pixels))
 
     def projected(self, features: Float[Tensor, "B C h w"]) -> Float[Tensor, "B D"]:
-        """Unit vectors of what `layers` made of the crops."""
+        """Unit vectors from the output of `layers` for the crops."""
         return functional.normalize(self.project(features.mean(dim=(2, 3))), dim=-1)
 
 

@@ -14,22 +14,32 @@ from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.world.tiny.clip import CANONICAL, CROP_PX
 from hilsplat.world.tiny.data import LabelledViews
 
-FRAMES = ("{}", "{}", "{}", "the {}", "a {}", "a photo of a {}", "a photo of the {}", "a picture of a {}")
+FRAMES: tuple[str, ...] = (
+    "{}",
+    "{}",
+    "{}",
+    "the {}",
+    "a {}",
+    "a photo of a {}",
+    "a photo of the {}",
+    "a picture of a {}",
+)
 """Sentence frames around a phrase; the bare phrase is the usual one."""
-GENERIC_FRAMES = ("{}", "{}", "a photo of {}", "a photo of a {}", "the {}", "a {}")
+GENERIC_FRAMES: tuple[str, ...] = ("{}", "{}", "a photo of {}", "a photo of a {}", "the {}", "a {}")
 LEAST_PX = 24
 """Smaller regions are not cut."""
 SHOWS, SHOWS_NOTHING = 0.5, 0.2
-"""A segmented mask shows the node with which its IoU is above the first; below the second, nothing."""
+"""A segmented mask shows the node with which its IoU is above the first value; below the second it shows
+nothing."""
 
 
 @dataclass(frozen=True)
 class CropTable:
-    """N masks that can be cut out of labelled views, and what may be said of each.
+    """N masks that can be cut out of labelled views, with their captions.
 
     Attributes:
         views: the views.
-        masks: segmented masks per view; empty where none were asked for.
+        masks: segmented masks per view; empty if none were requested.
         view: row of the view.
         node: id of the node that the mask shows, -1 for nothing in particular.
         level: `Level` of that node, 0 for nothing.
@@ -56,7 +66,7 @@ class CropTable:
 
     @property
     def rough(self) -> Bool[np.ndarray, " N"]:
-        """Which masks are the segmenter's."""
+        """Whether each mask came from the segmenter."""
         return self.segmented >= 0
 
     def cut(
@@ -96,12 +106,12 @@ def _shrunk(
 
 
 def roughen(rng: np.random.Generator, mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """A mask as a segmenter might have drawn it: grown, rounded, a bite taken out, a piece too much."""
+    """A mask as a segmenter might have drawn it: grown, rounded, with a piece missing or added."""
     rough = mask.astype(np.float32)
     area = float(mask.sum())
     sigma = float(np.clip(0.06 * area**0.5 * rng.uniform(0.2, 2.0), 0.4, 6.0))
     noise = cv2.GaussianBlur(rng.normal(0, 1, mask.shape).astype(np.float32), (0, 0), 2 + sigma)
-    noise /= noise.std() + 1e-6
+    noise = noise / (noise.std() + 1e-6)
     blurred = cv2.GaussianBlur(rough, (0, 0), sigma)
     found = blurred + rng.uniform(0.05, 0.3) * noise * (blurred > 0.02) > rng.uniform(0.25, 0.65)
     for chance, value in ((0.25, False), (0.2, True)):
@@ -112,7 +122,7 @@ def roughen(rng: np.random.Generator, mask: Bool[np.ndarray, "H W"]) -> Bool[np.
             radius = int(area**0.5 * rng.uniform(0.12, 0.35)) + 1
             cv2.circle(blob, (int(columns[pick]), int(rows[pick])), radius, 1, -1)
             found = np.where(blob > 0, value, found)
-    # One that lost its region is no example of it.
+    # A mask that lost its region is not an example of it.
     return found if (found & mask).sum() > 0.5 * (found | mask).sum() else mask
 
 
@@ -121,7 +131,7 @@ def best_node(
 ) -> tuple[int, float]:
     """Node whose region has the highest IoU with a mask, over all levels, and that IoU.
 
-    Of equally good nodes the one of the given level wins: a part may be all that is seen of a whole.
+    Ties go to the node of the given level: a part may be all that is visible of a whole.
     """
     best, best_iou = NONE, 0.0
     area = int(mask.sum())
@@ -143,7 +153,7 @@ def best_node(
 def list_crops(
     views: LabelledViews, masks: Sequence[HierarchicalMasks] = (), least_px: int = LEAST_PX
 ) -> CropTable:
-    """All masks of labelled views: the true regions, and the segmented masks where there are some.
+    """All masks of labelled views: the true regions, and the segmented masks, if any.
 
     Args:
         views: labelled views.
@@ -151,7 +161,7 @@ def list_crops(
         least_px: smaller regions are left out.
     """
     rows: list[tuple[int, ...]] = []
-    boxes: list[tuple[int, int, int, int]] = []
+    boxes: list[Sequence[int]] = []
     sets: dict[tuple[str, ...], int] = {}
     for view in range(len(views)):
         labels, nodes = views.labels[view], views.nodes[view]
@@ -166,8 +176,10 @@ def list_crops(
                 caption = sets.setdefault(nodes[node].phrases, len(sets))
                 rows.append((view, node, nodes[node].level, root[node], -1, caption))
                 boxes.append((box[1].start, box[0].start, box[1].stop, box[0].stop))
-        found = masks[view] if view < len(masks) else None
-        for index in range(len(found) if found is not None else 0):
+        if view >= len(masks):
+            continue
+        found = masks[view]
+        for index in range(len(found)):
             mask = found.dense(np.array([index]))[0]
             node, iou = best_node(mask, int(found.level[index]), labels, len(nodes))
             if iou > SHOWS and nodes[node].phrases:
@@ -177,15 +189,17 @@ def list_crops(
                 rows.append((view, NONE, 0, NONE, index, NONE))
             else:
                 continue
-            boxes.append(tuple(int(edge) for edge in found.box_xyxy[index]))
+            boxes.append(found.box_xyxy[index].tolist())
     columns = np.array(rows, np.int64).reshape(-1, 6).T
-    view, node, level, thing, segmented, caption = (np.ascontiguousarray(column) for column in columns)
-    box = np.array(boxes, np.int64).reshape(-1, 4)
-    return CropTable(views, masks, view, node, level, thing, segmented, box, caption, tuple(sets))
+    of_view, of_node, levels, things, segmented, captions = map(np.ascontiguousarray, columns)
+    box_xyxy = np.array(boxes, np.int64).reshape(-1, 4)
+    return CropTable(
+        views, masks, of_view, of_node, levels, things, segmented, box_xyxy, captions, tuple(sets)
+    )
 
 
 def list_segmented(views: LabelledViews, masks: Sequence[HierarchicalMasks]) -> CropTable:
-    """All segmented masks in their order, whatever they show; nothing is said of them."""
+    """All segmented masks in their order, whatever they show, without captions."""
     view = np.repeat(np.arange(len(masks)), [len(found) for found in masks])
     segmented = np.concatenate([np.arange(len(found)) for found in masks] + [np.zeros(0, np.int64)])
     box = np.concatenate([found.box_xyxy for found in masks] + [np.zeros((0, 4), np.int32)])
@@ -202,8 +216,8 @@ class Captioner:
     draw does not look at the crop, so a canonical phrase comes to mean nothing in particular: the
     yardstick that relevancy needs.
 
-    Every query of the vocabulary and some further phrases stand beside the captions of a batch: texts cost
-    little, and against them a crop learns at once what else it is and is not.
+    Every query of the vocabulary and some further phrases are added to the captions of a batch: texts cost
+    little, and they teach a crop at once what else it is and is not.
 
     Args:
         phrase_sets: distinct sets of phrases; the first of each is the query.

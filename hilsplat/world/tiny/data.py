@@ -56,7 +56,7 @@ def normalised(images: Shaped[np.ndarray, "B H W 3"]) -> Float32[np.ndarray, "B 
 def recolour(
     rng: np.random.Generator, image: UInt8[np.ndarray, "H W 3"], strength: float = 1.0
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Photographic differences: exposure, white balance, gamma, saturation, vignette, blur, noise."""
+    """Photographic variations: exposure, white balance, gamma, saturation, vignette, blur, noise."""
     size = image.shape[:2]
     if rng.random() < 0.15 * strength:
         small = cv2.resize(image, (size[1] // 2, size[0] // 2), interpolation=cv2.INTER_AREA)
@@ -84,7 +84,7 @@ def recolour(
 
 @dataclass(frozen=True)
 class SegmentExample:
-    """A training window: pixels, labels, where it lies in its view (x0, y0, side as shares)."""
+    """A training window: pixels, labels, its position in its view (x0, y0, side as shares)."""
 
     image: UInt8[np.ndarray, "S S 3"]
     labels: np.ndarray
@@ -104,7 +104,7 @@ def cut_window(
         rng: source of all choices.
         image: a square view.
         labels: (3, H, W) node ids.
-        size: side of the window in network pixels; the whole view where it is at least the view's side.
+        size: side of the window in network pixels; the whole view if it is at least the view's side.
         zoom: scale the window too.
     """
     full = image.shape[0]
@@ -127,7 +127,7 @@ def cut_window(
 def nested_targets(labels: np.ndarray) -> np.ndarray:
     """Node id per pixel and head (subpart, part, whole).
 
-    Where a pixel has no subpart, its subpart is its part; where it has no part, its part is its whole.
+    If a pixel has no subpart, its subpart is its part; if it has no part, its part is its whole.
 
     Args:
         labels: (3, H, W) node ids, whole, part, subpart; -1 for none. Ids differ between levels.

@@ -32,6 +32,8 @@ HALF_FROM = 64
 class _VisionEncoder(nn.Module):
     """The encoder together with the positional embeddings of a whole frame."""
 
+    positional: Tensor
+
     def __init__(self, encoder: SamEncoder) -> None:
         super().__init__()
         self.encoder = encoder

@@ -1,4 +1,4 @@
-"""The training loop of both small models: a killed training goes on, a finished one can go on for longer."""
+"""The training loop of both small models: an interrupted training resumes, a finished one can be extended."""
 
 import json
 import logging
@@ -30,7 +30,7 @@ class Tuning:
         peak: learning rate of the constant stretch.
         warmup: steps up to it.
         weight_decay: of AdamW.
-        average: weights that are kept are a running average with this memory per step.
+        average: the weights that are kept are a running average with this memory per step.
         measure_every: steps between rows of the learning curve.
         save_every: steps between saved states.
     """
@@ -45,7 +45,7 @@ class Tuning:
 
 @dataclass
 class Progress:
-    """Where a training stands.
+    """Progress of a training.
 
     Attributes:
         step: steps done.
@@ -72,14 +72,14 @@ class Progress:
 class Training:
     """Modules, optimiser and averaged weights of one model, with a state on disk.
 
-    Two files: `<name>.safetensors`, where the training stands, and `<name>-constant.safetensors`, where it
-    stood when the learning rate began to fall. A larger budget later goes on from the second, as if the
-    decay had never been: the constant stretch does not depend on how long it was meant to be.
-    All randomness follows from the number of the step, so a resumed run repeats an uninterrupted one.
+    Two files: `<name>.safetensors` holds the current state, `<name>-constant.safetensors` the state when the
+    learning rate began to fall. A larger budget later resumes from the second, as if the decay had never
+    happened: the constant stretch does not depend on its planned length. All randomness follows from the step
+    number, so a resumed run repeats an uninterrupted one.
 
     Args:
         modules: by name; trained together.
-        tuning: how.
+        tuning: how to optimise.
         folder: of the state.
         name: of the state's files; it should name everything that the weights depend on.
         device: where the modules live.
@@ -116,16 +116,17 @@ class Training:
         measure: Callable[[], dict[str, float]],
         budget: Budget,
     ) -> Curve:
-        """Train until the budget is used, from wherever the state on disk stands; ends with averaged weights.
+        """Train from the state on disk until the budget is used; ends with averaged weights.
 
         Args:
             make: the material of a step; prepared in a second thread.
             loss_of: the loss of that material and its terms for the curve.
-            measure: quality of the modules as they are when it is called (averaged weights).
+            measure: quality of the modules in their current state (averaged weights).
             budget: how long.
         """
         self._resume(budget)
-        curve, sums, since = Curve(self.progress.rows), {}, 0
+        curve, since = Curve(self.progress.rows), 0
+        sums: dict[str, float] = {}
         progress, clock = self.progress, time.monotonic()
         steps = prefetched(make, progress.step)
         while not progress.is_finished:
@@ -194,8 +195,8 @@ class Training:
                     )
                 rows = self.progress.rows
                 self._load(self.constant)
-                logger.info("another budget: going on from step %d of %d", self.progress.step, len(rows))
-            logger.info("going on at step %d, after %.1f minutes", self.progress.step, self.progress.minutes)
+                logger.info("another budget: continuing from step %d of %d", self.progress.step, len(rows))
+            logger.info("resuming at step %d, after %.1f minutes", self.progress.step, self.progress.minutes)
         self.progress.budget = asked
 
     def _save(self, path: Path) -> None:

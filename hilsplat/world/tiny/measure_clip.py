@@ -17,7 +17,7 @@ from hilsplat.world.tiny.data import LabelledViews, normalised
 
 CHUNK = 256
 COMMON = 20
-"""Of each level so many texts, the commonest, compete in the smaller of the two questions."""
+"""This many of the commonest texts of each level compete in the smaller of the two questions."""
 
 
 def tokenised(tokenizer: Tokenizer, texts: Sequence[str]) -> tuple[Tensor, Tensor]:
@@ -88,7 +88,7 @@ def measure_clip(
     of_set = np.array([texts.index(phrases[0]) for phrases in crops.phrase_sets], np.int64)
     coloured = [coloured_text(phrases) for phrases in crops.phrase_sets]
     hues = sorted({phrase for phrase in coloured if phrase})
-    hue_row = {phrase: row for row, phrase in enumerate(hues)}
+    hue_row: dict[str | None, int] = {phrase: row for row, phrase in enumerate(hues)}
     hue_of_set = np.array([hue_row.get(phrase, -1) for phrase in coloured], np.int64)
     vectors = embedded_crops(vision, crops, rows, background)
     similarity = vectors @ embedded_texts(text, tokenizer, texts).T
@@ -160,7 +160,7 @@ def measure_queries(
         views: labelled views.
         masks: automatic masks of each.
         crops: from `list_segmented` of the same views and masks.
-        least_px: regions below are not asked for.
+        least_px: smaller regions are not queried.
 
     Returns:
         per level: mean `iou` of the mask most similar to the text with the union of all regions that the

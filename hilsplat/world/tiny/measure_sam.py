@@ -69,7 +69,7 @@ def measure_sam(
     Returns:
         per level: mean `iou`; `best`, the same for the best of the three heads; share of prompts
         `above_75` % IoU; `correlation` of predicted and true IoU; `n`; and for each of `SIZES` the mean
-        `iou_<size>` (0 where there is none) and `n_<size>`.
+        `iou_<size>` (0 if there is none) and `n_<size>`.
     """
     found: dict[Level, list[tuple[float, float, float, float]]] = {level: [] for level in LEVELS}
     for view in range(len(views)):
@@ -117,7 +117,7 @@ def automatic_masks(
         folder: model folder.
         views: what to segment.
         workers: processes.
-        points_per_side: of the grid of prompts; all else is as the settings' defaults have it.
+        points_per_side: of the grid of prompts; everything else as in the settings' defaults.
     """
     if not len(views):
         return []
@@ -143,7 +143,7 @@ def cached_masks(
         digest: of the segmenter.
         views: what to segment.
         count: how many of them.
-        points_per_side: of the grid of prompts; the settings' default where None.
+        points_per_side: of the grid of prompts; None for the settings' default.
         workers: processes.
     """
     side = MasksSettings().points_per_side if points_per_side is None else points_per_side
@@ -185,7 +185,8 @@ def measure_everything(masks: list[HierarchicalMasks], views: LabelledViews) -> 
     """
     report = {}
     for level in LEVELS:
-        best, fits, count = [], 0, 0
+        best: list[float] = []
+        fits = count = 0
         for view, found in enumerate(masks):
             rows = found.rows_of(level)
             _, areas, iou = region_ious(views.labels[view][level.index], found.dense(rows))

@@ -44,7 +44,7 @@ SAMPLES = 2
 
 
 def phrases_of(nodes: Sequence[AnnotatedNode]) -> tuple[LabelledNode, ...]:
-    """Nodes with what may be said of them: the text, its synonyms, and the bare word of a part.
+    """Nodes with their phrases: the text, its synonyms, and the bare word of a part.
 
     The bare word ("head" of "bear head") is what people type after a path's first term.
     """
@@ -62,7 +62,7 @@ def phrases_of(nodes: Sequence[AnnotatedNode]) -> tuple[LabelledNode, ...]:
 
 
 def kind_of_seed(seed: int) -> tuple[str, int]:
-    """Kind of a training scene and how many objects it asks for; both follow from its seed."""
+    """Kind of a training scene and number of objects to request; both follow from its seed."""
     rng = np.random.default_rng((seed, 11))
     kinds = list(MIXTURE)
     kind = kinds[int(rng.choice(len(kinds), p=[MIXTURE[name][0] for name in kinds]))]
@@ -74,7 +74,7 @@ def scene_of_seed(seed: int) -> WorldScene:
     """A training scene.
 
     Raises:
-        SceneError: the seed is not one of the training split.
+        SceneError: the seed is not in the training split.
     """
     require_split(seed, "training")
     kind, objects = kind_of_seed(seed)
@@ -125,7 +125,7 @@ def generator_digest() -> str:
 
 
 def render_training_views(cache: Path, seeds: Sequence[int], views: int, workers: int) -> LabelledViews:
-    """Views of some training scenes, rendered where the cache has none.
+    """Views of some training scenes, rendered if the cache lacks them.
 
     Args:
         cache: folder that may be deleted at any time; its entries depend on the generator's code.
@@ -133,7 +133,7 @@ def render_training_views(cache: Path, seeds: Sequence[int], views: int, workers
         views: per scene.
         workers: processes that render.
     """
-    # A killed run goes on where it was; a changed generator renders anew.
+    # An interrupted run resumes; a changed generator renders everything anew.
     recipe = {
         "generator": generator_digest(),
         "views": views,

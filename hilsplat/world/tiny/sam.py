@@ -1,10 +1,10 @@
 """A small promptable segmenter with SAM's interface: point prompts in, three nested masks out.
 
-Three choices make it trainable in minutes on a CPU, in a world whose objects it will meet again:
-a dense U-shaped encoder whose embedding also says, for every pixel, where the centre of the region
-it belongs to lies at each level; a decoder that is one tiny pixel network whose weights are written by
-the prompt (dynamic convolution, CondInst); and full-resolution pixel features that end with
-resize and a 3x3 convolution, so that masks show no checkerboard.
+Three choices make it trainable in minutes on a CPU, in a world whose objects it will meet again: a dense
+U-shaped encoder whose embedding also says, for every pixel, where the centre of its region is at each level;
+a decoder that is one tiny pixel network whose weights are written by the prompt (dynamic convolution,
+CondInst); and full-resolution pixel features that end with resize and a 3x3 convolution, so that masks show
+no checkerboard.
 """
 
 from itertools import pairwise
@@ -52,7 +52,7 @@ def convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
 
 
 class Residual(nn.Module):
-    """Two 3x3 convolutions around which the input passes unchanged."""
+    """Two 3x3 convolutions with a skip connection."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -117,7 +117,7 @@ class SamEncoder(nn.Module):
 
 
 def positional_embeddings(windows: Float[Tensor, "B 3"], cells: int) -> Float[Tensor, "B C cells cells"]:
-    """Where each cell of the embedding lies.
+    """Positions of the cells of the embedding.
 
     Args:
         windows: x0, y0 and side of the image's window that each row of the batch shows, as shares of
@@ -146,10 +146,10 @@ def positional_embeddings(windows: Float[Tensor, "B 3"], cells: int) -> Float[Te
 class SamDecoder(nn.Module):
     """Prompts to masks: the prompt writes the weights of a two-layer network run at every pixel.
 
-    The pixel network sees 24 shared features, the pixel's position relative to the prompt, and, for
-    each head, how far the centre that the pixel votes for lies from the one the prompted pixel votes
-    for (difference and squared distance). All of these are affine in features shared by all prompts,
-    so its first layer is one matrix product per image.
+    The pixel network sees 24 shared features, the pixel's position relative to the prompt, and, for each
+    head, how far the centre that the pixel votes for is from the one the prompted pixel votes for (difference
+    and squared distance). All of these are affine in features shared by all prompts, so its first layer is
+    one matrix product per image.
     """
 
     def __init__(self) -> None:
@@ -165,7 +165,7 @@ class SamDecoder(nn.Module):
         )
         with torch.no_grad():
             self.weights.weight.mul_(0.3)
-            # Most pixels lie outside a mask: begin there.
+            # Most pixels are outside a mask: start there.
             self.weights.bias[-len(HEADS) :] = -2.0
 
     def forward(
@@ -189,7 +189,7 @@ class SamDecoder(nn.Module):
         hidden = torch.matmul(first.flatten(1, 2), shared).unflatten(1, (-1, HIDDEN))  # (B, P, H, n)
         hidden = functional.relu(hidden.add_(bias[..., None]), inplace=True)
         logits = (torch.matmul(second, hidden) + shift[..., None]).unflatten(-1, (side, side))
-        # Every fourth pixel tells area and confidence well enough, at a quarter of the time.
+        # Every fourth pixel gives area and confidence well enough, in a quarter of the time.
         seen = logits[..., ::2, ::2].flatten(3)
         return self.predicted_iou(token, seen, seen.new_full((1, 1, 1), 4.0)), logits
 
@@ -202,7 +202,7 @@ class SamDecoder(nn.Module):
         pixels: Int64[Tensor, "B P K"],
         weights: Float[Tensor, "B P K"],
     ) -> tuple[Float[Tensor, "B P 3"], Float[Tensor, "B P 3 K"]]:
-        """The same as `forward` at some pixels per prompt: what training needs, at a fraction of the time.
+        """The same as `forward` at some pixels per prompt: what training needs, in a fraction of the time.
 
         Args:
             points: as in `forward`.

@@ -1,4 +1,4 @@
-"""What the small segmenter is trained on besides its own outputs, and the losses of all of it."""
+"""Auxiliary training targets of the small segmenter, and the losses of all its outputs."""
 
 import torch
 from jaxtyping import Float
@@ -21,7 +21,7 @@ def segmentation_loss(
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """Loss of masks (dice and cross-entropy per area) and of the predicted IoU.
 
-    A prompt where nothing is labelled has no true mask: only its predicted IoU is trained, towards 0.
+    A prompt on an unlabelled pixel has no true mask: only its predicted IoU is trained, towards 0.
 
     Args:
         scores: predicted IoU.

@@ -1,7 +1,7 @@
 """What both trainings share: budget, learning rate, batches prepared ahead, learning curve."""
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import count
@@ -47,7 +47,7 @@ class Budget:
         return by_steps or (self.minutes > 0 and minutes >= (1 - DECAY_SHARE) * self.minutes)
 
     def decay_steps(self, step: int, minutes: float) -> int:
-        """Steps over which it falls when it begins now: what is left, or a quarter where that is less.
+        """Steps over which it falls when it begins now: what is left, or a quarter, whichever is less.
 
         A state that is already past the budget (trained with a larger one before) decays over a quarter.
         """
@@ -68,8 +68,8 @@ def learning_rate(step: int, peak: float, warmup: int, decay_from: int = -1, dec
     return rate
 
 
-def prefetched(make: Callable[[int], Batch], first: int = 0) -> Iterator[Batch]:
-    """Yield make(first), make(first + 1), ..., each prepared while its predecessor is worked on."""
+def prefetched(make: Callable[[int], Batch], first: int = 0) -> Generator[Batch, None, None]:
+    """Yield make(first), make(first + 1), ..., each prepared while its predecessor is being used."""
     with ThreadPoolExecutor(1) as pool:
         upcoming = pool.submit(make, first)
         for step in count(first + 1):

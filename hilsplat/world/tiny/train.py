@@ -32,14 +32,14 @@ from hilsplat.world.tiny.train_sam import train_sam
 logger = logging.getLogger(__name__)
 
 RECIPE_VERSIONS = {"sam": 2, "clip": 3}
-"""Raise it when networks, windows or losses change: a training in the cache then begins anew."""
+"""Raise it when networks, windows or losses change: a training in the cache then starts again."""
 STAGES = ("render", "sam", "clip")
 AUTOMATIC_VIEWS = 48
 """Unseen views that are segmented without prompts to measure recall."""
 
 
 ROUGH_PROMPTS = 20
-"""Prompts per image side when training views are segmented for CLIP; fewer than at run time do."""
+"""Prompts per image side when training views are segmented for CLIP; fewer than at run time are enough."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ def train_models(
 ) -> None:
     """Train the small SAM and CLIP on training scenes of the synthetic world, and write both model folders.
 
-    Views and the states of both trainings lie in the cache: a killed run goes on where it was, and a
-    finished one asked for more minutes or steps goes on from before its learning rate fell.
+    Views and the states of both trainings are kept in the cache: an interrupted run resumes, and a finished
+    one given more minutes or steps resumes from before its learning rate fell.
 
     Args:
         out: folder that will hold `sam-tiny` and `clip-tiny`.
@@ -103,7 +103,7 @@ def train_models(
 
 
 def rendered(cache: Path, settings: TrainingSettings, threads: int) -> Material:
-    """Render the views that a recipe asks for, where the cache has none."""
+    """Render the views of a recipe that the cache lacks."""
     train_seeds, other_seeds = training_seeds(settings.scenes, settings.validation_scenes)
     with stage_log("render", "training scenes") as counts:
         training = render_training_views(cache, train_seeds, settings.views, threads)
@@ -124,7 +124,7 @@ def rendered(cache: Path, settings: TrainingSettings, threads: int) -> Material:
 
 
 def _state_name(model: str, material: Material, seed: int, more: Mapping[str, Any]) -> str:
-    """Names a training by all that its weights depend on, except how long it lasts."""
+    """Names a training by everything that its weights depend on, except how long it lasts."""
     key = {"model": model, "seed": seed, "version": RECIPE_VERSIONS[model], **material.described, **more}
     return f"{model}-{sha256_of_json(key)[:12]}"
 

@@ -52,7 +52,7 @@ class CropDraw:
     def __init__(self, crops: CropTable, batch: int) -> None:
         self.ends = np.cumsum(crop_weights(crops))
         self.batch = batch
-        # Rows of one object of one view lie next to each other in this order.
+        # Rows of one object of one view are adjacent in this order.
         key = crops.view * (int(crops.thing.max(initial=0)) + 2) + crops.thing + 1
         self.order = np.argsort(key, kind="stable")
         self.first = np.searchsorted(key[self.order], key, side="left")
@@ -73,7 +73,7 @@ class CropDraw:
 
 
 def jittered(rng: np.random.Generator, pixels: np.ndarray) -> np.ndarray:
-    """Crops in other light, mirrored, some noisy or blurred; a black background stays black."""
+    """Crops in different light, mirrored, some noisy or blurred; a black background stays black."""
     count = len(pixels)
     pixels = pixels.astype(np.float32)
     seen = pixels.max(axis=3, keepdims=True) > 0
@@ -104,7 +104,7 @@ def train_clip(
     tuning: Tuning = TUNING,
     device: str = "cpu",
 ) -> tuple[ClipVision, ClipText, Tokenizer, Curve]:
-    """Train the small CLIP, or go on where a training with the same name was.
+    """Train the small CLIP, or resume a training with the same name.
 
     Args:
         crops: masks with their captions.
@@ -124,7 +124,7 @@ def train_clip(
     frames = [frame.format("") for frame in (*FRAMES, *GENERIC_FRAMES)]
     tokenizer = word_tokenizer([*captioner.phrases, *CANONICAL, *frames])
     vision, text = ClipVision(), ClipText(tokenizer.get_vocab_size())
-    vision.to(memory_format=torch.channels_last)
+    nn.utils.convert_conv2d_weight_memory_format(vision, torch.channels_last)
     scale = Scale()
     training = Training({"vision": vision, "text": text, "scale": scale}, tuning, state, name, where)
     drawer = CropDraw(crops, batch)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.world.tiny.batches import CropStage, SamBatch, class_rows, draw_batch
@@ -19,7 +19,7 @@ from hilsplat.world.tiny.steps import Budget, Curve
 CROP_STAGES = (CropStage(0.4, 128, 16, 24), CropStage(0.4, 192, 8, 36), CropStage(0.2, 256, 4, 48))
 """Windows of a step, drawn anew for each: small ones show more scenes, large ones more of one."""
 GROWN_STAGES = (CropStage(0.3, 192, 8, 36), CropStage(0.4, 256, 4, 48), CropStage(0.3, 384, 2, 96))
-"""The same later on: whole views among them, as the segmenter will be shown. In the first training that ended
+"""The same later on: whole views among them, as the segmenter will see them. In the first training that ended
 with these, the IoU of wholes rose by 0.04 in 700 steps."""
 GROWN_AT = 9500
 """Step from which windows are the grown ones; they are in any case while the learning rate falls."""
@@ -54,7 +54,7 @@ def train_sam(
     tuning: Tuning = TUNING,
     device: str = "cpu",
 ) -> tuple[SamEncoder, SamDecoder, Curve]:
-    """Train the small segmenter, or go on where a training with the same name was.
+    """Train the small segmenter, or resume a training with the same name.
 
     Args:
         views: labelled views.
@@ -72,7 +72,7 @@ def train_sam(
     where = torch.device(device)
     half = has_fast_half(where)
     rows, classes = class_rows(views)
-    encoder = SamEncoder().to(memory_format=torch.channels_last)
+    encoder = nn.utils.convert_conv2d_weight_memory_format(SamEncoder(), torch.channels_last)
     decoder, teacher = SamDecoder(), Teacher(len(rows) + 1)
     modules = {"encoder": encoder, "decoder": decoder, "teacher": teacher}
     training = Training(modules, tuning, state, name, where)

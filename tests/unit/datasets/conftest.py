@@ -62,5 +62,5 @@ def make_world(folder: Path) -> TrueWorld:
 
 @pytest.fixture
 def true_world(tmp_path) -> TrueWorld:
-    """The world, in a folder of its own."""
+    """The world, in its own folder."""
     return make_world(tmp_path / "world")

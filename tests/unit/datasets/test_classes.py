@@ -1,4 +1,4 @@
-"""Lists of classes: their numbers, their nesting, and the companion lists where those are at hand."""
+"""Lists of classes: their numbers, their nesting, and the companion lists if those are available."""
 
 import csv
 import itertools

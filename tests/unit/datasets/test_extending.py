@@ -1,4 +1,4 @@
-"""The data set of docs/extending.md reads as it is written there."""
+"""The data set of docs/extending.md can be read as documented."""
 
 import re
 import types
@@ -28,7 +28,7 @@ def test_the_data_set_of_the_documentation_is_read(example, tmp_path):
     write_png(tmp_path / "mine/images/000.png", np.zeros((6, 8, 3), np.uint8))
     write_png(tmp_path / "mine/labels/000/mug.png", np.repeat(mug[..., None], 3, axis=2))
     scene = example.DESK.open(tmp_path, "mine")
-    (region,) = scene.views["000"]
+    (region,) = scene.views["000.png"]
     assert region.text == "mug"
     assert np.array_equal(region.mask(), mug > 0)
     assert example.DESK.check(tmp_path, "mine").facts

@@ -1,4 +1,4 @@
-"""The registry, where data sets are looked for, and the `hilsplat datasets` command."""
+"""The registry, the search for data sets, and the `hilsplat datasets` command."""
 
 import pytest
 from typer.testing import CliRunner
@@ -78,7 +78,7 @@ def test_a_data_root_one_level_too_high_is_detected(data_root):
         DATASETS["lerf_ovs"].locate(data_root.parent)
 
 
-def test_a_missing_data_set_tells_what_is_there(data_root):
+def test_a_missing_data_set_names_what_is_there(data_root):
     with pytest.raises(SceneError, match=r"LERF-Mask is not below .*\n.*\n.*lerf_ovs"):
         DATASETS["lerf_mask"].locate(data_root)
 
@@ -111,7 +111,7 @@ def test_the_command_checks_scenes(data_root):
     assert code == 0
     assert "lerf_ovs/figurines: images: 4, labelled views: 1, regions: 5" in output
     assert "warning   published frames without label: frame_00041" in output
-    assert "lerf_ovs: not there: ramen, teatime, waldo_kitchen" in output
+    assert "lerf_ovs: missing: ramen, teatime, waldo_kitchen" in output
 
 
 def test_the_command_fails_on_a_scene_that_cannot_be_read_and_goes_on(data_root):

@@ -21,7 +21,7 @@ def region_of(mask, text, level=None, path=(), boxes=None):
     return LabelledRegion(text, mask.shape, lambda: mask, boxes, level, path or (text,))
 
 
-def labelled(block_world, views=("001",), levels=True):
+def labelled(block_world, views=("001.png",), levels=True):
     """Labels that say what the block world's annotations say; without levels, flat."""
     annotations = block_world.annotations
     regions = tuple(
@@ -80,18 +80,18 @@ def test_flat_labels_give_the_lerf_protocols_alone(block_world, rows):
 
 
 def test_every_labelled_view_is_scored_held_out_or_not(block_world, rows):
-    scores = rows(labels=labelled(block_world, views=("000", "001"), levels=False))
+    scores = rows(labels=labelled(block_world, views=("000.png", "001.png"), levels=False))
     assert set(scores["view"]) == {"000.png", "001.png"}
 
 
 def test_labelled_views_without_pose_are_named(block_world, rows):
-    with pytest.raises(SceneError, match="have no pose: 007"):
-        rows(labels=labelled(block_world, views=("001", "007")))
+    with pytest.raises(SceneError, match=r"have no pose: 007\.png\n"):
+        rows(labels=labelled(block_world, views=("001.png", "007.png")))
 
 
 def test_labels_of_another_shape_than_the_view_are_refused(rows):
     wide = region_of(np.ones((64, 80), bool), "bear")
-    scene = LabelledScene("lerf_ovs", "blocks", {}, None, {"001": (wide,)}, ("bear",))
+    scene = LabelledScene("lerf_ovs", "blocks", {}, None, {"001.png": (wide,)}, ("bear",))
     with pytest.raises(SceneError, match=r"label of view 001.png does not fit"):
         rows(labels=scene)
 

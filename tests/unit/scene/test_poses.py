@@ -8,7 +8,7 @@ from PIL import Image
 
 from hilsplat.base.errors import ImageError, RegistrationError, SceneError
 from hilsplat.base.images import read_image
-from hilsplat.scene.features import WorkImage, camera_groups, view_names
+from hilsplat.scene.features import WorkImage, camera_groups, view_name, view_names
 from hilsplat.scene.poses import check_registration, run_poses
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import PosesSettings
@@ -130,6 +130,7 @@ def test_other_mapper_and_matcher_pose_the_renders_too(tmp_path, settings):
 
 
 def test_views_are_named_after_files_and_collisions_are_refused(tmp_path):
+    assert view_name("DSC_1") == "DSC_1.png"
     assert view_names([tmp_path / "DSC_1.jpg", tmp_path / "a.b.PNG"]) == ["DSC_1.png", "a.b.png"]
     twice = [tmp_path / "train" / "r_0.png", tmp_path / "test" / "r_0.png"]
     assert view_names(twice) == ["train_r_0.png", "test_r_0.png"]

@@ -9,7 +9,7 @@ from hilsplat.world.scenes.scene import WorldScene
 
 
 def depth_view(scene: WorldScene, camera: Camera) -> Float32[np.ndarray, "H W"]:
-    """Depth along the optical axis through each pixel's centre, scene units; inf where nothing is."""
+    """Depth along the optical axis through each pixel's centre, scene units; inf where there is nothing."""
     origins, directions = _rays(camera, 1)
     result = _cast(scene, origins, directions)
     forward = camera.cam_from_world[2, :3].astype(np.float32)

@@ -1,4 +1,4 @@
-"""The pictures and the table of the manual show the world as it is."""
+"""The pictures and the table of the manual show the current world."""
 
 from collections.abc import Sequence
 

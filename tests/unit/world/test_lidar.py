@@ -1,4 +1,4 @@
-"""Lidar points lie on surfaces, and a camera that sees one labels it alike."""
+"""Lidar points lie on surfaces, and a camera that sees one gives it the same label."""
 
 import cv2
 import numpy as np
@@ -52,7 +52,7 @@ def test_beams_below_the_horizon_measure_the_flat_road(street, centres):
     )
     expected = height / np.sin(down)
     assert on_road.sum() > 1000
-    # Mended spots lie up to 6 mm above the road.
+    # Repaired patches are up to 6 mm above the road.
     assert np.abs(scan.range_m * np.sin(down) - height)[on_road].max() < 0.01
     assert np.median(np.abs(scan.range_m - expected)[on_road]) < 1e-3
 

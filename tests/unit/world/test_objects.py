@@ -25,7 +25,7 @@ def built(name, build=build_object):
 
 
 def volume(mesh: Mesh) -> float:
-    """Enclosed volume; positive where triangles are wound outwards."""
+    """Enclosed volume; positive if triangles are wound outwards."""
     a, b, c = mesh.triangles[:, 0], mesh.triangles[:, 1], mesh.triangles[:, 2]
     return float((a * np.cross(b, c)).sum() / 6)
 

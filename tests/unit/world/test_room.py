@@ -1,4 +1,4 @@
-"""Rooms: furniture meets nothing, everything stands on something, cameras have the way free."""
+"""Rooms: furniture touches nothing, everything stands on something, and the cameras' path is free."""
 
 import itertools
 
@@ -32,7 +32,7 @@ def box_of(scene, node, without=None):
 
 
 def overlap(first, second):
-    """How deep two boxes run into each other on their best axis, m; not positive where they do not meet."""
+    """How deep two boxes run into each other on their best axis, m; not positive if they do not meet."""
     return float((np.minimum(first[1], second[1]) - np.maximum(first[0], second[0])).min())
 
 
@@ -97,7 +97,7 @@ def test_only_wall_floor_and_ceiling_are_background(rooms):
 
 def test_nothing_in_a_room_runs_into_anything(rooms):
     for scene in rooms:
-        # The backsplash of a counter rises behind what stands on it; it is checked as a thing of its own.
+        # The backsplash of a counter rises behind what stands on it; it is checked as a separate thing.
         boxes = [box_of(scene, thing.node, without="counter backsplash") for thing in scene.placed]
         for (a, first), (b, second) in itertools.combinations(zip(scene.placed, boxes, strict=True), 2):
             if {a.name, b.name} == {"window", "curtain"}:

@@ -25,7 +25,7 @@ def test_a_seed_knows_its_split():
 
 def test_a_seed_of_another_split_is_refused():
     require_split(201, "benchmark")
-    with pytest.raises(SceneError, match=r"seed 201 is not of the training split"):
+    with pytest.raises(SceneError, match=r"seed 201 is not in the training split"):
         require_split(201, "training")
     with pytest.raises(SceneError, match=r"unknown split 'test'"):
         require_split(201, "test")

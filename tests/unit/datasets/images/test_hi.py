@@ -29,9 +29,9 @@ def edit(root, change, frame="frame_00002"):
 
 def test_a_written_world_is_read_back_equal(true_world, root):
     scene = HI_LERF.open(root, "ramen")
-    assert list(scene.views) == ["frame_00002", "frame_00004"]
+    assert list(scene.views) == ["frame_00002.png", "frame_00004.png"]
     nodes = true_world.annotations.nodes
-    for name, view in (("001.png", "frame_00002"), ("003.png", "frame_00004")):
+    for name, view in (("001.png", "frame_00002.png"), ("003.png", "frame_00004.png")):
         shown = true_world.annotations.views[name]
         assert len(scene.views[view]) == len(shown)
         for region, node in zip(scene.views[view], shown, strict=True):
@@ -44,7 +44,7 @@ def test_a_written_world_is_read_back_equal(true_world, root):
 
 
 def test_two_objects_may_share_a_text(root):
-    paws = [region for region in HI_LERF.open(root, "ramen").views["frame_00002"] if region.text == "paw"]
+    paws = [region for region in HI_LERF.open(root, "ramen").views["frame_00002.png"] if region.text == "paw"]
     assert [int(paw.mask().sum()) for paw in paws] == [16, 24]
     assert {paw.path for paw in paws} == {("bear", "paw")}
 
@@ -52,45 +52,45 @@ def test_two_objects_may_share_a_text(root):
 def test_hi_3dovs_takes_images_of_3d_ovs(tmp_path, true_world):
     write_hi(true_world, tmp_path / "hi_3dovs", tmp_path / "3d_ovs", "bed", ["001.png"], OVS_STEMS)
     scene = HI_3DOVS.open(tmp_path / "hi_3dovs", "bed")
-    assert scene.images["01"] == tmp_path / "3d_ovs" / "bed" / "images" / "01.jpg"
+    assert scene.images["01.png"] == tmp_path / "3d_ovs" / "bed" / "images" / "01.jpg"
     assert HI_3DOVS.check(tmp_path / "hi_3dovs", "bed").facts["posed views"] == 4
-    assert "published frames without label: 06, 11, 20, 28, 36" in scene.warnings
+    assert "published frames without label: 06.png, 11.png, 20.png, 28.png, 36.png" in scene.warnings
 
 
-def test_listed_frames_without_image_or_label_are_told(root):
+def test_listed_frames_without_image_or_label_are_reported(root):
     (root.parent / "lerf_ovs" / "ramen" / "images" / "frame_00004.jpg").unlink()
     scene = HI_LERF.open(root, "ramen")
-    assert list(scene.views) == ["frame_00002"]
-    told = "; ".join(scene.warnings)
-    assert "frame_00004.json has no image" in told
-    assert "published frames without image: frame_00006, frame_00024" in told
-    assert "published frames without label: frame_00006, frame_00024" in told
+    assert list(scene.views) == ["frame_00002.png"]
+    reported = "; ".join(scene.warnings)
+    assert "frame_00004.json has no image" in reported
+    assert "published frames without image: frame_00006.png, frame_00024.png" in reported
+    assert "published frames without label: frame_00006.png, frame_00024.png" in reported
 
 
-def test_a_parent_that_is_none_is_told(root):
+def test_an_invalid_parent_is_reported(root):
     def change(by_id, _):
         by_id[1]["parent"] = 99
         by_id[4]["parent"] = 0  # a subpart below a whole
 
     edit(root, change)
     scene = HI_LERF.open(root, "ramen")
-    told = "; ".join(scene.warnings)
-    assert "frame_00002.json, id 1 (head): its parent 99 does not exist" in told
-    assert "id 4 (nose), level 3: its parent 0 is of level 1" in told
-    paths = {region.text: region.path for region in scene.views["frame_00002"]}
+    reported = "; ".join(scene.warnings)
+    assert "frame_00002.json, id 1 (head): its parent 99 does not exist" in reported
+    assert "id 4 (nose), level 3: its parent 0 is of level 1" in reported
+    paths = {region.text: region.path for region in scene.views["frame_00002.png"]}
     assert paths["head"] == ("head",) and paths["nose"] == ("nose",) and paths["paw"] == ("bear", "paw")
 
 
-def test_a_child_outside_its_parent_is_told_with_its_share(root):
+def test_a_child_outside_its_parent_is_reported_with_its_share(root):
     def change(by_id, _):
         # The nose of 3 x 2 px (columns 9 to 11, rows 8 and 9) now begins in rows 10 and 11, the last of
-        # the head, and goes on for two rows below it.
+        # the head, and continues for two rows below it.
         by_id[4]["segmentation"] = [[9, 10], [11, 10], [11, 13], [9, 13]]
         by_id[4].pop("bbox")
 
     edit(root, change)
-    told = "; ".join(HI_LERF.open(root, "ramen").warnings)
-    assert "id 4 (nose): 50.0% of it lies outside its parent 1 (head)" in told
+    reported = "; ".join(HI_LERF.open(root, "ramen").warnings)
+    assert "id 4 (nose): 50.0% of it lies outside its parent 1 (head)" in reported
 
 
 def test_one_percent_outside_is_rasterisation(root):
@@ -108,8 +108,8 @@ def test_one_percent_outside_is_rasterisation(root):
         objects.append({"id": 92, "level": 2, "parent": 90, "category": "c", "segmentation": wide, **common})
 
     edit(root, change)
-    told = [line for line in HI_LERF.open(root, "ramen").warnings if "outside its parent" in line]
-    assert told == ["frame_00002.json, id 92 (c): 9.1% of it lies outside its parent 90 (a)"]
+    reported = [line for line in HI_LERF.open(root, "ramen").warnings if "outside its parent" in line]
+    assert reported == ["frame_00002.json, id 92 (c): 9.1% of it lies outside its parent 90 (a)"]
 
 
 @pytest.mark.parametrize(

@@ -22,9 +22,9 @@ def root(tmp_path, true_world):
 
 def test_a_written_world_is_read_back_equal(true_world, root):
     scene = open_scene(root, "teatime")
-    assert list(scene.views) == ["frame_00002", "frame_00004"]
+    assert list(scene.views) == ["frame_00002.png", "frame_00004.png"]
     assert scene.prompts == ("head", "paw")
-    for name, view in (("001.png", "frame_00002"), ("003.png", "frame_00004")):
+    for name, view in (("001.png", "frame_00002.png"), ("003.png", "frame_00004.png")):
         nodes = true_world.nodes(name, Level.PART)
         assert [region.text for region in scene.views[view]] == ["head", "paw"]
         for region in scene.views[view]:
@@ -38,17 +38,17 @@ def test_test_views_are_posed_images_that_images_train_lacks(root):
     write_png(folder / "test_mask" / "2" / "head.png", np.zeros((24, 40), np.uint8))
     # Now frame 1 is a test view too, and the first of them: every folder moves on by one view.
     scene = open_scene(root, "teatime")
-    assert list(scene.views) == ["frame_00001", "frame_00002", "frame_00004"]
-    assert not scene.views["frame_00004"][0].mask().any()
+    assert list(scene.views) == ["frame_00001.png", "frame_00002.png", "frame_00004.png"]
+    assert not scene.views["frame_00004.png"][0].mask().any()
 
 
-def test_an_image_without_a_pose_is_no_test_view(true_world, root):
+def test_an_image_without_a_pose_is_not_a_test_view(true_world, root):
     write_png(root / "teatime" / "images" / "frame_00000.png", np.zeros((24, 40, 3), np.uint8))
-    assert list(open_scene(root, "teatime").views) == ["frame_00002", "frame_00004"]
+    assert list(open_scene(root, "teatime").views) == ["frame_00002.png", "frame_00004.png"]
     cameras = [true_world.cameras[name] for name in true_world.cameras.names[:3]]
     names = [f"frame_0000{n}.jpg" for n in (1, 2, 3)]
     write_sparse(root / "teatime" / "sparse" / "0", cameras, names, np.zeros((0, 3)))
-    with pytest.raises(SceneError, match=r"do not fit the test views\n.*0 to 0, for frame_00002\n.*0, 1"):
+    with pytest.raises(SceneError, match=r"not match the test views\n.*0 to 0, for frame_00002.png\n.*0, 1"):
         open_scene(root, "teatime")
 
 
@@ -56,7 +56,7 @@ def test_foreground_is_above_128(root):
     values = np.full((24, 40), 128, np.uint8)
     values[0, 0], values[0, 1] = 129, 255
     write_png(root / "teatime" / "test_mask" / "0" / "head.png", values)
-    (head,) = [r for r in open_scene(root, "teatime").views["frame_00002"] if r.text == "head"]
+    (head,) = [r for r in open_scene(root, "teatime").views["frame_00002.png"] if r.text == "head"]
     assert np.argwhere(head.mask()).tolist() == [[0, 0], [0, 1]]
 
 
@@ -66,7 +66,7 @@ def test_masks_are_read_only_when_asked_for(root):
     path.write_bytes(whole[: len(whole) // 2])
     scene = open_scene(root, "teatime")  # the header is whole
     with pytest.raises(ImageError, match=r"head.png cannot be read"):
-        scene.views["frame_00002"][0].mask()
+        scene.views["frame_00002.png"][0].mask()
 
 
 def test_a_prompt_with_a_dot_is_refused_by_reader_and_writer(tmp_path, true_world, root):

@@ -68,9 +68,9 @@ def test_polygons_of_any_region_give_it_back_exactly():
 
 def test_a_written_world_is_read_back_equal(true_world, root):
     scene = open_scene(root, "figurines")
-    assert list(scene.images) == [f"frame_0000{n}" for n in (1, 2, 3, 4)]  # numbered from 1
-    assert list(scene.views) == ["frame_00002", "frame_00004"]
-    for name, view in (("001.png", "frame_00002"), ("003.png", "frame_00004")):
+    assert list(scene.images) == [f"frame_0000{n}.png" for n in (1, 2, 3, 4)]  # numbered from 1
+    assert list(scene.views) == ["frame_00002.png", "frame_00004.png"]
+    for name, view in (("001.png", "frame_00002.png"), ("003.png", "frame_00004.png")):
         nodes = true_world.nodes(name)
         assert {region.text for region in scene.views[view]} == set(nodes)
         for region in scene.views[view]:
@@ -89,7 +89,9 @@ def test_written_poses_are_read_back_equal(true_world, root):
 
 
 def test_objects_of_one_category_are_one_region_with_all_boxes(root):
-    (paw,) = [region for region in open_scene(root, "figurines").views["frame_00002"] if region.text == "paw"]
+    (paw,) = [
+        region for region in open_scene(root, "figurines").views["frame_00002.png"] if region.text == "paw"
+    ]
     # View 1: paws of rows 14 to 17, columns 3 to 6 and 13 to 18.
     assert paw.boxes().tolist() == [[3, 14, 6, 17], [13, 14, 18, 17]]
     assert paw.mask().sum() == 4 * 4 + 4 * 6
@@ -116,33 +118,33 @@ def test_iscrowd_may_be_number_or_boolean(tmp_path, iscrowd):
 
 def test_categories_differ_by_case(tmp_path, root):
     label_file(root / "label" / "figurines", [thing("Pot"), thing("pot")], (40, 24), "frame_00001")
-    assert [r.text for r in open_scene(root, "figurines").views["frame_00001"]] == ["Pot", "pot"]
+    assert [r.text for r in open_scene(root, "figurines").views["frame_00001.png"]] == ["Pot", "pot"]
 
 
 def test_a_frame_is_found_by_name_when_an_image_before_it_is_missing(root):
-    before = open_scene(root, "figurines").views["frame_00004"][0].mask()
+    before = open_scene(root, "figurines").views["frame_00004.png"][0].mask()
     (root / "figurines" / "images" / "frame_00003.jpg").unlink()
     scene = open_scene(root, "figurines")
-    assert scene.images["frame_00004"].name == "frame_00004.jpg"
-    assert np.array_equal(scene.views["frame_00004"][0].mask(), before)
-    assert scene.posed_views(["frame_00002.png", "frame_00004.png"])["frame_00004"] == "frame_00004.png"
+    assert scene.images["frame_00004.png"].name == "frame_00004.jpg"
+    assert np.array_equal(scene.views["frame_00004.png"][0].mask(), before)
+    scene.check_posed(["frame_00002.png", "frame_00004.png"])
 
 
 def test_labelled_frames_without_image_or_pose_are_named(root):
-    with pytest.raises(SceneError, match="have no pose: frame_00004"):
-        open_scene(root, "figurines").posed_views(["frame_00002.png", "frame_00003.png"])
+    with pytest.raises(SceneError, match=r"have no pose: frame_00004\.png\n"):
+        open_scene(root, "figurines").check_posed(["frame_00002.png", "frame_00003.png"])
     (root / "figurines" / "images" / "frame_00004.jpg").unlink()
-    with pytest.raises(SceneError, match="labelled frames of figurines have no image: frame_00004"):
+    with pytest.raises(SceneError, match=r"labelled frames of figurines have no image: frame_00004\.png\n"):
         open_scene(root, "figurines")
 
 
-def test_a_polygon_outside_the_image_is_clipped_and_told_or_refused(tmp_path):
+def test_a_polygon_outside_the_image_is_clipped_and_reported_or_refused(tmp_path):
     path = label_file(tmp_path, [thing(segmentation=[[15, 2], [25, 2], [25, 4], [15, 4]])])
     labels = read_isat(path)
     assert labels.objects[0].mask((10, 20)).sum() == 3 * 5  # columns 15 to 19
     assert len(labels.warnings) == 1 and "reaches 5 px outside the image; clipped" in labels.warnings[0]
     path = label_file(tmp_path, [thing(segmentation=[[30, 2], [35, 2], [35, 4]])])
-    with pytest.raises(SceneError, match=r"object 0 \(knife\): a polygon lies outside the image"):
+    with pytest.raises(SceneError, match=r"object 0 \(knife\): a polygon is outside the image"):
         read_isat(path)
 
 
@@ -152,7 +154,7 @@ def test_a_polygon_outside_the_image_is_clipped_and_told_or_refused(tmp_path):
         ('{"info": ', "cannot be read"),
         ("[]", "has no list `objects`"),
         ('{"shapes": []}', "has no list `objects`"),
-        ('{"info": {}, "objects": []}', "does not say how large"),
+        ('{"info": {}, "objects": []}', "does not give the size"),
     ],
 )
 def test_malformed_label_files_are_refused_by_name(tmp_path, text, message):
@@ -166,9 +168,9 @@ def test_malformed_label_files_are_refused_by_name(tmp_path, text, message):
     ("entry", "message"),
     [
         (thing(category=None), "object 0 has no category"),
-        (thing(segmentation=[[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]]), "segmentation is no polygon"),
-        (thing(segmentation=[]), "segmentation is no polygon"),
-        (thing(segmentation="x"), "segmentation is no polygon"),
+        (thing(segmentation=[[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]]), "segmentation is not a polygon"),
+        (thing(segmentation=[]), "segmentation is not a polygon"),
+        (thing(segmentation="x"), "segmentation is not a polygon"),
         (thing(bbox=[1, 2, 3]), "bbox cannot be used"),
     ],
 )
@@ -177,13 +179,13 @@ def test_malformed_objects_are_refused_by_number(tmp_path, entry, message):
         read_isat(label_file(tmp_path, [entry]))
 
 
-def test_a_label_of_a_scaled_copy_is_resized_and_told(root):
+def test_a_label_of_a_scaled_copy_is_resized_and_reported(root):
     for name in ("frame_00002", "frame_00004"):
         (root / "figurines" / "images" / f"{name}.jpg").unlink()
         write_png(root / "figurines" / "images" / f"{name}.png", np.zeros((12, 20, 3), np.uint8))
     scene = open_scene(root, "figurines")
     assert sum("resized by nearest neighbour" in sentence for sentence in scene.warnings) == 2
-    (bear,) = [region for region in scene.views["frame_00002"] if region.text == "bear"]
+    (bear,) = [region for region in scene.views["frame_00002.png"] if region.text == "bear"]
     assert bear.mask((12, 20)).sum() * 4 == pytest.approx(bear.mask().sum(), rel=0.2)
     # Columns 3 to 18 and rows 6 to 17 of 40 x 24, at half the size.
     assert bear.boxes((12, 20)).tolist() == [[1, 3, 9, 8]]
@@ -196,13 +198,16 @@ def test_a_label_of_another_release_is_refused(root):
         open_scene(root, "figurines")
 
 
-def test_unlisted_texts_and_missing_frames_are_told(root):
-    told = "; ".join(open_scene(root, "figurines").report().warnings)
-    assert "published frames without label: frame_00041, frame_00105, frame_00152, frame_00195" in told
-    assert "texts that the published list lacks: Ring, bear, head, nose, paw" in told
+def test_unlisted_texts_and_missing_frames_are_reported(root):
+    reported = "; ".join(open_scene(root, "figurines").report().warnings)
+    assert (
+        "published frames without label: frame_00041.png, frame_00105.png, frame_00152.png, frame_00195.png"
+        in reported
+    )
+    assert "texts that the published list lacks: Ring, bear, head, nose, paw" in reported
 
 
-def test_a_wrong_count_of_pairs_is_told_for_whole_published_scenes(tmp_path, true_world):
+def test_a_wrong_count_of_pairs_is_reported_for_whole_published_scenes(tmp_path, true_world):
     root = tmp_path / "lerf_ovs"
     write_lerf_ovs(true_world, root, "figurines", [])
     for frame in (41, 105, 152, 195):

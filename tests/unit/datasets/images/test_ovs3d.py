@@ -25,22 +25,22 @@ def root(tmp_path, true_world):
 def test_a_written_world_is_read_back_equal(true_world, root):
     scene = open_scene(root, "bed")
     assert scene.prompts == ("Ring", "bear")  # capitals sort first
-    assert list(scene.views) == ["00", "03"]
-    for name, view in (("000.png", "00"), ("003.png", "03")):
+    assert list(scene.views) == ["00.png", "03.png"]
+    for name, view in (("000.png", "00.png"), ("003.png", "03.png")):
         nodes = true_world.nodes(name, Level.WHOLE)
         assert [region.text for region in scene.views[view]] == ["Ring", "bear"]
         for region in scene.views[view]:
             truth = true_world.mask(name, nodes[region.text]) if region.text in nodes else np.zeros((24, 40))
             assert np.array_equal(region.mask(), truth)
     # The ring of the first view: rows 5 to 13, columns 26 to 34. The last view does not show it.
-    assert scene.views["00"][0].boxes().tolist() == [[26, 5, 34, 13]]
-    assert scene.views["03"][0].boxes().shape == (0, 4)
-    assert "regions without a pixel: 03: Ring" in open_scene(root, "bed").report().warnings
+    assert scene.views["00.png"][0].boxes().tolist() == [[26, 5, 34, 13]]
+    assert scene.views["03.png"][0].boxes().shape == (0, 4)
+    assert "regions without a pixel: 03.png: Ring" in open_scene(root, "bed").report().warnings
 
 
 def test_poses_of_llff_are_read_back_equal(true_world, root):
     posed = posed_images(root / "bed", "3D-OVS")
-    assert list(posed) == ["00", "01", "02", "03"]
+    assert list(posed) == ["00.png", "01.png", "02.png", "03.png"]
     for name, view in zip(true_world.cameras.names, posed.values(), strict=True):
         camera = true_world.cameras[name]
         assert np.allclose(view.cam_from_source, camera.cam_from_world, atol=1e-12)
@@ -49,7 +49,7 @@ def test_poses_of_llff_are_read_back_equal(true_world, root):
 
 def test_a_camera_that_looks_along_minus_z_of_its_llff_frame(tmp_path):
     # World axes as LLFF's camera: its columns (down, right, back) are -y, x, z of the world, so the
-    # camera stands at (1, 2, 3), looks along -z, and has world x on its right and -y below it.
+    # camera is at (1, 2, 3), looks along -z, and has world x on its right and -y below it.
     matrix = np.array([[0, 1, 0, 1, 30], [-1, 0, 0, 2, 40], [0, 0, 1, 3, 50]], float)
     np.save(tmp_path / "poses_bounds.npy", np.concatenate([matrix.ravel(), [0.5, 9.0]])[None])
     poses, sizes, bounds = read_poses_bounds(tmp_path / "poses_bounds.npy")
@@ -64,7 +64,7 @@ def test_the_focal_length_scales_with_the_image_on_disk(true_world, root):
     for n in range(4):
         (root / "bed" / "images" / f"0{n}.jpg").unlink()
         write_png(root / "bed" / "images" / f"0{n}.png", np.zeros((12, 20, 3), np.uint8))
-    K = posed_images(root / "bed", "3D-OVS")["00"].camera.calibration_matrix()
+    K = posed_images(root / "bed", "3D-OVS")["00.png"].camera.calibration_matrix()
     assert K.tolist() == [[25, 0, 10], [0, 25, 6], [0, 0, 1]]  # half of 50 and of the centre (20, 12)
 
 
@@ -110,7 +110,7 @@ def test_only_255_is_foreground(root):
     values = np.full((24, 40), 254, np.uint8)
     values[3, 4] = 255
     write_png(root / "bed" / "segmentations" / "00" / "bear.png", values)
-    assert np.argwhere(open_scene(root, "bed").views["00"][1].mask()).tolist() == [[3, 4]]
+    assert np.argwhere(open_scene(root, "bed").views["00.png"][1].mask()).tolist() == [[3, 4]]
 
 
 def test_classes_are_stripped_sorted_and_without_empty_lines(tmp_path):
@@ -129,7 +129,7 @@ def test_images_may_be_png(root):
     (root / "bed" / "images" / "00.jpg").unlink()
     write_png(root / "bed" / "images" / "00.png", np.zeros((24, 40, 3), np.uint8))
     scene = open_scene(root, "bed")
-    assert scene.images["00"].name == "00.png" and scene.images["01"].name == "01.jpg"
+    assert scene.images["00.png"].name == "00.png" and scene.images["01.png"].name == "01.jpg"
 
 
 def test_one_name_with_two_suffixes_is_refused(root):
@@ -138,12 +138,12 @@ def test_one_name_with_two_suffixes_is_refused(root):
         open_scene(root, "bed")
 
 
-def test_a_mask_of_another_size_is_resized_to_nearest_and_told(root):
+def test_a_mask_of_another_size_is_resized_to_nearest_and_reported(root):
     small = np.zeros((12, 20), np.uint8)
     small[1, 2] = 255
     write_png(root / "bed" / "segmentations" / "00" / "bear.png", small)
     scene = open_scene(root, "bed")
-    bear = scene.views["00"][1]
+    bear = scene.views["00.png"][1]
     assert np.argwhere(bear.mask((24, 40))).tolist() == [[2, 4], [2, 5], [3, 4], [3, 5]]
     assert any("bear.png is 20 x 12 px, its image 40 x 24 px: resized" in line for line in scene.warnings)
 
@@ -154,14 +154,14 @@ def test_a_mask_of_another_shape_is_refused(root):
         open_scene(root, "bed")
 
 
-def test_a_missing_mask_is_refused_and_tells_misspelt_ones(root):
+def test_a_missing_mask_is_refused_and_misspelt_ones_are_named(root):
     place = root / "bed" / "segmentations" / "03"
     (place / "bear.png").rename(place / "Bear.png")
     with pytest.raises(SceneError, match=r"lacks the masks of: bear\n.*\n.*classes.txt lacks: Bear"):
         open_scene(root, "bed")
 
 
-def test_a_mask_of_an_unknown_class_is_told(root):
+def test_a_mask_of_an_unknown_class_is_reported(root):
     place = root / "bed" / "segmentations" / "03"
     (place / "wood.png").write_bytes((place / "bear.png").read_bytes())
     assert "03: masks of unknown classes are not read: wood" in open_scene(root, "bed").warnings
@@ -179,6 +179,6 @@ def test_a_scene_without_any_pose_says_so(root):
     assert any("no poses" in line for line in open_scene(root, "bed").report().warnings)
 
 
-def test_missing_views_are_told(root):
+def test_missing_views_are_reported(root):
     warnings = open_scene(root, "bed").warnings
-    assert "published frames without segmentation: 04, 10, 23, 30" in warnings
+    assert "published frames without segmentation: 04.png, 10.png, 23.png, 30.png" in warnings

@@ -53,7 +53,7 @@ def make_images(folder: Path, frames: int) -> list[PosedImage]:
 
 
 def make_semantic_nerf(folder: Path, frames: int, lines: int | None = None) -> Path:
-    """A sequence whose frame n stands at x = n."""
+    """A sequence whose frame n is at x = n."""
     for name in ("rgb", "depth"):
         (folder / name).mkdir(parents=True)
     for number in range(frames):
@@ -98,7 +98,7 @@ def test_unpadded_frames_are_sorted_by_number_and_pictures_beside_them_are_left(
     images, warnings = read_images(make_semantic_nerf(tmp_path / "seq", 12, lines=15))
     assert [image.name for image in images] == [f"rgb_{number}.png" for number in range(12)]
     assert [image.world_from_cam[0, 3] for image in images] == list(range(12))
-    assert warnings == ("3 poses have no image and are passed over",)
+    assert warnings == ("3 poses have no image and are skipped",)
 
 
 def test_lens_is_half_the_width_unless_the_sequence_says(tmp_path):
@@ -187,7 +187,7 @@ def test_damage_is_answered_by_a_sentence_that_says_what_to_do(tmp_path):
     with refuse(r"1 lines, 3 images, the first without a line is frame 1"):
         read_images(make_semantic_nerf(tmp_path / "short", 3, lines=1))
     make_semantic_nerf(tmp_path / "deep" / "room0" / "room0", 1)
-    with refuse(r"no rendered sequence(.|\n)*fix       name the folder .*room0/room0"):
+    with refuse(r"not hold a rendered sequence(.|\n)*fix       use the folder .*room0/room0"):
         read_images(tmp_path / "deep" / "room0")
     (tmp_path / "short" / "traj_w_c.txt").write_text("1 0 0 0\n")
     with refuse(r"line 1: cannot be read\n  expected  16 numbers"):

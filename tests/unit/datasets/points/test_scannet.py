@@ -102,13 +102,13 @@ def test_poses_are_inverted_and_centres_moved_by_half_a_pixel(root):
     assert image.size_hw == (12, 16)
 
 
-def test_frames_without_a_pose_are_passed_over_and_told(tmp_path):
+def test_frames_without_a_pose_are_skipped_and_reported(tmp_path):
     folder = make_scan(tmp_path / "scannet", frames=5, lost=(1, 3))
     (folder / "pose" / "4.txt").unlink()
     scene = open_scan(tmp_path / "scannet", SCAN)
     assert [image.name for image in scene.images] == ["0.jpg", "2.jpg"]
     assert scene.warnings[0].startswith("2 frames were lost by tracking")
-    assert scene.warnings[1] == "1 images have no file in pose/ and are passed over, first 4"
+    assert scene.warnings[1] == "1 images have no file in pose/ and are skipped, first 4"
 
 
 def test_a_scan_without_any_pose_is_refused(tmp_path):
@@ -133,7 +133,7 @@ def test_alignment_is_off_by_default_and_turns_mesh_and_cameras_together(root):
         np.testing.assert_allclose(after.cam_from_world @ [90, 3, 3, 1], seen, atol=1e-9)
 
 
-def test_a_category_that_the_table_lacks_has_no_class_and_is_told(root):
+def test_a_category_that_the_table_lacks_has_no_class_and_is_reported(root):
     folder = root / "scans" / SCAN
     path = folder / f"{SCAN}.aggregation.json"
     path.write_text(path.read_text().replace('"chair"', '"trashcan"'))
@@ -242,16 +242,16 @@ def break_sens(folder: Path) -> None:
     [
         (break_json, r"aggregation\.json is not valid JSON(.|\n)*fix "),
         (break_labels, r"does not belong to(.|\n)*expected  the same 6 vertices(.|\n)*found     5 vertices"),
-        (break_places, r"does not belong to(.|\n)*found     vertices elsewhere"),
+        (break_places, r"does not belong to(.|\n)*found     vertices in other positions"),
         (break_mesh, r"labels\.ply cannot be read(.|\n)*found     a file of \d+ bytes(.|\n)*fix "),
         (break_segments, r"segs\.json does not belong(.|\n)*each of 5 vertices(.|\n)*found     2 values"),
         (break_groups, r"group 0 \(wall\): none of its segments(.|\n)*fix "),
         (break_group, r"group 0: cannot be read: KeyError\('objectId'\)"),
         (break_archive, r"scene0000_00 of ScanNet v2 is incomplete(.|\n)*labels\.ply(.|\n)*unpack"),
-        (break_name, r"first\.jpg is not named as a frame\n  expected  <number>\.jpg"),
+        (break_name, r"first\.jpg is not named like a frame\n  expected  <number>\.jpg"),
         (break_pose, r"0\.txt: the pose is not a rotation"),
         (break_pose_shape, r"0\.txt, line 1: cannot be read\n  expected  4 numbers\n  found     1 0 0"),
-        (break_table, r"is no table of ScanNet's labels(.|\n)*found     id,raw_category,nyu40id"),
+        (break_table, r"is not the table of ScanNet's labels(.|\n)*found     id,raw_category,nyu40id"),
         (break_depth_of_folder, r"wrong place(.|\n)*fix       move .*scene0000_00/scene0000_00 to"),
         (break_scans_folder, r"wrong place(.|\n)*fix       move .*scannet/scene0000_00 to .*scans"),
         (break_sens, r"still inside scene0000_00\.sens(.|\n)*SensReader"),

@@ -117,7 +117,7 @@ def test_street_as_waymo_reads_back_equal(street, tmp_path):
     distance, row = cKDTree(truth.xyz + shift).query(scan["points"])
     assert distance.max() < 2e-4
     labels = waymo_labels(scan["node_ids"], [node.text for node in nodes])
-    # Points of two things can coincide where the things touch, nowhere else.
+    # Points of two things can coincide only where the things touch.
     assert (truth.class_id[row] == labels[:, 1]).mean() > 0.9999
     assert (np.bincount(truth.class_id, minlength=23) == np.bincount(labels[:, 1], minlength=23)).all()
     moved = np.eye(4)

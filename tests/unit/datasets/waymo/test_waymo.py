@@ -127,7 +127,7 @@ def test_projections_behind_or_far_out_of_the_lens_are_invalid():
 
 
 def test_opencv_axes_give_the_same_pixel():
-    """Half a pixel: Waymo's 0 is the left edge of the first pixel, as here, so K is taken as it is."""
+    """Half a pixel: Waymo's 0 is the left edge of the first pixel, as here, so K is taken unchanged."""
     vehicle = turned(40, x=7.0)
     lens = replace(camera(), vehicle_from_cam=turned(90))
     in_world = vehicle @ turned(90) @ [*POINT[0], 1]
@@ -153,7 +153,7 @@ def test_pixel_poses_move_points_into_the_world():
     points = frame_points(replace(frame, pixel_pose=pose), np.eye(4))
     np.testing.assert_allclose(points.xyz[0], [-SQRT2, SQRT2, 0], atol=1e-6)
     np.testing.assert_allclose(points.xyz[1], [10 - SQRT2, SQRT2, 1], atol=1e-6)
-    # the second return has no poses of its own and uses the first's
+    # the second return has no poses and uses those of the first
     np.testing.assert_allclose(points.xyz[4], [10 - 2 * SQRT2, 2 * SQRT2, 1], atol=1e-6)
 
 
@@ -199,7 +199,7 @@ def test_registry_finds_and_checks_the_segments_that_are_there(root):
     assert dataset.missing(root, SEGMENT) == (f"validation/vehicle_pose/{SEGMENT}.parquet",)
 
 
-def test_projections_are_optional_and_told(root):
+def test_projections_are_optional_and_reported(root):
     (root / "validation" / "lidar_camera_projection" / f"{SEGMENT}.parquet").unlink()
     scene = open_segment(root, SEGMENT)
     assert scene.truth["waymo"].visible is None
@@ -363,5 +363,5 @@ SegmentationFrameList: repeated SegmentationFrame frames 1""")
 
 
 def test_first_pose_of_an_empty_file_is_refused(tmp_path):
-    with pytest.raises(SceneError, match=r"holds no frame"):
+    with pytest.raises(SceneError, match=r"does not hold any frame"):
         tfrecords.first_pose(write_records(tmp_path / "empty.tfrecord", []))

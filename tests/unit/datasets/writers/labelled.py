@@ -32,7 +32,7 @@ OVS_STEMS = ("{:02d}", 0)
 def write_lerf_ovs(world: TrueWorld, root: Path, scene: str, views: Sequence[str]) -> Mapping[str, str]:
     """Write `root/<scene>` and `root/label/<scene>`.
 
-    Each connected piece of a node is an object of its own, since the layout has one polygon per object.
+    Each connected piece of a node is a separate object, since the layout has one polygon per object.
 
     Args:
         world: the source.
@@ -165,7 +165,7 @@ def _file_name(text: str, dots: bool = True) -> str:
 
 
 def _depth_range(world: TrueWorld, cam_from_world: np.ndarray) -> np.ndarray:
-    """Nearest and farthest depth of the points in front of a camera; 0 and 1 where there is none."""
+    """Nearest and farthest depth of the points in front of a camera; 0 and 1 if there are none."""
     depth = world.points_xyz @ cam_from_world[2, :3] + cam_from_world[2, 3]
     depth = depth[depth > 0]
     return np.array([depth.min(), depth.max()]) if len(depth) else np.array([0.0, 1.0])

@@ -31,7 +31,7 @@ def write_semantic_mesh(
         xyz: vertices, metres.
         faces: triangles; each becomes a quad whose last corner occurs twice.
         object_of_face: row of `classes`, -1 for none. In the files objects count from 1.
-        classes: Replica's class id of each object, 0 where it has none for it.
+        classes: Replica's class id of each object, 0 if it has none for it.
     """
     places = {axis: xyz[:, column] for column, axis in enumerate("xyz")}
     colours = dict.fromkeys(("red", "green", "blue"), np.full(len(xyz), 128, dtype=np.uint8))

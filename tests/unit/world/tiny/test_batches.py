@@ -58,7 +58,7 @@ def test_edges_lie_on_both_sides_of_a_border():
     assert region_edges(blocks)[0].tolist() == [[0, 1, 1, 0]] * 2
 
 
-def test_a_batch_compares_a_prompt_with_the_region_it_lies_in():
+def test_a_batch_compares_a_prompt_with_the_region_around_it():
     views = drawn_views(3, 64)
     _, classes = class_rows(views)
     batch = draw_batch(views, classes, CropStage(1.0, 64, 4, 6, 256), np.random.default_rng(0))

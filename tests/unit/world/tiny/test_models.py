@@ -125,7 +125,7 @@ def test_the_committed_clip_is_as_good_as_its_card_says(unseen):
         assert of_level.mean() > card[level.label]["top1"] - 0.25
 
 
-def test_the_committed_clip_tells_texts_apart():
+def test_the_committed_clip_separates_texts():
     folder = MODELS / "clip-tiny"
     text = onnxruntime.InferenceSession(
         str(folder / "onnx" / "text_model.onnx"), providers=["CPUExecutionProvider"]

@@ -13,7 +13,7 @@ from hilsplat.world.tiny.train import train_models
 
 
 def test_only_training_scenes_are_rendered_for_training():
-    with pytest.raises(SceneError, match="not of the training split"):
+    with pytest.raises(SceneError, match="not in the training split"):
         scene_of_seed(201)
 
 

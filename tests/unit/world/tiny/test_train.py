@@ -1,4 +1,4 @@
-"""Training learns, repeats itself, goes on where it was, and measures what it says."""
+"""Training learns, repeats itself, resumes, and measures what it says."""
 
 import numpy as np
 import pytest
