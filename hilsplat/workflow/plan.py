@@ -84,7 +84,12 @@ class Plan:
             raise SettingsError(
                 "there is no scene to run",
                 expected=f"scenes of {sheet}: {', '.join(f'{row.name} ({row.group})' for row in self.rows)}",
-                found=f"groups {list(run.groups)}, only {list(run.only)}, data_root {run.data_root!r}",
+                found="; ".join(
+                    [
+                        f"groups {list(run.groups)}, only {list(run.only)}, data_root {run.data_root!r}",
+                        *(f"{name} is skipped: {reason}" for name, reason in self.absent.items()),
+                    ]
+                ),
                 fix="name other groups or scenes, or set data_root",
             )
         self._stages = functools.cache(run.stages)

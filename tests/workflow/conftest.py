@@ -18,13 +18,6 @@ UNFINISHED = shutil.ignore_patterns("*.pyc", "*.pyc.*", "*.tmp.*")
 """Files of Python and numba that other tests may be writing; they are renamed once complete."""
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """One process runs the tests of a module here, so that what its fixtures make is made once."""
-    for item in items:
-        if item.path.is_relative_to(Path(__file__).parent):
-            item.add_marker(pytest.mark.xdist_group(item.path.stem))
-
-
 @dataclass(frozen=True)
 class Project:
     """A copy of the project in which commands run on the copy's own code."""

@@ -81,5 +81,5 @@ def test_check_describes_the_cut_export(folder):
 
 
 def test_a_folder_without_an_export_cannot_be_cut(tmp_path):
-    with pytest.raises(ModelError, match=r"has no model.onnx to cut"):
+    with pytest.raises(ModelError, match=r"has no model.onnx to split"):
         split_clip(tmp_path)

@@ -22,8 +22,6 @@ from hilsplat.scene.finished import FinishedScene
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, build_finished_desk, region_mask
 
-pytestmark = pytest.mark.xdist_group("front door")
-
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory) -> Path:
