@@ -54,7 +54,7 @@ class Project:
 
     def snakemake(self, *words: str, cores: int = 2, check: bool = True) -> subprocess.CompletedProcess[str]:
         """Run Snakemake with the CI configuration."""
-        command = [sys.executable, "-m", "snakemake", "--cores", str(cores), "--configfile", "config/ci.yaml"]
+        command = [sys.executable, "-m", "snakemake", "--configfile", "config/ci.yaml", "--cores", str(cores)]
         return self.run(*command, *words, check=check)
 
     def planned(self, *words: str) -> set[str]:
