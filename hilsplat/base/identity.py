@@ -326,18 +326,10 @@ def _annotations(node: ast.FunctionDef | ast.AsyncFunctionDef) -> list[ast.expr]
 
 
 def _strip(top: ast.AST) -> None:
-    """Remove from a syntax tree, in place, what cannot change a result."""
-    in_functions = {
-        id(inner)
-        for node in ast.walk(top)
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-        for inner in ast.walk(node)
-        if isinstance(inner, ast.AnnAssign)
-    }
-    in_local_classes = {
-        id(inner) for node in ast.walk(top) if isinstance(node, ast.ClassDef) for inner in node.body
-    }
-    for node in ast.walk(top):
+    """Take out of a syntax tree, in place, what cannot change a result."""
+    waiting = [(top, False)]
+    while waiting:
+        node, is_local = waiting.pop()  # local: a statement of a function, whose annotations do nothing
         for block in ("body", "orelse", "finalbody"):
             statements = getattr(node, block, None)
             if isinstance(statements, list):
@@ -349,7 +341,10 @@ def _strip(top: ast.AST) -> None:
                 if each is not None:
                     each.annotation = None
             node.returns = None
-        elif isinstance(node, ast.AnnAssign) and id(node) in in_functions - in_local_classes:
+            is_local = True
+        elif isinstance(node, ast.ClassDef):
+            is_local = False
+        elif isinstance(node, ast.AnnAssign) and is_local:
             node.annotation = ast.Constant(None)
         elif isinstance(node, ast.Raise) or (isinstance(node, ast.Expr) and _is_log_call(node.value)):
             for inner in ast.walk(node):
@@ -364,6 +359,22 @@ def _strip(top: ast.AST) -> None:
                 node.args = node.args[:1]  # the second is its description
             elif called == "Plugins":
                 node.args = []
+        waiting += [(child, is_local) for child in _children(node)]
+
+
+_LEAVES = (ast.expr_context, ast.operator, ast.unaryop, ast.boolop, ast.cmpop)
+
+
+def _children(node: ast.AST) -> Iterator[ast.AST]:
+    """Nodes right below one, but for those that hold nothing, such as operators."""
+    for name in node._fields:
+        value = getattr(node, name, None)
+        if isinstance(value, list):
+            for each in value:
+                if isinstance(each, ast.AST) and not isinstance(each, _LEAVES):
+                    yield each
+        elif isinstance(value, ast.AST) and not isinstance(value, _LEAVES):
+            yield value
 
 
 def _is_log_call(node: ast.AST) -> bool:
@@ -427,9 +438,9 @@ class _Names:
             scope = _Scope(_bound_in(node.body), self._imported(node.body), is_class=True)
             self._inside(scope, node.body)
         elif isinstance(node, _COMPREHENSIONS):
-            self._inside(_Scope(_bound(node), {}), list(ast.iter_child_nodes(node)))
+            self._inside(_Scope(_bound(node), {}), list(_children(node)))
         else:
-            for child in ast.iter_child_nodes(node):
+            for child in _children(node):
                 self._visit(child)
 
     def _inside(self, scope: _Scope, body: Sequence[ast.AST]) -> None:
@@ -464,7 +475,7 @@ def _own(body: Iterable[ast.AST]) -> Iterator[ast.AST]:
         node = waiting.pop()
         yield node
         if not isinstance(node, (*_FUNCTIONS, ast.ClassDef)):
-            waiting += ast.iter_child_nodes(node)
+            waiting += _children(node)
 
 
 def _bound_in(body: Iterable[ast.AST]) -> set[str]:
