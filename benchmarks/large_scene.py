@@ -18,7 +18,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from benchmarks.memory import status_mib
 from hilsplat.base.artifacts import atomic_folder, write_index, write_npy
@@ -81,8 +80,7 @@ def made_gaussians(number: int) -> tuple[Gaussians, np.ndarray]:
         0.3 * rng.normal(size=(number, 1, 3)),
     )
     order = morton_order(arrays[0])
-    tensors = (torch.tensor(values[order], dtype=torch.float32) for values in arrays)
-    return Gaussians(*tensors), labels[order]
+    return Gaussians(*(values[order].astype(np.float32) for values in arrays)), labels[order]
 
 
 def ring_of_cameras(number: int, size_hw: tuple[int, int]) -> Cameras:

@@ -23,22 +23,20 @@ def peaks_mib(num_gaussians: int, size_hw: tuple[int, int], channels: int) -> tu
 
 def _measure(num_gaussians: int, size_hw: tuple[int, int], channels: int) -> tuple[float, float]:
     from benchmarks.scenes import random_scene
-    from hilsplat.splat.rasterise.api import to_parameters
     from hilsplat.splat.rasterise.cpu import blend_forward, blend_gradients, project_gaussians
 
     def passes(num: int, size_hw: tuple[int, int]) -> tuple[float, float]:
         gaussians, camera = random_scene(num, size_hw)
-        parameters = to_parameters(gaussians)
         features = np.ones((num, channels - 3), np.float32)
         grad = np.ones((*size_hw, channels), np.float32), np.ones(size_hw, np.float32)
         # reset the peak to what the process holds now
         Path("/proc/self/clear_refs").write_text("5")
         before = status_mib("VmRSS")
-        view = project_gaussians(parameters, camera, 3, 1)
+        view = project_gaussians(gaussians, camera, 3, 1)
         values = np.concatenate([view.colours, features], axis=1) if channels > 3 else view.colours
         image, alpha = blend_forward(view, values, 1)
         forward = status_mib("VmHWM") - before
-        blend_gradients(parameters, view, values, image, alpha, *grad, 1)
+        blend_gradients(gaussians, view, values, image, alpha, *grad, 1)
         return forward, status_mib("VmHWM") - before
 
     passes(1000, (32, 32))  # loads the kernels

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-import torch
 
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import Gaussians
@@ -41,5 +40,5 @@ def random_scene(
         generator.normal(size=(num_gaussians, (sh_degree + 1) ** 2, 3)) * 0.3,
     )
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    gaussians = Gaussians(*(torch.tensor(values, dtype=torch.float32) for values in arrays))
+    gaussians = Gaussians(*(values.astype(np.float32) for values in arrays))
     return gaussians, Camera("view", np.eye(4), K, size_hw)

@@ -19,7 +19,7 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.quadratic import StackedWeights
 from hilsplat.field.autoencoder import train_autoencoder
-from hilsplat.field.field import LanguageField
+from hilsplat.field.language_field import LanguageField
 from hilsplat.field.linear_code import LinearCode
 from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
 from hilsplat.query.language_scene import LanguageScene

@@ -17,11 +17,10 @@ from benchmarks.scenes import SIZES, random_scene
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.densify import ScreenGradients
 from hilsplat.splat.fit import fit_step
-from hilsplat.splat.optimise import FIELDS, Adam
+from hilsplat.splat.gaussians import FIELDS, Gaussians
+from hilsplat.splat.optimise import Adam
 from hilsplat.splat.photometric import photometric_loss
-from hilsplat.splat.rasterise.api import to_parameters
 from hilsplat.splat.rasterise.cpu import (
-    Parameters,
     blend_forward,
     blend_gradients,
     project_gaussians,
@@ -61,17 +60,16 @@ def name(what: str, scene: str, threads: int, channels: int | None = None) -> st
 
 @cache
 def scene_of(scene: str) -> tuple:
-    """Camera, parameters, and hits (Gaussians blended at pixels) of a scene."""
+    """Camera, Gaussians, and hits (Gaussians blended at pixels) of a scene."""
     gaussians, camera = random_scene(*SIZES[scene])
-    parameters = to_parameters(gaussians)
-    row_start, _, _ = sparse_weights(project_gaussians(parameters, camera, 3, 2), 0.0, 2)
-    return camera, parameters, int(row_start[-1])
+    row_start, _, _ = sparse_weights(project_gaussians(gaussians, camera, 3, 2), 0.0, 2)
+    return camera, gaussians, int(row_start[-1])
 
 
-def blended(parameters: Parameters, view, channels: int) -> np.ndarray:
+def blended(gaussians: Gaussians, view, channels: int) -> np.ndarray:
     """Colours, then random features up to the number of channels."""
     rng = np.random.default_rng(1)
-    more = rng.normal(size=(len(parameters.means), channels - 3)).astype(np.float32)
+    more = rng.normal(size=(len(gaussians), channels - 3)).astype(np.float32)
     return np.concatenate([view.colours, more], axis=1) if channels > 3 else view.colours
 
 
@@ -79,11 +77,11 @@ def blended(parameters: Parameters, view, channels: int) -> np.ndarray:
 @channels
 @threads
 def test_forward(benchmark, scene, channels, threads):
-    camera, parameters, hits = scene_of(scene)
-    values = blended(parameters, project_gaussians(parameters, camera, 3, 1), channels)
+    camera, gaussians, hits = scene_of(scene)
+    values = blended(gaussians, project_gaussians(gaussians, camera, 3, 1), channels)
 
     def forward():
-        return blend_forward(project_gaussians(parameters, camera, 3, threads), values, threads)
+        return blend_forward(project_gaussians(gaussians, camera, 3, threads), values, threads)
 
     benchmark.extra_info |= {"case": name("forward", scene, threads, channels), "threads": threads}
     benchmark.extra_info |= {"count": hits, "of": "hits", "flop": hits * (22 + 2 * channels)}
@@ -95,15 +93,15 @@ def test_forward(benchmark, scene, channels, threads):
 @channels
 @threads
 def test_backward(benchmark, scene, channels, threads):
-    camera, parameters, hits = scene_of(scene)
-    view = project_gaussians(parameters, camera, 3, threads)
-    values = blended(parameters, view, channels)
+    camera, gaussians, hits = scene_of(scene)
+    view = project_gaussians(gaussians, camera, 3, threads)
+    values = blended(gaussians, view, channels)
     image, alpha = blend_forward(view, values, threads)
     rng = np.random.default_rng(2)
     grads = [rng.normal(size=shown.shape).astype(np.float32) for shown in (image, alpha)]
 
     def backward():
-        return blend_gradients(parameters, view, values, image, alpha, *grads, threads)
+        return blend_gradients(gaussians, view, values, image, alpha, *grads, threads)
 
     benchmark.extra_info |= {"case": name("backward", scene, threads, channels), "threads": threads}
     benchmark.extra_info |= {"count": hits, "of": "hits", "flop": hits * (40 + 4 * channels)}
@@ -113,20 +111,20 @@ def test_backward(benchmark, scene, channels, threads):
 @scenes
 @threads
 def test_fit_iteration(benchmark, scene, threads):
-    camera, parameters, _ = scene_of(scene)
-    view = project_gaussians(parameters, camera, 3, 2)
+    camera, gaussians, _ = scene_of(scene)
+    view = project_gaussians(gaussians, camera, 3, 2)
     image, _ = blend_forward(view, view.colours, 2)
     target = (255 * np.clip(image, 0, 1)).astype(np.uint8)
     views = [TrainingView("view", camera, target)]
     rng = np.random.default_rng(3)
-    start = {field: getattr(parameters, field).copy() for field in FIELDS}
+    start = {field: getattr(gaussians, field).copy() for field in FIELDS}
     start["sh"] += 0.1 * rng.normal(size=start["sh"].shape).astype(np.float32)
     state = FitState(Adam.start(start), ScreenGradients.start(len(start["means"])), rng, step=HALF_WAY)
 
     def reset():
         # each round begins at the same Gaussians, or the scene would drift away from its hits
         for field in FIELDS:
-            state.adam.parameters[field][...] = start[field] if field == "sh" else getattr(parameters, field)
+            state.adam.parameters[field][...] = start[field] if field == "sh" else getattr(gaussians, field)
         state.step, state.order = HALF_WAY, []
 
     benchmark.extra_info |= {"case": name("fit iteration", scene, threads), "count": 1, "of": "iterations"}

@@ -1,6 +1,8 @@
 """The device of the sparse algebra after the fit: our kernels on the CPU, or torch on CUDA."""
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Literal
 
@@ -17,6 +19,22 @@ def cuda_missing() -> str | None:
     import torch
 
     return None if torch.cuda.is_available() else f"torch {torch.__version__} finds no CUDA device"
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Make torch sum in one order: the same bytes for any number of threads of the stage.
+
+    torch keeps the number per thread: work on a pool enters this in each of its threads.
+    """
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @cache

@@ -56,20 +56,19 @@ def query(
     start_logging(None)
     from hilsplat.query.answer import answer
 
-    typer.echo(
-        answer(
-            _folder(scene, results),
-            text,
-            level=level,
-            variant=variant,
-            views=views,
-            answerer=answerer,
-            view=view,
-            out=out,
-            device=device,
-            threads=threads,
-        )
-    )
+    for found in answer(
+        _folder(scene, results),
+        text,
+        level=level,
+        variant=variant,
+        views=views,
+        answerer=answerer,
+        view=view,
+        out=out,
+        device=device,
+        threads=threads,
+    ):
+        typer.echo(found)
 
 
 @app.command()

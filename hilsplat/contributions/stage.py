@@ -234,7 +234,7 @@ def run_contributions(
                 f"no train view of {scene.name} has a mask",
                 fix="loosen masks.predicted_iou_min or masks.stability_min, then run the masks stage again",
             )
-        np.save(folder / "means.npy", gaussians.means.detach().numpy().astype(np.float32))
+        np.save(folder / "means.npy", gaussians.means)
         write_npz(folder / "rows.npz", **{name: np.concatenate(values) for name, values in rows.items()})
         quadratic = builder.finish()
         kept = "G" if isinstance(quadratic, Gram) else "W"

@@ -1,70 +1,29 @@
-"""The language field: one latent per Gaussian and level, and the stage that solves it.
+"""The stage that solves the language field.
 
 Geometry is frozen, so the contributions hold everything that the losses need: see `problem` for the quadratic
 part, `contrast` for the hierarchy losses and `solver` for how they are minimised.
 """
 
-import json
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import safetensors.numpy
-from jaxtyping import Float32
-from safetensors import SafetensorError, safe_open
 
-from hilsplat.base.artifacts import atomic_path, read_index, read_npz, sha256_of_file, write_json
-from hilsplat.base.device import compute_device
-from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.base.artifacts import read_index, read_npz, sha256_of_file, write_json
+from hilsplat.base.device import compute_device, one_torch_thread
+from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.progress import stage_log
 from hilsplat.contributions.mask_operator import MaskOperator, MaskProducts
 from hilsplat.contributions.rows import Contributions
-from hilsplat.field.autoencoder import autoencoder_file, load_latents, one_torch_thread
+from hilsplat.field.code import autoencoder_file, load_latents
 from hilsplat.field.contrast import Contrast, view_relations
-from hilsplat.field.linear_code import METADATA_KEY
+from hilsplat.field.language_field import LanguageField, report_path
 from hilsplat.field.problem import QuadraticProblem
 from hilsplat.field.solver import keep_labelled, solve_field
 from hilsplat.settings import FieldSettings
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class LanguageField:
-    """One latent per Gaussian and level.
-
-    Attributes:
-        features: latents of N Gaussians at L = 3 levels, coarse to fine; 0 without a latent.
-        gaussians_sha256: digest of the PLY that they belong to.
-        autoencoder_sha256: digest of the autoencoder that decodes them.
-    """
-
-    features: Float32[np.ndarray, "N 3 D"]
-    gaussians_sha256: str
-    autoencoder_sha256: str
-
-    def save(self, path: Path) -> None:
-        """Write `field.safetensors` atomically; the same field gives the same bytes."""
-        about = {"gaussians_sha256": self.gaussians_sha256, "autoencoder_sha256": self.autoencoder_sha256}
-        metadata = {METADATA_KEY: json.dumps(about, sort_keys=True)}
-        features = np.ascontiguousarray(self.features)
-        with atomic_path(path) as temporary:
-            safetensors.numpy.save_file({"features": features}, temporary, metadata=metadata)
-
-    @staticmethod
-    def load(path: Path) -> "LanguageField":
-        """Read `field.safetensors`.
-
-        Raises:
-            ArtifactError: the file is missing, damaged or not a language field.
-        """
-        try:
-            with safe_open(path, framework="np") as file:
-                about = json.loads(file.metadata()[METADATA_KEY])
-                return LanguageField(file.get_tensor("features"), **about)
-        except (FileNotFoundError, SafetensorError, KeyError, TypeError) as error:
-            raise ArtifactError(f"{path} cannot be read: {error}", fix="rerun the field stage") from error
 
 
 def run_field(
@@ -131,11 +90,6 @@ def run_field(
             },
         )
         counts |= {"masks": len(contributions), "Gaussians": len(features), "unseen": unseen}
-
-
-def report_path(field: Path) -> Path:
-    """Path of the report on a field: `field.report.json` for `field.safetensors`."""
-    return Path(field).with_suffix(".report.json")
 
 
 def read_parents(tree_folder: Path, contributions: Contributions) -> dict[str, np.ndarray]:

@@ -12,6 +12,7 @@ covered pixels are left out, and features of Gaussians are not scaled to unit le
 import logging
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,20 +20,21 @@ from jaxtyping import Float, Float32, Int32
 from torch import Tensor
 
 from hilsplat.base.artifacts import read_index, sha256_of_file, write_json
+from hilsplat.base.device import one_torch_thread
 from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.base.progress import stage_log
 from hilsplat.contributions.compositing import MIN_ALPHA
 from hilsplat.contributions.rows import Contributions
 from hilsplat.contributions.stage import label_maps
-from hilsplat.field.autoencoder import autoencoder_file, load_latents, one_torch_thread
-from hilsplat.field.field import LanguageField, report_path
+from hilsplat.field.code import autoencoder_file, load_latents
+from hilsplat.field.language_field import LanguageField, report_path
 from hilsplat.field.losses.latent_regression import latent_regression_loss
 from hilsplat.scene.finished import require_same
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ReferenceSettings
 from hilsplat.splat.ply import load_ply
-from hilsplat.splat.rasterise.api import render
+from hilsplat.splat.rasterise.api import draw
 from hilsplat.splat.rasterise.device import choose_device
 
 logger = logging.getLogger(__name__)
@@ -74,6 +76,25 @@ def rendered_loss(
     return (average[inside] - targets[rows[inside].long()]).abs().sum() / (len(labels) * targets.shape[1])
 
 
+class _Blended(torch.autograd.Function):
+    """Features blended into a view, premultiplied, and the alpha, with the rasteriser's own gradients."""
+
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> Any:
+        features, gaussians, camera, threads, device = arguments
+        values = features.detach().numpy()
+        seen = draw(gaussians, camera, 0, features=values, threads=threads, device=device)
+        ctx.gradients = seen.gradients
+        return torch.from_numpy(seen.image[..., 3:]), torch.from_numpy(seen.alpha)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> Any:
+        by_image, by_alpha = (grad.numpy() for grad in grads)
+        by_image = np.concatenate([np.zeros((*by_alpha.shape, 3), np.float32), by_image], axis=2)
+        by_features = ctx.gradients(by_image, np.ascontiguousarray(by_alpha)).features
+        return torch.from_numpy(by_features), None, None, None, None
+
+
 def run_reference(
     scene_folder: Path,
     gaussians_ply: Path,
@@ -106,10 +127,8 @@ def run_reference(
     labels = [label_maps(HierarchicalMasks.load(Path(masks_folder) / f"{view}.npz")) for view in views]
     own_latents = [latents[contributions.view == number] for number in range(len(views))]
     chosen = choose_device(device)
-    if chosen == "cuda":
-        gaussians = type(gaussians)(**{name: value.cuda() for name, value in vars(gaussians).items()})
     shape = (len(gaussians), len(LEVELS) * latents.shape[1])
-    features = torch.zeros(shape, device=gaussians.means.device, requires_grad=True)
+    features = torch.zeros(shape, requires_grad=True)
     optimiser = torch.optim.Adam([features], lr=settings.rate, eps=1e-15)
     draws = np.random.default_rng(seed)
     curve: list[dict[str, float]] = []
@@ -119,18 +138,9 @@ def run_reference(
     with stage_log("reference field", scene.name) as counts, one_torch_thread():
         for step in range(1, settings.steps + 1):
             number = int(draws.integers(len(views)))
-            shown = render(
-                gaussians,
-                scene.cameras[views[number]],
-                features=features,
-                sh_degree=0,
-                threads=threads,
-                device=chosen,
-            )
-            assert shown.features is not None  # asked for above
-            loss = rendered_loss(
-                shown.features, shown.alpha, labels[number], own_latents[number], settings.loss
-            )
+            camera = scene.cameras[views[number]]
+            shown, alpha = _Blended.apply(features, gaussians, camera, threads, chosen)
+            loss = rendered_loss(shown, alpha, labels[number], own_latents[number], settings.loss)
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
@@ -140,7 +150,7 @@ def run_reference(
                 curve.append({"step": step, "loss": float(np.mean(recent)), "seconds": round(seconds, 2)})
                 logger.info("reference field: step %d, loss %.5f", step, curve[-1]["loss"])
                 recent = []
-        found = features.detach().cpu().numpy().reshape(len(gaussians), len(LEVELS), latents.shape[1])
+        found = features.detach().numpy().reshape(len(gaussians), len(LEVELS), latents.shape[1])
         LanguageField(
             np.ascontiguousarray(found, np.float32),
             contributions.gaussians_sha256,

@@ -16,7 +16,7 @@ from jaxtyping import Float32, Int32
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.contributions.rows import Contributions
 from hilsplat.contributions.stage import label_maps
-from hilsplat.field.autoencoder import load_latents
+from hilsplat.field.code import load_latents
 from hilsplat.scene.finished import require_same
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks

@@ -8,8 +8,8 @@ from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import stage_log
-from hilsplat.field.autoencoder import autoencoder_file
-from hilsplat.field.field import LanguageField
+from hilsplat.field.code import autoencoder_file
+from hilsplat.field.language_field import LanguageField
 from hilsplat.methods.method import MethodInputs
 from hilsplat.methods.registry import method_of
 from hilsplat.settings import MethodSettings

@@ -1,24 +1,13 @@
 """Ask a finished scene for a text: a ranked list as text, and a picture."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
-from matplotlib.figure import Figure
-
 from hilsplat.base.levels import LEVELS
-from hilsplat.query.hits import Hit, doubts_of, hits_of
+from hilsplat.query.hits import Hit, counted, doubts_of, hits_of
 from hilsplat.query.language_scene import PATH_SEPARATOR, LanguageScene, path_of
 from hilsplat.query.node_search import NodeHits
-from hilsplat.query.pictures import (
-    label_left,
-    paint_answer,
-    paint_relevancy,
-    save_figure,
-    show,
-    show_from_above,
-)
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.segment.origin import made_from_truth, masks_label
 from hilsplat.semantic_tree.export import write_selection_ply
@@ -39,8 +28,10 @@ def answer(
     out: Path | None = None,
     device: str = "cpu",
     threads: int = 1,
-) -> str:
-    """Ask a scene; write `panel.png` and `selection.ply`, and say what was found.
+) -> Iterator[str]:
+    """Ask a scene: yield what was found, then write `panel.png` and `selection.ply` and yield their names.
+
+    The answer takes milliseconds; the picture, with its libraries and renderings, a second or two.
 
     Args:
         folder: `results/<dataset>/<scene>`, or a copy of it anywhere.
@@ -65,64 +56,19 @@ def answer(
     scene = LanguageScene.from_parts(found.parts, settings, threads=threads, device=device)
     nodes = scene.find(text, level, answerer=answerer, view=view)
     hits = hits_of(scene, nodes, LISTED)
-    panel = (Path(out) if out is not None else found.folder / "queries" / file_name(text)) / "panel.png"
-    shown = list(dict.fromkeys([*([view] if view else []), *views_of(scene, hits, views)]))[:views]
     label = masks_label(found.parts.masks)
     note = f"; a diagnostic, masks made from the true labels: {label}" if made_from_truth(label) else ""
+    yield report(scene, text, nodes, view) + note
+
+    from hilsplat.query.query_panel import query_panel
+
+    panel = (Path(out) if out is not None else found.folder / "queries" / file_name(text)) / "panel.png"
+    shown = list(dict.fromkeys([*([view] if view else []), *views_of(scene, hits, views)]))[:views]
     asked = "" if view is None else f", of what {view} shows"
     query_panel(scene, text, nodes, shown, panel, note=asked + note, answerer=answerer)
     selection = panel.with_name("selection.ply")
     write_selection_ply(found.parts.gaussians, scene.gaussians_of(nodes.ids), selection)
-    return f"{report(scene, text, nodes, view)}{note}\nwrote {panel} and {selection.name}"
-
-
-def query_panel(
-    scene: LanguageScene,
-    text: str,
-    hits: NodeHits,
-    views: Sequence[str],
-    out_png: Path,
-    *,
-    note: str = "",
-    answerer: str = "tree",
-) -> None:
-    """Draw a query: photograph, answer and relevancy at three levels per view, and the scene from above.
-
-    `note` ends the title; doubts follow below it. With the answerer "field", relevancy is that of the field.
-    """
-    last = path_of(text)[-1]
-    size_hw = scene.scene.cameras[views[0]].size_hw
-    width_in, columns = 13.0, 5
-    row_in = width_in / columns * size_hw[0] / size_hw[1] + 0.1
-    map_in = 4.2
-    figure = Figure(figsize=(width_in, len(views) * row_in + map_in + 0.6), layout="constrained")
-    found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
-    title = f"“{text}” in {scene.scene.name}: {found}{note}"
-    figure.suptitle("\n".join([title, *map(str, doubts_of(scene, hits))]), fontsize=12, fontweight="bold")
-    heights = [len(views) * row_in, map_in]
-    (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)
-    grid = upper.subplots(len(views), columns, squeeze=False)
-    for axes, view in zip(grid, views, strict=True):
-        image, mask = scene.image(view), scene.node_masks(view, hits.ids)
-        if answerer == "tree":
-            relevancy = scene.node_relevancy_map([last], view)[0]
-        else:
-            relevancy = scene.field_relevancy([last], view, exact=False)[0]
-        low, high = float(relevancy.min()), float(relevancy.max())
-        show(axes[0], image, view)
-        label_left(axes[0], f"{scene.scene.split[view]} view")
-        show(axes[1], paint_answer(image, mask), f"answer: {mask.mean():.1%} of the view")
-        for each in LEVELS:
-            top = float(relevancy[each.index].max())
-            picture = paint_relevancy(image, relevancy[each.index], low, high)
-            show(
-                axes[2 + each.index], picture, f"relevancy, {each.label}: {top:.2f}", bold=each is hits.level
-            )
-    selected = np.zeros(len(scene.gaussians), np.bool_)
-    selected[scene.gaussians_of(hits.ids)] = True
-    title = f"from above: {np.count_nonzero(selected)} of {len(selected)} Gaussians; triangles are cameras"
-    show_from_above(lower.subplots(), scene.gaussians, scene.scene.cameras, selected, title)
-    save_figure(figure, out_png)
+    yield f"wrote {panel} and {selection.name}"
 
 
 def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]:
@@ -162,11 +108,6 @@ def report(scene: LanguageScene, text: str, found: NodeHits, view: str | None = 
             f"no answer is part of anything that answers to {first!r}: the whole scene was searched instead"
         )
     return "\n".join([*lines, *(f"doubtful: {doubt}" for doubt in doubts)])
-
-
-def counted(count: int, noun: str) -> str:
-    """A count with its noun: 1 node, 2 nodes."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def file_name(text: str) -> str:

@@ -114,3 +114,8 @@ def doubts_of(scene: "LanguageScene", found: NodeHits) -> tuple[Doubt, ...]:
         elif each.is_doubtful:
             doubts.append(Doubt(each.text, each.level, scene.score(each.margin)))
     return tuple(doubts)
+
+
+def counted(count: int, noun: str) -> str:
+    """A count with its noun: 1 node, 2 nodes."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

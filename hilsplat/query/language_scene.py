@@ -21,8 +21,8 @@ from hilsplat.base.errors import SettingsError
 from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.field.autoencoder import Code, autoencoder_file, load_code
-from hilsplat.field.field import LanguageField
+from hilsplat.field.code import Code, autoencoder_file, load_code
+from hilsplat.field.language_field import LanguageField
 from hilsplat.query.field_colours import field_colours
 from hilsplat.query.hits import Hit, hits_of
 from hilsplat.query.latent_relevancy import LatentRelevancy

@@ -6,22 +6,24 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-import torch
 from jaxtyping import Float32
 
 from hilsplat.base.device import ComputeDevice, compute_device
-from hilsplat.field.autoencoder import CHUNK_ROWS, Code, one_torch_thread
+from hilsplat.field.code import CHUNK_ROWS, Code
 from hilsplat.field.linear_code import LinearCode
-from hilsplat.query.device_look_up import PlacedOnDevice
 from hilsplat.query.linear_look_up import LinearLookUp, PlacedLinear
 from hilsplat.query.projected_look_up import PlacedProjected, ProjectedLookUp
 from hilsplat.query.relevancy import relevancy
 
 PIXELS_AT_A_TIME = 1 << 16
 
-Placed = PlacedLinear | PlacedProjected | PlacedOnDevice
+if TYPE_CHECKING:
+    from hilsplat.query.device_look_up import PlacedOnDevice
+
+Placed: TypeAlias = "PlacedLinear | PlacedProjected | PlacedOnDevice"
 
 
 class LatentRelevancy:
@@ -73,7 +75,11 @@ class LatentRelevancy:
             placed = self._look_up.place(latents)
         else:
             placed = self._look_up.place(latents, self._decode_in_parts)
-        return placed if self._device == "cpu" else PlacedOnDevice.of(placed, self._device)
+        if self._device == "cpu":
+            return placed
+        from hilsplat.query.device_look_up import PlacedOnDevice
+
+        return PlacedOnDevice.of(placed, self._device)
 
     def fast(
         self,
@@ -88,7 +94,7 @@ class LatentRelevancy:
         """
         out = np.empty((len(texts), len(placed.generic)), np.float32)
         for text, row in zip(texts, out, strict=True):
-            if isinstance(placed, PlacedOnDevice):
+            if not isinstance(placed, PlacedLinear | PlacedProjected):
                 row[:] = placed.relevancy(*self._text_weights(placed, text), self._scale)
                 continue
 
@@ -104,7 +110,7 @@ class LatentRelevancy:
         return out
 
     def _text_weights(
-        self, placed: PlacedOnDevice, text: Float32[np.ndarray, " C"]
+        self, placed: "PlacedOnDevice", text: Float32[np.ndarray, " C"]
     ) -> tuple[np.float32, Float32[np.ndarray, " R"]]:
         if isinstance(self._look_up, LinearLookUp):
             return self._look_up.text_weights(text)
@@ -112,14 +118,8 @@ class LatentRelevancy:
         return self._look_up.text_weights(placed.directions, text)
 
     def _decode_in_parts(self, work: Callable[[slice], None], count: int) -> None:
-        """`_in_parts` for work that decodes: torch takes one thread, since the parts share the cores."""
-
-        def alone(span: slice) -> None:
-            torch.set_num_threads(1)  # applies to this thread of the pool only
-            work(span)
-
-        with one_torch_thread():
-            self._in_parts(alone, count, CHUNK_ROWS)
+        """`_in_parts` for work that decodes: as many rows at once as `decode_array` takes."""
+        self._in_parts(work, count, CHUNK_ROWS)
 
     def _in_parts(self, work: Callable[[slice], None], count: int, at_a_time: int = PIXELS_AT_A_TIME) -> None:
         spans = [slice(begin, begin + at_a_time) for begin in range(0, count, at_a_time)]

@@ -90,15 +90,15 @@ def show_from_above(
     axes: Axes, gaussians: Gaussians, cameras: Cameras, selected: Bool[np.ndarray, " N"], title: str
 ) -> None:
     """Gaussians seen along the cameras' mean up direction, selected ones orange; cameras as triangles."""
-    means = gaussians.means.detach().numpy().astype(np.float64)
+    means = gaussians.means.astype(np.float64)
     centres = np.stack([cameras[name].centre for name in cameras.names])
     rotation = _from_above(cameras)
     flat, flat_cameras = means @ rotation.T, centres @ rotation.T
     low, high = np.percentile(flat[:, :2], (1, 99), axis=0)
     low, high = np.minimum(low, flat_cameras[:, :2].min(0)), np.maximum(high, flat_cameras[:, :2].max(0))
-    colours = np.clip(0.5 + SH_CONSTANT * gaussians.sh[:, 0].detach().numpy(), 0, 1)
+    colours = np.clip(0.5 + SH_CONSTANT * gaussians.sh[:, 0], 0, 1)
     colours = 0.5 * colours + 0.45
-    visible = np.flatnonzero((gaussians.opacities.detach().numpy() > 0.3) & ~selected)
+    visible = np.flatnonzero((gaussians.opacities > 0.3) & ~selected)
     shown = visible[:: max(1, len(visible) // MAX_POINTS)]
     shown = shown[np.argsort(flat[shown, 2], kind="stable")]
     axes.scatter(flat[shown, 0], flat[shown, 1], s=1.5, c=colours[shown].clip(0, 1), linewidths=0)

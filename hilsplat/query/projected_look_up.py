@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, Int16
 
-from hilsplat.field.autoencoder import Autoencoder
+from hilsplat.field.code import Code
 from hilsplat.query.look_up_kernels import projected_relevancy
 
 ERROR = 2e-3
@@ -56,7 +56,7 @@ class PlacedProjected:
 class ProjectedLookUp:
     """Relevancy of a network's latents: within `ERROR` of that of the decoded vectors, at every pixel."""
 
-    def __init__(self, code: Autoencoder, canonical: Float32[np.ndarray, "K C"], scale: float) -> None:
+    def __init__(self, code: Code, canonical: Float32[np.ndarray, "K C"], scale: float) -> None:
         self._code, self._canonical, self._scale = code, canonical, np.float32(scale)
         self._may_lose = lost_for_error(scale, code.channels)
 

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import ArtifactError
@@ -36,7 +35,7 @@ def bring_gaussians(ply: Path, scene: Scene) -> tuple[Gaussians, dict[str, Any]]
     gaussians = load_ply(ply, fix=FIX)
     if len(gaussians) == 0:
         raise ArtifactError(f"{ply} does not hold any Gaussians", fix=FIX)
-    lengths = torch.linalg.vector_norm(gaussians.quats, dim=1)
+    lengths = np.linalg.norm(gaussians.quats.astype(np.float64), axis=1)
     if (zero := int((lengths < 1e-12).sum())) > 0:
         raise ArtifactError(
             f"{ply}: {zero} of {len(gaussians)} Gaussians have no rotation: rot_0..3 are all zero", fix=FIX

@@ -12,7 +12,8 @@ from jaxtyping import Float32, Float64, Int32
 
 from hilsplat.base.rotations import rotate, unit_quaternions
 from hilsplat.settings import GaussiansSettings
-from hilsplat.splat.optimise import FIELDS, Adam
+from hilsplat.splat.gaussians import FIELDS
+from hilsplat.splat.optimise import Adam
 
 SMALL = 0.01
 """Largest axis, in units of the extent, up to which a Gaussian is cloned; larger ones are split (3DGS)."""

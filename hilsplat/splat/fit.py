@@ -4,7 +4,6 @@ import logging
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Float64
 
 from hilsplat.base.artifacts import sha256_of_json, sha256_of_path
@@ -51,8 +50,8 @@ def fit_step(
         behind = state.generator.uniform(size=3)
     behind = behind.astype(np.float32)
 
-    parameters = state.adam.as_parameters()
-    seen = draw(parameters, view.camera, degree, threads=threads, device=choose_device(settings.device))
+    device = choose_device(settings.device)
+    seen = draw(state.adam.as_gaussians(), view.camera, degree, threads=threads, device=device)
     shown = seen.image + (1 - seen.alpha)[..., None] * behind
     target = to_float(view.image)
     loss, grad = photometric_loss(shown, target, ssim_weight=settings.ssim_weight, threads=threads)
@@ -144,10 +143,9 @@ def fit_gaussians(
     if settings.initial != "frozen":
         order = morton_order(parameters["means"])
         parameters = {name: values[order] for name, values in parameters.items()}
-    tensors = {name: torch.from_numpy(values) for name, values in parameters.items()}
     if checkpoint:
         checkpoint.unlink(missing_ok=True)
-    return Gaussians(**tensors), np.array(state.curve, dtype=np.float64).reshape(-1, 4)
+    return Gaussians(**parameters), np.array(state.curve, dtype=np.float64).reshape(-1, 4)
 
 
 def run_gaussians(

@@ -50,7 +50,7 @@ def write_report(
 
     def picture(camera: Camera) -> UInt8[np.ndarray, "H W 3"]:
         color = render(gaussians, camera, background=background, threads=threads).color
-        return np.round(color.detach().clamp(0, 1).numpy() * 255).astype(np.uint8)
+        return np.round(color.clip(0, 1) * 255).astype(np.uint8)
 
     views, split = load_views(scene, "test", settings.image_scale), "test"
     if not views:

@@ -1,15 +1,15 @@
 """The Gaussians of a scene, in the unconstrained form we optimise."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
+import numpy as np
+from jaxtyping import Float32
+from scipy.special import expit
 
 
 @dataclass(frozen=True)
 class Gaussians:
-    """N anisotropic 3D Gaussians of one scene, in the unconstrained form we optimise.
+    """N anisotropic 3D Gaussians of one scene, as contiguous arrays.
 
     Attributes:
         means: centres, scene units.
@@ -19,26 +19,30 @@ class Gaussians:
         sh: colour as spherical harmonics, K = (degree + 1)**2; row 0 is the constant term.
     """
 
-    means: Float[Tensor, "N 3"]
-    log_scales: Float[Tensor, "N 3"]
-    quats: Float[Tensor, "N 4"]
-    opacity_logits: Float[Tensor, " N"]
-    sh: Float[Tensor, "N K 3"]
+    means: Float32[np.ndarray, "N 3"]
+    log_scales: Float32[np.ndarray, "N 3"]
+    quats: Float32[np.ndarray, "N 4"]
+    opacity_logits: Float32[np.ndarray, " N"]
+    sh: Float32[np.ndarray, "N K 3"]
 
     def __len__(self) -> int:
         return len(self.means)
 
     @property
-    def scales(self) -> Float[Tensor, "N 3"]:
+    def scales(self) -> Float32[np.ndarray, "N 3"]:
         """Standard deviations, scene units."""
-        return self.log_scales.exp()
+        return np.exp(self.log_scales)
 
     @property
-    def opacities(self) -> Float[Tensor, " N"]:
+    def opacities(self) -> Float32[np.ndarray, " N"]:
         """Peak alphas in (0, 1)."""
-        return torch.sigmoid(self.opacity_logits)
+        return expit(self.opacity_logits)
 
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics: K = 1, 4, 9, 16 is degree 0, 1, 2, 3."""
         return round(self.sh.shape[1] ** 0.5) - 1
+
+
+FIELDS = tuple(field.name for field in fields(Gaussians))
+"""Names of the parameters."""

@@ -14,7 +14,8 @@ from scipy.special import comb, expit, logit
 from hilsplat.base.compiled import compiled
 from hilsplat.base.rotations import matrix_entries
 from hilsplat.settings import GaussiansSettings
-from hilsplat.splat.optimise import FIELDS, Adam
+from hilsplat.splat.gaussians import FIELDS
+from hilsplat.splat.optimise import Adam
 from hilsplat.splat.rasterise.cpu import Gradients, over_ranges
 
 MAX_TOGETHER = 51

@@ -7,9 +7,9 @@ import numpy as np
 
 from hilsplat.base.compiled import compiled
 from hilsplat.settings import GaussiansSettings
-from hilsplat.splat.rasterise.cpu import Gradients, Parameters, over_ranges
+from hilsplat.splat.gaussians import FIELDS, Gaussians
+from hilsplat.splat.rasterise.cpu import Gradients, over_ranges
 
-FIELDS = ("means", "log_scales", "quats", "opacity_logits", "sh")
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15  # 3DGS
 
 OPACITY_RATE = 0.05  # 3DGS
@@ -77,9 +77,9 @@ class Adam:
     def __len__(self) -> int:
         return len(self.parameters["means"])
 
-    def as_parameters(self) -> Parameters:
-        """The current values, as the rasteriser takes them (shared memory)."""
-        return Parameters(**self.parameters)
+    def as_gaussians(self) -> Gaussians:
+        """The current values (shared memory)."""
+        return Gaussians(**self.parameters)
 
     def step(
         self, gradients: Gradients, settings: GaussiansSettings, rate_of_means: float, threads: int

@@ -3,12 +3,11 @@
 from pathlib import Path
 
 import numpy as np
-import torch
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.errors import ArtifactError
-from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.gaussians import FIELDS, Gaussians
 
 
 def _names(num_bases: int) -> list[str]:
@@ -29,18 +28,17 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
     Raw parameters are stored as they are: log scales, opacity logits, quaternions wxyz of any
     length. Normals are zero, as in 3DGS.
     """
-    n = len(gaussians)
-    sh = gaussians.sh.detach().cpu()
+    n, sh = len(gaussians), gaussians.sh
     columns = (
         gaussians.means,
-        torch.zeros(n, 3),
+        np.zeros((n, 3)),
         sh[:, 0],
-        sh[:, 1:].transpose(1, 2).reshape(n, 3 * (sh.shape[1] - 1)),
+        sh[:, 1:].transpose(0, 2, 1).reshape(n, 3 * (sh.shape[1] - 1)),
         gaussians.opacity_logits[:, None],
         gaussians.log_scales,
         gaussians.quats,
     )
-    values = torch.cat([part.detach().cpu().float() for part in columns], dim=1).numpy()
+    values = np.concatenate(columns, axis=1)
     names = _names(sh.shape[1])
     table = np.ascontiguousarray(values, dtype="<f4").view([(name, "<f4") for name in names]).reshape(n)
     with atomic_path(path) as temporary:
@@ -80,23 +78,24 @@ def load_ply(path: Path, fix: str = "delete it and run the gaussians stage again
             fix=fix,
         )
 
-    def columns(*names: str) -> torch.Tensor:
+    def columns(*names: str) -> np.ndarray:
         values = [np.asarray(vertex[name], dtype=np.float32) for name in names]
-        return torch.from_numpy(np.stack(values, axis=1)) if values else torch.zeros(vertex.count, 0)
+        return np.stack(values, axis=1) if values else np.zeros((vertex.count, 0), np.float32)
 
     dc = columns(*(f"f_dc_{k}" for k in range(3)))[:, None]
     rest = columns(*(f"f_rest_{k}" for k in range(num_rest)))
-    rest = rest.reshape(len(dc), 3, num_bases - 1).transpose(1, 2)
+    rest = rest.reshape(len(dc), 3, num_bases - 1).transpose(0, 2, 1)
     gaussians = Gaussians(
         means=columns("x", "y", "z"),
         log_scales=columns(*(f"scale_{k}" for k in range(3))),
         quats=columns(*(f"rot_{k}" for k in range(4))),
-        opacity_logits=columns("opacity")[:, 0].clone(),
-        sh=torch.cat([dc, rest], dim=1).contiguous(),
+        opacity_logits=columns("opacity")[:, 0],
+        sh=np.concatenate([dc, rest], axis=1),
     )
-    finite = torch.isfinite(
-        torch.cat([gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.sh.flatten(1)], dim=1)
-    ).all(dim=1) & torch.isfinite(gaussians.opacity_logits)
+    finite = np.ones(len(gaussians), np.bool_)
+    for name in FIELDS:
+        values = np.isfinite(getattr(gaussians, name))
+        finite &= values.all(axis=tuple(range(1, values.ndim)))
     if not finite.all():
         raise ArtifactError(
             f"{path}: {int((~finite).sum())} of {len(gaussians)} Gaussians hold a number that is not finite",

@@ -1,7 +1,6 @@
 """Gaussians moved by a similarity, so that every view of them looks the same."""
 
 import numpy as np
-import torch
 from jaxtyping import Float, Float64
 
 from hilsplat.base.errors import HilsplatError
@@ -46,18 +45,19 @@ def move_gaussians(gaussians: Gaussians, similarity: Float[np.ndarray, "4 4"]) -
         HilsplatError: `similarity` is not a similarity.
     """
     scale, rotation, translation = decompose(similarity)
-    means = gaussians.means.detach().cpu().double().numpy()
-    quats = gaussians.quats.detach().cpu().double().numpy()
+    means, log_scales, quats, sh = (
+        values.astype(np.float64)
+        for values in (gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.sh)
+    )
     by_band = sh_rotation(rotation, gaussians.sh_degree)
-    sh = np.einsum("kj,njc->nkc", by_band, gaussians.sh.detach().cpu().double().numpy())
     return Gaussians(
         means=_float32(scale * np.einsum("ij,nj->ni", rotation, means) + translation),
-        log_scales=_float32(gaussians.log_scales.detach().cpu().double().numpy() + np.log(scale)),
+        log_scales=_float32(log_scales + np.log(scale)),
         quats=_float32(multiply(quaternion_of(rotation), quats)),
-        opacity_logits=gaussians.opacity_logits.detach().cpu().clone(),
-        sh=_float32(sh),
+        opacity_logits=gaussians.opacity_logits.copy(),
+        sh=_float32(np.einsum("kj,njc->nkc", by_band, sh)),
     )
 
 
-def _float32(values: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+def _float32(values: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(values, dtype=np.float32)

@@ -8,11 +8,11 @@ grey.
 import json
 import logging
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import onnx
-import torch
 from onnx import TensorProto, helper, numpy_helper
 from tokenizers import Tokenizer, models, pre_tokenizers
 
@@ -23,8 +23,8 @@ from hilsplat.cli.main import app
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import save_ply
+from tests.unit.round_gaussians import round_gaussians
 
 HEIGHT, WIDTH = 24, 36
 NUM_VIEWS = 6
@@ -127,14 +127,9 @@ def _write_scene() -> None:
     rows, columns = np.divmod(np.arange(HEIGHT * WIDTH), WIDTH)
     count = len(rows)
     colours = (canvas.reshape(-1, 3) / 255 - 0.5) / 0.28209479177387814
-    gaussians = Gaussians(
-        torch.from_numpy(np.stack([columns, rows, np.zeros(count)], axis=1).astype(np.float32)),
-        torch.full((count, 3), float(np.log(0.25))),
-        torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
-        torch.full((count,), 5.0),
-        torch.from_numpy(colours.astype(np.float32))[:, None],
-    )
-    save_ply(SCENE / "gaussians.ply", gaussians)
+    means = np.stack([columns, rows, np.zeros(count)], axis=1)
+    plain = round_gaussians(means, log_scale=np.log(0.25), opacity_logit=5.0)
+    save_ply(SCENE / "gaussians.ply", replace(plain, sh=colours.astype(np.float32)[:, None]))
     masks = SCENE / "default/masks"
     for shift, name in enumerate(names[:-1]):
         dense = np.stack([region_mask(region[0], shift) for region in REGIONS])

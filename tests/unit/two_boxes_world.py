@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.sparse as sp
-import torch
 
 from hilsplat.base.artifacts import write_index, write_npy, write_npz
 from hilsplat.base.images import write_png
@@ -16,7 +15,7 @@ from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ContributionsSettings
-from hilsplat.splat.gaussians import Gaussians
+from tests.unit.round_gaussians import round_gaussians
 
 HEIGHT, WIDTH = 8, 12
 NUM_GAUSSIANS = HEIGHT * WIDTH
@@ -135,13 +134,7 @@ def build_two_boxes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TwoBoxes
 
     gaussian = np.arange(NUM_GAUSSIANS)
     means = np.stack([gaussian % WIDTH, gaussian // WIDTH, np.zeros(NUM_GAUSSIANS)], axis=1)
-    gaussians = Gaussians(
-        torch.from_numpy(means.astype(np.float32)),
-        torch.zeros(NUM_GAUSSIANS, 3),
-        torch.tensor([[1.0, 0, 0, 0]]).repeat(NUM_GAUSSIANS, 1),
-        torch.zeros(NUM_GAUSSIANS),
-        torch.zeros(NUM_GAUSSIANS, 1, 3),
-    )
+    gaussians = round_gaussians(means)
     monkeypatch.setattr(stage, "load_ply", lambda path: gaussians)
     monkeypatch.setattr(
         stage,

@@ -1,13 +1,15 @@
 """A scene whose row names a PLY is not fitted; its report names the origin of the Gaussians."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
-import torch
 
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import save_ply
+from tests.unit.round_gaussians import round_gaussians
 from tests.workflow.conftest import Project, copy_project
 
 SCENE = "results/synthetic/tiny"
@@ -15,14 +17,8 @@ SCENE = "results/synthetic/tiny"
 
 def three_gaussians(seed: int) -> Gaussians:
     """Three round Gaussians at random places."""
-    n = 3
-    return Gaussians(
-        torch.randn(n, 3, generator=torch.Generator().manual_seed(seed)),
-        torch.full((n, 3), -2.0),
-        torch.tensor([[1.0, 0, 0, 0]] * n),
-        torch.zeros(n),
-        torch.ones(n, 4, 3),
-    )
+    plain = round_gaussians(np.random.default_rng(seed).normal(size=(3, 3)), log_scale=-2.0)
+    return replace(plain, sh=np.ones((3, 4, 3), np.float32))
 
 
 @pytest.fixture

@@ -61,7 +61,7 @@ class PointAnswers:
             threads: threads of the search.
         """
         gaussians = scene.gaussians
-        means, opacities = (array.detach().numpy() for array in (gaussians.means, gaussians.opacities))
+        means, opacities = (gaussians.means, gaussians.opacities)
         if mode == "frozen":
             carried = carry.frozen(opacities, len(points))
         elif mode == "nearest":
@@ -70,7 +70,7 @@ class PointAnswers:
             radius = VOTE_RADIUS_M * scene_units_per_metre
             carried = carry.vote(points, means, opacities, radius, threads=threads)
         else:
-            scales, quats = (array.detach().numpy() for array in (gaussians.scales, gaussians.quats))
+            scales, quats = (gaussians.scales, gaussians.quats)
             carried = carry.density(points, means, opacities, scales, quats, threads=threads)
         return PointAnswers(scene, carried)
 

@@ -1,26 +1,16 @@
 """Rendering Gaussians into a view: images with gradients, feature maps, sparse weights."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Float
+from jaxtyping import Float32
 from scipy.sparse import csr_matrix
-from torch import Tensor
 
 from hilsplat.base.errors import HilsplatError
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.rasterise import cpu, cuda
-from hilsplat.splat.rasterise.cpu import (
-    Drawn,
-    Parameters,
-    blend_forward,
-    blend_gradients,
-    project_gaussians,
-    sparse_weights,
-)
+from hilsplat.splat.rasterise import cpu
+from hilsplat.splat.rasterise.cpu import Drawn, project_gaussians, sparse_weights
 from hilsplat.splat.rasterise.device import Device
 
 
@@ -34,21 +24,9 @@ class Rendering:
         features: blended features, premultiplied (divide by alpha for their average), or None.
     """
 
-    color: Float[Tensor, "H W 3"]
-    alpha: Float[Tensor, "H W"]
-    features: Float[Tensor, "H W D"] | None = None
-
-
-def to_parameters(gaussians: Gaussians) -> Parameters:
-    """Gaussians as contiguous float32 arrays, which share memory with tensors that are so already."""
-    tensors = (gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh)
-    return Parameters(*(_to_array(tensor) for tensor in tensors))
-
-
-def _to_array(values: Tensor | np.ndarray) -> np.ndarray:
-    if isinstance(values, Tensor):
-        values = values.detach().cpu().numpy()
-    return np.ascontiguousarray(values, dtype=np.float32)
+    color: Float32[np.ndarray, "H W 3"]
+    alpha: Float32[np.ndarray, "H W"]
+    features: Float32[np.ndarray, "H W D"] | None = None
 
 
 def _checked_degree(gaussians: Gaussians, sh_degree: int | None) -> int:
@@ -61,45 +39,17 @@ def _checked_degree(gaussians: Gaussians, sh_degree: int | None) -> int:
     return degree
 
 
-class _Render(torch.autograd.Function):
-    """Premultiplied RGB + feature channels and alpha, with the CPU backend's own gradients."""
-
-    @staticmethod
-    def forward(ctx: Any, *arguments: Any) -> Any:
-        *tensors, features, camera, degree, threads = arguments
-        parameters = Parameters(*(_to_array(tensor) for tensor in tensors))
-        view = project_gaussians(parameters, camera, degree, threads)
-        channels = view.colours
-        if features is not None:
-            channels = np.concatenate([channels, _to_array(features)], axis=1)
-        image, alpha = blend_forward(view, channels, threads)
-        ctx.replay = (parameters, view, channels, image, alpha, threads)
-        ctx.inputs = [(tensor.device, tensor.dtype) for tensor in tensors]
-        ctx.features = (features.device, features.dtype) if features is not None else None
-        return torch.from_numpy(image), torch.from_numpy(alpha)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Any) -> Any:
-        parameters, view, channels, image, alpha, threads = ctx.replay
-        grad_image, grad_alpha = (_to_array(grad) for grad in grads)
-        g = blend_gradients(parameters, view, channels, image, alpha, grad_image, grad_alpha, threads)
-        arrays = (g.means, g.log_scales, g.quats, g.opacity_logits, g.sh)
-        out = [torch.from_numpy(a).to(*place) for a, place in zip(arrays, ctx.inputs, strict=True)]
-        by_features = torch.from_numpy(g.features).to(*ctx.features) if ctx.features else None
-        return *out, by_features, None, None, None
-
-
 def render(
     gaussians: Gaussians,
     camera: Camera,
     *,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    features: Float[Tensor, "N D"] | None = None,
+    features: Float32[np.ndarray, "N D"] | None = None,
     sh_degree: int | None = None,
     threads: int = 1,
     device: Device = "cpu",
 ) -> Rendering:
-    """Render a view; differentiable in all parameters of the Gaussians and in `features`.
+    """Render a view; `draw` does the same and has the gradients.
 
     The conventions are gsplat's, on both devices:
 
@@ -120,8 +70,7 @@ def render(
 
         alpha = o exp(-r^2 / (2 ((f s / z)^2 + 0.3))), if that is at least 1/255.
 
-    Gaussians behind the camera get zero gradient; without any Gaussian the background shows.
-    Gradients are first-order only and do not reach the camera.
+    Without any Gaussian the background shows.
 
     Args:
         features: further channels to blend in the same pass; any number.
@@ -129,41 +78,48 @@ def render(
         threads: CPU threads; the result has the same bytes for any number.
         device: backend; see `device.choose_device`.
 
-    Returns:
-        images on the device of `gaussians`.
-
     Raises:
         HilsplatError: parameters are not finite, quaternions are zero, or features have another number
             of rows.
     """
     degree = _checked_degree(gaussians, sh_degree)
-    g = gaussians
-    if features is not None and len(features) != len(g):
+    seen = draw(gaussians, camera, degree, features=features, threads=threads, device=device)
+    color = seen.image[..., :3] + (1 - seen.alpha)[..., None] * np.array(background, np.float32)
+    return Rendering(color, seen.alpha, seen.image[..., 3:] if features is not None else None)
+
+
+def draw(
+    gaussians: Gaussians,
+    camera: Camera,
+    degree: int,
+    *,
+    features: Float32[np.ndarray, "N D"] | None = None,
+    threads: int,
+    device: Device,
+) -> Drawn:
+    """Image and alpha of a view, without background, and the gradients on demand.
+
+    Gaussians behind the camera get zero gradient. Gradients are first-order only and do not reach the
+    camera.
+
+    Args:
+        degree: of the spherical harmonics.
+        features, threads, device: as in `render`.
+
+    Raises:
+        HilsplatError: as in `render`.
+    """
+    if features is not None and len(features) != len(gaussians):
         raise HilsplatError(
             "features do not fit the Gaussians",
-            expected=f"{len(g)} rows",
+            expected=f"{len(gaussians)} rows",
             found=f"{len(features)} rows",
         )
     if device == "cuda":
-        image, alpha = cuda.render_channels(g, camera, degree, features)
-    else:
-        image, alpha = _Render.apply(
-            g.means, g.log_scales, g.quats, g.opacity_logits, g.sh, features, camera, degree, threads
-        )
-    behind = torch.tensor(background, dtype=image.dtype, device=image.device)
-    color = image[..., :3] + (1.0 - alpha)[..., None] * behind
-    return Rendering(color, alpha, image[..., 3:] if features is not None else None)
+        from hilsplat.splat.rasterise import cuda
 
-
-def draw(parameters: Parameters, camera: Camera, degree: int, *, threads: int, device: Device) -> Drawn:
-    """One view of a fit, on plain arrays: image, alpha, and the gradients on demand.
-
-    Raises:
-        HilsplatError: parameters are not finite, or quaternions have length zero.
-    """
-    if device == "cuda":
-        return cuda.draw(parameters, camera, degree)
-    return cpu.draw(parameters, camera, degree, threads)
+        return cuda.draw(gaussians, camera, degree, features)
+    return cpu.draw(gaussians, camera, degree, features, threads)
 
 
 def pixel_weights(
@@ -179,8 +135,10 @@ def pixel_weights(
         sum to the alpha of the view.
     """
     if device == "cuda":
+        from hilsplat.splat.rasterise import cuda
+
         return cuda.pixel_weights(gaussians, camera, min_weight)
-    view = project_gaussians(to_parameters(gaussians), camera, 0, threads)
+    view = project_gaussians(gaussians, camera, 0, threads)
     row_start, columns, weights = sparse_weights(view, min_weight, threads)
     if row_start[-1] < np.iinfo(np.int32).max:
         row_start = row_start.astype(np.int32)

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float32, Float64, Int32
 
 from hilsplat.base.errors import HilsplatError
 from hilsplat.scene.cameras import Camera
+from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise.binning import Tiles, bin_gaussians, fill_lists
 from hilsplat.splat.rasterise.blend import add_slots, blend, blend_backward, blend_weights, sort_rows
 from hilsplat.splat.rasterise.project import GEOMETRY, MOMENTS, pack_camera, project, project_backward
@@ -47,17 +48,6 @@ def over_ranges(
     pieces = min(count, RANGES_PER_THREAD * threads) if threads > 1 and count > 1 else 1
     edges = first + np.linspace(0, count, pieces + 1).astype(int)
     return over_edges(work, edges.tolist(), threads, *arguments)
-
-
-@dataclass(frozen=True)
-class Parameters:
-    """Gaussians as contiguous float32 arrays; fields as in `Gaussians`."""
-
-    means: Float32[np.ndarray, "N 3"]
-    log_scales: Float32[np.ndarray, "N 3"]
-    quats: Float32[np.ndarray, "N 4"]
-    opacity_logits: Float32[np.ndarray, " N"]
-    sh: Float32[np.ndarray, "N K 3"]
 
 
 @dataclass(frozen=True)
@@ -100,16 +90,16 @@ class Gradients:
 
 @dataclass(frozen=True)
 class Drawn:
-    """One view of a fit, drawn by either backend.
+    """One view, drawn by either backend.
 
     Attributes:
-        image: premultiplied RGB, without background.
+        image: premultiplied RGB, then features; without background.
         alpha: coverage.
         drawn: whether a Gaussian reaches a pixel of the view.
         gradients: function from the gradients of image and alpha to those of the parameters.
     """
 
-    image: Float32[np.ndarray, "H W 3"]
+    image: Float32[np.ndarray, "H W C"]
     alpha: Float32[np.ndarray, "H W"]
     drawn: Bool[np.ndarray, " N"]
     gradients: Callable[[np.ndarray, np.ndarray], Gradients]
@@ -125,19 +115,18 @@ def refuse_broken(broken: int, total: int) -> None:
         )
 
 
-def project_gaussians(parameters: Parameters, camera: Camera, degree: int, threads: int) -> Projected:
+def project_gaussians(gaussians: Gaussians, camera: Camera, degree: int, threads: int) -> Projected:
     """Project all Gaussians into a view and list them per tile.
 
     Raises:
         HilsplatError: parameters that are not finite, or quaternions of length zero.
     """
-    n = len(parameters.means)
+    n = len(gaussians)
     geometry = np.zeros((n, GEOMETRY), np.float32)
     box = np.empty((n, 4), np.int32)
     colours = np.zeros((n, 3), np.float32)
     row = pack_camera(camera)
-    p = parameters
-
+    p = gaussians
     known = (p.means, p.log_scales, p.quats, p.opacity_logits, p.sh, degree, row)
     refuse_broken(sum(over_ranges(project, n, threads, *known, geometry, box, colours)), n)
     tiles = bin_gaussians(box, geometry[:, 6], camera.size_hw)
@@ -196,7 +185,7 @@ def blend_forward(
 
 
 def blend_gradients(
-    parameters: Parameters,
+    gaussians: Gaussians,
     view: Projected,
     channels: Float32[np.ndarray, "N C"],
     image: Float32[np.ndarray, "H W C"],
@@ -211,7 +200,7 @@ def blend_gradients(
         channels: what was blended: the view's colours in the first 3 columns, then features.
         image, alpha: what `blend_forward` returned.
     """
-    t, p, n = view.tiles, parameters, len(parameters.means)
+    t, p, n = view.tiles, gaussians, len(gaussians)
     columns = MOMENTS + channels.shape[1]
     sums = np.zeros((n, columns))
     blended = (view.geometry, view.box, channels, image, alpha, grad_image, grad_alpha)
@@ -224,7 +213,7 @@ def blend_gradients(
         over_edges(add_slots, edges, threads, band.gaussian, slots, sums)
     # np.zeros leaves the zeroing to the threads that first write there; np.zeros_like would do it here
     out = Gradients(
-        **{name: np.zeros(values.shape, np.float32) for name, values in vars(p).items()},
+        **{name: np.zeros(getattr(p, name).shape, np.float32) for name in FIELDS},
         features=sums[:, MOMENTS + 3 :].astype(np.float32),
         means_px=np.zeros((n, 2), np.float32),
     )
@@ -234,17 +223,26 @@ def blend_gradients(
     return out
 
 
-def draw(parameters: Parameters, camera: Camera, degree: int, threads: int) -> Drawn:
-    """One view of a fit: image, alpha, and the gradients on demand.
+def draw(
+    gaussians: Gaussians,
+    camera: Camera,
+    degree: int,
+    features: Float32[np.ndarray, "N D"] | None,
+    threads: int,
+) -> Drawn:
+    """Image, alpha, and the gradients on demand; see `api.draw`.
 
     Raises:
         HilsplatError: parameters that are not finite, or quaternions of length zero.
     """
-    view = project_gaussians(parameters, camera, degree, threads)
-    image, alpha = blend_forward(view, view.colours, threads)
+    view = project_gaussians(gaussians, camera, degree, threads)
+    channels = view.colours
+    if features is not None:
+        channels = np.concatenate([channels, features], axis=1)
+    image, alpha = blend_forward(view, channels, threads)
 
     def gradients(grad_image: np.ndarray, grad_alpha: np.ndarray) -> Gradients:
-        return blend_gradients(parameters, view, view.colours, image, alpha, grad_image, grad_alpha, threads)
+        return blend_gradients(gaussians, view, channels, image, alpha, grad_image, grad_alpha, threads)
 
     return Drawn(image, alpha, view.box[:, 1] >= view.box[:, 0], gradients)
 

@@ -7,18 +7,18 @@ gradients repeat to rounding, not to the bit.
 gsplat works in float32 throughout: a Gaussian wider than about 1e9 px overflows there.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from hilsplat.scene.cameras import Camera
-from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise.blend import MAX_ALPHA
-from hilsplat.splat.rasterise.cpu import Drawn, Gradients, Parameters, refuse_broken
+from hilsplat.splat.rasterise.cpu import Drawn, Gradients, refuse_broken
 from hilsplat.splat.rasterise.project import LOW_PASS_PX2, NEAR
 
 TILE = 16
@@ -27,31 +27,42 @@ EVERYTHING = 2**31 - 1
 """Past the last batch of any tile."""
 
 
-def _on_device(gaussians: Gaussians) -> Gaussians:
-    """The same Gaussians as float32 on the device; gradients flow back."""
-    g = gaussians
-    tensors = (g.means, g.log_scales, g.quats, g.opacity_logits, g.sh)
-    g = Gaussians(*(tensor.to("cuda", torch.float32) for tensor in tensors))
-    numbers = torch.cat(
-        [g.means, g.log_scales, g.quats, g.opacity_logits[:, None], g.sh.flatten(1)], dim=1
-    ).detach()
-    broken = ~numbers.isfinite().all(dim=1) | (g.quats.detach() == 0).all(dim=1)
-    refuse_broken(int(broken.sum()), len(g))
-    return g
+class OnDevice(NamedTuple):
+    """Gaussians as float32 tensors on the device; fields as in `Gaussians`."""
+
+    means: Float[Tensor, "N 3"]
+    log_scales: Float[Tensor, "N 3"]
+    quats: Float[Tensor, "N 4"]
+    opacity_logits: Float[Tensor, " N"]
+    sh: Float[Tensor, "N K 3"]
+
+    @staticmethod
+    def of(gaussians: Gaussians) -> "OnDevice":
+        """Copy Gaussians to the device.
+
+        Raises:
+            HilsplatError: parameters are not finite, or quaternions are zero.
+        """
+        g = OnDevice(*(torch.from_numpy(getattr(gaussians, name)).cuda() for name in FIELDS))
+        broken = (g.quats == 0).all(dim=1)
+        for values in g:
+            broken |= ~values.isfinite().reshape(len(values), -1).all(dim=1)
+        refuse_broken(int(broken.sum()), len(gaussians))
+        return g
 
 
 def blend(
-    gaussians: Gaussians, camera: Camera, channels: Float[Tensor, "N C"]
+    g: OnDevice, camera: Camera, channels: Float[Tensor, "N C"]
 ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"], dict[str, Any]]:
     """Blend channels of Gaussians on the device: premultiplied image, alpha, intermediate results."""
     import gsplat
 
     height, width = camera.size_hw
     image, alpha, notes = gsplat.rasterization(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
+        g.means,
+        g.quats,
+        g.log_scales.exp(),
+        g.opacity_logits.sigmoid(),
         channels,
         torch.tensor(camera.cam_from_world, dtype=torch.float32, device="cuda")[None],
         torch.tensor(camera.K, dtype=torch.float32, device="cuda")[None],
@@ -69,29 +80,12 @@ def blend(
     return image[0], alpha[0, ..., 0], notes
 
 
-def colours(gaussians: Gaussians, camera: Camera, degree: int) -> Float[Tensor, "N 3"]:
+def colours(g: OnDevice, camera: Camera, degree: int) -> Float[Tensor, "N 3"]:
     """RGB in a view: max(0, 0.5 + spherical harmonics), on the device."""
     import gsplat
 
     centre = torch.tensor(camera.centre, dtype=torch.float32, device="cuda")
-    return (gsplat.spherical_harmonics(degree, gaussians.means - centre, gaussians.sh) + 0.5).clamp_min(0.0)
-
-
-def render_channels(
-    gaussians: Gaussians, camera: Camera, degree: int, features: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """Premultiplied RGB (+ features) and alpha, on the Gaussians' device."""
-    home = gaussians.means.device
-    if len(gaussians) == 0:
-        width = 3 + (features.shape[1] if features is not None else 0)
-        nothing = torch.zeros(*camera.size_hw, width + 1, device=home)
-        return nothing[..., :-1], nothing[..., -1]
-    g = _on_device(gaussians)
-    channels = colours(g, camera, degree)
-    if features is not None:
-        channels = torch.cat([channels, features.to("cuda", torch.float32)], dim=1)
-    image, alpha, _ = blend(g, camera, channels)
-    return image.to(home), alpha.to(home)
+    return (gsplat.spherical_harmonics(degree, g.means - centre, g.sh) + 0.5).clamp_min(0.0)
 
 
 def pixel_weights(gaussians: Gaussians, camera: Camera, min_weight: float) -> csr_matrix:
@@ -107,7 +101,7 @@ def pixel_weights(gaussians: Gaussians, camera: Camera, min_weight: float) -> cs
     if len(gaussians) == 0:
         return csr_matrix(shape, dtype=np.float32)
     with torch.no_grad():
-        g = _on_device(gaussians)
+        g = OnDevice.of(gaussians)
         _, _, notes = blend(g, camera, torch.zeros(len(g), 1, device="cuda"))
         who, pixel, _ = gsplat.rasterize_to_indices_in_range(
             0,
@@ -129,7 +123,7 @@ def pixel_weights(gaussians: Gaussians, camera: Camera, min_weight: float) -> cs
         dy = notes["means2d"][0, who, 1] - (pixel // width + 0.5)
         conic = notes["conics"][0, who]
         power = 0.5 * (conic[:, 0] * dx * dx + conic[:, 2] * dy * dy) + conic[:, 1] * dx * dy
-        alpha = (g.opacities[who] * torch.exp(-power)).clamp_max(MAX_ALPHA).double()
+        alpha = (g.opacity_logits.sigmoid()[who] * torch.exp(-power)).clamp_max(MAX_ALPHA).double()
         count = torch.bincount(pixel, minlength=height * width)
         weight = alpha * _light_before(alpha, count)
         kept = (weight >= min_weight) & (weight > 0)
@@ -151,25 +145,43 @@ def _light_before(alpha: Float[Tensor, " E"], count: Tensor) -> Float[Tensor, " 
     return torch.exp(log_before - log_before[begin].repeat_interleave(count[count > 0]))
 
 
-def draw(parameters: Parameters, camera: Camera, degree: int) -> Drawn:
-    """One view of a fit: image, alpha, and the gradients on demand (see the CPU backend's `draw`)."""
-    fields = ("means", "log_scales", "quats", "opacity_logits", "sh")
-    leaves = [torch.from_numpy(getattr(parameters, name)).cuda().requires_grad_() for name in fields]
-    g = _on_device(Gaussians(*leaves))
-    image, alpha, notes = blend(g, camera, colours(g, camera, degree))
+def draw(
+    gaussians: Gaussians, camera: Camera, degree: int, features: Float32[np.ndarray, "N D"] | None
+) -> Drawn:
+    """Image, alpha, and the gradients on demand; see `api.draw`."""
+    width = 0 if features is None else features.shape[1]
+    if len(gaussians) == 0:
+        return _nothing(gaussians, camera, width)
+    leaves = [values.requires_grad_() for values in OnDevice.of(gaussians)]
+    g = OnDevice(*leaves)
+    blended = torch.from_numpy(
+        np.zeros((len(gaussians), 0), np.float32) if features is None else features
+    ).cuda()
+    blended.requires_grad_()
+    image, alpha, notes = blend(g, camera, torch.cat([colours(g, camera, degree), blended], dim=1))
 
     def gradients(grad_image: np.ndarray, grad_alpha: np.ndarray) -> Gradients:
         grads = torch.autograd.grad(
             [image, alpha],
-            [*leaves, notes["means2d"]],
+            [*leaves, blended, notes["means2d"]],
             [torch.from_numpy(np.ascontiguousarray(grad)).cuda() for grad in (grad_image, grad_alpha)],
         )
-        *by_field, by_mean_px = (grad.cpu().numpy() for grad in grads)
-        return Gradients(
-            **dict(zip(fields, by_field, strict=True)),
-            features=np.zeros((len(leaves[0]), 0), np.float32),
-            means_px=by_mean_px[0],
-        )
+        *by_field, by_features, by_mean_px = (grad.cpu().numpy() for grad in grads)
+        by_name = dict(zip(FIELDS, by_field, strict=True))
+        return Gradients(**by_name, features=by_features, means_px=by_mean_px[0])
 
     drawn = (notes["radii"][0] > 0).all(dim=-1).cpu().numpy()
     return Drawn(image.detach().cpu().numpy(), alpha.detach().cpu().numpy(), drawn, gradients)
+
+
+def _nothing(gaussians: Gaussians, camera: Camera, width: int) -> Drawn:
+    """A view without Gaussians, which gsplat does not take."""
+
+    def gradients(grad_image: np.ndarray, grad_alpha: np.ndarray) -> Gradients:
+        by_name = {name: np.zeros_like(getattr(gaussians, name)) for name in FIELDS}
+        return Gradients(
+            **by_name, features=np.zeros((0, width), np.float32), means_px=np.zeros((0, 2), np.float32)
+        )
+
+    image = np.zeros((*camera.size_hw, 3 + width), np.float32)
+    return Drawn(image, np.zeros(camera.size_hw, np.float32), np.zeros(0, np.bool_), gradients)

@@ -2,9 +2,8 @@
 
 import logging
 from functools import cache
+from importlib.util import find_spec
 from typing import Literal
-
-import torch
 
 from hilsplat.base.errors import DeviceError
 
@@ -16,6 +15,10 @@ Device = Literal["cpu", "cuda"]
 @cache
 def cuda_problem() -> str | None:
     """Why the CUDA backend cannot be used here; None if it can."""
+    if find_spec("gsplat") is None:  # first, because torch takes a second or two to import
+        return "gsplat is not installed"
+    import torch
+
     if not torch.cuda.is_available():
         return f"torch {torch.__version__} finds no CUDA device"
     try:

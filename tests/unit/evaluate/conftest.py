@@ -1,6 +1,6 @@
 """A flat world of coloured blocks whose tree, field and annotations are exact."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnota
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
+from tests.unit.round_gaussians import round_gaussians
 
 SIDE_PX = 64
 BLOCK_PX = 2
@@ -54,14 +55,11 @@ def encode_texts(texts):
 
 @pytest.fixture(scope="session")
 def block_world(tmp_path_factory) -> BlockWorld:
-    import torch
-
     from hilsplat.base.artifacts import write_index
-    from hilsplat.field.autoencoder import Autoencoder
-    from hilsplat.field.field import LanguageField
+    from hilsplat.field.language_field import LanguageField
+    from hilsplat.field.network_code import Autoencoder
     from hilsplat.query.language_scene import LanguageScene
     from hilsplat.semantic_tree.tree import SemanticTree
-    from hilsplat.splat.gaussians import Gaussians
 
     class Uncoded(Autoencoder):
         """Latents are the CLIP vectors themselves."""
@@ -127,14 +125,8 @@ def block_world(tmp_path_factory) -> BlockWorld:
     features = np.where((node_of_gaussian >= 0)[..., None], clip[node_of_gaussian], 0).astype(np.float32)
     means = np.stack([middle[:, 1] / 32 - 1, middle[:, 0] / 32 - 1, np.zeros(len(middle))], axis=1)
     colours = (image[middle[:, 0], middle[:, 1]] / 255 - 0.5) / 0.282
-    count = len(middle)
-    gaussians = Gaussians(
-        torch.from_numpy(means.astype(np.float32)),
-        torch.full((count, 3), -4.0),
-        torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
-        torch.full((count,), 3.0),
-        torch.from_numpy(colours.astype(np.float32))[:, None],
-    )
+    plain = round_gaussians(means, log_scale=-4.0, opacity_logit=3.0)
+    gaussians = replace(plain, sh=colours.astype(np.float32)[:, None])
     tree = SemanticTree(
         level=np.array([node[1] for node in NODES], np.uint8),
         parent=np.array([node[2] for node in NODES], np.int32),

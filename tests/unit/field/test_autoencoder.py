@@ -7,15 +7,9 @@ import torch
 from hilsplat.base.artifacts import read_index
 from hilsplat.base.errors import ArtifactError
 from hilsplat.contributions.rows import Contributions
-from hilsplat.field.autoencoder import (
-    Autoencoder,
-    load_code,
-    load_latents,
-    mask_targets,
-    reconstruction_loss,
-    run_autoencoder,
-    train_autoencoder,
-)
+from hilsplat.field.autoencoder import mask_targets, run_autoencoder
+from hilsplat.field.code import load_code, load_latents
+from hilsplat.field.network_code import Autoencoder, reconstruction_loss, train_autoencoder
 from hilsplat.semantic_tree.tree import SemanticTree, run_semantic_tree
 from hilsplat.settings import AutoencoderSettings, SemanticTreeSettings
 

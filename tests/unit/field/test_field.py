@@ -15,7 +15,8 @@ from hilsplat.contributions.quadratic import StackedWeights
 from hilsplat.contributions.stage import painted_indicator
 from hilsplat.field.autoencoder import run_autoencoder
 from hilsplat.field.contrast import Contrast, ViewRelations, distinct, instance_term, part_term
-from hilsplat.field.field import LanguageField, run_field
+from hilsplat.field.field import run_field
+from hilsplat.field.language_field import LanguageField
 from hilsplat.field.losses.latent_regression import latent_regression_loss
 from hilsplat.field.minimise import lbfgs
 from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
@@ -24,8 +25,8 @@ from hilsplat.field.solver import keep_labelled, solve_field
 from hilsplat.methods.method import MethodInputs
 from hilsplat.semantic_tree.tree import run_semantic_tree
 from hilsplat.settings import AutoencoderSettings, FieldSettings, ReferenceSettings, SemanticTreeSettings
-from hilsplat.splat.gaussians import Gaussians
 from tests.unit.field.clustering import clustering_loss
+from tests.unit.round_gaussians import round_gaussians
 
 PIXELS, GAUSSIANS, CHANNELS = 60, 12, 2
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
@@ -315,14 +316,8 @@ def test_the_reference_trainer_and_baselines_refuse_other_gaussians(boxes_with_l
 def test_the_reference_trainer_lowers_its_loss(boxes_with_latents, monkeypatch):
     world, contributions, autoencoder = boxes_with_latents
     row, column = np.divmod(np.arange(96), 12)
-    means = torch.from_numpy(np.stack([column - 5.5, row - 3.5, np.full(96, 10.0)], axis=1)).float()
-    flat = Gaussians(
-        means,
-        torch.full((96, 3), -1.5),
-        torch.tensor([[1.0, 0, 0, 0]]).repeat(96, 1),
-        torch.full((96,), 5.0),
-        torch.zeros(96, 1, 3),
-    )
+    means = np.stack([column - 5.5, row - 3.5, np.full(96, 10.0)], axis=1)
+    flat = round_gaussians(means, log_scale=-1.5, opacity_logit=5.0)
     monkeypatch.setattr("hilsplat.field.reference_trainer.load_ply", lambda path: flat)
     out = world.folder / "reference" / "field.safetensors"
     arguments = (world.scene, world.ply, world.masks, contributions, autoencoder, out)

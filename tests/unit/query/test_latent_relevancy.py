@@ -6,8 +6,8 @@ import torch
 
 from hilsplat.base.device import compute_device
 from hilsplat.base.errors import DeviceError
-from hilsplat.field.autoencoder import Autoencoder, train_autoencoder
 from hilsplat.field.linear_code import LinearCode
+from hilsplat.field.network_code import Autoencoder, train_autoencoder
 from hilsplat.query import projected_look_up
 from hilsplat.query.device_look_up import PlacedOnDevice
 from hilsplat.query.latent_relevancy import LatentRelevancy

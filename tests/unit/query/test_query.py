@@ -4,14 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from hilsplat.base.artifacts import write_json
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.base.provenance import provenance_path
-from hilsplat.field.autoencoder import load_code, run_autoencoder
-from hilsplat.field.field import LanguageField, run_field
+from hilsplat.field.autoencoder import run_autoencoder
+from hilsplat.field.code import load_code
+from hilsplat.field.field import run_field
+from hilsplat.field.language_field import LanguageField
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.node_search import ancestor_margins, automatic_level, best_nodes, search
 from hilsplat.query.view_nodes import ViewNodes
@@ -20,7 +21,7 @@ from hilsplat.scene.finished import FinishedScene, require_same
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree, run_semantic_tree
 from hilsplat.settings import AutoencoderSettings, EvaluateSettings, FieldSettings, SemanticTreeSettings
-from hilsplat.splat.gaussians import Gaussians
+from tests.unit.round_gaussians import round_gaussians
 from tests.unit.two_boxes_world import (
     HEIGHT,
     NUM_GAUSSIANS,
@@ -56,10 +57,9 @@ def scene(tmp_path_factory) -> LanguageScene:
         vectors.update({text: vector / np.linalg.norm(vector) for text, vector in new.items()})
         return np.stack([vectors[text] for text in texts]).astype(np.float32)
 
-    zeros = torch.zeros(NUM_GAUSSIANS, 3)
     return LanguageScene(
         Scene.load(world.scene),
-        Gaussians(zeros, zeros, torch.zeros(NUM_GAUSSIANS, 4), torch.zeros(NUM_GAUSSIANS), zeros[:, None]),
+        round_gaussians(np.zeros((NUM_GAUSSIANS, 3))),
         SemanticTree.load(folder / "st"),
         LanguageField.load(folder / "field.safetensors"),
         load_code(folder / "ae"),

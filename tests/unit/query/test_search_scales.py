@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.sparse as sp
-import torch
 
 from hilsplat.base.levels import Level
-from hilsplat.field.autoencoder import Autoencoder
-from hilsplat.field.field import LanguageField
+from hilsplat.field.language_field import LanguageField
+from hilsplat.field.network_code import Autoencoder
 from hilsplat.query.hits import doubts_of
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.node_search import margin_range, search
@@ -19,7 +18,7 @@ from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings
-from hilsplat.splat.gaussians import Gaussians
+from tests.unit.round_gaussians import round_gaussians
 
 
 def tree_of(levels: list[int], parents: list[int]) -> SemanticTree:
@@ -94,7 +93,6 @@ def three_mugs() -> LanguageScene:
     settings = EvaluateSettings(relevancy_scale=100)
     camera = Cameras(("a.png",), np.eye(4)[None], np.eye(3)[None], np.array([[2, 2]], np.int32))
     no_points = np.zeros((0, 3), np.float32)
-    zeros = torch.zeros(1, 3)
     return LanguageScene(
         Scene(
             Path(),
@@ -106,7 +104,7 @@ def three_mugs() -> LanguageScene:
             no_points.astype(np.uint8),
             np.eye(4),
         ),
-        Gaussians(zeros, zeros, torch.zeros(1, 4), torch.zeros(1), zeros[:, None]),
+        round_gaussians(np.zeros((1, 3))),
         replace(tree, clip=vectors),
         LanguageField(np.zeros((1, 3, 2), np.float32), "", ""),
         Autoencoder(6, 2),

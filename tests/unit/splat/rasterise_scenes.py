@@ -6,9 +6,8 @@ import numpy as np
 import torch
 
 from hilsplat.scene.cameras import Camera
-from hilsplat.splat.gaussians import Gaussians
-
-FIELDS = ("means", "log_scales", "quats", "opacity_logits", "sh")
+from hilsplat.splat.gaussians import FIELDS, Gaussians
+from tests.unit.round_gaussians import round_gaussians
 
 
 def camera(height: int = 40, width: int = 56, focal: float = 50.0) -> Camera:
@@ -40,18 +39,15 @@ def random_gaussians(n: int, seed: int = 0, degree: int = 3) -> Gaussians:
         rng.normal(size=n) * 2,
         rng.normal(size=(n, (degree + 1) ** 2, 3)) * 0.4,
     )
-    return Gaussians(*(torch.tensor(values, dtype=torch.float32) for values in arrays))
+    return Gaussians(*(values.astype(np.float32) for values in arrays))
 
 
 def round_gaussian(opacity: float, scale: float, depth: float) -> Gaussians:
     """One round white Gaussian on the optical axis of a camera at the origin."""
-    return Gaussians(
-        torch.tensor([[0.0, 0.0, depth]]),
-        torch.full((1, 3), math.log(scale)),
-        torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        torch.tensor([math.log(opacity / (1 - opacity))]),
-        torch.full((1, 1, 3), 0.5 / 0.28209479177387814),
-    )
+    logit = math.log(opacity / (1 - opacity))
+    plain = round_gaussians(np.array([[0, 0, depth]]), log_scale=math.log(scale), opacity_logit=logit)
+    plain.sh[:] = 0.5 / 0.28209479177387814
+    return plain
 
 
 def rows(gaussians: Gaussians, chosen: slice) -> Gaussians:
@@ -59,6 +55,6 @@ def rows(gaussians: Gaussians, chosen: slice) -> Gaussians:
     return Gaussians(*(getattr(gaussians, name)[chosen] for name in FIELDS))
 
 
-def leaves(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> list[torch.Tensor]:
-    """Copies of the parameters that gather gradients."""
-    return [getattr(gaussians, name).to(dtype, copy=True).requires_grad_() for name in FIELDS]
+def leaves(gaussians: Gaussians) -> list[torch.Tensor]:
+    """The parameters as float64 tensors that gather gradients."""
+    return [torch.from_numpy(getattr(gaussians, name).astype(np.float64)).requires_grad_() for name in FIELDS]

@@ -4,12 +4,14 @@ Every Gaussian is evaluated at every pixel, and gradients are torch's own. It sh
 backends, and repeats their constants and formulas on purpose.
 """
 
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from hilsplat.scene.cameras import Camera
-from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.gaussians import FIELDS, Gaussians
 
 SH = (
     lambda x, y, z: 0.28209479177387814 + 0 * x,
@@ -43,12 +45,24 @@ def rotations(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
     return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
 
 
+class Tensors(NamedTuple):
+    """Gaussians as tensors; fields as in `Gaussians`."""
+
+    means: Float[Tensor, "N 3"]
+    log_scales: Float[Tensor, "N 3"]
+    quats: Float[Tensor, "N 4"]
+    opacity_logits: Float[Tensor, " N"]
+    sh: Float[Tensor, "N K 3"]
+
+
 def render_reference(
-    gaussians: Gaussians, camera: Camera, sh_degree: int, features: Float[Tensor, "N D"] | None = None
+    gaussians: Gaussians | Tensors,
+    camera: Camera,
+    sh_degree: int,
+    features: Float[Tensor, "N D"] | None = None,
 ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"], Float[Tensor, "N H W"]]:
     """Premultiplied RGB (+ features), alpha, and the blending weights, in float64."""
-    fields = ("means", "log_scales", "quats", "opacity_logits", "sh")
-    g = Gaussians(*(getattr(gaussians, name).double() for name in fields))
+    g = Tensors(*(torch.as_tensor(getattr(gaussians, name)).double() for name in FIELDS))
     height, width = camera.size_hw
     cam_from_world, K = torch.from_numpy(camera.cam_from_world), torch.from_numpy(camera.K)
     cam = g.means @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
@@ -67,7 +81,7 @@ def render_reference(
         ],
         dim=1,
     )
-    root = jacobian @ cam_from_world[:3, :3] @ rotations(g.quats) * g.scales[:, None]
+    root = jacobian @ cam_from_world[:3, :3] @ rotations(g.quats) * g.log_scales.exp()[:, None]
     covariance = root @ root.transpose(1, 2) + 0.3 * torch.eye(2, dtype=torch.float64)
     conic = torch.linalg.inv(covariance)
     centre = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=1)
@@ -85,7 +99,7 @@ def render_reference(
     )
     offset = centre[:, None, None] - torch.stack([columns, rows], dim=-1)
     power = -0.5 * torch.einsum("nhwi,nij,nhwj->nhw", offset, conic, offset)
-    alpha = (g.opacities[:, None, None] * power.exp()).clamp(max=0.999)
+    alpha = (g.opacity_logits.sigmoid()[:, None, None] * power.exp()).clamp(max=0.999)
     alpha = torch.where((alpha >= 1 / 255) & drawn[:, None, None], alpha, torch.zeros_like(alpha))
     order = torch.argsort(z, stable=True)
     alpha = alpha[order]

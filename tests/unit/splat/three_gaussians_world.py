@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from hilsplat.base.artifacts import write_json
 from hilsplat.base.images import write_png
@@ -36,11 +35,11 @@ def ring(number: int, size: int) -> Cameras:
 def three_gaussians() -> Gaussians:
     """What there is to see."""
     return Gaussians(
-        torch.tensor([[0.4, 0, 0], [-0.4, 0.2, 0.1], [0, -0.4, 0.3]]),
-        torch.tensor([[0.3, 0.2, 0.2], [0.15, 0.3, 0.2], [0.2, 0.2, 0.35]]).log(),
-        torch.tensor([[1.0, 0.2, 0, 0], [1, 0, 0.3, 0], [1, 0, 0, 0]]),
-        torch.tensor([3.0, 3.0, 3.0]),
-        torch.tensor([[[1.5, -1, -1]], [[-1, 1.5, -1]], [[-1, -1, 1.5]]]),
+        np.array([[0.4, 0, 0], [-0.4, 0.2, 0.1], [0, -0.4, 0.3]], np.float32),
+        np.log(np.array([[0.3, 0.2, 0.2], [0.15, 0.3, 0.2], [0.2, 0.2, 0.35]], np.float32)),
+        np.array([[1.0, 0.2, 0, 0], [1, 0, 0.3, 0], [1, 0, 0, 0]], np.float32),
+        np.array([3.0, 3.0, 3.0], np.float32),
+        np.array([[[1.5, -1, -1]], [[-1, 1.5, -1]], [[-1, -1, 1.5]]], np.float32),
     )
 
 
@@ -48,7 +47,7 @@ def three_gaussians_scene(folder: Path, scene_from_source: np.ndarray | None = N
     """Nine views, two of them held out; eight sparse points."""
     truth, cameras = three_gaussians(), ring(NUM_VIEWS, SIZE_PX)
     for name in cameras.names:
-        color = render(truth, cameras[name]).color.clamp(0, 1).numpy()
+        color = render(truth, cameras[name]).color.clip(0, 1)
         write_png(folder / "images" / name, np.round(color * 255).astype(np.uint8))
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 3)).astype(np.float32)
     split = {name: "test" if row % 4 == 3 else "train" for row, name in enumerate(cameras.names)}
@@ -64,6 +63,6 @@ def mean_psnr(scene: Scene, gaussians: Gaussians) -> float:
     """Mean PSNR of the held-out views, dB."""
     values = []
     for name in scene.views("test"):
-        shown = render(gaussians, scene.cameras[name]).color.clamp(0, 1).numpy()
+        shown = render(gaussians, scene.cameras[name]).color.clip(0, 1)
         values.append(psnr(shown, scene.image(name).astype(np.float32) / 255))
     return float(np.mean(values))

@@ -1,0 +1,84 @@
+"""The scene's code: CLIP vectors to a few numbers and back, by a network or linearly; reading it."""
+
+import json
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float32
+from safetensors import SafetensorError, safe_open
+
+from hilsplat.base.artifacts import read_index, read_npz
+from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.contributions.rows import Contributions
+from hilsplat.field.linear_code import METADATA_KEY, LinearCode
+
+CHUNK_ROWS = 4096
+"""Rows to decode at once: their hidden layers, 4 MiB, stay in the processor's cache. Chunks of 65,536 rows
+took twice as long."""
+
+
+class Code(Protocol):
+    """What encodes CLIP vectors: `linear_code.LinearCode` or `network_code.Autoencoder`."""
+
+    @property
+    def channels(self) -> int:
+        """Width C of the CLIP vectors."""
+
+    @property
+    def latent(self) -> int:
+        """Size d of a latent."""
+
+    def encode_array(self, vectors: Float32[np.ndarray, "B C"]) -> Float32[np.ndarray, "B D"]:
+        """Latents of vectors."""
+
+    def decode_array(self, latents: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:
+        """Vectors of unit length."""
+
+    def save(self, path: Path) -> None:
+        """Write a .safetensors file; the same code gives the same bytes."""
+
+
+def load_code(folder: Path) -> Code:
+    """Read the code of a finished folder, network or linear.
+
+    Raises:
+        ArtifactError: the file is missing or damaged.
+    """
+    path = autoencoder_file(folder)
+    try:
+        with safe_open(path, framework="np") as file:
+            about = json.loads(file.metadata()[METADATA_KEY])
+            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        if about.get("code") == "pca":
+            return LinearCode(state["mean"], state["basis"])
+        from hilsplat.field.network_code import Autoencoder
+
+        return Autoencoder.from_arrays(about["channels"], about["latent"], state)
+    except (FileNotFoundError, SafetensorError, KeyError, TypeError) as error:
+        raise ArtifactError(
+            f"{path} cannot be read: {error}", fix="run the autoencoder stage again"
+        ) from error
+
+
+def autoencoder_file(folder: Path) -> Path:
+    """File of the weights in a finished folder."""
+    return Path(folder) / "autoencoder.safetensors"
+
+
+def load_latents(folder: Path, contributions: Contributions) -> Float32[np.ndarray, "M D"]:
+    """Latent of each mask, checked against the contributions' rows.
+
+    Raises:
+        MisalignedArtifactError: the numbers of rows differ.
+    """
+    read_index(folder)
+    latents = read_npz(Path(folder) / "latents.npz")["latents"]
+    if len(latents) != len(contributions):
+        raise MisalignedArtifactError(
+            f"latents of {folder} do not belong to these contributions",
+            expected=f"{len(contributions)} rows",
+            found=f"{len(latents)} rows",
+            fix="run the autoencoder stage again",
+        )
+    return latents
