@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32
@@ -18,6 +18,7 @@ CHUNK_ROWS = 4096
 took twice as long."""
 
 
+@runtime_checkable
 class Code(Protocol):
     """What encodes CLIP vectors: `linear_code.LinearCode` or `network_code.Autoencoder`."""
 

@@ -38,8 +38,8 @@ def write_report(
 ) -> dict[str, Any]:
     """Write the report folder and return report.json's content.
 
-    It holds `report.json`, `test_views.png` (photograph, rendering, error), `flyaround.png`,
-    `flyaround.mp4` if ffmpeg is on PATH, `curves.png` after a fit, and the index.
+    It holds `report.json`, `test_views.png` (photograph, rendering, error), `flyaround.mp4`,
+    `flyaround.png`, `curves.png` after a fit, and the index.
 
     Args:
         scene: its held-out views are scored, or its training views if none are held out.
@@ -86,7 +86,7 @@ def write_report(
         write_png(temporary / "test_views.png", contact_sheet(cells, columns=6))
         path = [view.camera for view in load_views(scene, "train", settings.image_scale)]
         path = path or [view.camera for view in views]
-        report["flyaround"] = write_flyaround(temporary, path, picture)
+        write_flyaround(temporary, path, picture)
         if curve is not None:
             _draw_curves(temporary / "curves.png", curve)
         write_json(temporary / "report.json", report)

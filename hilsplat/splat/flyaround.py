@@ -1,9 +1,6 @@
-"""A smooth closed camera path around what the cameras saw, as a contact sheet and, with ffmpeg, a film."""
+"""A smooth closed camera path around what the cameras saw, as a film and a contact sheet."""
 
-import logging
-import shutil
-import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +8,10 @@ from jaxtyping import Float64, UInt8
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.distance import cdist
 
+from hilsplat.base.film import write_film
 from hilsplat.base.images import write_png
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.sheets import contact_sheet
-
-logger = logging.getLogger(__name__)
 
 FRAMES = 120
 FRAMES_PER_S = 24
@@ -24,7 +20,6 @@ MAX_STOPS = 80
 """Upper limit on the cameras that the path visits; of more, it visits every n-th."""
 SMOOTHING = 1 / 40
 """Width of the smoothing, as a share of the round: it removes the shake of hand-held photographs."""
-TIMEOUT_S = 600
 
 
 def closed_path(cameras: list[Camera], frames: int) -> list[Camera]:
@@ -92,56 +87,21 @@ def short_round(distances: Float64[np.ndarray, "S S"]) -> list[int]:
 
 def write_flyaround(
     folder: Path, cameras: list[Camera], picture: Callable[[Camera], UInt8[np.ndarray, "H W 3"]]
-) -> str:
-    """Write `flyaround.png` and, if ffmpeg is on PATH, `flyaround.mp4`.
+) -> None:
+    """Write `flyaround.mp4`, and every tenth of its frames as `flyaround.png`.
 
     Args:
         cameras: training cameras, which the path visits.
         picture: renders a camera.
-
-    Returns:
-        One line for the report: what became of the film.
     """
-    path = closed_path(cameras, FRAMES)
-    every = FRAMES // SHEET_FRAMES
-    program = shutil.which("ffmpeg")
-    if program is None:
-        frames = {number: picture(path[number]) for number in range(0, FRAMES, every)}
-        line = "no film: ffmpeg is not on PATH"
-    else:
-        frames = dict(enumerate(picture(camera) for camera in path))
-        line = _write_film(program, folder / "flyaround.mp4", [frames[number] for number in range(FRAMES)])
-    write_png(
-        folder / "flyaround.png",
-        contact_sheet([frames[number] for number in range(0, FRAMES, every)], columns=4),
-    )
-    return line
+    shown: list[UInt8[np.ndarray, "H W 3"]] = []
 
+    def frames() -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+        for number, camera in enumerate(closed_path(cameras, FRAMES)):
+            frame = picture(camera)
+            if number % (FRAMES // SHEET_FRAMES) == 0:
+                shown.append(frame)
+            yield frame
 
-def _write_film(program: str, path: Path, frames: list[UInt8[np.ndarray, "H W 3"]]) -> str:
-    """Encode frames as H.264 in yuv420p, which every player shows; the same frames, the same bytes."""
-    height, width = frames[0].shape[:2]
-    command = [
-        *(program, "-hide_banner", "-loglevel", "error", "-y", "-nostdin"),
-        *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(FRAMES_PER_S)),
-        *("-i", "pipe:0"),
-        *("-vf", "crop=trunc(iw/2)*2:trunc(ih/2)*2"),  # yuv420p needs even sides
-        *("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-threads", "1"),
-        *("-map_metadata", "-1", "-fflags", "+bitexact", "-flags:v", "+bitexact"),
-        *("-movflags", "+faststart", str(path)),
-    ]
-    try:
-        subprocess.run(
-            command,
-            input=b"".join(frame.tobytes() for frame in frames),
-            capture_output=True,
-            check=True,
-            timeout=TIMEOUT_S,
-        )
-    except (OSError, subprocess.SubprocessError) as error:
-        path.unlink(missing_ok=True)
-        reason = (getattr(error, "stderr", None) or b"").decode(errors="replace").strip().splitlines()
-        line = f"no film: ffmpeg failed: {reason[-1] if reason else error}"
-        logger.warning("%s", line)
-        return line
-    return f"flyaround.mp4: {len(frames)} frames at {FRAMES_PER_S} per second"
+    write_film(folder / "flyaround.mp4", frames(), FRAMES_PER_S)
+    write_png(folder / "flyaround.png", contact_sheet(shown, columns=4))

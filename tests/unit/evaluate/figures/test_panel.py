@@ -13,9 +13,9 @@ from hilsplat.base.levels import Level
 from hilsplat.base.provenance import provenance_path
 from hilsplat.evaluate.figures.panel import annotated_rows, draw_panel, free_rows, truths_of
 from hilsplat.query.answer import file_name, report, views_of
-from hilsplat.query.query_panel import query_panel
 from hilsplat.query.hits import hits_of
 from hilsplat.query.pictures import ANSWER_RGB, TRUTH_RGB, outline, paint_answer, save_figure
+from hilsplat.query.query_panel import query_panel
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 
