@@ -48,7 +48,7 @@ def bring_gaussians(ply: Path, scene: Scene) -> tuple[Gaussians, dict[str, Any]]
         moved = "in the coordinates that the JSON file beside it describes"
     logger.info("%s: %d Gaussians of %s, %s", scene.name, len(gaussians), ply, moved)
     origin = {
-        "kind": "brought along",
+        "kind": "imported",
         "file": ply.name,  # its folder is in the provenance
         "sha256": sha256_of_file(ply),
         "taken_as": moved,

@@ -79,7 +79,7 @@ def write_report(
     if report["psnr_db"] <= np.mean(flat):
         report["warnings"].append(
             f"the {split} views score {report['psnr_db']:.1f} dB, no more than one flat colour does: look at "
-            "test_views.png; the Gaussians may stand in other coordinates than the cameras, or the poses "
+            "test_views.png; the Gaussians may be in other coordinates than the cameras, or the poses "
             "may be wrong"
         )
     with atomic_folder(folder) as temporary:

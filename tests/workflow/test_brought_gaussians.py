@@ -40,7 +40,7 @@ def brought(project: Path, tmp_path: Path) -> Project:
 def test_brought_gaussians_take_the_place_of_a_fit(brought: Project) -> None:
     brought.snakemake("--keep-going", f"{SCENE}/gaussians.ply")
     report = json.loads((brought.root / SCENE / "gaussians/report.json").read_text())
-    assert report["origin"]["kind"] == "brought along"
+    assert report["origin"]["kind"] == "imported"
     assert report["origin"]["file"] == "three.ply"
     assert report["gaussians"] == 3
     assert report["warnings"]  # three random Gaussians do not show the scene

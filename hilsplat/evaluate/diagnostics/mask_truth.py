@@ -73,7 +73,7 @@ def fit_of_view(masks: HierarchicalMasks, truth: HierarchyAnnotations, view: str
 
 
 def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, out: Path) -> str:
-    """Write a table of all views, and a picture of a middling view and the worst one.
+    """Write a table of all views, and a picture of a median view and the worst one.
 
     Args:
         scene_folder: scene artifact.
@@ -97,7 +97,7 @@ def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, o
         }
         counts["views"] = len(fits)
         rows = [table_row(scene.name, masks_label(masks_folder), level, fits) for level in LEVELS]
-        figure = draw_fits(scene, truth, Path(masks_folder), fits, middling_and_worst(fits))
+        figure = draw_fits(scene, truth, Path(masks_folder), fits, median_and_worst(fits))
         save_png_and_pdf(figure, out)
         write_csv(Path(out).with_suffix(".csv"), COLUMNS, rows)
     return markdown_table(COLUMNS, rows, 3)
@@ -128,7 +128,7 @@ def table_row(scene: str, masks: str, level: Level, fits: Mapping[str, dict[Leve
     ]
 
 
-def middling_and_worst(fits: Mapping[str, dict[Level, ViewFit]]) -> list[str]:
+def median_and_worst(fits: Mapping[str, dict[Level, ViewFit]]) -> list[str]:
     """The view whose mean over all regions is the median, and the one whose mean is lowest."""
 
     def mean_of(view: str) -> float:
@@ -159,7 +159,7 @@ def draw_fits(
         masks = HierarchicalMasks.load(masks_folder / f"{view}.npz")
         above, below = axes[2 * number], axes[2 * number + 1]
         above[0].set_axis_on()
-        show(above[0], image, f"{view}: {('a middling view', 'the worst view')[number]}")
+        show(above[0], image, f"{view}: {('median view', 'worst view')[number]}")
         for level in LEVELS:
             fit = fits[view][level]
             column = 1 + level.index

@@ -35,8 +35,8 @@ COLUMNS_NOTE = (
     "All in %. Columns of measured rows are named after the paper's; on the stand-in, LERF and 3D-OVS are "
     "their protocols (lerf/langsplat or lerf/tree-nodes, level chosen; 3d-ovs/langsplat), and Hi-LERF is "
     "hierarchy/level-given: mIoU is the mean of L1 to L3, HC its containment reading. The level is given, "
-    "so a row tells the parts of the method apart, and not how well levels are chosen. "
-    f'"{AGAINST}": difference in Hi-LERF mIoU to the default field, scene by scene; mean and standard error '
+    "so a row measures the parts of the method, not how well levels are chosen. "
+    f'"{AGAINST}": Hi-LERF mIoU minus that of the default field, paired by scene; mean and standard error '
     "over the scenes."
 )
 
@@ -46,7 +46,7 @@ def ablation_table(sources: Sources) -> Table:
     footnotes = (
         COLUMNS_NOTE,
         "Initial-2D: levels of the 2D masks. 3D-HC: 3D hierarchical clustering. Instance, Part: contrastive "
-        "losses. Our rows name the losses that are on; d is the number of latents.",
+        "losses. Our rows name the losses that are switched on; d is the size of a latent.",
     )
     blocks = [reported(sources, "ablation"), *component_blocks(sources)]
     return sources.finished("ablation", "Ablation", blocks, footnotes)
@@ -56,8 +56,8 @@ def theta_table(sources: Sources) -> Table:
     """Sweep over the coverage threshold."""
     footnotes = (
         COLUMNS_NOTE,
-        "theta decides which mask of a view lies in which other. It reaches our field through L_ins and "
-        "L_part alone, and the semantic tree not at all: its rows differ by little or nothing.",
+        "theta decides which masks of a view count as inside which others. It affects our field only through "
+        "L_ins and L_part, and the semantic tree not at all: rows differ little or not at all.",
     )
     blocks = [reported(sources, "coverage threshold"), *component_blocks(sources, ("field",))]
     return sources.finished("theta", "Influence of the coverage threshold theta", blocks, footnotes)
@@ -65,7 +65,7 @@ def theta_table(sources: Sources) -> Table:
 
 def omega_table(sources: Sources) -> Table:
     """Sweep over the similarity degree."""
-    footnotes = (COLUMNS_NOTE, "Omega is part of L_ins alone.")
+    footnotes = (COLUMNS_NOTE, "Omega appears in L_ins only.")
     blocks = [reported(sources, "similarity degrees"), *component_blocks(sources, ("field",))]
     return sources.finished("omega", "Influence of the similarity degree Omega", blocks, footnotes)
 

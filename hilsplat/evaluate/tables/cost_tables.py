@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 LOWER = ("(min)", "(GB)", "(s)")
 COST_NOTE = (
     "Measured rows, on this machine, means over scenes: preparation is masks, trees of the views and CLIP; "
-    "training is contributions, semantic tree, autoencoder and field; neither holds the 3D Gaussians. "
-    "Memory is the largest of the training jobs, in main memory (the paper: GPU). A query is one text in one "
+    "training is contributions, semantic tree, autoencoder and field; neither includes the 3D Gaussians. "
+    "Memory is the peak of the training jobs, in main memory (the paper: GPU). A query is one text in one "
     "view: text encoding, compositing weights of the view, relevancy and mask."
 )
 
@@ -60,7 +60,7 @@ def pruning_table(sources: Sources) -> Table:
     footnotes = (
         COST_NOTE,
         "The paper removes redundant pairs by similarity of features and gives no rule. What our variant "
-        "removes stands in its settings (variants in config/config.yaml).",
+        "removes is set in config/config.yaml (variants).",
     )
     return sources.finished("pruning", "Cost with pruned pairs", blocks, footnotes)
 

@@ -74,14 +74,14 @@ def hierarchy_table(sources: Sources) -> Table:
         "nesting). HC literal: share of the parent covered by the child (the printed formula; perfect masks "
         "score low). HC anchored: share of the child inside the annotated parent. The row of the "
         "annotations gives what perfect masks would score.",
-        "A path of texts asks whole > part > subpart: more information than the paper's protocol gives.",
-        "The field answers in each view by what that view shows, and so does the tree: nodes that the view "
-        "shows compete. Scene-wide: those of the whole scene do, one answer in 3D for all views.",
-        "View consistency: of the surface points that two neighbouring views both show, IoU of those that "
-        "the answer holds in one view and in the other, by exact geometry, level given; mean over texts of "
-        "a level, then over levels. Texts that neither view answers there are left out. It measures "
+        "A path of texts asks for whole > part > subpart: more information than the paper's protocol gives.",
+        "The field and the tree answer each view by what that view shows: only nodes visible in it compete. "
+        "Scene-wide: all nodes of the scene compete, and one answer in 3D serves all views.",
+        "View consistency: of the surface points visible in two neighbouring views, IoU of those inside the "
+        "answer of one view and of the other, by exact geometry, level given; mean over the texts of a "
+        "level, then over levels. Texts that neither view answers there are left out. It measures "
         "consistency, not correctness.",
-        "Avg, best threshold: the threshold of every map is chosen with the truth; a diagnostic, no result.",
+        "Avg, best threshold: the threshold of every map is chosen with the truth; a diagnostic, not a result.",
     )
     return sources.finished("hierarchy", "Queries at three levels", blocks, footnotes)
 

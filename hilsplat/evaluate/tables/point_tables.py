@@ -34,7 +34,7 @@ AP_COLUMNS = {"ap": "ScanNet200 AP", "ap25": "ScanNet200 AP@25", "ap50": "ScanNe
 MODE_NOTE = (
     "Points get their class from the Gaussians by the mode named after 'points:' (nearest: the nearest "
     "Gaussian of opacity 0.1 or more; frozen: the Gaussian that the point became). Classes are queried by "
-    "their names alone; the highest cosine wins. Where the name is not in the CLIP model's vocabulary, it "
+    "their names alone; the highest cosine wins. A name outside the CLIP model's vocabulary "
     "still competes."
 )
 

@@ -21,11 +21,11 @@ STAND_IN_NOTE = (
 
 TRUE_MASKS_NOTE = (
     "Rows that begin with 'diagnostic, true masks' were given masks made from the true labels, with the "
-    "faults named under Masks. They are no results and are ranked with nothing; they tell errors of the "
+    "faults named under Masks. They are not results and are not ranked; they separate errors of the "
     "method from errors of the segmenter."
 )
 
-SEEDS_NOTE = "Values with ± are mean and standard deviation over seeds; rows without hold nothing random."
+SEEDS_NOTE = "Values with ± are mean and standard deviation over seeds; nothing is random in rows without ±."
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ def test_source_coordinates_become_the_scenes(turned_scene, source_ply):
     for name in ("means", "log_scales", "opacity_logits", "sh"):
         np.testing.assert_allclose(getattr(brought, name), getattr(truth, name), atol=1e-5)
     assert mean_psnr(turned_scene, brought) > 45
-    assert origin["kind"] == "brought along"
+    assert origin["kind"] == "imported"
     assert origin["taken_as"] == "in the coordinates of the scene's source"
 
 
@@ -65,14 +65,14 @@ def test_the_stage_reports_on_brought_gaussians_without_a_fit(
         brought=source_ply,
     )
     report = read_json(out / "report" / "report.json")
-    assert report["origin"]["kind"] == "brought along"
+    assert report["origin"]["kind"] == "imported"
     assert report["origin"]["file"] == "theirs.ply"
     assert report["split"] == "test"
     assert report["psnr_db"] > 45
     assert report["warnings"] == []
     assert not (out / "report" / "curves.png").exists()
     assert (out / "report" / "flyaround.png").is_file()
-    assert read_json(out / "g.json")["origin"]["kind"] == "brought along"
+    assert read_json(out / "g.json")["origin"]["kind"] == "imported"
     # the written PLY and its JSON lead back to where the brought one was
     again = move_gaussians(load_ply(out / "g.ply"), np.array(read_json(out / "g.json")["source_from_scene"]))
     np.testing.assert_allclose(again.means, load_ply(source_ply).means, atol=1e-4)

@@ -7,7 +7,7 @@ from hilsplat.base.artifacts import write_index
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.images import read_image
 from hilsplat.base.levels import Level
-from hilsplat.evaluate.diagnostics.mask_truth import fit_of_view, middling_and_worst, run_mask_truth
+from hilsplat.evaluate.diagnostics.mask_truth import fit_of_view, median_and_worst, run_mask_truth
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.overlaps import region_ious
 
@@ -84,8 +84,8 @@ def test_views_that_are_shown(block_world):
     perfect = block_world.annotations
     good = fit_of_view(found_masks(), perfect, VIEW)
     bad = fit_of_view(masks_of({Level.WHOLE: [box((0, 4), (0, 4))]}), perfect, VIEW)
-    assert middling_and_worst({"a": good, "b": bad, "c": good}) == ["a", "b"]
-    assert middling_and_worst({"a": good}) == ["a"]
+    assert median_and_worst({"a": good, "b": bad, "c": good}) == ["a", "b"]
+    assert median_and_worst({"a": good}) == ["a"]
 
 
 def test_masks_of_another_size_are_refused(block_world):
