@@ -76,8 +76,8 @@ def import_poses(
         origin_of_points = "triangulated from the known poses"
         if len(points[0]) < MIN_TRIANGULATED:
             warnings.append(
-                f"only {len(points[0])} points could be triangulated; replaced by {NUM_RANDOM_POINTS} random ones "
-                "in front of the cameras"
+                f"only {len(points[0])} points could be triangulated; replaced by "
+                f"{NUM_RANDOM_POINTS} random ones in front of the cameras"
             )
             points = random_points(views, seed)
             origin_of_points = "random"

@@ -115,8 +115,8 @@ TREE_NODES = ProtocolCard(
     MASK + LOCALIZATION,
     "pairs",
     "3D nodes that the view shows, at most 0.05 of the range of the level's cosine margins (with a fifth of "
-    "their ancestors' mean) below the best, or 0.15 if the cosine with it is at least 0.9, rendered; level chosen "
-    "by the tree",
+    "their ancestors' mean) below the best, or 0.15 if the cosine with it is at least 0.9, rendered; level "
+    "chosen by the tree",
     "ours",
 )
 LEVEL_GIVEN = ProtocolCard(

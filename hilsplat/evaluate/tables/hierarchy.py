@@ -81,7 +81,7 @@ def hierarchy_table(sources: Sources) -> Table:
         "answer of one view and of the other, by exact geometry, level given; mean over the texts of a "
         "level, then over levels. Texts that neither view answers there are left out. It measures "
         "consistency, not correctness.",
-        "Avg, best threshold: the threshold of every map is chosen with the truth; a diagnostic, not a result.",
+        "Avg, best threshold: the threshold of every map is chosen with the truth: a diagnostic.",
     )
     return sources.finished("hierarchy", "Queries at three levels", blocks, footnotes)
 
