@@ -40,7 +40,7 @@ def test_a_row_with_true_masks_says_so_beside_its_method_and_its_masks(tmp_path)
         ("omega-2, tree", "sam-tiny"),
         ("diagnostic, true masks: hilsplat, tree", TRUE_MASKS),
     ]
-    assert "They are no results" in text
+    assert "They are not results" in text
 
 
 def test_a_row_with_true_masks_is_ranked_with_nothing(tmp_path):
