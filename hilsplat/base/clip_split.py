@@ -69,3 +69,14 @@ def split_clip(folder: Path) -> list[Path]:
             onnx.save(extractor.extract_model(list(wanted), list(given)), str(temporary))
         written.append(path)
     return written
+
+
+def split_whole(folder: Path) -> None:
+    """Replace a CLIP's `model.onnx`, and its external weights, by the two networks.
+
+    Raises:
+        ModelError: as `split_clip`.
+    """
+    halves = split_clip(folder)
+    for path in halves[0].parent.glob(f"{WHOLE}*"):
+        path.unlink()
