@@ -73,7 +73,8 @@ def answer(
     query_panel(scene, text, nodes, shown, panel, note=asked + note, answerer=answerer)
     selection = panel.with_name("selection.ply")
     write_selection_ply(found.parts.gaussians, scene.gaussians_of(nodes.ids), selection)
-    return f"{report(scene, text, nodes, view)}{note}\nwrote {panel} and {selection.name}"
+    caution = f"\n{scene.caution}" if scene.caution else ""
+    return f"{report(scene, text, nodes, view)}{note}{caution}\nwrote {panel} and {selection.name}"
 
 
 def query_panel(
@@ -98,7 +99,8 @@ def query_panel(
     figure = Figure(figsize=(width_in, len(views) * row_in + map_in + 0.6), layout="constrained")
     found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
     title = f"“{text}” in {scene.scene.name}: {found}{note}"
-    figure.suptitle("\n".join([title, *map(str, doubts_of(scene, hits))]), fontsize=12, fontweight="bold")
+    doubts = [*([scene.caution] if scene.caution else []), *map(str, doubts_of(scene, hits))]
+    figure.suptitle("\n".join([title, *doubts]), fontsize=12, fontweight="bold")
     heights = [len(views) * row_in, map_in]
     (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)
     grid = upper.subplots(len(views), columns, squeeze=False)
