@@ -72,11 +72,12 @@ def split_clip(folder: Path) -> list[Path]:
 
 
 def split_whole(folder: Path) -> None:
-    """Replace a CLIP's `model.onnx`, and its external weights, by the two networks.
+    """Replace a CLIP's `model.onnx` by the two networks; a file of weights beside it stays.
 
     Raises:
         ModelError: as `split_clip`.
     """
-    halves = split_clip(folder)
-    for path in halves[0].parent.glob(f"{WHOLE}*"):
-        path.unlink()
+    whole = whole_clip(folder)
+    split_clip(folder)
+    if whole is not None:
+        whole.unlink()

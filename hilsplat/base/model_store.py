@@ -96,7 +96,7 @@ def read_model(folder: Path) -> PresentModel | None:
         config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    family = FAMILY_OF.get(config.get("model_type", "")) if isinstance(config, dict) else None
+    family = FAMILY_OF.get(str(config.get("model_type"))) if isinstance(config, dict) else None
     if family is None or not any(folder.rglob("*.onnx")):
         return None
     return PresentModel(folder, family, is_embedded(config))

@@ -9,21 +9,53 @@ import huggingface_hub
 import requests
 from huggingface_hub.errors import CacheNotFound, OfflineModeIsEnabled
 
-from hilsplat.base.clip_split import WHOLE
+from hilsplat.base.clip_split import HALVES, WHOLE
 from hilsplat.base.errors import DownloadError
 from hilsplat.base.onnx_models import DESCRIPTIONS, KINDS
 
-PLACES = ("onnx/", "")
-"""Folders of a repository that may hold its networks, the usual one first."""
-
-BESIDE = ("tokenizer_config.json", "special_tokens_map.json")
-"""Files of a CLIP that are taken if they are there."""
-
 WEIGHTS = ("model.safetensors", "pytorch_model.bin")
-"""PyTorch weights that can be exported, the preferred one first."""
+"""PyTorch weights that can be exported, the preferred one first. Of the second, a pickle, transformers runs
+nothing (`weights_only`)."""
 
 SMALL_BYTES = 50_000_000
 """Larger text files of a PyTorch model are not part of its tokenizer."""
+
+
+WHOLES = tuple(f"{place}{WHOLE.removesuffix('.onnx')}" for place in ("onnx/", ""))
+"""Places of a whole CLIP."""
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Files of a kind of model.
+
+    Attributes:
+        networks: places of each network without `.onnx`, the usual one first.
+        described: files that must be beside them.
+        whole: places of a network that holds all of them, from which they can be split.
+        beside: files that are taken if they are there.
+    """
+
+    networks: tuple[tuple[str, ...], ...]
+    described: tuple[str, ...]
+    whole: tuple[str, ...] = ()
+    beside: tuple[str, ...] = ("tokenizer_config.json", "special_tokens_map.json")
+
+    @property
+    def usual(self) -> tuple[str, ...]:
+        """Every file, at its usual place."""
+        return (*self.described, *(f"{places[0]}.onnx" for places in self.networks))
+
+
+PARTS = {
+    kind: Parts(
+        tuple((f"onnx/{name}", name) for name in networks),
+        DESCRIPTIONS[kind],
+        WHOLES if set(networks) == set(HALVES) else (),
+    )
+    for kind, networks in KINDS.items()
+}
+"""By the `model_type` in config.json."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +133,8 @@ def read_listing(repository: str, revision: str | None) -> Listing:
     info = huggingface_hub.HfApi().model_info(repository, revision=revision, files_metadata=True)
     files = {}
     for each in info.siblings or ():
+        if each.rfilename.startswith("/") or ".." in each.rfilename.split("/"):
+            continue  # no hub has such a file, and it would be written elsewhere
         digest = each.lfs.sha256 if each.lfs else each.blob_id
         if digest is None or each.size is None:
             raise DownloadError(
@@ -149,41 +183,42 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
         kind = json.loads(config).get("model_type")
     except (ValueError, AttributeError):
         kind = None
-    if kind not in KINDS:
+    if kind not in PARTS:
         raise DownloadError(
             f"{listing.repository} is no model that can be used here",
-            expected=f"model_type {' or '.join(KINDS)} in config.json",
+            expected=f"model_type {' or '.join(PARTS)} in config.json",
             found=f"model_type {kind!r}",
             fix="name a SAM or a CLIP (hilsplat models list)",
         )
-    ending = f"_{variant}" if variant else ""
-    described = [*DESCRIPTIONS[kind], *(name for name in BESIDE if name in listing.files)]
-    for names in (tuple(KINDS[kind]), (WHOLE.removesuffix(".onnx"),)):
-        for place in PLACES:
-            networks = {f"{place}{name}{ending}.onnx": f"onnx/{name}.onnx" for name in names}
-            if all(path in listing.files for path in networks):
-                # a network looks for its weights under the names that it was saved with
-                weights = [
-                    path
-                    for path in listing.files
-                    if any(path.startswith((f"{network}_data", f"{network}.data")) for network in networks)
-                ]
-                beside = {path: f"onnx/{Path(path).name}" for path in weights}
-                listing.require(*described)
-                plain = {path: path for path in described}
-                return Choice({**plain, **networks, **beside}, split=names != tuple(KINDS[kind]))
-    if variant:
-        listing.require(*(f"onnx/{name}{ending}.onnx" for name in KINDS[kind]))
+    parts, ending = PARTS[kind], f"_{variant}" if variant else ""
+    for networks, split in ((parts.networks, False), ((parts.whole,), True)):
+        places = [_first(listing, each, ending) for each in networks]
+        if None not in places:
+            listing.require(*parts.described)
+            plain = [*parts.described, *(path for path in parts.beside if path in listing.files)]
+            files = {f"{place}{ending}.onnx": f"{place}.onnx" for place in places}
+            # a network looks for its weights under the names that it was saved with
+            weights = [
+                path
+                for path in listing.files
+                if any(path.startswith((f"{network}_data", f"{network}.data")) for network in files)
+            ]
+            return Choice({**{path: path for path in (*plain, *weights)}, **files}, split=split)
     weights = [name for name in WEIGHTS if name in listing.files][:1]
-    if not weights:
-        listing.require(*(f"onnx/{name}.onnx" for name in KINDS[kind]))
+    if variant or not weights:
+        listing.require(*(f"{places[0]}{ending}.onnx" for places in parts.networks))
     texts = [
         path
         for path, file in listing.files.items()
         if path.endswith((".json", ".txt")) and "/" not in path and file.size < SMALL_BYTES
     ]
-    listing.require(*(name for name in DESCRIPTIONS[kind] if name != "tokenizer.json"))
+    listing.require(*(name for name in parts.described if name != "tokenizer.json"))
     return Choice({path: path for path in [*texts, *weights]}, exported=True)
+
+
+def _first(listing: Listing, places: tuple[str, ...], ending: str) -> str | None:
+    """The first place at which the repository has a network."""
+    return next((place for place in places if f"{place}{ending}.onnx" in listing.files), None)
 
 
 OUT_OF_REACH = (requests.ConnectionError, requests.Timeout, OfflineModeIsEnabled)

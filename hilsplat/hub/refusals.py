@@ -9,8 +9,7 @@ import requests
 from huggingface_hub.errors import GatedRepoError, RepositoryNotFoundError
 
 from hilsplat.base.errors import DownloadError, HilsplatError
-from hilsplat.base.onnx_models import DESCRIPTIONS, KINDS
-from hilsplat.hub.listing import OUT_OF_REACH
+from hilsplat.hub.listing import OUT_OF_REACH, PARTS
 from hilsplat.hub.wanted import Wanted
 
 KEPT = "what was transferred is kept, and continued"
@@ -99,9 +98,5 @@ def _innermost(error: BaseException) -> str:
 
 def _files_by_hand(wanted: Wanted) -> list[str]:
     """Files that make the model, for someone without a way to the hub."""
-    families = [wanted.release.family] if wanted.release else list(KINDS)
-    return [
-        name
-        for family in families
-        for name in (*DESCRIPTIONS[family], *(f"onnx/{network}.onnx" for network in KINDS[family]))
-    ]
+    families = [wanted.release.family] if wanted.release else list(PARTS)
+    return [name for family in families for name in PARTS[family].usual]

@@ -19,7 +19,10 @@ from hilsplat.hub import get, transfer
 from hilsplat.hub.get import get_models
 from hilsplat.hub.overview import check_models, models_table
 from tests.loopback_hub import Refusal, git_sha1
+from tests.unit.export.conftest import clip_parts
 from tests.unit.hub.conftest import CLIP, SAM, point_at
+
+__all__ = ["clip_parts"]
 
 ENCODER = "vision_encoder.onnx"
 TARGET = Path("models/sam-vit-base")
@@ -280,6 +283,29 @@ def test_external_weights_come_along_under_their_own_names(hub, repositories, tm
     hub.repositories["some/large"] = external
     get_models(["some/large"])
     assert f"onnx/{ENCODER}_data" in files_of(Path("models/large"))
+
+
+def test_a_whole_clip_is_split(hub, clip_parts):
+    whole = clip_parts[2]
+    assert (whole / "model.onnx").is_file()
+    hub.repositories["some/whole"] = whole
+    get_models(["some/whole"])
+    assert {"vision_model.onnx", "text_model.onnx"} <= set(files_of(Path("models/whole")))
+    assert "model.onnx" not in files_of(Path("models/whole"))
+
+
+def test_a_hub_cannot_write_outside_the_model(hub, monkeypatch):
+    info = hub.info
+
+    def with_escape(repository: str) -> dict:
+        answer = info(repository)
+        name = f"onnx/{ENCODER}_data/../../../../escaped"
+        more = {"rfilename": name, "size": 1, "blobId": git_sha1(b"x")}
+        return {**answer, "siblings": [*answer["siblings"], more]}
+
+    monkeypatch.setattr(hub, "info", with_escape)
+    get_models(["sam-vit-base"])
+    assert visible() == ["sam-vit-base"] and not any("escaped" in path for _, path, _ in hub.asked)
 
 
 def set_offline(monkeypatch) -> None:
