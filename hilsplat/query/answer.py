@@ -3,6 +3,7 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import wrap
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,6 +13,7 @@ from hilsplat.query.hits import Hit, doubts_of, hits_of
 from hilsplat.query.language_scene import PATH_SEPARATOR, LanguageScene, path_of
 from hilsplat.query.node_search import NodeHits
 from hilsplat.query.pictures import (
+    TITLE_LETTERS,
     label_left,
     paint_answer,
     paint_relevancy,
@@ -99,7 +101,7 @@ def query_panel(
     figure = Figure(figsize=(width_in, len(views) * row_in + map_in + 0.6), layout="constrained")
     found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
     title = f"“{text}” in {scene.scene.name}: {found}{note}"
-    doubts = [*([scene.caution] if scene.caution else []), *map(str, doubts_of(scene, hits))]
+    doubts = [*wrap(scene.caution, TITLE_LETTERS), *map(str, doubts_of(scene, hits))]
     figure.suptitle("\n".join([title, *doubts]), fontsize=12, fontweight="bold")
     heights = [len(views) * row_in, map_in]
     (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)
