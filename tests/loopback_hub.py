@@ -43,6 +43,7 @@ class LoopbackHub:
         replaced: file name -> bytes that are sent in its place.
         refusals: part of a path -> answers that its next requests get.
         licences: owner/name -> licence in its card.
+        ranged: whether a part of a file can be asked for; some mirrors send the whole.
         asked: (method, path, Range header) of each request, in order.
     """
 
@@ -52,6 +53,7 @@ class LoopbackHub:
     replaced: dict[str, bytes] = field(default_factory=dict)
     refusals: dict[str, list[Refusal]] = field(default_factory=dict)
     licences: dict[str, str] = field(default_factory=dict)
+    ranged: bool = True
     asked: list[tuple[str, str, str]] = field(default_factory=list)
 
     def commit(self, repository: str) -> str:
@@ -146,7 +148,8 @@ def handler_of(hub: LoopbackHub) -> type[BaseHTTPRequestHandler]:
                 return
             content = hub.replaced.get(path.name, content)
             status, start = 200, 0
-            if given := re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", "")):
+            given = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
+            if given and hub.ranged:
                 status, start = 206, int(given[1])
                 headers["Content-Range"] = f"bytes {start}-{len(content) - 1}/{len(content)}"
             cuts = hub.cuts.get(path.name, [])

@@ -88,7 +88,7 @@ def patiently(
             return attempt()
         except requests.RequestException as error:
             now = reached()
-            failures, before = (1 if now > before else failures + 1), now
+            failures, before = (1 if now > before else failures + 1), max(now, before)
             wait_s = _wait_s(error, failures)
             if wait_s is None or failures >= tries:
                 raise

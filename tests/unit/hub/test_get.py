@@ -108,6 +108,21 @@ def test_a_cut_transfer_goes_on_at_the_byte_that_it_reached(hub, repositories, w
     assert (TARGET / "onnx" / ENCODER).read_bytes() == (repositories[SAM] / "onnx" / ENCODER).read_bytes()
 
 
+def test_a_mirror_that_sends_the_whole_file_again_is_read_from_its_beginning(hub, repositories, waits):
+    hub.ranged = False
+    hub.cuts[ENCODER] = [200_000]
+    get_models(["sam-vit-base"])
+    assert (TARGET / "onnx" / ENCODER).read_bytes() == (repositories[SAM] / "onnx" / ENCODER).read_bytes()
+
+
+def test_a_mirror_that_cuts_each_of_its_whole_files_is_given_up(hub, waits):
+    hub.ranged = False
+    hub.cuts[ENCODER] = [300_000, 200_000] * 20
+    with pytest.raises(DownloadError, match="cannot be fetched"):
+        get_models(["sam-vit-base"])
+    assert len(waits) == transfer.TRIES - 1
+
+
 def test_a_transfer_that_was_given_up_is_kept_and_continued_by_the_next_command(hub, waits):
     hub.cuts[ENCODER] = [300_000, *[0] * (transfer.TRIES + 1)]
     with pytest.raises(
