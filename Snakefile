@@ -41,5 +41,10 @@ rule all:
         PLAN.targets(),
 
 
+onstart:
+    for line in PLAN.answering():
+        logger.info(line)
+
+
 onsuccess:
     shell("hilsplat efficiency --results results --out results/efficiency.csv")

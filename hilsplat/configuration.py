@@ -3,11 +3,13 @@
 import difflib
 import json
 import re
-from typing import Any, Literal, get_args, get_origin
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from hilsplat.base.errors import SettingsError
+from hilsplat.base.model_store import AUTO, EMBEDDED, read_model, real_model
 from hilsplat.settings import (
     AutoencoderSettings,
     ClipSettings,
@@ -50,6 +52,10 @@ class StageSettings(Section):
     figures: FiguresSettings = FiguresSettings()
     training: TrainingSettings = TrainingSettings()
 
+    def with_models(self) -> "StageSettings":
+        """All sections with the models that are there: see the function of this name."""
+        return self.model_copy(update={"masks": with_models(self.masks), "clip": with_models(self.clip)})
+
     def depends_on_seed(self, stage: str) -> bool:
         """Whether the result of a stage, or of one that it reads, depends on the variant's seed."""
         return any(getattr(self, section).is_random for section in UPSTREAM[stage])
@@ -68,6 +74,30 @@ def parse_section(name: str, text: str) -> Any:
         return SECTIONS[name].model_validate_json(text or "{}")
     except ValidationError as error:
         raise settings_error(error, name, SECTIONS[name]) from error
+
+
+Settings = TypeVar("Settings", bound=Section)
+
+
+def with_models(section: Settings) -> Settings:
+    """The section with `auto` replaced by the models that are there, so that records name what was used.
+
+    `masks.segmenter: auto` is the SAM that `masks.model` names or, if that is auto too, the best real one in
+    `models/`; without a real one it is the graph segmenter. `masks.model: auto` and `clip.model: auto` are
+    the best real model, else the embedded one. Other sections come back as they are.
+    """
+    if isinstance(section, ClipSettings) and section.model == AUTO:
+        return section.model_copy(update={"model": str(real_model("clip") or EMBEDDED["clip"])})
+    if isinstance(section, MasksSettings) and AUTO in (section.segmenter, section.model):
+        named = section.model != AUTO
+        folder = Path(section.model) if named else real_model("sam") or Path(EMBEDDED["sam"])
+        segmenter = section.segmenter
+        if segmenter == AUTO:  # a folder that is named and missing is for the stage to report
+            model = read_model(folder)
+            is_real = not model.embedded if model else named
+            segmenter = "sam" if is_real else "graph"
+        return section.model_copy(update={"segmenter": segmenter, "model": str(folder)})
+    return section
 
 
 def settings_error(error: ValidationError, where: str, model: type[BaseModel]) -> SettingsError:

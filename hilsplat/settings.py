@@ -151,12 +151,17 @@ class GaussiansSettings(Section):
 class MasksSettings(Section):
     """Masks of each view, at three levels."""
 
-    segmenter: Literal["sam", "graph", "truth-perturbed"] = knob(
+    segmenter: Literal["auto", "sam", "graph", "truth-perturbed"] = knob(
         "sam",
         "sam: the SAM in `model`; graph: OpenCV's graph segmentation, without weights, for photographs; "
+        "auto: sam if a real one is there, else graph; "
         "truth-perturbed: a diagnostic, true masks of a synthetic scene with the faults in section perturb",
     )
-    model: str = knob("models/sam-tiny", "folder of a SAM in the Hugging Face ONNX export layout")
+    model: str = knob(
+        "models/sam-tiny",
+        "folder of a SAM in the Hugging Face ONNX export layout; auto: the best real one in models/, else "
+        "models/sam-tiny",
+    )
     points_per_side: int = knob(32, "point prompts per image side", ge=1, le=128, origin="LangSplat: 32")
     points_per_batch: int = knob(64, "prompts per decoder call", ge=1, le=4096, origin="LangSplat: 64")
     crop_layers: int = knob(
@@ -253,7 +258,11 @@ class CoverageTreeSettings(Section):
 class ClipSettings(Section):
     """CLIP vectors of masks."""
 
-    model: str = knob("models/clip-tiny", "folder of a CLIP in the Hugging Face ONNX export layout")
+    model: str = knob(
+        "models/clip-tiny",
+        "folder of a CLIP in the Hugging Face ONNX export layout; auto: the best real one in models/, else "
+        "models/clip-tiny",
+    )
     background: Literal["black", "keep"] = knob(
         "black", "pixels of a crop outside its mask: painted black, or kept", origin="LangSplat: black"
     )

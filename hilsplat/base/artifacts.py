@@ -40,7 +40,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     os.close(handle)
     temporary = Path(name)
     try:
-        with _full_disk_told(path):
+        with full_disk_told(path):
             yield temporary
             temporary.chmod(0o644)
             temporary.replace(path)
@@ -59,7 +59,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
     try:
-        with _full_disk_told(path):
+        with full_disk_told(path):
             yield temporary
             temporary.chmod(0o755)
             if path.exists():
@@ -70,7 +70,12 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _full_disk_told(path: Path) -> Iterator[None]:
+def full_disk_told(path: Path) -> Iterator[None]:
+    """Turn the system's "no space left" while `path` is written into an error that says so.
+
+    Raises:
+        DiskSpaceError: the disk is full.
+    """
     try:
         yield
     except OSError as error:
@@ -97,7 +102,7 @@ def require_free_space(folder: Path, needed_mib: float) -> None:
             f"too little space on the disk of {folder}",
             expected=f"at least {needed_mib:.0f} MiB free",
             found=f"{free_mib:.0f} MiB free",
-            fix="free space, or point the results folder at another disk",
+            fix="free space, or keep this folder on another disk (a symbolic link will do)",
         )
 
 

@@ -69,3 +69,15 @@ def split_clip(folder: Path) -> list[Path]:
             onnx.save(extractor.extract_model(list(wanted), list(given)), str(temporary))
         written.append(path)
     return written
+
+
+def split_whole(folder: Path) -> None:
+    """Replace a CLIP's `model.onnx` by the two networks; a file of weights beside it stays.
+
+    Raises:
+        ModelError: as `split_clip`.
+    """
+    whole = whole_clip(folder)
+    split_clip(folder)
+    if whole is not None:
+        whole.unlink()

@@ -48,6 +48,10 @@ class ModelError(HilsplatError):
     """A model folder is missing, incomplete or of the wrong kind."""
 
 
+class DownloadError(HilsplatError):
+    """A model cannot be fetched: the hub is out of reach, refuses, or sent other bytes than it stated."""
+
+
 class ArtifactError(HilsplatError):
     """A stage's output is missing, incomplete, damaged or belongs to other inputs."""
 

@@ -3,12 +3,20 @@
 import logging
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import contextmanager
 from typing import TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    DownloadColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeRemainingColumn,
+    TransferSpeedColumn,
+)
 
 Item = TypeVar("Item")
 logger = logging.getLogger(__name__)
@@ -46,6 +54,37 @@ def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterato
         if time.monotonic() - last >= LOG_EVERY_S and done != total:
             logger.info("%s: %d of %s", what, done, total if total is not None else "?")
             last = time.monotonic()
+
+
+@contextmanager
+def transfer_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Show how many bytes of a transfer are there; yields the function that is told that number.
+
+    Args:
+        what: name of what is transferred.
+        total: its bytes.
+    """
+    if sys.stderr.isatty():
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            DownloadColumn(),
+            TransferSpeedColumn(),
+            TimeRemainingColumn(),
+        )
+        with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+            task = progress.add_task(what, total=total)
+            yield lambda reached: progress.update(task, completed=reached)
+        return
+    last = time.monotonic()
+
+    def tell(reached: int) -> None:
+        nonlocal last
+        if time.monotonic() - last >= LOG_EVERY_S and reached != total:
+            logger.info("%s: %.0f of %.0f MB", what, reached / 1e6, total / 1e6)
+            last = time.monotonic()
+
+    yield tell
 
 
 @contextmanager

@@ -1,10 +1,11 @@
-"""Model folders: check, split, train."""
+"""Model folders: get, list, check, split, train."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from hilsplat.base.model_store import MODELS
 from hilsplat.cli.apps import models_app
 from hilsplat.cli.stage import (
     DEFAULT_CACHE,
@@ -17,13 +18,54 @@ from hilsplat.cli.stage import (
 )
 
 
+@models_app.command("get")
+def models_get(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="names of `hilsplat models list`, or owner/name on the hub; default: the recommended pair",
+            show_default=False,
+        ),
+    ] = None,
+    revision: Annotated[str | None, typer.Option(help="branch, tag or commit of the repository")] = None,
+    variant: Annotated[
+        str, typer.Option(help="networks of another precision: quantized, fp16, int8, ...; default: full")
+    ] = "",
+    out: Annotated[Path, typer.Option(help="folder of the models")] = MODELS,
+) -> None:
+    """Fetch released models from the model hub, check them, and put them into models/.
+
+    A transfer that was cut goes on where it stopped. HF_ENDPOINT, HF_HOME, HF_TOKEN, HF_HUB_OFFLINE and the
+    usual proxy variables are respected.
+    """
+    start_logging(None)
+    from hilsplat.hub.get import get_models
+
+    typer.echo(get_models(names or (), out, revision, variant))
+
+
+@models_app.command("list")
+def models_list(folder: Annotated[Path, typer.Option(help="folder of the models")] = MODELS) -> None:
+    """List released models and those that are here, with size, licence and use."""
+    start_logging(None)
+    from hilsplat.hub.overview import models_table
+
+    typer.echo(models_table(folder))
+
+
 @models_app.command("check")
-def models_check(folder: Annotated[Path, typer.Argument(help="model folder")]) -> None:
-    """Describe a model folder, and time one image."""
+def models_check(
+    folder: Annotated[Path | None, typer.Argument(help="model folder; default: all in models/")] = None,
+) -> None:
+    """Describe a model folder, or all that are here, and time one image."""
     start_logging(None)
     from hilsplat.embed.model_check import check_model
+    from hilsplat.hub.overview import check_models
 
-    typer.echo(check_model(folder))
+    text, num_failed = (check_model(folder), 0) if folder is not None else check_models()
+    typer.echo(text)
+    if num_failed:
+        raise typer.Exit(1)
 
 
 @models_app.command("split")

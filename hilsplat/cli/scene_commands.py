@@ -30,6 +30,7 @@ def new(
     """Add a folder of photographs to the scene sheet, and report on its images."""
     start_logging(None)
     from hilsplat.scene.photos import add_scene
+    from hilsplat.workflow.answering import models_of_photographs
 
     report = add_scene(sheet, name, photos)
     typer.echo(str(report))
@@ -38,6 +39,8 @@ def new(
         f"  snakemake --cores 2 --config 'groups=[photos]' 'only=[{name}]'\n"
         f"  hilsplat query photos/{name} 'bear nose'"
     )
+    for line in models_of_photographs(sheet.with_name("config.yaml"), name):
+        typer.echo(line)
 
 
 @app.command()

@@ -44,7 +44,7 @@ def start_logging(log: Path | None) -> None:
         file = logging.FileHandler(log, mode="w", encoding="utf-8")
         file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
         root.addHandler(file)
-    for noisy in ("matplotlib", "numba", "PIL", "fontTools"):
+    for noisy in ("matplotlib", "numba", "PIL", "fontTools", "urllib3"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
 
 
@@ -102,7 +102,7 @@ def _recorded(settings: Any) -> dict[str, Any]:
 
 
 def section_of(name: str, text: str) -> Any:
-    """One section of the settings, from JSON."""
-    from hilsplat.configuration import parse_section
+    """One section of the settings, from JSON; `auto` becomes the models that are there."""
+    from hilsplat.configuration import parse_section, with_models
 
-    return parse_section(name, text)
+    return with_models(parse_section(name, text))

@@ -58,7 +58,8 @@ def answer(
     hits = hits_of(scene, nodes, LISTED)
     label = masks_label(found.parts.masks)
     note = f"; a diagnostic, masks made from the true labels: {label}" if made_from_truth(label) else ""
-    yield report(scene, text, nodes, view) + note
+    caution = f"\n{scene.caution}" if scene.caution else ""
+    yield f"{report(scene, text, nodes, view)}{note}{caution}"
 
     from hilsplat.query.query_panel import query_panel
 

@@ -5,6 +5,7 @@
 Gaussians.
 """
 
+import logging
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -20,6 +21,7 @@ from hilsplat.base.device import ComputeDevice, compute_device
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.model_store import is_embedded, meaningless
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.field.code import Code, autoencoder_file, load_code
 from hilsplat.field.language_field import LanguageField
@@ -31,12 +33,14 @@ from hilsplat.query.relevancy import margins, relevancy_of_margins
 from hilsplat.query.view_nodes import ViewNodes
 from hilsplat.query.view_store import ViewStore
 from hilsplat.scene.cameras import Camera
-from hilsplat.scene.finished import FinishedScene, SceneParts, require_made_for
+from hilsplat.scene.finished import FinishedScene, SceneParts, is_drawn, require_made_for
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.nodes import node_means
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings
 from hilsplat.splat.gaussians import Gaussians
+
+logger = logging.getLogger(__name__)
 
 PATH_SEPARATOR = ">"
 
@@ -79,6 +83,7 @@ class LanguageScene:
         settings: canonical phrases, scale of the relevancy, and how nodes are selected.
         threads: number of threads for look-ups.
         device: "cpu" or "cuda", for look-ups of the field.
+        caution: why no answer of this scene means anything, in a sentence; empty: no such reason.
     """
 
     scene: Scene
@@ -91,6 +96,7 @@ class LanguageScene:
     settings: EvaluateSettings = field(default_factory=EvaluateSettings)
     threads: int = 1
     device: ComputeDevice = "cpu"
+    caution: str = ""
     _views: ViewStore = field(default_factory=ViewStore, repr=False)
     _texts: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
 
@@ -117,7 +123,10 @@ class LanguageScene:
         """
         found = FinishedScene.locate(Path(folder), variant)
         settings = found.evaluate_settings()
-        return LanguageScene.from_parts(found.parts, settings, threads=threads, device=device)
+        scene = LanguageScene.from_parts(found.parts, settings, threads=threads, device=device)
+        if scene.caution:
+            logger.warning("%s: %s", scene.scene.name, scene.caution)
+        return scene
 
     @staticmethod
     def from_parts(
@@ -176,6 +185,9 @@ class LanguageScene:
             settings,
             threads,
             compute_device(cast(ComputeDevice, device)),
+            meaningless(clip.model.folder.name)
+            if is_embedded(clip.model.config) and not is_drawn(parts.scene)
+            else "",
         )
 
     # -- answers ----------------------------------------------------------------------------------

@@ -19,6 +19,9 @@ RELEVANCY_COLOURS = "inferno"
 SH_CONSTANT = 0.28209479177387814
 """Value of the constant spherical harmonic; colour is 0.5 + this times row 0 of `sh`."""
 
+TITLE_LETTERS = 110
+"""Longest line of a title over a panel."""
+
 MAX_POINTS = 30_000
 """Most Gaussians that a map from above shows."""
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import wrap
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -11,6 +12,7 @@ from hilsplat.query.hits import counted, doubts_of
 from hilsplat.query.language_scene import LanguageScene, path_of
 from hilsplat.query.node_search import NodeHits
 from hilsplat.query.pictures import (
+    TITLE_LETTERS,
     label_left,
     paint_answer,
     paint_relevancy,
@@ -42,7 +44,8 @@ def query_panel(
     figure = Figure(figsize=(width_in, len(views) * row_in + map_in + 0.6), layout="constrained")
     found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
     title = f"“{text}” in {scene.scene.name}: {found}{note}"
-    figure.suptitle("\n".join([title, *map(str, doubts_of(scene, hits))]), fontsize=12, fontweight="bold")
+    doubts = [*wrap(scene.caution, TITLE_LETTERS), *map(str, doubts_of(scene, hits))]
+    figure.suptitle("\n".join([title, *doubts]), fontsize=12, fontweight="bold")
     heights = [len(views) * row_in, map_in]
     (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)
     grid = upper.subplots(len(views), columns, squeeze=False)

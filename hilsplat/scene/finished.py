@@ -120,6 +120,15 @@ class FinishedScene:
         return _section(EvaluateSettings, _recorded_settings(panel).get("evaluate", {}))
 
 
+def is_drawn(scene: Path) -> bool:
+    """Whether the views of a `Scene` artifact were drawn from the synthetic world, by its provenance."""
+    record = provenance_path(scene)
+    if not record.is_file():
+        return False
+    images = Path(read_json(record)["inputs"].get("images", {}).get("path", ""))
+    return images.parts[-2:] == ("world", "images")
+
+
 def _recorded_settings(artifact: Path) -> dict[str, Any]:
     """Settings in an artifact's provenance; none if it has no provenance."""
     record = provenance_path(artifact)

@@ -29,6 +29,7 @@ from hilsplat.datasets.sources import (
 from hilsplat.evaluate.tables.build import TABLES
 from hilsplat.methods.registry import METHODS, OURS, require_method
 from hilsplat.scene.sheet import SceneRow, choose_scenes, read_sheet
+from hilsplat.workflow.answering import doubt_about_photographs, models_of
 from hilsplat.workflow.model_digests import model_digest
 from hilsplat.workflow.stages import stage_code
 
@@ -92,7 +93,7 @@ class Plan:
                 ),
                 fix="name other groups or scenes, or set data_root",
             )
-        self._stages = functools.cache(run.stages)
+        self._stages = functools.cache(lambda *which: run.stages(*which).with_models())
 
     # ---- wildcards and threads ----------------------------------------------------------------------
 
@@ -156,6 +157,19 @@ class Plan:
             return model_digest(Path(getattr(stages, section).model), CACHE)
 
         return digest
+
+    def answering(self) -> list[str]:
+        """Which models make the masks and the words of which scenes, one line each, doubts included."""
+        scenes: dict[tuple[str, str], list[str]] = {}
+        for row in self.scenes:
+            stages = self._stages("default", scopes_of(row))
+            key = (models_of(stages), "" if row.world else doubt_about_photographs(stages))
+            scenes.setdefault(key, []).append(row.name)
+        lines = []
+        for (models, doubt), names in scenes.items():
+            lines.append(f"{some(names)}: {models}")
+            lines += [doubt] if doubt else []
+        return lines
 
     def shared(self, stage: str, path: str) -> Callable[[VariantJob], str]:
         """Input: a stage's output, from the first variant with the same settings up to that stage.

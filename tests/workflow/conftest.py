@@ -12,7 +12,9 @@ from pathlib import Path
 
 import pytest
 
-PARTS = ("Snakefile", "rules", "workflow", "config", "hilsplat", "models")
+MODELS = ("models/sam-tiny", "models/clip-tiny")
+"""Of the checkout's models the tests see these alone, whatever was fetched."""
+PARTS = ("Snakefile", "rules", "workflow", "config", "hilsplat", *MODELS)
 SCENE = Path("results/synthetic/tiny")
 UNFINISHED = shutil.ignore_patterns("*.pyc", "*.pyc.*", "*.tmp.*")
 """Files of Python and numba that other tests may be writing; they are renamed once complete."""

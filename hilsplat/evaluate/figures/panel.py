@@ -23,6 +23,7 @@ from hilsplat.evaluate.truths import annotated_truths, labelled_truths
 from hilsplat.query.language_scene import LanguageScene, path_of
 from hilsplat.query.node_search import NodeHits
 from hilsplat.query.pictures import (
+    TITLE_LETTERS,
     label_left,
     paint_answer,
     paint_relevancy,
@@ -179,7 +180,8 @@ def draw_panel(
     figure = Figure(figsize=(WIDTH_IN, overview_in + queries_in + 0.45), layout="constrained")
     label = label_of_index(index)
     warning = ": a diagnostic, masks made from the true labels" if made_from_truth(label) else ""
-    figure.suptitle(scene.name + warning, fontsize=12, fontweight="bold")
+    title = [scene.name + warning, *textwrap.wrap(answers.caution, TITLE_LETTERS)]
+    figure.suptitle("\n".join(title), fontsize=12, fontweight="bold")
     parts: list[FigureBase] = [figure]
     if rows:
         parts = list(figure.subfigures(2, 1, squeeze=False, height_ratios=[overview_in, queries_in]).flat)

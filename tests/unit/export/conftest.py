@@ -18,7 +18,7 @@ MERGES = ("r e", "re d</w>", "m u", "mu g</w>")
 
 def export(folder: Path, out: Path) -> Path:
     """`optimum-cli export onnx --model folder out`."""
-    exporters = pytest.importorskip("optimum.exporters.onnx", reason="needs the extra export-tests")
+    exporters = pytest.importorskip("optimum.exporters.onnx", reason="needs the extra export")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of torch's tracer, about the exporter's own code
         exporters.main_export(str(folder), output=out, task="feature-extraction", do_validation=False)
@@ -39,7 +39,7 @@ def enliven(model) -> None:
 @pytest.fixture(scope="session")
 def sam_parts(tmp_path_factory):
     """A SAM for images of 64 px: transformers' model, its processor, and its exported folder."""
-    transformers = pytest.importorskip("transformers", reason="needs the extra export-tests")
+    transformers = pytest.importorskip("transformers", reason="needs the extra export")
     folder = tmp_path_factory.mktemp("sam")
     vision = transformers.SamVisionConfig(
         hidden_size=16,
@@ -78,7 +78,7 @@ def sam_parts(tmp_path_factory):
 @pytest.fixture(scope="session")
 def clip_parts(tmp_path_factory):
     """A CLIP for crops of 32 px and texts of 16 tokens, as `sam_parts`; its export is one `model.onnx`."""
-    transformers = pytest.importorskip("transformers", reason="needs the extra export-tests")
+    transformers = pytest.importorskip("transformers", reason="needs the extra export")
     from transformers.models.clip.tokenization_clip import bytes_to_unicode
 
     folder = tmp_path_factory.mktemp("clip")

@@ -15,6 +15,8 @@ import pytest
 import hilsplat
 from hilsplat.base.artifacts import read_npy
 from hilsplat.base.errors import ArtifactError, ModelError, SettingsError
+from hilsplat.base.onnx_models import open_model_folder
+from hilsplat.base.provenance import provenance_path, write_provenance
 from hilsplat.evaluate.figures.comparison import open_variants
 from hilsplat.evaluate.figures.panel import run_figures
 from hilsplat.field.code import autoencoder_file
@@ -126,6 +128,41 @@ def test_a_copy_without_any_clip_names_the_places(desk, elsewhere, monkeypatch):
     (elsewhere / "models").mkdir()
     with pytest.raises(ModelError, match=rf"no CLIP at models/colours or in {elsewhere}/models"):
         hilsplat.open("desk")
+
+
+def test_answers_about_photographs_by_the_embedded_clip_are_called_meaningless(
+    desk, elsewhere, project, caplog
+):
+    shutil.copytree(desk, elsewhere / "copy")
+    with caplog.at_level("WARNING"):
+        assert hilsplat.open(Path("copy") / SCENE).caution == ""  # colours is a CLIP of its own
+    assert "mean nothing" not in caplog.text
+    card = elsewhere / "copy/models/colours/config.json"
+    card.write_text(json.dumps({**json.loads(card.read_text()), "world_only": True}))
+    index = elsewhere / "copy" / SCENE / "default/clip/index.json"
+    digest = open_model_folder(card.parent).digest
+    index.write_text(json.dumps({**json.loads(index.read_text()), "model_sha256": digest}))
+    with caplog.at_level("WARNING"):
+        caution = hilsplat.open(Path("copy") / SCENE).caution
+    assert caution.startswith("colours knows the synthetic world alone: its answers about photographs mean")
+    assert f"photos/desk: {caution}" in caplog.text
+    told = run_command(project, "query", str(Path("copy") / SCENE), "mug")
+    assert told.returncode == 0 and caution in told.stdout and "hilsplat models get" in caution
+    # a synthetic scene is what the embedded models know
+    write_provenance(
+        elsewhere / "copy" / SCENE / "scene",
+        stage="poses",
+        code="",
+        command=(),
+        settings={},
+        seed=None,
+        inputs={"images": desk / SCENE / "scene"},
+    )
+    record = provenance_path(elsewhere / "copy" / SCENE / "scene")
+    text = record.read_text()
+    assert hilsplat.open(Path("copy") / SCENE).caution == caution
+    record.write_text(text.replace(str(desk / SCENE / "scene"), "results/synthetic/x/world/images"))
+    assert hilsplat.open(Path("copy") / SCENE).caution == ""
 
 
 def test_a_scene_that_is_not_there_is_named(elsewhere):

@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 from hilsplat.base.errors import HilsplatError, SettingsError
+from hilsplat.configuration import SECTIONS
+from hilsplat.workflow.answering import models_of_photographs
 from hilsplat.workflow.model_digests import model_digest
 from hilsplat.workflow.plan import Plan, any_of, some
 
@@ -195,6 +197,67 @@ def test_a_model_folder_counts_by_its_bytes(tmp_path):
     model_digest.cache_clear()
     (folder / "a.onnx").write_bytes(b"22")
     assert model_digest(folder, tmp_path / "cache") != first
+
+
+OF_PHOTOGRAPHS = {"photos": {"masks": {"segmenter": "auto", "model": "auto"}, "clip": {"model": "auto"}}}
+
+
+def lay_model(name: str, kind: str, embedded: bool = False) -> None:
+    folder = Path("models") / name
+    folder.mkdir(parents=True)
+    (folder / "a.onnx").write_text(name)
+    (folder / "config.json").write_text(json.dumps({"model_type": kind, "world_only": embedded}))
+
+
+def test_a_downloaded_model_reruns_masks_and_clip_of_photographs_alone(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    lay_model("sam-tiny", "sam", embedded=True)
+    lay_model("clip-tiny", "clip", embedded=True)
+    photo, drawn = Job("photos", "desk"), Job("synthetic", "one")
+
+    def parameters(job: Job) -> dict[str, str]:
+        model_digest.cache_clear()  # as in another process
+        made = plan(tmp_path, groups=["benchmark", "photos"], overrides=OF_PHOTOGRAPHS)
+        settings = {name: made.settings(name)(job) for name in SECTIONS}
+        return {**settings, **{f"model of {name}": made.model(name)(job) for name in ("masks", "clip")}}
+
+    before = {job: parameters(job) for job in (photo, drawn)}
+    assert json.loads(before[photo]["masks"])["segmenter"] == "graph"
+    assert json.loads(before[photo]["clip"])["model"] == "models/clip-tiny"
+    lay_model("sam-vit-base", "sam")
+    lay_model("clip-vit-base-patch16", "clip")
+    after = {job: parameters(job) for job in (photo, drawn)}
+    assert after[drawn] == before[drawn]
+    moved = {name for name, value in after[photo].items() if value != before[photo][name]}
+    assert moved == {"masks", "clip", "model of masks", "model of clip"}
+    masks = json.loads(after[photo]["masks"])
+    assert (masks["segmenter"], masks["model"]) == ("sam", "models/sam-vit-base")
+    assert json.loads(after[photo]["clip"])["model"] == "models/clip-vit-base-patch16"
+
+
+def test_a_run_says_which_models_answer_and_when_answers_mean_nothing(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    lay_model("sam-tiny", "sam", embedded=True)
+    lay_model("clip-tiny", "clip", embedded=True)
+    config = {"groups": ["benchmark", "photos"], "overrides": OF_PHOTOGRAPHS}
+    drawn, photo, doubt = plan(tmp_path, **config).answering()
+    assert drawn == "synthetic/one, synthetic/two, rooms/room: masks by sam-tiny; words by clip-tiny"
+    assert photo.startswith("photos/desk: masks by the graph segmenter") and "words by clip-tiny" in photo
+    assert "answers about photographs mean nothing" in doubt and "hilsplat models get" in doubt
+    (tmp_path / "config/config.yaml").write_text(json.dumps({"overrides": OF_PHOTOGRAPHS}))
+    assert models_of_photographs(tmp_path / "config/config.yaml", "desk") == [
+        photo.removeprefix("photos/desk: "),
+        doubt,
+    ]
+    lay_model("clip-vit-base-patch16", "clip")
+    lay_model("sam-vit-base", "sam")
+    assert plan(tmp_path, **config).answering()[1:] == [
+        "photos/desk: masks by sam-vit-base; words by clip-vit-base-patch16"
+    ]
+    assert models_of_photographs(tmp_path / "config/config.yaml", "desk") == [
+        "masks by sam-vit-base; words by clip-vit-base-patch16"
+    ]
+    assert models_of_photographs(tmp_path / "nowhere.yaml", "desk") == []
 
 
 def test_names_match_themselves_alone():

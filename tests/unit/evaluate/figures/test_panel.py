@@ -10,6 +10,7 @@ from PIL import Image
 from hilsplat.base.artifacts import write_json
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
+from hilsplat.base.model_store import meaningless
 from hilsplat.base.provenance import provenance_path
 from hilsplat.evaluate.figures.panel import annotated_rows, draw_panel, free_rows, truths_of
 from hilsplat.query.answer import file_name, report, views_of
@@ -69,6 +70,14 @@ def test_panel_without_annotations_takes_given_texts(block_world, tmp_path):
     figure = draw_panel(block_world.answers, block_world.folder / "masks", rows, EVALUATE)
     save_figure(figure, tmp_path / "panel.png", dpi=60)
     assert (tmp_path / "panel.png").stat().st_size > 10_000
+
+
+def test_a_panel_of_meaningless_answers_says_so(block_world):
+    drawn = (block_world.folder / "masks", [], EVALUATE)
+    sound = draw_panel(block_world.answers, *drawn)
+    doubtful = draw_panel(replace(block_world.answers, caution=meaningless("clip-tiny")), *drawn)
+    assert "\n" not in sound.get_suptitle()
+    assert "answers about photographs mean nothing" in doubtful.get_suptitle().replace("\n", " ")
 
 
 def test_panel_without_queries_shows_the_overview(block_world, tmp_path):

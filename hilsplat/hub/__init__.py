@@ -1,0 +1,1 @@
+"""Released models: fetched from a model hub, checked, exported where no ready networks exist."""

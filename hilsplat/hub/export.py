@@ -1,0 +1,78 @@
+"""PyTorch weights to ONNX networks, by optimum in a process of its own (the extra `export`)."""
+
+import importlib.util
+import logging
+import os
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+from hilsplat.base.clip_split import split_whole, whole_clip
+from hilsplat.base.errors import ModelError
+
+logger = logging.getLogger(__name__)
+
+NEEDED = ("optimum.exporters.onnx", "transformers", "PIL", "torch")
+"""Without Pillow, optimum writes no preprocessor_config.json, and says nothing."""
+
+INSTALL = "pip install --constraint constraints.txt --editable '.[export]'"
+
+LAST_LINES = 15
+"""Lines of the exporter's output that an error shows."""
+
+
+def require_exporter(what: str) -> None:
+    """Refuse before anything is fetched if the exporter is not installed.
+
+    Raises:
+        ModelError: some of its packages are missing.
+    """
+    if missing := [name for name in NEEDED if not _is_installed(name)]:
+        raise ModelError(
+            f"{what} has no ready networks, and what would make them is not installed",
+            expected="the extra export: optimum-onnx, transformers, torch, pillow",
+            found=f"no {', '.join(missing)}",
+            fix=f"{INSTALL}, then run the command again",
+        )
+
+
+def _is_installed(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:  # of the package above it
+        return False
+
+
+def export_networks(weights: Path, out: Path) -> dict[str, str]:
+    """Make the networks of a PyTorch SAM or CLIP in the layout that is read here.
+
+    Args:
+        weights: folder of the transformers library: config.json, weights, preprocessor, tokenizer.
+        out: folder to write.
+
+    Returns:
+        versions of the exporter's packages.
+
+    Raises:
+        ModelError: the exporter fails; its last lines are shown.
+    """
+    logger.info("exporting to ONNX; this takes a few minutes and about three times the weights in memory")
+    words = ("export", "onnx", "--model", str(weights), "--task", "feature-extraction", str(out))
+    done = subprocess.run(
+        [sys.executable, "-m", "optimum.commands.optimum_cli", *words],
+        env={**os.environ, "HF_HUB_OFFLINE": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        lines = (done.stdout + done.stderr).strip().splitlines()[-LAST_LINES:]
+        raise ModelError(
+            f"the weights in {weights} cannot be exported: the exporter ended with {done.returncode}",
+            found="\n            ".join(lines) or "no output",
+            fix=f"install the versions that are tested together ({INSTALL}), then run the command again",
+        )
+    if whole_clip(out) is not None:
+        split_whole(out)
+    return {name: metadata.version(name) for name in ("optimum-onnx", "transformers", "torch")}

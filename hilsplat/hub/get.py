@@ -1,0 +1,253 @@
+"""`hilsplat models get`: a model from the hub into `models/`, whole and checked, or not at all."""
+
+import logging
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hilsplat.base.artifacts import full_disk_told, output_lock, read_json, write_json
+from hilsplat.base.clip_split import split_whole
+from hilsplat.base.errors import DiskSpaceError, DownloadError
+from hilsplat.base.model_store import MODELS, RECOMMENDED, real_model
+from hilsplat.base.progress import transfer_bar
+from hilsplat.embed.model_check import check_model
+from hilsplat.hub.export import export_networks, require_exporter
+from hilsplat.hub.listing import (
+    OUT_OF_REACH,
+    Choice,
+    Listing,
+    choose_files,
+    read_cached_listing,
+    read_listing,
+)
+from hilsplat.hub.refusals import told_plainly
+from hilsplat.hub.transfer import fetch, partial, patiently
+from hilsplat.hub.wanted import Wanted
+
+logger = logging.getLogger(__name__)
+
+ORIGIN = "origin.json"
+"""File of a model's folder that says where it came from."""
+
+SPARE_BYTES = 200_000_000
+"""Free space that a transfer leaves."""
+
+EXPORT_FACTOR = 4
+"""Disk that weights to be exported need, over their size: they, the whole network, and its halves."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A model of which it is known what to fetch.
+
+    Attributes:
+        wanted: name and repository.
+        listing: the repository at a commit.
+        choice: its files that are needed.
+        staging: folder in which they grow; kept after a failure, and continued.
+        target: folder in `models/`.
+    """
+
+    wanted: Wanted
+    listing: Listing
+    choice: Choice
+    staging: Path
+    target: Path
+
+    @property
+    def num_bytes(self) -> int:
+        """Size of all files that are needed."""
+        return sum(self.listing.files[path].size for path in self.choice.files)
+
+    @property
+    def missing_bytes(self) -> int:
+        """Size of what has not been transferred yet."""
+        here = 0
+        for path, place in self.choice.files.items():
+            for grown in (self.staging / place, partial(self.listing.files[path], self.staging / place)):
+                here += grown.stat().st_size if grown.is_file() else 0
+        return max(0, self.num_bytes - here)
+
+
+def get_models(
+    names: Sequence[str], models: Path = MODELS, revision: str | None = None, variant: str = ""
+) -> str:
+    """Fetch models into `models/<name>`, each whole and checked; say what they are.
+
+    Args:
+        names: names of the table, or owner/name; empty: the recommended pair.
+        models: folder of the models.
+        revision: branch, tag or commit of a single model; None: the hub's default.
+        variant: networks of another precision, such as "quantized" or "fp16"; empty: full precision.
+
+    Returns:
+        what `check_model` says about each, and which models photographs use.
+
+    Raises:
+        DownloadError: the hub is out of reach, refuses, lacks the files, or sends others than it states.
+        DiskSpaceError: the disk is or becomes full; what was transferred is kept.
+        ModelError: what was fetched does not work, or cannot be exported.
+    """
+    if not names:
+        logger.info("the recommended pair: %s", " and ".join(RECOMMENDED))
+    if revision is not None and len(names) != 1:
+        raise DownloadError(
+            "a revision belongs to one model",
+            found=f"{len(names)} names",
+            fix="name one model with --revision",
+        )
+    prepared, texts = [], []
+    for name in names or RECOMMENDED:
+        wanted = Wanted.named(name, variant)
+        target = models / wanted.name
+        with told_plainly(wanted, models):
+            _require_ours(wanted, target)
+            listing = _listing(wanted, revision)
+            if _is_present(target, listing):
+                texts.append(f"{target} is there already, from {listing.repository} at {listing.revision}")
+            else:
+                prepared.append(_prepare(wanted, listing, target, variant))
+    if prepared:
+        _require_space(prepared, models)
+    for found in prepared:
+        with told_plainly(found.wanted, models), output_lock(found.target):
+            texts.append(_install(found))
+    used = [model.name for family in ("sam", "clip") if (model := real_model(family, models)) is not None]
+    return "\n\n".join([*texts, f"photographs use {' and '.join(used)}"])
+
+
+def _require_ours(wanted: Wanted, target: Path) -> None:
+    """Refuse to replace a folder that was not fetched from this repository."""
+    if not target.exists():
+        return
+    origin = _origin(target)
+    if origin.get("repository") != wanted.repository:
+        raise DownloadError(
+            f"{target} is there already and was not fetched from {wanted.repository}",
+            found=f"{ORIGIN} names {origin['repository']}" if origin else f"no {ORIGIN}",
+            fix="rename or remove that folder, then run the command again",
+        )
+
+
+def _origin(folder: Path) -> dict[str, Any]:
+    return read_json(folder / ORIGIN) if (folder / ORIGIN).is_file() else {}
+
+
+def _is_present(target: Path, listing: Listing) -> bool:
+    """Whether the target was fetched at this commit and has every file, as long as it was."""
+    origin = _origin(target)
+    return origin.get("revision") == listing.revision and all(
+        (target / path).is_file() and (target / path).stat().st_size == size
+        for path, size in origin["holds"].items()
+    )
+
+
+def _listing(wanted: Wanted, revision: str | None) -> Listing:
+    """What the hub has, or its cache on this machine if the hub is out of reach."""
+    try:
+        return patiently(lambda: read_listing(wanted.repository, revision), tries=3)
+    except OUT_OF_REACH:
+        cached = read_cached_listing(wanted.repository, revision)
+        if cached is None:
+            raise
+        logger.info("the hub is out of reach: %s is taken from its cache here", wanted.repository)
+        return cached
+
+
+def _prepare(wanted: Wanted, listing: Listing, target: Path, variant: str) -> Prepared:
+    """Choose the files, by the repository's config.json."""
+    staging = target.with_name(f".{target.name}.part")
+    (config,) = listing.require("config.json")
+    fetch(listing, config, staging / config.path, lambda reached: None)
+    choice = choose_files(listing, (staging / config.path).read_bytes(), variant)
+    found = Prepared(wanted, listing, choice, staging, target)
+    logger.info(
+        "%s: %s at %s, %.1f MB in %d files, %.1f MB of them still to fetch; licence: %s",
+        wanted.name,
+        wanted.repository,
+        listing.revision[:12],
+        found.num_bytes / 1e6,
+        len(choice.files),
+        found.missing_bytes / 1e6,
+        listing.licence or (wanted.release.licence if wanted.release else "not stated by the hub"),
+    )
+    if choice.exported:
+        require_exporter(wanted.repository)
+    return found
+
+
+def _require_space(prepared: Sequence[Prepared], models: Path) -> None:
+    """Say how much is fetched and how much is free.
+
+    Raises:
+        DiskSpaceError: it does not fit.
+    """
+    fetched = sum(each.missing_bytes for each in prepared)
+    made = sum(each.num_bytes * (EXPORT_FACTOR - 1) for each in prepared if each.choice.exported)
+    free = shutil.disk_usage(models).free
+    logger.info("%.1f MB to fetch; %.1f GB free on the disk of %s", fetched / 1e6, free / 1e9, models)
+    if free < fetched + made + SPARE_BYTES:
+        raise DiskSpaceError(
+            f"too little space on the disk of {models}",
+            expected=f"{(fetched + made + SPARE_BYTES) / 1e9:.1f} GB free",
+            found=f"{free / 1e9:.1f} GB",
+            fix="free space, or make this folder a symbolic link to another disk",
+        )
+
+
+def _install(found: Prepared) -> str:
+    """Fetch all files, make the model's folder beside its place, check it, and rename it."""
+    listing, choice = found.listing, found.choice
+    with transfer_bar(found.wanted.name, found.num_bytes) as tell:
+        before = 0
+        for path, place in choice.files.items():
+            start = before
+
+            def reached(num_bytes: int, start: int = start) -> None:
+                tell(start + num_bytes)
+
+            fetch(listing, listing.files[path], found.staging / place, reached)
+            before += listing.files[path].size
+    for file in found.staging.rglob("*"):
+        if file.is_file() and file.relative_to(found.staging).as_posix() not in choice.files.values():
+            file.unlink()  # of another revision
+    if not choice.exported:
+        if choice.split:
+            split_whole(found.staging)
+        return _place(found, found.staging)
+    with tempfile.TemporaryDirectory(prefix=f".{found.target.name}-", dir=found.target.parent) as temporary:
+        made = Path(temporary) / found.target.name
+        with full_disk_told(made):
+            versions = export_networks(found.staging, made)
+        text = _place(found, made, exported=versions)
+    shutil.rmtree(found.staging)
+    return text
+
+
+def _place(found: Prepared, made: Path, **more: Any) -> str:
+    """Check a finished folder, write `origin.json` into it, and rename it to its place."""
+    text = check_model(made).replace(str(made), str(found.target))
+    files = [path for path in sorted(made.rglob("*")) if path.is_file() and path.name != ORIGIN]
+    origin = {
+        "repository": found.listing.repository,
+        "revision": found.listing.revision,
+        "files": [
+            {
+                "path": path,
+                "bytes": file.size,
+                "sha256" if len(file.digest) == 64 else "git_sha1": file.digest,
+            }
+            for path, file in sorted(found.listing.files.items())
+            if path in found.choice.files
+        ],
+        **more,
+        "holds": {path.relative_to(made).as_posix(): path.stat().st_size for path in files},
+    }
+    write_json(made / ORIGIN, origin)
+    if found.target.exists():
+        shutil.rmtree(found.target)
+    made.replace(found.target)
+    return text

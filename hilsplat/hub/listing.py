@@ -1,0 +1,225 @@
+"""What a repository of the hub holds, and which of its files a model needs here."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import huggingface_hub
+import requests
+from huggingface_hub.errors import CacheNotFound, OfflineModeIsEnabled
+
+from hilsplat.base.clip_split import HALVES, WHOLE
+from hilsplat.base.errors import DownloadError
+from hilsplat.base.onnx_models import DESCRIPTIONS, KINDS
+
+WEIGHTS = ("model.safetensors", "pytorch_model.bin")
+"""PyTorch weights that can be exported, the preferred one first. Of the second, a pickle, transformers runs
+nothing (`weights_only`)."""
+
+SMALL_BYTES = 50_000_000
+"""Larger text files of a PyTorch model are not part of its tokenizer."""
+
+
+WHOLES = tuple(f"{place}{WHOLE.removesuffix('.onnx')}" for place in ("onnx/", ""))
+"""Places of a whole CLIP."""
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Files of a kind of model.
+
+    Attributes:
+        networks: places of each network without `.onnx`, the usual one first.
+        described: files that must be beside them.
+        whole: places of a network that holds all of them, from which they can be split.
+        beside: files that are taken if they are there.
+    """
+
+    networks: tuple[tuple[str, ...], ...]
+    described: tuple[str, ...]
+    whole: tuple[str, ...] = ()
+    beside: tuple[str, ...] = ("tokenizer_config.json", "special_tokens_map.json")
+
+    @property
+    def usual(self) -> tuple[str, ...]:
+        """Every file, at its usual place."""
+        return (*self.described, *(f"{places[0]}.onnx" for places in self.networks))
+
+
+PARTS = {
+    kind: Parts(
+        tuple((f"onnx/{name}", name) for name in networks),
+        DESCRIPTIONS[kind],
+        WHOLES if set(networks) == set(HALVES) else (),
+    )
+    for kind, networks in KINDS.items()
+}
+"""By the `model_type` in config.json."""
+
+
+@dataclass(frozen=True)
+class HubFile:
+    """A file as the hub states it.
+
+    Attributes:
+        path: inside the repository.
+        size: bytes.
+        digest: SHA-256 of the bytes (64 digits), or git's SHA-1 of a small file (40 digits).
+        cached: the file in the hub's cache on this machine, if the listing was made from that.
+    """
+
+    path: str
+    size: int
+    digest: str
+    cached: Path | None = None
+
+
+@dataclass(frozen=True)
+class Listing:
+    """A repository at one commit.
+
+    Attributes:
+        repository: owner/name.
+        revision: the commit.
+        licence: as the hub states it; empty if it does not.
+        files: by path.
+    """
+
+    repository: str
+    revision: str
+    licence: str
+    files: Mapping[str, HubFile]
+
+    def require(self, *paths: str) -> list[HubFile]:
+        """Files by path.
+
+        Raises:
+            DownloadError: the repository lacks some of them.
+        """
+        if missing := [path for path in paths if path not in self.files]:
+            raise DownloadError(
+                f"{self.repository} lacks {', '.join(missing)}",
+                expected="a model in the layout of the Hugging Face ONNX exports, or one to export",
+                found=", ".join(sorted(self.files)[:20]),
+                fix="name another repository (hilsplat models list)",
+            )
+        return [self.files[path] for path in paths]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The files that are fetched.
+
+    Attributes:
+        files: file of the repository -> its place in the model's folder.
+        exported: they are PyTorch weights, from which the networks are still to be made.
+        split: they are a whole CLIP, to be split into its two networks.
+    """
+
+    files: Mapping[str, str]
+    exported: bool = False
+    split: bool = False
+
+
+def read_listing(repository: str, revision: str | None) -> Listing:
+    """Ask the hub what a repository holds.
+
+    Raises:
+        requests.RequestException: the hub is out of reach, or refuses.
+        OfflineModeIsEnabled: HF_HUB_OFFLINE is set.
+        DownloadError: the hub states no digest of a file.
+    """
+    info = huggingface_hub.HfApi().model_info(repository, revision=revision, files_metadata=True)
+    files = {}
+    for each in info.siblings or ():
+        if each.rfilename.startswith("/") or ".." in each.rfilename.split("/"):
+            continue  # no hub has such a file, and it would be written elsewhere
+        digest = each.lfs.sha256 if each.lfs else each.blob_id
+        if digest is None or each.size is None:
+            raise DownloadError(
+                f"{huggingface_hub.constants.ENDPOINT} states no size and digest of {each.rfilename}",
+                expected="what the hub's API states about each file (?blobs=true)",
+                fix="unset HF_ENDPOINT, or name a complete mirror",
+            )
+        files[each.rfilename] = HubFile(each.rfilename, each.size, digest)
+    licence = getattr(info.card_data, "license", None) or ""
+    return Listing(repository, str(info.sha), str(licence), files)
+
+
+def read_cached_listing(repository: str, revision: str | None) -> Listing | None:
+    """What the hub's cache on this machine (HF_HOME) holds of a repository; its files are named by digest."""
+    try:
+        repositories = huggingface_hub.scan_cache_dir(huggingface_hub.constants.HF_HUB_CACHE).repos
+    except CacheNotFound:
+        return None
+    wanted = revision or huggingface_hub.constants.DEFAULT_REVISION
+    for repo in repositories:
+        if (repo.repo_type, repo.repo_id) != ("model", repository):
+            continue
+        for snapshot in repo.revisions:
+            if wanted in snapshot.refs or wanted == snapshot.commit_hash:
+                files = {}
+                for each in snapshot.files:
+                    path = each.file_path.relative_to(snapshot.snapshot_path).as_posix()
+                    files[path] = HubFile(path, each.size_on_disk, each.blob_path.name, each.file_path)
+                return Listing(repository, snapshot.commit_hash, "", files)
+    return None
+
+
+def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
+    """Which files of a repository make a model: ready networks, else a whole CLIP, else PyTorch weights.
+
+    Args:
+        listing: the repository.
+        config: its config.json.
+        variant: "quantized", "fp16", ...: networks of that ending, which get the plain names; empty: the
+            plain ones.
+
+    Raises:
+        DownloadError: the model is of no kind that is read here, or it has neither networks nor weights.
+    """
+    try:
+        kind = json.loads(config).get("model_type")
+    except (ValueError, AttributeError):
+        kind = None
+    if kind not in PARTS:
+        raise DownloadError(
+            f"{listing.repository} is no model that can be used here",
+            expected=f"model_type {' or '.join(PARTS)} in config.json",
+            found=f"model_type {kind!r}",
+            fix="name a SAM or a CLIP (hilsplat models list)",
+        )
+    parts, ending = PARTS[kind], f"_{variant}" if variant else ""
+    for networks, split in ((parts.networks, False), ((parts.whole,), True)):
+        places = [_first(listing, each, ending) for each in networks]
+        if None not in places:
+            listing.require(*parts.described)
+            plain = [*parts.described, *(path for path in parts.beside if path in listing.files)]
+            files = {f"{place}{ending}.onnx": f"{place}.onnx" for place in places}
+            # a network looks for its weights under the names that it was saved with
+            weights = [
+                path
+                for path in listing.files
+                if any(path.startswith((f"{network}_data", f"{network}.data")) for network in files)
+            ]
+            return Choice({**{path: path for path in (*plain, *weights)}, **files}, split=split)
+    weights = [name for name in WEIGHTS if name in listing.files][:1]
+    if variant or not weights:
+        listing.require(*(f"{places[0]}{ending}.onnx" for places in parts.networks))
+    texts = [
+        path
+        for path, file in listing.files.items()
+        if path.endswith((".json", ".txt")) and "/" not in path and file.size < SMALL_BYTES
+    ]
+    listing.require(*(name for name in parts.described if name != "tokenizer.json"))
+    return Choice({path: path for path in [*texts, *weights]}, exported=True)
+
+
+def _first(listing: Listing, places: tuple[str, ...], ending: str) -> str | None:
+    """The first place at which the repository has a network."""
+    return next((place for place in places if f"{place}{ending}.onnx" in listing.files), None)
+
+
+OUT_OF_REACH = (requests.ConnectionError, requests.Timeout, OfflineModeIsEnabled)
+"""Errors that say nothing about the repository: there is no way to the hub."""

@@ -1,0 +1,56 @@
+"""Tables for people: which models there are, and whether those that are here work."""
+
+from pathlib import Path
+
+from hilsplat.base.errors import HilsplatError
+from hilsplat.base.model_store import MODELS, RECOMMENDED, RELEASES, present_models, real_model
+from hilsplat.embed.model_check import check_model
+
+COLUMNS = "{:<24} {:<5} {:>8}  {:<11} {:<14} {}"
+
+
+def models_table(models: Path = MODELS) -> str:
+    """Released models with size and licence, and models that are here; which of them photographs use."""
+    here = {model.folder.name: model for model in present_models(models)}
+    chosen = {str(real_model(family, models)) for family in ("sam", "clip")}
+
+    def state(name: str) -> str:
+        if name not in here:
+            return "part of it" if (models / f".{name}.part").is_dir() else ""
+        return "here, in use" if str(here[name].folder) in chosen else "here"
+
+    lines = [COLUMNS.format("name", "kind", "MB", "licence", "", "what for")]
+    for release in RELEASES:
+        kind, use = release.family.upper(), release.use
+        if release.name in RECOMMENDED:
+            use += " (recommended)"
+        lines.append(
+            COLUMNS.format(
+                release.name, kind, release.megabytes, release.licence, state(release.name), use
+            ).rstrip()
+        )
+    for name, model in here.items():
+        if name in {release.name for release in RELEASES}:
+            continue
+        files = [path for path in model.folder.rglob("*") if path.is_file()]
+        size = f"{sum(path.stat().st_size for path in files) / 1e6:.0f}"
+        use = "the synthetic world alone" if model.embedded else ""
+        lines.append(COLUMNS.format(name, model.family.upper(), size, "", state(name), use).rstrip())
+    lines += ["", "hilsplat models get NAME, or owner/name of the hub; without a name, the recommended pair"]
+    return "\n".join(lines)
+
+
+def check_models(models: Path = MODELS) -> tuple[str, int]:
+    """Check every model folder that is here.
+
+    Returns:
+        what `check_model` says about each, and how many do not work.
+    """
+    texts, num_failed = [], 0
+    for model in present_models(models):
+        try:
+            texts.append(check_model(model.folder))
+        except HilsplatError as error:
+            texts.append(f"{model.folder} does not work: {error}")
+            num_failed += 1
+    return "\n\n".join(texts) or f"there is no model in {models}", num_failed

@@ -1,0 +1,102 @@
+"""What the network and the hub raise, as errors that say what to do."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import huggingface_hub
+import requests
+from huggingface_hub.errors import GatedRepoError, RepositoryNotFoundError
+
+from hilsplat.base.errors import DownloadError, HilsplatError
+from hilsplat.hub.listing import OUT_OF_REACH, PARTS
+from hilsplat.hub.wanted import Wanted
+
+KEPT = "what was transferred is kept, and continued"
+
+
+@contextmanager
+def told_plainly(wanted: Wanted, models: Path) -> Iterator[None]:
+    """Turn what the network and the hub raise into errors that say what to do.
+
+    Raises:
+        DownloadError: in their place.
+    """
+    place = f"{huggingface_hub.constants.ENDPOINT}/{wanted.repository}"
+    try:
+        yield
+    except HilsplatError:
+        raise
+    except GatedRepoError as error:
+        raise DownloadError(
+            f"{wanted.repository} asks for consent before it is fetched ({_status(error)})",
+            fix=f"accept its terms at {place}, `hf auth login` or set HF_TOKEN, and run the command again",
+        ) from error
+    except RepositoryNotFoundError as error:
+        raise DownloadError(
+            f"the hub has no repository {wanted.repository}, or does not show it to you ({_status(error)})",
+            expected=place,
+            fix="correct the name (hilsplat models list); for a private one, `hf auth login` or set HF_TOKEN",
+        ) from error
+    except requests.HTTPError as error:
+        raise _refused(error, wanted, place) from error
+    except (requests.RequestException, *OUT_OF_REACH) as error:
+        raise DownloadError(
+            f"{wanted.repository} cannot be fetched: {type(error).__name__}, no way to {place}",
+            found="HF_HUB_OFFLINE is set" if huggingface_hub.constants.HF_HUB_OFFLINE else _innermost(error),
+            fix=f"run the command again where the hub can be reached ({KEPT}; HF_ENDPOINT names a mirror, "
+            f"HTTPS_PROXY a proxy), or put these files into {models / wanted.name} by hand, from {place}: "
+            f"{', '.join(_files_by_hand(wanted))}",
+        ) from error
+    except OSError as error:
+        if error.filename is None:
+            raise
+        raise DownloadError(
+            f"{error.filename} cannot be written: {error.strerror}", fix=f"make {models} writable"
+        ) from error
+
+
+def _refused(error: requests.HTTPError, wanted: Wanted, place: str) -> DownloadError:
+    """What an answer other than 2xx means."""
+    response = error.response
+    assert response is not None  # an HTTPError is made from an answer
+    status = response.status_code
+    if status == requests.codes.too_many_requests:
+        return DownloadError(
+            f"the hub has had too many requests to serve {wanted.repository} now ({_status(error)})",
+            found=f"Retry-After: {response.headers.get('Retry-After', 'not stated')}",
+            fix=f"run the command again later ({KEPT}); `hf auth login` or HF_TOKEN raises the limit",
+        )
+    if status in (requests.codes.unauthorized, requests.codes.forbidden):
+        return DownloadError(
+            f"the hub refuses {wanted.repository} ({_status(error)})",
+            fix=f"look at {place}; `hf auth login` or set HF_TOKEN to one that may read it",
+        )
+    if status == requests.codes.not_found:
+        return DownloadError(
+            f"the hub does not have what was asked of {wanted.repository} ({_status(error)})",
+            found=str(response.url),
+            fix=f"correct the name or --revision; {place} shows what there is",
+        )
+    return DownloadError(
+        f"the hub does not serve {wanted.repository} ({_status(error)})",
+        found=str(response.url),
+        fix=f"run the command again later: {KEPT}",
+    )
+
+
+def _status(error: requests.HTTPError) -> str:
+    return f"{error.response.status_code} {error.response.reason}" if error.response is not None else ""
+
+
+def _innermost(error: BaseException) -> str:
+    """The first cause of an error, in its own words."""
+    while (cause := error.__cause__ or error.__context__) is not None:
+        error = cause
+    return str(error) or type(error).__name__
+
+
+def _files_by_hand(wanted: Wanted) -> list[str]:
+    """Files that make the model, for someone without a way to the hub."""
+    families = [wanted.release.family] if wanted.release else list(PARTS)
+    return [name for family in families for name in PARTS[family].usual]

@@ -1,0 +1,92 @@
+"""Which models are there, and which of them `auto` means."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from hilsplat.base.model_store import RECOMMENDED, RELEASES, present_models, read_model, real_model
+from hilsplat.configuration import with_models
+from hilsplat.settings import ClipSettings, FieldSettings, MasksSettings
+
+AUTO = MasksSettings(segmenter="auto", model="auto")
+
+
+def lay(folder: Path, kind: str, embedded: bool = False, network: str = "onnx/a.onnx") -> Path:
+    (folder / network).parent.mkdir(parents=True, exist_ok=True)
+    (folder / network).touch()
+    (folder / "config.json").write_text(json.dumps({"model_type": kind, "world_only": embedded}))
+    return folder
+
+
+@pytest.fixture
+def models(tmp_path, monkeypatch) -> Path:
+    """The models of a fresh checkout, in the working directory."""
+    monkeypatch.chdir(tmp_path)
+    lay(Path("models/sam-tiny"), "sam", embedded=True)
+    lay(Path("models/clip-tiny"), "clip", embedded=True)
+    return Path("models")
+
+
+def test_the_embedded_models_say_so_themselves(project):
+    found = {model.folder.name: model.embedded for model in present_models(project / "models")}
+    assert found["sam-tiny"] and found["clip-tiny"]
+
+
+def test_without_a_real_model_photographs_get_the_graph_segmenter_and_the_embedded_clip(models):
+    assert with_models(AUTO) == MasksSettings(segmenter="graph", model="models/sam-tiny")
+    assert with_models(ClipSettings(model="auto")).model == "models/clip-tiny"
+    assert with_models(MasksSettings(segmenter="sam", model="auto")).model == "models/sam-tiny"
+
+
+def test_a_real_model_is_used_and_the_best_one_of_several(models):
+    lay(models / "zebra-sam", "sam", network="vision_encoder.onnx")
+    assert with_models(AUTO) == MasksSettings(segmenter="sam", model="models/zebra-sam")
+    for name in ("slimsam-77", "sam-vit-base"):
+        lay(models / name, "sam")
+    assert with_models(AUTO).model == "models/sam-vit-base"
+    lay(models / "clip-vit-base-patch16", "clip")
+    lay(models / "clip-vit-b-16-laion2b", "clip")
+    assert with_models(ClipSettings(model="auto")).model == "models/clip-vit-b-16-laion2b"
+    assert [model.folder.name for model in present_models()] == [
+        "sam-vit-base",
+        "slimsam-77",
+        "clip-vit-b-16-laion2b",
+        "clip-vit-base-patch16",
+        "zebra-sam",
+        "clip-tiny",
+        "sam-tiny",
+    ]
+
+
+def test_what_is_named_is_used_whatever_else_is_there(models):
+    lay(models / "sam-vit-huge", "sam")
+    for section in (MasksSettings(), MasksSettings(segmenter="graph"), ClipSettings(), FieldSettings()):
+        assert with_models(section) == section
+    lay(models / "mine", "sam")
+    named = MasksSettings(segmenter="auto", model="models/mine")
+    assert with_models(named) == MasksSettings(segmenter="sam", model="models/mine")
+    embedded = MasksSettings(segmenter="auto", model="models/sam-tiny")
+    assert with_models(embedded) == MasksSettings(segmenter="graph", model="models/sam-tiny")
+    lost = MasksSettings(segmenter="auto", model="models/lost")  # the stage says that it is missing
+    assert with_models(lost).segmenter == "sam"
+
+
+def test_what_is_half_there_or_of_another_kind_is_passed_over(models):
+    lay(models / ".sam-vit-base.part", "sam")
+    lay(models / "bert", "bert")
+    (models / "weights").mkdir()
+    (models / "weights/config.json").write_text('{"model_type": "sam"}')
+    (models / "list").mkdir()
+    (models / "list/config.json").write_text("[]")
+    (models / "broken").mkdir()
+    (models / "broken/config.json").write_text("{")
+    assert read_model(models / "none") is None
+    assert [model.folder.name for model in present_models()] == ["clip-tiny", "sam-tiny"]
+    assert real_model("sam") is None
+    assert present_models(Path("nowhere")) == []
+
+
+def test_the_recommended_pair_is_one_of_each_family():
+    by_name = {release.name: release for release in RELEASES}
+    assert [by_name[name].family for name in RECOMMENDED] == ["sam", "clip"]

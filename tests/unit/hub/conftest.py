@@ -1,0 +1,81 @@
+"""A loopback hub with a small SAM and a small CLIP, and `huggingface_hub` pointed at it."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import huggingface_hub
+import numpy as np
+import onnx
+import pytest
+from huggingface_hub import file_download
+from huggingface_hub.utils import reset_sessions
+from onnx import numpy_helper
+
+from hilsplat.hub import transfer
+from tests.loopback_hub import LoopbackHub, loopback_hub
+from tests.unit.finished_desk import write_colour_clip
+from tests.unit.segment.conftest import write_disc_sam
+
+SAM, CLIP = "Xenova/sam-vit-base", "Xenova/clip-vit-base-patch16"
+PADDING_BYTES = 600_000
+
+
+def pad(network: Path) -> None:
+    """Make a network's file large, by a constant that it does not use."""
+    model = onnx.load(network)
+    noise = np.random.default_rng(0).integers(0, 255, PADDING_BYTES, dtype=np.uint8)
+    model.graph.initializer.append(numpy_helper.from_array(noise, "unused"))
+    network.write_bytes(model.SerializeToString())
+
+
+@pytest.fixture(scope="session")
+def repositories(tmp_path_factory) -> dict[str, Path]:
+    """The two models as the hub keeps them: with a card and a second set of networks."""
+    folder = tmp_path_factory.mktemp("hub")
+    sam = write_disc_sam(folder / "sam")
+    pad(sam / "onnx/vision_encoder.onnx")
+    for name in ("vision_encoder", "prompt_encoder_mask_decoder"):
+        content = (sam / f"onnx/{name}.onnx").read_bytes()
+        (sam / f"onnx/{name}_quantized.onnx").write_bytes(content)
+    (sam / "README.md").write_text("card")
+    clip = folder / "clip"
+    write_colour_clip(clip)
+    (clip / "onnx").mkdir()
+    for network in clip.glob("*.onnx"):
+        network.rename(clip / "onnx" / network.name)
+    (clip / "onnx/model.onnx").write_bytes(b"both halves, which are not needed")
+    return {SAM: sam, CLIP: clip}
+
+
+def point_at(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What HF_ENDPOINT does when the library is first imported."""
+    monkeypatch.setattr(huggingface_hub.constants, "ENDPOINT", endpoint)
+    template = endpoint + "/{repo_id}/resolve/{revision}/{filename}"
+    for module in (huggingface_hub.constants, file_download):
+        monkeypatch.setattr(module, "HUGGINGFACE_CO_URL_TEMPLATE", template)
+
+
+@pytest.fixture
+def hub(repositories, monkeypatch, tmp_path) -> Iterator[LoopbackHub]:
+    """The hub; the working directory is an empty project, and nobody sleeps."""
+    with loopback_hub() as served:
+        served.repositories.update(repositories)
+        point_at(served.endpoint, monkeypatch)
+        monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", False)
+        monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+        monkeypatch.setenv("HF_TOKEN", "hf_of_the_user")
+        monkeypatch.delenv("HTTP_PROXY", raising=False)
+        monkeypatch.delenv("http_proxy", raising=False)
+        (tmp_path / "project").mkdir()
+        monkeypatch.chdir(tmp_path / "project")
+        reset_sessions()
+        yield served
+        reset_sessions()
+
+
+@pytest.fixture
+def waits(monkeypatch) -> list[float]:
+    """Seconds that would have been waited."""
+    seconds: list[float] = []
+    monkeypatch.setattr(transfer.time, "sleep", seconds.append)
+    return seconds

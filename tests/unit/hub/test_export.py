@@ -1,0 +1,78 @@
+"""A CLIP without ready networks is fetched, exported in another process and split, by the real command."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hilsplat.base.errors import ModelError
+from hilsplat.base.model_store import RELEASES
+from hilsplat.embed.clip import ClipModel
+from hilsplat.hub import export
+from hilsplat.hub.get import get_models
+from tests.unit.export.conftest import clip_parts
+
+__all__ = ["clip_parts"]
+
+NAME = "clip-vit-b-16-laion2b"
+REPOSITORY = next(release.repository for release in RELEASES if release.name == NAME)
+
+
+def command(endpoint: str, *words: str) -> subprocess.CompletedProcess[str]:
+    """`hilsplat`, as a user runs it who set HF_ENDPOINT."""
+    environment = {key: value for key, value in os.environ.items() if key != "HF_HUB_OFFLINE"}
+    return subprocess.run(
+        [sys.executable, "-c", "from hilsplat.cli.main import main; main()", *words],
+        env={**environment, "HF_ENDPOINT": endpoint, "HF_HOME": str(Path.cwd() / "home")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_weights_are_fetched_exported_split_and_answer_as_transformers(hub, clip_parts):
+    import torch
+
+    model, processor, exported = clip_parts
+    hub.repositories[REPOSITORY] = exported.parent / "torch"
+    done = command(hub.endpoint, "models", "get", NAME)
+    assert done.returncode == 0, done.stderr
+    assert "kind       clip" in done.stdout and f"folder     models/{NAME}" in done.stdout
+    folder = Path("models") / NAME
+    origin = json.loads((folder / "origin.json").read_text())
+    assert origin["repository"] == REPOSITORY and "optimum-onnx" in origin["exported"]
+    assert "model.safetensors" in [entry["path"] for entry in origin["files"]]
+    names = {path.name for path in folder.rglob("*")}
+    assert {"vision_model.onnx", "text_model.onnx", "preprocessor_config.json", "tokenizer.json"} <= names
+    assert not {"model.onnx", "model.safetensors"} & names
+    assert sorted(path.name for path in Path("models").iterdir() if path.is_dir()) == [NAME]
+    inputs = processor.tokenizer(["red mug"], return_tensors="pt")
+    with torch.no_grad():
+        (expected,) = model.get_text_features(**inputs).numpy()
+    (found,) = ClipModel.load(folder).embed_texts(["red mug"])
+    # both to unit length; float32 through two runtimes
+    assert abs(found - expected / (expected**2).sum() ** 0.5).max() < 1e-4
+
+
+def test_weights_that_cannot_be_exported_show_the_exporter_s_last_lines(tmp_path):
+    (tmp_path / "config.json").write_text('{"model_type": "clip"}')
+    with pytest.raises(ModelError, match=r"the exporter ended with 1(.|\n)*Error(.|\n)*pip install"):
+        export.export_networks(tmp_path, tmp_path / "out")
+
+
+def test_without_the_extra_nothing_is_fetched_and_the_message_gives_the_line(hub, clip_parts, monkeypatch):
+    hub.repositories[REPOSITORY] = clip_parts[2].parent / "torch"
+    monkeypatch.setattr(export, "NEEDED", (*export.NEEDED, "no_such_exporter.onnx"))
+    with pytest.raises(ModelError, match=r"no no_such_exporter.onnx\n  fix +pip install .* '\.\[export\]'"):
+        get_models([NAME])
+    assert not hub.ranges("model.safetensors")
+
+
+def test_offline_the_command_ends_with_a_message_and_without_a_traceback(hub):
+    done = command("http://127.0.0.1:9", "models", "get", "sam-vit-base")
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert "put these files into models/sam-vit-base by hand" in done.stderr
+    assert not Path("models/sam-vit-base").exists()

@@ -1,0 +1,393 @@
+"""Models from a hub on this machine: whole and checked, or nothing under their name."""
+
+import errno
+import hashlib
+import json
+import logging
+import shutil
+from pathlib import Path
+
+import huggingface_hub
+import pytest
+import requests
+from huggingface_hub.utils import reset_sessions
+
+from hilsplat.base.artifacts import sha256_of_file
+from hilsplat.base.errors import DiskSpaceError, DownloadError, ModelError
+from hilsplat.base.model_store import RELEASES, real_model
+from hilsplat.hub import get, transfer
+from hilsplat.hub.get import get_models
+from hilsplat.hub.overview import check_models, models_table
+from tests.loopback_hub import Refusal, git_sha1
+from tests.unit.export.conftest import clip_parts
+from tests.unit.hub.conftest import CLIP, SAM, point_at
+
+__all__ = ["clip_parts"]
+
+ENCODER = "vision_encoder.onnx"
+TARGET = Path("models/sam-vit-base")
+STAGING = Path("models/.sam-vit-base.part")
+
+
+def visible() -> list[str]:
+    """Names in `models/` that a reader looks at."""
+    return sorted(path.name for path in Path("models").glob("[!.]*"))
+
+
+def files_of(folder: Path) -> list[str]:
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+
+
+def test_without_a_name_the_recommended_pair_arrives_and_is_used(hub, repositories, caplog):
+    caplog.set_level(logging.INFO)
+    assert "sam-vit-base" in models_table() and "in use" not in models_table()
+    text = get_models(())
+    assert "kind       sam" in text and "kind       clip" in text and "folder     models/sam-vit-base" in text
+    assert text.endswith("photographs use sam-vit-base and clip-vit-base-patch16")
+    assert "the recommended pair: sam-vit-base and clip-vit-base-patch16" in caplog.text
+    assert "0.6 MB in 4 files" in caplog.text and "GB free on the disk of models" in caplog.text
+    assert "licence: Apache-2.0" in caplog.text
+    assert visible() == ["clip-vit-base-patch16", "sam-vit-base"]
+    # only what is needed: no card, no quantized copies, no whole CLIP
+    networks = ["onnx/prompt_encoder_mask_decoder.onnx", "onnx/vision_encoder.onnx"]
+    assert files_of(TARGET) == ["config.json", *networks, "origin.json", "preprocessor_config.json"]
+    assert "onnx/model.onnx" not in files_of(Path("models/clip-vit-base-patch16"))
+    for path in networks:
+        assert (TARGET / path).read_bytes() == (repositories[SAM] / path).read_bytes()
+    assert (real_model("sam"), real_model("clip")) == (TARGET, Path("models/clip-vit-base-patch16"))
+    rows = [line.split() for line in models_table().splitlines()]
+    assert ["sam-vit-base", "SAM", "376", "Apache-2.0", "here,", "in", "use"] in [row[:7] for row in rows]
+    report, num_failed = check_models()
+    assert num_failed == 0 and report.count("digest") == 2
+    (TARGET / "onnx" / ENCODER).write_bytes(b"damaged")
+    report, num_failed = check_models()
+    assert num_failed == 1 and "models/sam-vit-base does not work" in report
+
+
+def test_the_origin_names_repository_commit_and_digests(hub, repositories):
+    hub.licences[SAM] = "apache-2.0"
+    get_models([SAM], revision="main")
+    origin = json.loads((TARGET / "origin.json").read_text())
+    assert (origin["repository"], origin["revision"]) == (SAM, hub.commit(SAM))
+    by_path = {entry["path"]: entry for entry in origin["files"]}
+    encoder = repositories[SAM] / "onnx" / ENCODER
+    assert by_path[f"onnx/{ENCODER}"]["sha256"] == sha256_of_file(encoder)
+    content = (repositories[SAM] / "config.json").read_bytes()
+    expected = {"path": "config.json", "bytes": len(content), "git_sha1": git_sha1(content)}
+    assert by_path["config.json"] == expected
+    assert hub.endpoint not in (TARGET / "origin.json").read_text()
+
+
+def test_a_second_get_transfers_nothing_and_a_new_commit_replaces(hub, repositories, tmp_path):
+    get_models(["sam-vit-base"])
+    hub.asked.clear()
+    assert "models/sam-vit-base is there already" in get_models(["sam-vit-base"])
+    assert [path for _, path, _ in hub.asked] == [f"/api/models/{SAM}"]
+    (TARGET / "onnx" / ENCODER).unlink()  # a file is lost: fetched again
+    assert "kind       sam" in get_models(["sam-vit-base"])
+    newer = tmp_path / "newer"
+    shutil.copytree(repositories[SAM], newer)
+    preprocessing = json.loads((newer / "preprocessor_config.json").read_text())
+    (newer / "preprocessor_config.json").write_text(json.dumps({**preprocessing, "resample": 3}))
+    (newer / "more").write_text("a file")
+    hub.repositories[SAM] = newer
+    get_models(["sam-vit-base"])
+    assert json.loads((TARGET / "preprocessor_config.json").read_text())["resample"] == 3
+    assert json.loads((TARGET / "origin.json").read_text())["revision"] == hub.commit(SAM)
+
+
+def test_a_cut_transfer_goes_on_at_the_byte_that_it_reached(hub, repositories, waits):
+    hub.cuts[ENCODER] = [200_000, 150_000]
+    get_models(["sam-vit-base"])
+    first, second, third = hub.ranges(ENCODER)
+    assert first == ""
+    starts = [int(each.removeprefix("bytes=").removesuffix("-")) for each in (second, third)]
+    for start, reached in zip(starts, (200_000, starts[0] + 150_000), strict=True):
+        assert reached - transfer.CHUNK_BYTES < start <= reached
+    assert waits == [1.0, 1.0]  # both attempts brought new bytes
+    assert (TARGET / "onnx" / ENCODER).read_bytes() == (repositories[SAM] / "onnx" / ENCODER).read_bytes()
+
+
+def test_a_mirror_that_sends_the_whole_file_again_is_read_from_its_beginning(hub, repositories, waits):
+    hub.ranged = False
+    hub.cuts[ENCODER] = [200_000]
+    get_models(["sam-vit-base"])
+    assert (TARGET / "onnx" / ENCODER).read_bytes() == (repositories[SAM] / "onnx" / ENCODER).read_bytes()
+
+
+def test_a_mirror_that_cuts_each_of_its_whole_files_is_given_up(hub, waits):
+    hub.ranged = False
+    hub.cuts[ENCODER] = [300_000, 200_000] * 20
+    with pytest.raises(DownloadError, match="cannot be fetched"):
+        get_models(["sam-vit-base"])
+    assert len(waits) == transfer.TRIES - 1
+
+
+def test_a_transfer_that_was_given_up_is_kept_and_continued_by_the_next_command(hub, waits):
+    hub.cuts[ENCODER] = [300_000, *[0] * (transfer.TRIES + 1)]
+    with pytest.raises(
+        DownloadError, match=r"cannot be fetched(.|\n)*is kept, and continued(.|\n)*onnx/vision_enc"
+    ):
+        get_models(["sam-vit-base"])
+    assert waits == [1.0, 2.0, 4.0, 8.0] and visible() == []
+    assert "part of it" in models_table()
+    (part,) = STAGING.rglob("*.part")
+    reached = part.stat().st_size
+    assert 300_000 - transfer.CHUNK_BYTES < reached <= 300_000
+    hub.cuts.clear()
+    hub.asked.clear()
+    get_models(["sam-vit-base"])
+    assert hub.ranges(ENCODER) == [f"bytes={reached}-"]
+    assert visible() == ["sam-vit-base"] and not STAGING.exists()
+
+
+def test_other_bytes_than_the_hub_states_are_refused_and_deleted(hub, repositories):
+    content = (repositories[SAM] / "onnx" / ENCODER).read_bytes()
+    hub.replaced[ENCODER] = content[:-1] + bytes([content[-1] ^ 1])
+    with pytest.raises(
+        DownloadError, match=rf"arrived with other bytes(.|\n)*{hashlib.sha256(content).hexdigest()}"
+    ):
+        get_models(["sam-vit-base"])
+    assert visible() == [] and not list(STAGING.rglob(f"{ENCODER}*"))
+    hub.replaced["config.json"] = b"{}" + b" " * ((repositories[SAM] / "config.json").stat().st_size - 2)
+    (STAGING / "config.json").unlink()
+    with pytest.raises(DownloadError, match=r"config.json of Xenova/sam-vit-base arrived with other bytes"):
+        get_models(["sam-vit-base"])
+    hub.replaced.clear()
+    get_models(["sam-vit-base"])
+    assert visible() == ["sam-vit-base"]
+
+
+def test_a_disk_that_is_too_small_is_told_before_the_transfer(hub, monkeypatch):
+    monkeypatch.setattr(get.shutil, "disk_usage", lambda folder: type("Usage", (), {"free": 100_000_000})())
+    with pytest.raises(
+        DiskSpaceError, match=r"disk of models\n  expected  0\.2 GB free\n  found     0\.1 GB"
+    ):
+        get_models(["sam-vit-base"])
+    assert hub.ranges(ENCODER) == []
+
+
+def test_a_disk_that_becomes_full_keeps_what_is_there(hub, monkeypatch):
+    whole = transfer._continue
+
+    def fill(listing, file, part, tell):
+        if part.name.startswith(ENCODER):
+            part.write_bytes(b"some")
+            raise OSError(errno.ENOSPC, "No space left on device", str(part))
+        whole(listing, file, part, tell)
+
+    monkeypatch.setattr(transfer, "_continue", fill)
+    with pytest.raises(DiskSpaceError, match=r"no space left while writing(.|\n)*finished work is kept"):
+        get_models(["sam-vit-base"])
+    assert visible() == [] and list(STAGING.rglob("*.part"))
+
+
+@pytest.mark.parametrize(
+    ("asked", "waited"),
+    [
+        ({"Retry-After": "7"}, [7.0]),
+        ({"RateLimit": '"resolvers";r=0;t=12'}, [12.0]),
+        ({}, [1.0]),
+        ({"Retry-After": "Wed, 21 Oct 2015 07:28:00 GMT"}, [0.0]),
+    ],
+)
+@pytest.mark.parametrize("where", ["/api/", "/resolve/"])
+def test_a_busy_hub_is_given_the_time_that_it_asks_for(hub, waits, asked, waited, where):
+    hub.refusals[where] = [Refusal(429, asked)]
+    get_models([CLIP])
+    assert waits == waited and visible() == ["clip-vit-base-patch16"]
+
+
+def test_a_hub_that_stays_busy_or_asks_for_hours_is_named(hub, waits):
+    hub.refusals["/api/"] = [Refusal(429, {"Retry-After": "7200"})]
+    with pytest.raises(DownloadError, match=r"too many requests(.|\n)*Retry-After: 7200(.|\n)*HF_TOKEN"):
+        get_models(["sam-vit-base"])
+    assert waits == []
+    hub.refusals["/api/"] = [Refusal(503)] * 9
+    with pytest.raises(DownloadError, match=r"does not serve Xenova/sam-vit-base \(503"):
+        get_models(["sam-vit-base"])
+    assert waits == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("refusal", "message"),
+    [
+        (Refusal(401, {"X-Error-Code": "GatedRepo"}), r"asks for consent(.|\n)*accept its terms at http"),
+        (Refusal(403), r"refuses Xenova/sam-vit-base \(403"),
+        (Refusal(401), r"refuses Xenova/sam-vit-base \(401"),
+        (Refusal(404, {"X-Error-Code": "EntryNotFound"}), r"does not have what was asked"),
+    ],
+)
+def test_refusals_say_what_to_do(hub, waits, refusal, message):
+    hub.refusals["/api/"] = [refusal]
+    with pytest.raises(DownloadError, match=message):
+        get_models(["sam-vit-base"])
+    assert waits == [] and visible() == []
+
+
+def test_unknown_names_repositories_and_revisions_are_named(hub):
+    with pytest.raises(DownloadError, match=r"no model is known by the name 'sam-vit'(.|\n)*sam-vit-base"):
+        get_models(["sam-vit"])
+    with pytest.raises(DownloadError, match="'a b/c' cannot be a repository"):
+        get_models(["a b/c"])
+    with pytest.raises(DownloadError, match="the hub has no repository some/thing"):
+        get_models(["some/thing"])
+    with pytest.raises(DownloadError, match=r"does not have what was asked(.|\n)*revision/v9"):
+        get_models(["sam-vit-base"], revision="v9")
+    with pytest.raises(DownloadError, match="a revision belongs to one model"):
+        get_models([], revision="main")
+
+
+def test_a_repository_of_another_kind_or_without_networks_is_refused(hub, tmp_path):
+    other = tmp_path / "bert"
+    other.mkdir()
+    (other / "config.json").write_text('{"model_type": "bert"}')
+    hub.repositories["some/bert"] = other
+    with pytest.raises(DownloadError, match=r"no model that can be used here(.|\n)*model_type 'bert'"):
+        get_models(["some/bert"])
+    (other / "config.json").write_text('{"model_type": "sam", "x": 1}')
+    with pytest.raises(DownloadError, match=r"some/bert lacks onnx/vision_encoder.onnx"):
+        get_models(["some/bert"])
+    with pytest.raises(DownloadError, match=r"lacks onnx/vision_encoder_fp16.onnx"):
+        get_models(["sam-vit-base"], variant="fp16")
+    assert visible() == []
+
+
+def test_a_variant_gets_a_folder_of_its_own_and_the_plain_names(hub, repositories):
+    get_models(["sam-vit-base"], variant="quantized")
+    assert visible() == ["sam-vit-base-quantized"]
+    folder = Path("models/sam-vit-base-quantized")
+    assert f"onnx/{ENCODER}" in files_of(folder) and "onnx/vision_encoder_quantized.onnx" not in files_of(
+        folder
+    )
+    paths = [entry["path"] for entry in json.loads((folder / "origin.json").read_text())["files"]]
+    assert "onnx/vision_encoder_quantized.onnx" in paths
+
+
+def test_a_folder_of_the_user_is_not_replaced(hub):
+    TARGET.mkdir(parents=True)
+    (TARGET / "mine.onnx").write_text("mine")
+    with pytest.raises(DownloadError, match=r"is there already and was not fetched from Xenova/sam-vit-base"):
+        get_models(["sam-vit-base"])
+    assert (TARGET / "mine.onnx").read_text() == "mine"
+
+
+def test_a_model_that_does_not_work_is_not_installed(hub, repositories, tmp_path):
+    broken = tmp_path / "broken"
+    shutil.copytree(repositories[SAM], broken)
+    (broken / "onnx/prompt_encoder_mask_decoder.onnx").write_bytes(b"no network")
+    hub.repositories["some/broken"] = broken
+    with pytest.raises(ModelError, match=r"prompt_encoder_mask_decoder.onnx cannot be opened"):
+        get_models(["some/broken"])
+    assert visible() == []
+
+
+def test_external_weights_come_along_under_their_own_names(hub, repositories, tmp_path):
+    import onnx
+
+    external = tmp_path / "external"
+    shutil.copytree(repositories[SAM], external)
+    model = onnx.load(external / "onnx" / ENCODER)
+    onnx.save(
+        model,
+        external / "onnx" / ENCODER,
+        save_as_external_data=True,
+        location=f"{ENCODER}_data",
+        size_threshold=0,
+    )
+    hub.repositories["some/large"] = external
+    get_models(["some/large"])
+    assert f"onnx/{ENCODER}_data" in files_of(Path("models/large"))
+
+
+def test_a_whole_clip_is_split(hub, clip_parts):
+    whole = clip_parts[2]
+    assert (whole / "model.onnx").is_file()
+    hub.repositories["some/whole"] = whole
+    get_models(["some/whole"])
+    assert {"vision_model.onnx", "text_model.onnx"} <= set(files_of(Path("models/whole")))
+    assert "model.onnx" not in files_of(Path("models/whole"))
+
+
+def test_a_hub_cannot_write_outside_the_model(hub, monkeypatch):
+    info = hub.info
+
+    def with_escape(repository: str) -> dict:
+        answer = info(repository)
+        name = f"onnx/{ENCODER}_data/../../../../escaped"
+        more = {"rfilename": name, "size": 1, "blobId": git_sha1(b"x")}
+        return {**answer, "siblings": [*answer["siblings"], more]}
+
+    monkeypatch.setattr(hub, "info", with_escape)
+    get_models(["sam-vit-base"])
+    assert visible() == ["sam-vit-base"] and not any("escaped" in path for _, path, _ in hub.asked)
+
+
+def set_offline(monkeypatch) -> None:
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    reset_sessions()
+
+
+def test_offline_the_message_says_which_files_to_put_where(hub, monkeypatch):
+    set_offline(monkeypatch)
+    with pytest.raises(DownloadError) as told:
+        get_models(["clip-vit-base-patch16"])
+    message = str(told.value)
+    assert "HF_HUB_OFFLINE is set" in message
+    assert "put these files into models/clip-vit-base-patch16 by hand" in message
+    assert "config.json, preprocessor_config.json, tokenizer.json, onnx/vision_model.onnx" in message
+    assert hub.asked == []
+
+
+def test_a_hub_out_of_reach_is_told_after_a_few_tries(hub, monkeypatch, waits):
+    point_at("http://127.0.0.1:9", monkeypatch)
+    with pytest.raises(
+        DownloadError, match=r"no way to http://127.0.0.1:9/Xenova(.|\n)*refused(.|\n)*HTTPS_PROXY"
+    ):
+        get_models(["sam-vit-base"])
+    assert waits == [1.0, 2.0]
+
+
+def test_offline_the_cache_of_the_hub_serves(hub, monkeypatch, repositories, tmp_path):
+    for path in ("config.json", "preprocessor_config.json", "tokenizer.json"):
+        huggingface_hub.hf_hub_download(CLIP, path, cache_dir=tmp_path / "cache")
+    huggingface_hub.hf_hub_download(CLIP, "onnx/vision_model.onnx", cache_dir=tmp_path / "cache")
+    set_offline(monkeypatch)
+    with pytest.raises(DownloadError, match=r"clip-vit-base-patch16 lacks onnx/text_model.onnx"):
+        get_models(["clip-vit-base-patch16"])
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", False)
+    reset_sessions()
+    huggingface_hub.hf_hub_download(CLIP, "onnx/text_model.onnx", cache_dir=tmp_path / "cache")
+    hub.asked.clear()
+    set_offline(monkeypatch)
+    assert "kind       clip" in get_models(["clip-vit-base-patch16"])
+    assert hub.asked == []
+    origin = json.loads(Path("models/clip-vit-base-patch16/origin.json").read_text())
+    assert origin["revision"] == hub.commit(CLIP)
+
+
+def test_what_the_cache_of_the_hub_has_is_not_transferred_again(hub, tmp_path):
+    huggingface_hub.hf_hub_download(SAM, f"onnx/{ENCODER}", cache_dir=tmp_path / "cache")
+    hub.asked.clear()
+    get_models(["sam-vit-base"])
+    assert hub.ranges(ENCODER) == [] and hub.ranges("prompt_encoder_mask_decoder.onnx") == []
+    assert visible() == ["sam-vit-base"]
+
+
+def test_names_of_the_table_are_folders_and_repositories():
+    assert len({release.name for release in RELEASES}) == len(RELEASES)
+    assert all(release.repository.count("/") == 1 for release in RELEASES)
+
+
+def test_a_lost_connection_inside_a_listing_is_tried_again(hub, waits, monkeypatch):
+    attempts = iter([requests.ConnectionError("cut"), None])
+    listing = get.read_listing
+
+    def once_lost(*words):
+        if (error := next(attempts)) is not None:
+            raise error
+        return listing(*words)
+
+    monkeypatch.setattr(get, "read_listing", once_lost)
+    get_models([CLIP])
+    assert waits == [1.0]

@@ -1,0 +1,81 @@
+"""From a project without real models to an answer about photographs: get, new, run, query."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+from hilsplat.base.model_store import RECOMMENDED, RELEASES
+from tests.loopback_hub import LoopbackHub, loopback_hub
+from tests.workflow.conftest import Project, copy_project
+
+SMALL = {
+    # a run of seconds; the photographs are renders of the tiny scene, so the lens is known
+    "poses": {"camera_model": "simple_pinhole", "test_every": 4},
+    "gaussians": {"iterations": 150, "max_gaussians": 8000},
+    "masks": {"points_per_side": 8, "min_area_px": 8},
+    "semantic_tree": {"min_views": 2},
+}
+RUN = ("--configfile", "config/small.yaml", "--config", "groups=[photos]", "only=[desk]")
+DESK = Path("results/photos/desk")
+
+
+def serve(hub: LoopbackHub, project: Path, folder: Path) -> None:
+    """Put the embedded networks on the hub as released ones: no word says that they know one world alone."""
+    repository_of = {release.name: release.repository for release in RELEASES}
+    for name, embedded in zip(RECOMMENDED, ("sam-tiny", "clip-tiny"), strict=True):
+        shutil.copytree(project / "models" / embedded, folder / name)
+        config = json.loads((folder / name / "config.json").read_text())
+        del config["world_only"]
+        (folder / name / "config.json").write_text(json.dumps(config))
+        hub.repositories[repository_of[name]] = folder / name
+
+
+def test_get_new_run_and_query(project: Path, tmp_path: Path) -> None:
+    copy = copy_project(project, tmp_path / "project", results=False)
+    (copy.root / "config/small.yaml").write_text(json.dumps({"overrides": {"photos": SMALL}}))
+    world = {"views": 12, "image_px": 128, "arc_deg": 100, "objects": 3, "samples": 2}
+    source = ("--source", "world:tabletop:210", "--out", "drawn", "--settings", json.dumps(world))
+    hilsplat(copy, "world", "make", *source)
+    (copy.root / "drawn/images").rename(copy.root / "photographs")
+
+    without = hilsplat(copy, "new", "before", "photographs")
+    assert "words by clip-tiny" in without and "mean nothing" in without
+    with loopback_hub() as hub:
+        serve(hub, project, tmp_path / "hub")
+        hub.cuts["vision_encoder.onnx"] = [2_000_000]
+        printed = hilsplat(copy, "models", "get", HF_ENDPOINT=hub.endpoint, HF_HOME=str(tmp_path / "home"))
+        assert len(hub.ranges("vision_encoder.onnx")) == 2
+    assert "photographs use sam-vit-base and clip-vit-base-patch16" in printed
+    told = hilsplat(copy, "new", "desk", "photographs")
+    assert "masks by sam-vit-base; words by clip-vit-base-patch16" in told and "nothing" not in told
+
+    run = snakemake(copy)
+    assert "photos/desk: masks by sam-vit-base; words by clip-vit-base-patch16" in run
+    for stage, name in (("masks", "sam-vit-base"), ("clip", "clip-vit-base-patch16")):
+        index = json.loads((copy.root / DESK / "default" / stage / "index.json").read_text())
+        assert index["model"] == f"models/{name}"
+        record = json.loads((copy.root / DESK / f"default/{stage}.provenance.json").read_text())
+        assert record["settings"]["model"] == f"models/{name}"
+    answer = hilsplat(copy, "query", "photos/desk", "mug")
+    assert "to 'mug' in photos/desk" in answer and "mean nothing" not in answer
+
+    # without them, masks and words would be made anew by what is left; poses and Gaussians stay
+    shutil.rmtree(copy.root / "models/sam-vit-base")
+    shutil.rmtree(copy.root / "models/clip-vit-base-patch16")
+    planned = snakemake(copy, "-n")
+    assert "rule masks:" in planned and "rule clip:" in planned
+    assert "rule poses:" not in planned and "rule gaussians:" not in planned
+
+
+def hilsplat(project: Project, *words: str, **environment: str) -> str:
+    """What the copy's own command prints."""
+    offline = {"HF_HUB_OFFLINE": "0", **environment}
+    command = "from hilsplat.cli.main import main; main()"
+    return project.run(sys.executable, "-c", command, *words, **offline).stdout
+
+
+def snakemake(project: Project, *words: str) -> str:
+    """What a run of the photographs prints."""
+    done = project.run(sys.executable, "-m", "snakemake", "--cores", "2", *RUN, *words)
+    return done.stdout + done.stderr
