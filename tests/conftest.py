@@ -5,8 +5,23 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from jaxtyping import install_import_hook
 
 PROJECT = Path(__file__).resolve().parents[1]
+
+UNCHECKED = (
+    "hilsplat.base.identity",
+    "hilsplat.world.objects.",
+    "hilsplat.world.paints",
+    "hilsplat.world.shapes",
+)
+"""Modules of small functions that are called tens of thousands of times, for each definition or each piece of
+an object: checks would take five times as long as the tests themselves."""
+
+# All other modules have the shapes and types of arguments and results checked at every call.
+files = [path.relative_to(PROJECT).with_suffix("") for path in (PROJECT / "hilsplat").rglob("[!_]*.py")]
+checked = [name for name in map(".".join, (file.parts for file in files)) if not name.startswith(UNCHECKED)]
+install_import_hook(checked, "beartype.beartype")
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 
