@@ -25,6 +25,9 @@ HLG_SYSTEM_GAMMA = 1.2
 KNEE = 0.6
 """Linear light, white = 1, above which HDR highlights are compressed towards 1."""
 
+BAND_ROWS = 32
+"""Rows that are tone-mapped at once: they stay in the processor's cache."""
+
 BT709_FROM_BT2020: Float64[np.ndarray, "3 3"] = np.array(
     [[1.660491, -0.587641, -0.072850], [-0.124550, 1.132900, -0.008349], [-0.018151, -0.100579, 1.118730]]
 )
@@ -53,7 +56,9 @@ def rgb_pixels(frame: "VideoFrame") -> UInt8[np.ndarray, "H W 3"]:
     pixels = turned.to_ndarray()
     if not is_hdr:
         return pixels
-    return srgb_from_hdr(pixels, is_hlg=int(frame.color_trc) == HLG)
+    is_hlg = int(frame.color_trc) == HLG
+    bands = [pixels[row : row + BAND_ROWS] for row in range(0, len(pixels), BAND_ROWS)]
+    return np.concatenate([srgb_from_hdr(band, is_hlg=is_hlg) for band in bands])
 
 
 def srgb_from_hdr(signal: UInt16[np.ndarray, "H W 3"], *, is_hlg: bool) -> UInt8[np.ndarray, "H W 3"]:
