@@ -27,6 +27,10 @@ class HilsplatError(Exception):
                 lines.append(f"  {name:<9} {value}")
         super().__init__("\n".join(lines))
 
+    def add_line(self, name: str, value: object) -> None:
+        """Add a line such as `found`, known only to a caller, at the end of the message."""
+        self.args = (f"{self}\n  {name:<9} {value}",)
+
 
 class SettingsError(HilsplatError):
     """A key is unknown, or a value has the wrong type or is out of range."""

@@ -1,5 +1,6 @@
 """Reading and writing images: upright, RGB, channel-last."""
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from hilsplat.base.files import IMAGE_SUFFIXES, list_images
 __all__ = [
     "IMAGE_SUFFIXES",
     "list_images",
+    "open_image",
     "read_image",
     "resize_to_fit",
     "to_float",
@@ -23,6 +25,23 @@ __all__ = [
 
 DEEP_MAX = 65535
 """Largest value of a 16-bit channel; 257 of its steps are one step of 8 bits."""
+
+
+def open_image(path: Path) -> Image.Image:
+    """Open an image with Pillow, which reads HEIF (.heic) by the library pillow-heif.
+
+    Size and EXIF are known at once, pixels are decoded on demand. A HEIF image comes upright: its rotation is
+    part of the format, and its EXIF orientation is reset.
+    """
+    _register_heif()
+    return Image.open(path)
+
+
+@functools.cache
+def _register_heif() -> None:
+    import pillow_heif
+
+    pillow_heif.register_heif_opener()
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
@@ -36,7 +55,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     """
     path = Path(path)
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             image.load()
             upright = ImageOps.exif_transpose(image)
             if upright.mode.startswith("I"):  # Pillow would clip what exceeds 255
@@ -51,7 +70,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
             return np.asarray(upright.convert("RGB"))
     except FileNotFoundError as error:
         raise ImageError(f"image {path} is missing") from error
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         size = path.stat().st_size if path.exists() else 0
         raise ImageError(
             f"image {path} cannot be read: {error}",

@@ -24,15 +24,18 @@ from hilsplat.cli.stage import (
 @app.command()
 def new(
     name: Annotated[str, typer.Argument(help="name of the scene: letters, digits, . _ -")],
-    photos: Annotated[Path, typer.Argument(help="folder of photographs")],
+    photos: Annotated[
+        Path, typer.Argument(help="folder of photographs or videos, a video, or a zip of photographs")
+    ],
     sheet: Annotated[Path, typer.Option(help="scene sheet")] = Path("config/scenes.tsv"),
+    frames: Annotated[int, typer.Option(min=3, max=1000, help="most frames taken from videos")] = 60,
 ) -> None:
-    """Add a folder of photographs to the scene sheet, and report on its images."""
+    """Add photographs, or the frames of a video, to the scene sheet, and say what is likely to fail."""
     start_logging(None)
     from hilsplat.scene.photos import add_scene
     from hilsplat.workflow.answering import models_of_photographs
 
-    report = add_scene(sheet, name, photos)
+    report = add_scene(sheet, name, photos, frames=frames)
     typer.echo(str(report))
     typer.echo(
         f"\nadded photos/{name} to {sheet}. Next:\n"

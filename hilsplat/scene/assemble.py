@@ -14,6 +14,7 @@ from hilsplat.base.artifacts import atomic_folder, write_json
 from hilsplat.base.images import read_image, write_png
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.lost_views import stack_pictures
 from hilsplat.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
@@ -155,6 +156,7 @@ def write_scene(
     report: dict[str, Any],
     *,
     turn: bool,
+    lost: Path | None = None,
 ) -> None:
     """Write the scene artifact with its registration report; the folder appears whole or not at all.
 
@@ -168,6 +170,7 @@ def write_scene(
         split: "train" or "test" per view.
         report: what registration found; this function adds split and size per view.
         turn: turn the scene so that +z is up.
+        lost: picture of the photographs that were not registered, appended to that of the cameras.
     """
     views = sorted(views, key=lambda view: view.view)
     source_poses = np.stack([view.cam_from_source for view in views])
@@ -199,6 +202,8 @@ def write_scene(
             entry["focal_px"] = round(float(cameras.K[camera_row, 0, 0]), 3)
         write_json(folder / "registration.json", report)
         plot_registration(folder / "registration.png", scene, report)
+        if lost is not None:
+            stack_pictures(folder / "registration.png", lost)
         scene.save()
 
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import UnidentifiedImageError
 
 from hilsplat.base.errors import ImageError, SceneError
-from hilsplat.base.images import read_image, resize_to_fit, write_png
+from hilsplat.base.images import open_image, read_image, resize_to_fit, write_png
 from hilsplat.base.progress import track
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.settings import PosesSettings
@@ -30,6 +30,12 @@ PEAK_THRESHOLD = 0.02 / 3 / 2
 """SIFT contrast threshold, half of COLMAP's: renders and indoor photographs are low in contrast."""
 
 EXIF_35MM_FOCAL = 0xA405
+EXIF_FOCAL = 0x920A
+EXIF_PLANE_RESOLUTION = 0xA20E
+EXIF_PLANE_UNIT = 0xA210
+EXIF_STORED_WIDTH, EXIF_STORED_HEIGHT = 0xA002, 0xA003
+PLANE_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+"""EXIF's units of the focal plane's resolution (inch by default) in mm."""
 EXIF_SUB_FOLDER = 0x8769
 EXIF_ORIENTATION = 0x0112
 DIAGONAL_35MM = 43.2666
@@ -88,17 +94,30 @@ def view_names(sources: Sequence[Path]) -> list[str]:
 
 
 def exif_focal_px(path: Path, size_hw: tuple[int, int]) -> float | None:
-    """Focal length from EXIF (35 mm equivalent), in px of an image of the given size."""
+    """Focal length from EXIF, in px of the same picture shrunk to the given size; None if EXIF has none.
+
+    From the 35 mm equivalent or, without one, from the focal length and the pixels per length of the sensor.
+    """
     try:
-        with Image.open(path) as image:
-            focal_mm = image.getexif().get_ifd(EXIF_SUB_FOLDER).get(EXIF_35MM_FOCAL)
+        with open_image(path) as image:
+            tags = image.getexif().get_ifd(EXIF_SUB_FOLDER)
+            size = image.size
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
         return None  # EXIF may be damaged; whether the pixels can be read is checked elsewhere
-    try:
-        focal = float(focal_mm or 0)
-    except (TypeError, ValueError):
-        return None
-    return focal / DIAGONAL_35MM * float(np.hypot(*size_hw)) if focal > 0 else None
+
+    def number(tag: int) -> float:
+        try:
+            value = float(tags.get(tag) or 0)
+        except (TypeError, ValueError, ZeroDivisionError):
+            return 0.0
+        return value if np.isfinite(value) and value > 0 else 0.0
+
+    if focal := number(EXIF_35MM_FOCAL):
+        return focal / DIAGONAL_35MM * float(np.hypot(*size_hw))
+    pixels_per_mm = number(EXIF_PLANE_RESOLUTION) / PLANE_UNIT_MM.get(int(number(EXIF_PLANE_UNIT)), 25.4)
+    # The resolution is that of the picture as the camera stored it; programs that shrink it keep these tags.
+    stored_px = max(number(EXIF_STORED_WIDTH), number(EXIF_STORED_HEIGHT)) or max(size)
+    return number(EXIF_FOCAL) * pixels_per_mm * max(size_hw) / stored_px or None
 
 
 def prepare_images(sources: Sequence[Path], folder: Path, max_side_px: int) -> list[WorkImage]:

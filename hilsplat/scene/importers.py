@@ -1,17 +1,17 @@
 """Make a scene from images with known poses."""
 
 import logging
+import math
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image
 
 from hilsplat.base.errors import ImageError, RegistrationError, SceneError
 from hilsplat.base.files import list_images
-from hilsplat.base.images import read_image, resize_to_fit, write_png
+from hilsplat.base.images import open_image, read_image, resize_to_fit, write_png
 from hilsplat.base.progress import track
 from hilsplat.scene.assemble import PosedView, split_views, undistort, write_scene
 from hilsplat.scene.colmap import pycolmap
@@ -153,13 +153,29 @@ def _images_without_pose(known: KnownPoses, used: Collection[Path]) -> list[Path
 def _with_pixels(view: KnownView, file: Path, view_name: str, folder: Path, max_side_px: int) -> PosedView:
     """Read a view's image as its camera describes it, write the work image, and fit the lens to it."""
     folder.mkdir(parents=True, exist_ok=True)
-    pixels = resize_to_fit(_read_as_described(file, view.camera), max_side_px)
-    height, width = pixels.shape[:2]
+    pixels = _read_as_described(file, view.camera)
     camera = pycolmap.Camera(view.camera.todict())
+    if view.border_px:
+        pixels = _without_border(pixels, camera, view.border_px)
+    pixels = resize_to_fit(pixels, max_side_px)
+    height, width = pixels.shape[:2]
     if (camera.width, camera.height) != (width, height):
         camera.rescale(width, height)
     write_png(folder / view_name, pixels)
     return PosedView(view_name, folder / view_name, camera, view.cam_from_source)
+
+
+def _without_border(
+    pixels: UInt8[np.ndarray, "H W 3"], camera: pycolmap.Camera, border_px: int
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Cut a border off an image; the camera, whose px it is measured in, is fitted in place."""
+    border_px = math.ceil(border_px * pixels.shape[1] / camera.width)
+    camera.rescale(pixels.shape[1], pixels.shape[0])
+    camera.width -= 2 * border_px
+    camera.height -= 2 * border_px
+    camera.principal_point_x -= border_px
+    camera.principal_point_y -= border_px
+    return np.ascontiguousarray(pixels[border_px:-border_px, border_px:-border_px])
 
 
 def _read_as_described(path: Path, camera: pycolmap.Camera) -> UInt8[np.ndarray, "H W 3"]:
@@ -170,7 +186,7 @@ def _read_as_described(path: Path, camera: pycolmap.Camera) -> UInt8[np.ndarray,
     """
     upright = read_image(path)
     candidates = [upright]
-    with Image.open(path) as image:
+    with open_image(path) as image:
         if image.getexif().get(EXIF_ORIENTATION, 1) != 1:
             candidates.insert(0, np.asarray(image.convert("RGB")))
     for pixels in candidates:

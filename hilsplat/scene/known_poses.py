@@ -8,6 +8,7 @@ from jaxtyping import Float64
 
 from hilsplat.base.errors import SceneError
 from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.layouts import polycam_folders, record3d_export
 from hilsplat.scene.llff import POSES_BOUNDS
 
 MODEL_FOLDERS = ("sparse/0", "sparse")
@@ -21,8 +22,9 @@ class KnownPoses:
 
     Attributes:
         root: the folder.
-        kind: "colmap", "transforms" or "llff".
-        files: the model folder, the transforms files (training first, then testing), or LLFF's file.
+        kind: "colmap", "transforms", "llff", "polycam" or "record3d".
+        files: the model folder; the transforms files (training first, then testing); LLFF's file; Polycam's
+            folders of images and cameras; Record3D's folder of images and its file of poses.
     """
 
     root: Path
@@ -40,6 +42,7 @@ class KnownView:
         camera: its lens, for the size that the source states.
         cam_from_source: world-to-camera transform, OpenCV axes.
         is_test: the source holds it out for testing.
+        border_px: width of a border without a picture, px of the camera; it is cut off.
     """
 
     name: str
@@ -47,10 +50,11 @@ class KnownView:
     camera: pycolmap.Camera
     cam_from_source: Float64[np.ndarray, "4 4"]
     is_test: bool = False
+    border_px: int = 0
 
 
 def find_known_poses(folder: Path) -> KnownPoses | None:
-    """Look for a COLMAP model, transforms files or LLFF's file, in this order; None if there is none.
+    """Look for a COLMAP model, transforms, LLFF's file, Polycam or Record3D, in this order; None if none.
 
     Raises:
         SceneError: there is a `sparse/` folder without a complete model in it.
@@ -67,6 +71,9 @@ def find_known_poses(folder: Path) -> KnownPoses | None:
             return KnownPoses(folder, "transforms", tuple(files))
     if (folder / POSES_BOUNDS).is_file():
         return KnownPoses(folder, "llff", (folder / POSES_BOUNDS,))
+    for kind, export in (("polycam", polycam_folders(folder)), ("record3d", record3d_export(folder))):
+        if export is not None:
+            return KnownPoses(folder, kind, export)
     if (folder / "sparse").is_dir():
         raise SceneError(
             f"{folder / 'sparse'} does not hold a complete COLMAP model",

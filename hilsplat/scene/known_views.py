@@ -1,23 +1,23 @@
-"""Read posed views: COLMAP models, transforms.json (nerfstudio, Blender), poses_bounds.npy (LLFF)."""
+"""Read posed views: COLMAP models, transforms.json (nerfstudio, Blender), LLFF, Polycam, Record3D."""
 
 import json
 import math
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, list_images
+from hilsplat.base.images import open_image
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.known_poses import KnownPoses, KnownView
 from hilsplat.scene.llff import llff_views
 from hilsplat.scene.model import camera_of, pose_matrix, reprojection_errors, sparse_points
-
-OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+from hilsplat.scene.phone_exports import OPENGL_TO_OPENCV, read_polycam, read_record3d
 
 
 def known_views(known: KnownPoses) -> list[KnownView]:
@@ -30,6 +30,10 @@ def known_views(known: KnownPoses) -> list[KnownView]:
         return read_colmap(known)[0]
     if known.kind == "transforms":
         return read_transforms(known)[0]
+    if known.kind == "polycam":
+        return read_polycam(known)
+    if known.kind == "record3d":
+        return read_record3d(known)
     folder = known.root / "images"
     images = list_images(folder if folder.is_dir() else known.root)
     return [
@@ -75,7 +79,12 @@ def read_colmap(
 
 
 def _find_image(root: Path, name: str) -> Path | None:
-    """File of an image named in a source: as named, or with a suffix added, in the folder or its images/."""
+    """File of an image named in a source: as named, or with a suffix added, in the folder or its images/.
+
+    Raises:
+        SceneError: the name leads out of the folder.
+    """
+    _check_inside(root, name)
     for base in (root / "images", root):
         candidate = base / name
         if candidate.is_file():
@@ -84,6 +93,16 @@ def _find_image(root: Path, name: str) -> Path | None:
             if (with_suffix := candidate.with_name(candidate.name + suffix)).is_file():
                 return with_suffix
     return None
+
+
+def _check_inside(root: Path, name: str) -> None:
+    """Refuse a name in a source that leads out of its folder: a download could then read any file."""
+    if Path(name).is_absolute() or Path(os.path.normpath(name)).parts[:1] == ("..",):
+        raise SceneError(
+            f"the poses in {root} name a file outside it: {name}",
+            expected="names below the folder",
+            fix="put the images into the folder, and correct the names in the file with the poses",
+        )
 
 
 def read_transforms(
@@ -108,6 +127,7 @@ def read_transforms(
         for number, frame in enumerate(content["frames"]):
             views.append(_read_frame(known, file, number, {**content, **frame}))
         if points is None and isinstance(content.get("ply_file_path"), str):
+            _check_inside(known.root, content["ply_file_path"])
             points = _read_ply_points(known.root / content["ply_file_path"])
     return views, points
 
@@ -149,7 +169,7 @@ def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> p
             if image is None:
                 width = height = 2  # never used: the view has no image and is left out
             else:
-                with Image.open(image) as opened:
+                with open_image(image) as opened:
                     width, height = opened.size
         width, height = int(width), int(height)
         if "fl_x" in frame:

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
-from PIL import Image
 
 from hilsplat.base.errors import SceneError
+from hilsplat.base.images import open_image
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.colmap import pycolmap
 
@@ -77,7 +77,7 @@ def llff_views(
         )
     views = []
     for image, pose, (_, width_px, focal_px) in zip(images, poses, sizes, strict=True):
-        with Image.open(image) as opened:
+        with open_image(image) as opened:
             width, height = opened.size
         camera = pycolmap.Camera(
             model="SIMPLE_PINHOLE",

@@ -2,11 +2,19 @@
 
 import hashlib
 from collections import Counter, defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from hilsplat.base.errors import SceneError
+import cv2
+
+from hilsplat.base.errors import ImageError, SceneError
 from hilsplat.base.files import list_images
+from hilsplat.base.images import open_image, read_image, resize_to_fit
+from hilsplat.base.progress import track
+from hilsplat.scene.features import EXIF_ORIENTATION, exif_focal_px
+from hilsplat.scene.intake import brought_photographs
+from hilsplat.scene.layouts import has_known_poses, photo_folder
+from hilsplat.scene.photo_check import CHECK_SIDE_PX, CheckedPhoto, photo_doubts
 from hilsplat.scene.sheet import (
     COLUMNS,
     MIN_PHOTOS,
@@ -15,16 +23,12 @@ from hilsplat.scene.sheet import (
     PHOTOS,
     UNITS,
     content_lines,
-    has_known_poses,
     name_problem,
-    photo_folder,
     project_root,
     read_sheet,
 )
 
-OTHER_PHOTO_SUFFIXES = frozenset(
-    {".heic", ".heif", ".avif", ".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".gif"}
-)
+OTHER_PHOTO_SUFFIXES = frozenset({".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".gif", ".jxl"})
 """Photographs in formats that are not read; a folder of them deserves a better message than "no images"."""
 
 
@@ -39,6 +43,8 @@ class PhotoReport:
         num_rotated: photographs that an EXIF flag turns upright.
         duplicates: groups of file names with identical bytes.
         passed_over: number of skipped files per suffix: photographs in formats that are not read.
+        doubts: what is likely to fail, and what to do about it (`photo_check`).
+        notes: what was done to make the folder (`intake`).
     """
 
     folder: Path
@@ -47,6 +53,8 @@ class PhotoReport:
     num_rotated: int
     duplicates: tuple[tuple[str, ...], ...]
     passed_over: dict[str, int]
+    doubts: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def num_readable(self) -> int:
@@ -59,7 +67,7 @@ class PhotoReport:
         return self.num_readable - sum(len(names) - 1 for names in self.duplicates)
 
     def __str__(self) -> str:
-        lines = [f"{self.num_readable} photographs in {self.folder}"]
+        lines = [*self.notes, f"{self.num_readable} photographs in {self.folder}"]
         for (height, width), count in sorted(self.sizes.items(), key=lambda item: (-item[1], item[0])):
             lines.append(f"  {count:>5}  of {width} x {height} px (width x height)")
         if self.num_rotated:
@@ -71,17 +79,16 @@ class PhotoReport:
         if self.unreadable:
             lines.append(f"  {len(self.unreadable):>5}  cannot be read:")
             lines += [f"           {name}: {reason}" for name, reason in self.unreadable]
+        lines += [f"  doubt  {doubt}" for doubt in self.doubts]
         return "\n".join(lines)
 
 
 def inspect_photos(folder: Path) -> PhotoReport:
-    """Read every photograph of a folder (or of its `images/`) in full and report what is there.
+    """Read every photograph of a folder (or of its `images/`) in full, report what is there, and doubt it.
 
     Raises:
         SceneError: there is no such folder, or two photographs differ only in their suffix.
     """
-    from PIL import Image, ImageOps
-
     folder = Path(folder)
     if not folder.is_dir():
         raise SceneError(
@@ -94,21 +101,23 @@ def inspect_photos(folder: Path) -> PhotoReport:
     by_digest: dict[str, list[str]] = defaultdict(list)
     by_stem: dict[str, list[str]] = defaultdict(list)
     num_rotated = 0
-    for path in list_images(where):
+    checked: list[CheckedPhoto] = []
+    for path in track(list_images(where), "photographs checked"):
         if path.stat().st_size == 0:
             unreadable.append((path.name, "the file is empty"))
             continue
         try:
-            with Image.open(path) as image:
-                image.load()
-                turned = image.getexif().get(0x0112, 1) not in (0, 1)
-                width, height = ImageOps.exif_transpose(image).size
-        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-            reason = str(error).replace(str(path), path.name)
+            pixels = read_image(path)
+        except ImageError as error:
+            reason = str(error.__cause__).replace(str(path), path.name)
             unreadable.append((path.name, f"{reason} ({path.stat().st_size} bytes)"))
             continue
-        sizes[height, width] += 1
-        num_rotated += turned
+        size_hw = (pixels.shape[0], pixels.shape[1])
+        sizes[size_hw] += 1
+        with open_image(path) as image:
+            num_rotated += image.getexif().get(EXIF_ORIENTATION, 1) not in (0, 1)
+        grey = cv2.cvtColor(resize_to_fit(pixels, CHECK_SIDE_PX), cv2.COLOR_RGB2GRAY)
+        checked.append(CheckedPhoto(path.name, size_hw, exif_focal_px(path, size_hw), grey))
         with path.open("rb") as stream:
             by_digest[hashlib.file_digest(stream, "sha256").hexdigest()].append(path.name)
         by_stem[path.stem].append(path.name)
@@ -119,6 +128,8 @@ def inspect_photos(folder: Path) -> PhotoReport:
                 found=", ".join(names),
                 fix="rename or remove all but one: views are named after the file without its suffix",
             )
+    copies = {name for names in by_digest.values() for name in names[1:]}
+    distinct = [photo for photo in checked if photo.name not in copies]
     passed_over = Counter(
         path.suffix.lower()
         for path in where.iterdir()
@@ -131,26 +142,27 @@ def inspect_photos(folder: Path) -> PhotoReport:
         num_rotated=num_rotated,
         duplicates=tuple(tuple(names) for names in by_digest.values() if len(names) > 1),
         passed_over=dict(passed_over),
+        doubts=tuple(photo_doubts(distinct, have_poses=has_known_poses(folder))),
     )
 
 
-def add_scene(sheet: Path, name: str, photos: Path, unit: str = "arbitrary") -> PhotoReport:
+def add_scene(sheet: Path, name: str, photos: Path, unit: str = "arbitrary", frames: int = 60) -> PhotoReport:
     """Append your own photographs to the sheet as scene `photos/<name>`; a missing sheet is created.
 
-    The folder stays where it is: the sheet points to it, by a relative path if it is inside the project.
+    A folder stays where it is: the sheet points to it, by a relative path if it is inside the project. The
+    frames of a video and the content of an archive go to `photos/<name>/` in the project.
 
     Args:
         sheet: the scene sheet.
         name: name of the new scene.
-        photos: folder of photographs.
+        photos: folder of photographs or of videos, a video, or a zip of photographs.
         unit: unit of lengths, for a folder with metric poses.
+        frames: largest number of frames taken from videos.
 
     Raises:
         SceneError: the name cannot be used or is taken, photographs cannot be read, or there are
             fewer than three different ones and no known poses. The sheet is then unchanged.
     """
-    from hilsplat.base.artifacts import write_text
-
     sheet, photos = Path(sheet), Path(photos).expanduser().resolve()
     if problem := name_problem(name):
         raise SceneError(
@@ -169,7 +181,16 @@ def add_scene(sheet: Path, name: str, photos: Path, unit: str = "arbitrary") -> 
             found=f"source {row.source}",
             fix="choose another name, or remove its line from the sheet first",
         )
-    report = inspect_photos(photos)
+    root = project_root(sheet)
+    with brought_photographs(photos, root / PHOTOS / name, frames) as brought:
+        report = replace(inspect_photos(brought.folder), notes=brought.notes)
+        _check(report, brought.folder)
+        _append(sheet, name, brought.folder, unit)
+    return report
+
+
+def _check(report: PhotoReport, photos: Path) -> None:
+    """Refuse photographs that cannot be read, or too few of them."""
     if report.unreadable:
         raise SceneError(
             f"{len(report.unreadable)} photographs in {report.folder} cannot be read",
@@ -183,8 +204,14 @@ def add_scene(sheet: Path, name: str, photos: Path, unit: str = "arbitrary") -> 
             f"{report.folder} has too few photographs",
             expected=f"at least {MIN_PHOTOS} (20 or more are better)",
             found="; ".join(found),
-            fix="add photographs (JPEG or PNG) of the same scene",
+            fix="add photographs of the same scene; of a video, film longer and walk around it",
         )
+
+
+def _append(sheet: Path, name: str, photos: Path, unit: str) -> None:
+    """Write the row of a scene at the end of the sheet."""
+    from hilsplat.base.artifacts import write_text
+
     root = project_root(sheet)
     source = photos.relative_to(root).as_posix() if photos.is_relative_to(root) else str(photos)
     if not source.isprintable() or source.startswith("world:"):
@@ -199,4 +226,3 @@ def add_scene(sheet: Path, name: str, photos: Path, unit: str = "arbitrary") -> 
         header = list(COLUMNS)
         text = "\t".join(header) + "\n"
     write_text(sheet, text + "\t".join(values.get(column, NOTHING[1]) for column in header) + "\n")
-    return report

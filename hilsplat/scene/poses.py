@@ -28,8 +28,10 @@ from hilsplat.scene.features import (
 )
 from hilsplat.scene.importers import import_poses
 from hilsplat.scene.known_poses import find_known_poses
+from hilsplat.scene.layouts import photo_folder
+from hilsplat.scene.lost_views import name_neighbours, plot_lost
 from hilsplat.scene.model import camera_of, pose_matrix, reprojection_errors, sparse_points
-from hilsplat.scene.sheet import MIN_PHOTOS, photo_folder
+from hilsplat.scene.sheet import MIN_PHOTOS
 from hilsplat.settings import PosesSettings
 
 logger = logging.getLogger(__name__)
@@ -39,6 +41,9 @@ INIT_MIN_INLIERS = 50
 
 POSE_MIN_INLIERS = 15
 """Points that each further view must see to be posed (reference block; COLMAP: 30)."""
+
+LOST_PICTURE = "not_registered.png"
+"""Written beside the scene folder if too few photographs were registered."""
 
 WEAK_POINTS_PER_VIEW = 13
 """Good runs on renders had at least this many points per registered view; useless ones had 4 to 18."""
@@ -141,13 +146,24 @@ def _reconstruct(
     models = map_views(database, work / "images", work / "models", settings.mapper, seed)
     model = models[0] if models else None
     report = registration_report(work_images, matches, models, settings)
+    name_neighbours(database, report["views"])
     report = {
         "scene": name,
         "poses": f"structure from motion, {settings.mapper} mapper, {matcher} matching, {camera_model}",
         "seed": seed,
         **report,
     }
-    check_registration(images, name, report, settings)
+    picture = work / LOST_PICTURE
+    has_lost = plot_lost(picture, work / "images", report)
+    kept = out.with_name(LOST_PICTURE)
+    kept.unlink(missing_ok=True)  # of an earlier try
+    try:
+        check_registration(images, name, report, settings)
+    except RegistrationError as error:
+        if has_lost:
+            shutil.copyfile(picture, kept)
+            error.add_line("picture", f"{kept} shows the lost photographs and where they belong")
+        raise
     assert model is not None
     views = [
         PosedView(
@@ -157,7 +173,8 @@ def _reconstruct(
     ]
     xyz, rgb = sparse_points(model)
     split = split_views([view.view for view in views], settings.test_every)
-    write_scene(out, name, "arbitrary", views, xyz, rgb, split, report, turn=True)
+    lost = picture if has_lost else None
+    write_scene(out, name, "arbitrary", views, xyz, rgb, split, report, turn=True, lost=lost)
     return report
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, list_images
+from hilsplat.scene.layouts import has_known_poses, photo_folder
 
 COLUMNS = ("dataset", "scene", "group", "source", "unit")
 OPTIONAL_COLUMNS = ("gaussians",)
@@ -100,23 +101,6 @@ def project_root(sheet: Path) -> Path:
     """Folder that relative sources start from: above `config/`, or else the sheet's own folder."""
     folder = Path(sheet).resolve().parent
     return folder.parent if folder.name == "config" else folder
-
-
-def photo_folder(folder: Path) -> Path:
-    """Where the photographs of a source are: the folder itself, or its `images/` if it has none."""
-    folder = Path(folder)
-    if not list_images(folder) and (folder / "images").is_dir():
-        return folder / "images"
-    return folder
-
-
-def has_known_poses(folder: Path) -> bool:
-    """Whether a folder brings its own poses (COLMAP model, transforms*.json or poses_bounds.npy)."""
-    return (
-        (folder / "sparse").is_dir()
-        or any(folder.glob("transforms*.json"))
-        or (folder / "poses_bounds.npy").is_file()
-    )
 
 
 def read_sheet(

@@ -1,12 +1,16 @@
 """Images of every kind become upright RGB of 8 bits."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
+import pillow_heif
 import pytest
 from PIL import Image
 
 from hilsplat.base.errors import ImageError
+from hilsplat.base.files import list_images
 from hilsplat.base.images import read_image
 
 GREY = np.array([[0, 128, 255], [10, 20, 30]], np.uint8)
@@ -67,3 +71,42 @@ def test_pixels_of_unknown_range_are_refused(tmp_path):
     path = saved(tmp_path, Image.fromarray(np.full((2, 2), 70000, np.int32)), ".tif")
     with pytest.raises(ImageError, match=r"70000, are not 16-bit values"):
         read_image(path)
+
+
+def gradient() -> Image.Image:
+    """40 x 24 px, red to the right and green downwards: every quarter turn differs."""
+    y, x = np.mgrid[:24, :40]
+    return Image.fromarray(np.stack([x * 6, y * 10, 0 * x], axis=-1).astype(np.uint8))
+
+
+@pytest.mark.parametrize("suffix", [".heic", ".HEIF", ".avif", ".webp", ".TIF", ".JPG", ".bmp"])
+def test_phone_and_web_formats_are_listed_and_read(tmp_path, suffix):
+    pillow_heif.register_heif_opener()  # for writing; reading registers it itself
+    path = saved(tmp_path, gradient(), suffix, quality=95)
+    assert list_images(tmp_path) == [path]
+    assert np.abs(read_image(path).astype(int) - np.asarray(gradient())).mean() < 4
+
+
+def test_reading_heif_needs_no_preparation(tmp_path, project):
+    pillow_heif.register_heif_opener()
+    path = saved(tmp_path, gradient(), ".heic")
+    read = f"from pathlib import Path; import hilsplat.base.images as i; i.read_image(Path({str(path)!r}))"
+    subprocess.run([sys.executable, "-c", read], check=True, cwd=project)
+
+
+@pytest.mark.parametrize("suffix", [".heic", ".jpg", ".avif"])
+def test_exif_orientation_turns_the_picture_upright(tmp_path, suffix):
+    pillow_heif.register_heif_opener()
+    exif = Image.Exif()
+    exif[0x0112] = 6  # shown a quarter turn clockwise
+    path = saved(tmp_path, gradient(), suffix, quality=95, exif=exif.tobytes())  # HEIF: as `irot`
+    expected = np.rot90(np.asarray(gradient()), -1)
+    found = read_image(path).astype(int)
+    assert found.shape == expected.shape
+    assert np.abs(found - expected).mean() < 4
+
+
+def test_a_picture_too_large_to_be_a_photograph_is_refused_in_words(tmp_path, monkeypatch):
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
+    with pytest.raises(ImageError, match=r"image\.png cannot be read(.|\n)*exceeds limit"):
+        read_image(saved(tmp_path, gradient(), ".png"))

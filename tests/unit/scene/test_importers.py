@@ -1,13 +1,16 @@
-"""Known poses: COLMAP models and transforms.json become the same scene artifact."""
+"""Known poses: COLMAP models, transforms.json and exports of phones become the same scene artifact."""
 
 import json
+import zipfile
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from hilsplat.base.errors import RegistrationError, SceneError
+from hilsplat.scene import phone_exports
 from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.photos import add_scene
 from hilsplat.scene.poses import run_poses
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import PosesSettings
@@ -148,4 +151,134 @@ def test_poses_that_mirror_or_scale_are_refused(tmp_path, factors):
     content["frames"][1]["transform_matrix"] = pose.tolist()
     path.write_text(json.dumps(content))
     with pytest.raises(SceneError, match=r"frame 1 \(images/b\): transform_matrix is not a rigid pose"):
+        import_scene(tmp_path / "in", tmp_path / "scene")
+
+
+@pytest.mark.parametrize("name", ["../secret", "images/../../secret", "/etc/secret"])
+def test_names_that_lead_out_of_the_folder_are_refused(tmp_path, name):
+    write_transforms(tmp_path / "in", fl_x=40)
+    path = tmp_path / "in" / "transforms.json"
+    content = json.loads(path.read_text())
+    content["frames"][1]["file_path"] = name
+    path.write_text(json.dumps(content))
+    with pytest.raises(SceneError, match=rf"name a file outside it: {name}"):
+        import_scene(tmp_path / "in", tmp_path / "scene")
+    write_transforms(tmp_path / "points", fl_x=40, ply_file_path=name)
+    with pytest.raises(SceneError, match=rf"name a file outside it: {name}"):
+        import_scene(tmp_path / "points", tmp_path / "scene")
+
+
+def test_a_colmap_model_cannot_name_files_outside_its_folder(tmp_path):
+    write_colmap(tmp_path / "in", "txt")
+    images = tmp_path / "in" / "sparse" / "0" / "images.txt"
+    images.write_text(images.read_text().replace("b.jpg", "../../../b.jpg"))
+    with pytest.raises(SceneError, match=r"outside it: \.\./\.\./\.\./b\.jpg"):
+        import_scene(tmp_path / "in", tmp_path / "scene")
+
+
+# ---- exports of phones: the camera looks along world +z of ARKit, whose y is up --------------------------
+
+LOOKS_ALONG_Z = np.array([[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]])  # columns: right -x, up +y, back -z
+
+
+def check_phone_scene(scene):
+    """x, y, z of ARKit are y, z, x here: the camera looks along +x, and z is up."""
+    camera = scene.cameras["1.png"]
+    np.testing.assert_allclose(camera.cam_from_world[2, :3], [1, 0, 0], atol=1e-9)  # ahead
+    np.testing.assert_allclose(camera.cam_from_world[1, :3], [0, 0, -1], atol=1e-9)  # down
+    steps = scene.cameras["2.png"].centre - scene.cameras["1.png"].centre
+    np.testing.assert_allclose(steps, [0.3, 0.1, 0.2], atol=1e-6)  # ARKit (0.1, 0.2, 0.3), in metres
+
+
+def write_polycam(folder, corrected, size_hw=(90, 120)):
+    prefix = "corrected_" if corrected else ""
+    images, cameras = (folder / "keyframes" / f"{prefix}{what}" for what in ("images", "cameras"))
+    write_images(images, [f"{number}.jpg" for number in range(4)], size_hw)
+    cameras.mkdir(parents=True)
+    for number in range(3):  # the last has no camera
+        matrix = np.column_stack([LOOKS_ALONG_Z, number * np.array([0.1, 0.2, 0.3])])
+        content = {f"t_{row}{column}": matrix[row, column] for row in range(3) for column in range(4)}
+        content |= {"fx": 100.0, "fy": 101.0, "cx": 61.0, "cy": 44.0, "width": 120, "height": 90}
+        (cameras / f"{number}.json").write_text(json.dumps(content))
+
+
+def test_polycam_exports_are_turned_to_z_up(tmp_path):
+    write_polycam(tmp_path / "in", corrected=False)
+    scene = import_scene(tmp_path / "in", tmp_path / "scene")
+    assert scene.cameras.names == ("0.png", "1.png", "2.png")
+    check_phone_scene(scene)
+    np.testing.assert_allclose(scene.cameras["0.png"].K, [[100, 0, 61], [0, 101, 44], [0, 0, 1]])
+
+
+def test_corrected_polycam_images_come_first_and_lose_their_border(tmp_path):
+    write_polycam(tmp_path / "in", corrected=False, size_hw=(30, 40))
+    write_polycam(tmp_path / "in", corrected=True, size_hw=(180, 240))  # twice the camera's size
+    scene = import_scene(tmp_path / "in", tmp_path / "scene")
+    # doubled, less 15 px of the camera, which are 30 of the image, on each side
+    np.testing.assert_allclose(scene.cameras["0.png"].K, [[200, 0, 92], [0, 202, 58], [0, 0, 1]])
+    assert scene.image("0.png").shape == (120, 180, 3)
+
+
+def write_record3d(folder, metadata="metadata.json", images="rgb", count=3):
+    write_images(folder / images, [f"{number}.jpg" for number in range(count)], (90, 120))
+    # half a turn about y: quaternion (0, 1, 0, 0) in the order x, y, z, w
+    poses = [[0, 1, 0, 0, *(number * np.array([0.1, 0.2, 0.3]))] for number in range(count)]
+    intrinsics = [100.0, 0, 0, 0, 101.0, 0, 61.0, 44.0, 1]  # by columns
+    (folder / metadata).write_text(
+        json.dumps({"K": intrinsics, "w": 120, "h": 90, "fps": 60, "poses": poses})
+    )
+
+
+@pytest.mark.parametrize(("metadata", "images"), [("metadata.json", "rgb"), ("metadata", "rgbd")])
+def test_record3d_exports_are_turned_to_z_up(tmp_path, metadata, images):
+    write_record3d(tmp_path / "in", metadata, images)
+    scene = import_scene(tmp_path / "in", tmp_path / "scene")
+    check_phone_scene(scene)
+    np.testing.assert_allclose(scene.cameras["0.png"].K, [[100, 0, 61], [0, 101, 44], [0, 0, 1]])
+
+
+def test_long_recordings_are_thinned_evenly(tmp_path, monkeypatch):
+    monkeypatch.setattr(phone_exports, "MAX_VIEWS", 4)
+    write_record3d(tmp_path / "in", count=10)
+    assert import_scene(tmp_path / "in", tmp_path / "scene").cameras.names == (
+        "0.png",
+        "3.png",
+        "6.png",
+        "9.png",
+    )
+
+
+def test_an_r3d_archive_is_imported(tmp_path):
+    write_record3d(tmp_path / "in", "metadata", "rgbd")
+    with zipfile.ZipFile(tmp_path / "scan.r3d", "w") as opened:
+        for path in [*sorted((tmp_path / "in").rglob("*.*")), tmp_path / "in/metadata"]:
+            opened.write(path, path.relative_to(tmp_path / "in"))
+        opened.writestr("rgbd/0.depth", b"not needed")
+    report = add_scene(tmp_path / "scenes.tsv", "scan", tmp_path / "scan.r3d")
+    assert report.num_readable == 3
+    assert not list((tmp_path / "photos/scan").rglob("*.depth"))
+    check_phone_scene(import_scene(tmp_path / "photos/scan", tmp_path / "scene"))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{}", r"does not hold poses of Record3D: KeyError\('K'\)"),
+        ("[]", "does not hold a JSON object"),
+        ("{", "is not valid JSON"),
+        ('{"K": [1,0,0,0,1,0,0,0,1], "w": 1, "h": 1, "poses": [[0,0,0,0,0,0,0]]}', "poses of Record3D"),
+    ],
+)
+def test_unusable_phone_exports_are_refused(tmp_path, content, message):
+    write_record3d(tmp_path / "in")
+    (tmp_path / "in/metadata.json").write_text(content)
+    with pytest.raises(SceneError, match=message):
+        import_scene(tmp_path / "in", tmp_path / "scene")
+
+
+def test_a_polycam_camera_that_scales_is_refused(tmp_path):
+    write_polycam(tmp_path / "in", corrected=False)
+    path = tmp_path / "in/keyframes/cameras/1.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "t_00": -2.0}))
+    with pytest.raises(SceneError, match=r"cameras/1\.json: not a rigid pose"):
         import_scene(tmp_path / "in", tmp_path / "scene")

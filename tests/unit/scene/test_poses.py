@@ -26,7 +26,7 @@ def write_noise(folder, count, size=48):
     return folder
 
 
-def plane_views(folder, views=5, size=160):
+def plane_views(folder, views=5, size=160, step_deg=9):
     """Renders of a textured corner (the planes x = 0 and y = 0) by a pinhole camera on an arc.
 
     Returns the camera centres, and a transforms.json content with the true poses.
@@ -35,7 +35,7 @@ def plane_views(folder, views=5, size=160):
     noise = np.random.default_rng(1).random((2, 64, 64, 3)).repeat(4, axis=1).repeat(4, axis=2)
     centres, frames, focal = [], [], 1.2 * size
     for number in range(views):
-        angle = np.radians(45 + 9 * (number - (views - 1) / 2))
+        angle = np.radians(45 + step_deg * (number - (views - 1) / 2))
         centre = np.array([4 * np.cos(angle), 4 * np.sin(angle), 1.0 + 0.2 * (number % 2)])
         forward = -centre / np.linalg.norm(centre)
         right = np.cross(forward, [0, 0, 1])

@@ -114,9 +114,9 @@ def test_bad_cells_are_named(tmp_path, row, message):
 
 def test_a_folder_of_unread_photographs_says_what_it_holds(tmp_path):
     (tmp_path / "phone").mkdir()
-    (tmp_path / "phone" / "a.HEIC").write_bytes(b"x")
+    (tmp_path / "phone" / "a.DNG").write_bytes(b"x")
     row = ("photos", "a", "photos", "phone", "arbitrary")
-    with pytest.raises(SceneError, match=r"has no images(.|\n)*1 files \.heic"):
+    with pytest.raises(SceneError, match=r"has no images(.|\n)*1 files \.dng"):
         read_sheet(write_sheet(tmp_path, row))
     assert len(read_sheet(write_sheet(tmp_path, row), checked_groups=())) == 1
 
@@ -132,7 +132,7 @@ def test_inspection_finds_damaged_turned_and_copied_photographs(tmp_path):
     whole = (folder / "photo_2.jpg").read_bytes()
     (folder / "truncated.jpg").write_bytes(whole[: len(whole) // 2])
     (folder / "text.png").write_text("no image")
-    (folder / "phone.heic").write_bytes(b"x")
+    (folder / "raw.nef").write_bytes(b"x")
 
     report = inspect_photos(tmp_path)  # the folder above images/ works too
     assert report.folder == folder
@@ -142,7 +142,7 @@ def test_inspection_finds_damaged_turned_and_copied_photographs(tmp_path):
     assert [name for name, _ in report.unreadable] == ["empty.jpg", "text.png", "truncated.jpg"]
     assert dict(report.unreadable)["empty.jpg"] == "the file is empty"
     assert "truncated" in dict(report.unreadable)["truncated.jpg"]
-    assert report.passed_over == {".heic": 1}
+    assert report.passed_over == {".nef": 1}
     assert "5 photographs in" in str(report) and "4  of 40 x 30 px" in str(report)
 
 
@@ -167,7 +167,7 @@ def test_adding_too_few_or_damaged_photographs_leaves_the_sheet_alone(tmp_path):
     (folder / "empty.jpg").touch()
     with pytest.raises(SceneError, match=r"empty\.jpg: the file is empty"):
         add_scene(sheet, "desk", folder)
-    with pytest.raises(SceneError, match=r"photo folder .* is missing"):
+    with pytest.raises(SceneError, match=r"gone is missing(.|\n)*a folder of photographs, a video, or a zip"):
         add_scene(sheet, "desk", tmp_path / "gone")
     assert not sheet.exists()
 

@@ -1,0 +1,83 @@
+"""Unpacking an archive of photographs that a stranger may have made."""
+
+import stat
+import zipfile
+from pathlib import Path, PurePosixPath
+
+from hilsplat.base.artifacts import require_free_space
+from hilsplat.base.errors import SceneError
+from hilsplat.base.files import IMAGE_SUFFIXES
+
+MAX_FILES = 50_000
+MAX_TOTAL_GIB = 20
+"""Limits of what an archive may state; a capture has some hundred files and rarely a gigabyte."""
+
+POSE_SUFFIXES = frozenset({".json", ".txt", ".bin", ".npy", ".ply"})
+"""Files that may hold poses or points; `metadata` of Record3D has no suffix."""
+
+
+def unpack_photographs(archive: Path, folder: Path) -> None:
+    """Unpack the images and pose files of a zip archive into an existing, empty folder.
+
+    Nothing is written before every entry was checked. No more is written than the archive states.
+
+    Raises:
+        SceneError: it is no zip archive, is damaged or encrypted, states too much, or holds links or names
+        that
+            lead out of the folder.
+        DiskSpaceError: the disk cannot hold it.
+    """
+    try:
+        with zipfile.ZipFile(archive) as opened:
+            entries = [entry for entry in opened.infolist() if not entry.is_dir()]
+            _check(archive, entries)
+            wanted = [entry for entry in entries if _is_wanted(PurePosixPath(entry.filename))]
+            require_free_space(folder, sum(entry.file_size for entry in wanted) / 2**20 + 200)
+            for entry in wanted:
+                target = folder / PurePosixPath(entry.filename)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                # zipfile stops at the stated size, and checks it and the CRC.
+                with opened.open(entry) as source, target.open("xb") as sink:
+                    while block := source.read(1 << 20):
+                        sink.write(block)
+    except (zipfile.BadZipFile, NotImplementedError, EOFError, OSError, RuntimeError) as error:
+        raise SceneError(
+            f"archive {archive} cannot be unpacked: {error}",
+            found=f"a file of {archive.stat().st_size} bytes" if archive.is_file() else "no file",
+            fix="copy it again, or unpack it yourself and give the folder",
+        ) from error
+
+
+def _is_wanted(name: PurePosixPath) -> bool:
+    """Whether an entry is an image or may hold poses; what systems add themselves is not wanted."""
+    if any(part.startswith(".") or part == "__MACOSX" for part in name.parts):
+        return False
+    return name.suffix.lower() in IMAGE_SUFFIXES | POSE_SUFFIXES or name.name == "metadata"
+
+
+def _check(archive: Path, entries: list[zipfile.ZipInfo]) -> None:
+    """Refuse an archive that is too large or could write elsewhere."""
+    fix = "unpack it yourself with a program that you trust, look at it, and give the folder"
+    total_gib = sum(entry.file_size for entry in entries) / 2**30
+    if len(entries) > MAX_FILES or total_gib > MAX_TOTAL_GIB:
+        raise SceneError(
+            f"archive {archive} is too large for a set of photographs",
+            expected=f"at most {MAX_FILES} files and {MAX_TOTAL_GIB} GiB unpacked",
+            found=f"{len(entries)} files and {total_gib:.1f} GiB",
+            fix=fix,
+        )
+    names: set[str] = set()
+    for entry in entries:
+        name = PurePosixPath(entry.filename)
+        if name.is_absolute() or ".." in name.parts or "\\" in entry.filename or ":" in entry.filename:
+            problem = "leads out of the archive's folder"
+        elif stat.S_ISLNK(entry.external_attr >> 16):
+            problem = "is a link"
+        elif entry.flag_bits & 1:
+            problem = "is encrypted"
+        elif str(name) in names:
+            problem = "is there twice"
+        else:
+            names.add(str(name))
+            continue
+        raise SceneError(f"archive {archive}: entry {entry.filename!r} {problem}", fix=fix)

@@ -1,0 +1,96 @@
+"""What people bring, brought into a folder of photographs: videos, archives, or a folder as it is."""
+
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from hilsplat.base.artifacts import atomic_folder
+from hilsplat.base.errors import SceneError
+from hilsplat.base.files import VIDEO_SUFFIXES, list_images, list_videos
+from hilsplat.scene.layouts import has_known_poses, photo_folder, unwrapped
+
+
+@dataclass(frozen=True)
+class Brought:
+    """A folder to be registered as a scene's source.
+
+    Attributes:
+        folder: the folder.
+        notes: what was done and left out on the way, in sentences.
+    """
+
+    folder: Path
+    notes: tuple[str, ...] = ()
+
+
+@contextmanager
+def brought_photographs(source: Path, target: Path, frames: int) -> Iterator[Brought]:
+    """The folder of photographs that a source gives: itself, or `target`, made from videos or an archive.
+
+    If the block ends with an error, a folder that was made is removed again.
+
+    Args:
+        source: a folder with photographs, or with videos alone; a video; or a .zip (or Record3D's .r3d).
+        target: folder to make, if one has to be made.
+        frames: largest number of frames taken from videos.
+
+    Raises:
+        SceneError: the source cannot be used, or the target exists.
+    """
+    source = Path(source)
+    if not source.exists():
+        raise SceneError(
+            f"{source} is missing", fix="give a folder of photographs, a video, or a zip of photographs"
+        )
+    make: Callable[[Path], list[str]]
+    if videos := _videos_of(source):
+
+        def make(folder: Path) -> list[str]:
+            from hilsplat.scene.video import extract_frames  # PyAV takes time to load
+
+            named = ", ".join(video.name for video in videos)
+            notes = extract_frames(videos, folder, frames)
+            return [f"{len(list_images(folder))} frames of {named} are in {target}", *notes]
+
+    elif source.is_dir():
+        beside = list_videos(photo_folder(source))
+        note = f"{len(beside)} videos beside the photographs (Live Photos) are not used" if beside else ""
+        yield Brought(source, (note,) if note else ())
+        return
+    elif source.suffix.lower() in (".zip", ".r3d"):
+
+        def make(folder: Path) -> list[str]:
+            from hilsplat.scene.archive import unpack_photographs
+
+            unpack_photographs(source, folder)
+            return [f"{source.name} unpacked to {target}"]
+
+    else:
+        raise SceneError(
+            f"{source} is a file of an unknown kind",
+            expected=f"a folder of photographs, a video ({', '.join(sorted(VIDEO_SUFFIXES))}), or a .zip",
+            fix="give the folder that holds the photographs",
+        )
+    if target.exists():
+        raise SceneError(
+            f"{target} is in the way",
+            fix="choose another name for the scene, or move that folder away",
+        )
+    with atomic_folder(target) as folder:
+        notes = make(folder)
+    try:
+        yield Brought(unwrapped(target), tuple(notes))
+    except BaseException:
+        shutil.rmtree(target, ignore_errors=True)
+        raise
+
+
+def _videos_of(source: Path) -> list[Path]:
+    """The videos to take frames from: the source itself, or those of a folder without photographs."""
+    if source.is_file():
+        return [source] if source.suffix.lower() in VIDEO_SUFFIXES else []
+    if list_images(photo_folder(source)) or has_known_poses(source):
+        return []
+    return list_videos(source)

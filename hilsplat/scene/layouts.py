@@ -1,0 +1,58 @@
+"""How folders of photographs are laid out; light enough to import at the start of the workflow."""
+
+from pathlib import Path
+
+from hilsplat.base.files import list_images
+
+
+def photo_folder(folder: Path) -> Path:
+    """Where the photographs of a source are: the folder itself or, if it has none, where exports put them."""
+    folder = Path(folder)
+    if list_images(folder):
+        return folder
+    if (folder / "images").is_dir():
+        return folder / "images"
+    if (polycam := polycam_folders(folder)) is not None:
+        return polycam[0]
+    if (record3d := record3d_export(folder)) is not None:
+        return record3d[0]
+    return folder
+
+
+def has_known_poses(folder: Path) -> bool:
+    """Whether a folder brings its own poses, in any form that `find_known_poses` finds."""
+    return (
+        (folder / "sparse").is_dir()
+        or any(folder.glob("transforms*.json"))
+        or (folder / "poses_bounds.npy").is_file()
+        or polycam_folders(folder) is not None
+        or record3d_export(folder) is not None
+    )
+
+
+def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
+    """Folders of images and of cameras in a raw Polycam export, the corrected ones if there are any."""
+    for prefix in ("corrected_", ""):
+        images, cameras = (folder / "keyframes" / f"{prefix}{what}" for what in ("images", "cameras"))
+        if images.is_dir() and cameras.is_dir():
+            return images, cameras
+    return None
+
+
+def record3d_export(folder: Path) -> tuple[Path, Path] | None:
+    """Folder of images and file of poses in a Record3D export: an image sequence, or an unpacked .r3d."""
+    for metadata in (folder / "metadata.json", folder / "metadata"):
+        for images in (folder / "rgb", folder / "rgbd"):
+            if metadata.is_file() and images.is_dir():
+                return images, metadata
+    return None
+
+
+def unwrapped(folder: Path) -> Path:
+    """The folder that holds something: archives often wrap their content in a folder of its own."""
+    while photo_folder(folder) == folder and not list_images(folder) and not has_known_poses(folder):
+        inside = [path for path in folder.iterdir() if not path.name.startswith(".")]
+        if len(inside) != 1 or not inside[0].is_dir():
+            break
+        folder = inside[0]
+    return folder

@@ -1,0 +1,133 @@
+"""Poses that phones measured while they recorded: raw exports of Polycam and Record3D.
+
+Layouts and axes as nerfstudio's `polycam_utils.py`, `record3d_utils.py` and `process_data.py` read them.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from hilsplat.base.errors import SceneError
+from hilsplat.base.files import list_images
+from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
+from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.known_poses import KnownPoses, KnownView
+
+MAX_VIEWS = 300
+"""A recording has many more frames than a scene needs; views are then taken at even distances (nerfstudio:
+300 for Record3D, 600 for Polycam)."""
+
+POLYCAM_BORDER_PX = 15
+"""Corrected images have black borders where they were undistorted (nerfstudio: `crop_border_pixels`)."""
+
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+Z_UP_FROM_Y_UP = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""ARKit's world has y up; scenes here have z up. A cyclic permutation, so nothing is mirrored."""
+
+
+def read_polycam(known: KnownPoses) -> list[KnownView]:
+    """Read `keyframes/cameras/<stem>.json`, or the corrected ones: fx, fy, cx, cy, width, height in px, and
+    t_00 ... t_23, the camera-to-world matrix by rows, metres, OpenGL axes.
+
+    Raises:
+        SceneError: a camera is not valid JSON, lacks a key, or is not a rigid pose.
+    """
+    images, cameras = known.files
+    border_px = POLYCAM_BORDER_PX if images.name.startswith("corrected") else 0
+    views = []
+    for image in _spread(list_images(images)):
+        file = cameras / f"{image.stem}.json"
+        if not file.is_file():
+            continue  # Polycam drops cameras that it could not correct
+        content = _json(file)
+        try:
+            matrix = np.array(
+                [[float(content[f"t_{row}{column}"]) for column in range(4)] for row in range(3)]
+            )
+            camera = pycolmap.Camera(
+                model="PINHOLE",
+                width=int(content["width"]),
+                height=int(content["height"]),
+                params=[float(content[key]) for key in ("fx", "fy", "cx", "cy")],
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise SceneError(
+                f"{file} is not a camera of Polycam: {error!r}",
+                expected="fx, fy, cx, cy, width, height and t_00 to t_23",
+                fix="export the raw data again (developer mode)",
+            ) from error
+        views.append(KnownView(image.name, image, camera, _pose(matrix, str(file)), border_px=border_px))
+    return views
+
+
+def read_record3d(known: KnownPoses) -> list[KnownView]:
+    """Read `metadata`: `K` by columns, `w` and `h` in px, and `poses`, a row for each image <number>.jpg:
+    quaternion xyzw and position of the camera in the world, metres, OpenGL axes.
+
+    Raises:
+        SceneError: the file is not such JSON, or a row is not a rigid pose.
+    """
+    from scipy.spatial.transform import Rotation
+
+    folder, file = known.files
+    content = _json(file)
+    try:
+        intrinsics = np.array(content["K"], dtype=np.float64).reshape(3, 3).T
+        width, height = int(content["w"]), int(content["h"])
+        rows = np.array(content["poses"], dtype=np.float64).reshape(-1, 7)
+        matrices = np.concatenate([Rotation.from_quat(rows[:, :4]).as_matrix(), rows[:, 4:, None]], axis=2)
+    except (KeyError, TypeError, ValueError) as error:
+        raise SceneError(
+            f"{file} does not hold poses of Record3D: {error!r}",
+            expected="K (9 numbers), w, h, and poses (rows of 7 numbers)",
+            fix="export the recording again",
+        ) from error
+    images = {int(path.stem): path for path in list_images(folder) if path.stem.isdigit()}
+    camera = {
+        "model": "PINHOLE",
+        "width": width,
+        "height": height,
+        "params": [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]],
+    }
+    numbers = _spread(sorted(number for number in images if number < len(matrices)))
+    return [
+        KnownView(
+            images[number].name,
+            images[number],
+            pycolmap.Camera(**camera),
+            _pose(matrices[number], f"{file}, pose {number}"),
+        )
+        for number in numbers
+    ]
+
+
+def _spread(items: list[Any]) -> list[Any]:
+    """At most `MAX_VIEWS` of the items, at even distances, the first and the last among them."""
+    if len(items) <= MAX_VIEWS:
+        return items
+    return [items[row] for row in np.linspace(0, len(items) - 1, MAX_VIEWS).round().astype(int)]
+
+
+def _json(file: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise SceneError(f"{file} is not valid JSON: {error}", fix="export it again") from error
+    if not isinstance(content, dict):
+        raise SceneError(f"{file} does not hold a JSON object", fix="export it again")
+    return content
+
+
+def _pose(world_from_cam: Float64[np.ndarray, "3 4"], where: str) -> Float64[np.ndarray, "4 4"]:
+    """World-to-camera transform (OpenCV axes, z up) of a camera-to-world matrix (OpenGL axes, y up)."""
+    if not np.isfinite(world_from_cam).all() or not are_rotations(world_from_cam[:, :3], RIGID_TOLERANCE):
+        raise SceneError(
+            f"{where}: not a rigid pose",
+            found=np.array2string(world_from_cam, precision=4, suppress_small=True).replace("\n", ""),
+            fix="export it again",
+        )
+    full = np.vstack([world_from_cam, [0.0, 0.0, 0.0, 1.0]])
+    return np.linalg.inv(Z_UP_FROM_Y_UP @ full @ OPENGL_TO_OPENCV)

@@ -1,0 +1,337 @@
+"""Photographs from video: the sharpest frame of each stretch of the camera's way."""
+
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+from pathlib import Path
+
+import av
+import numpy as np
+from av.container import InputContainer
+from av.video.stream import VideoStream
+from jaxtyping import Int64, UInt8
+from PIL import Image
+
+from hilsplat.base.artifacts import sha256_of_file, write_json
+from hilsplat.base.errors import SceneError
+from hilsplat.base.progress import track
+from hilsplat.scene.motion import displacement, sharpness
+from hilsplat.scene.video_colours import rgb_pixels
+
+logger = logging.getLogger(__name__)
+
+CANDIDATES_PER_FRAME = 4
+"""Frames kept per frame that is asked for, from which the camera's way is measured."""
+
+MIN_STEP = 0.01
+"""Displacement between two frames, as a share of the diagonal, below which they show the same: about 0.7
+degrees of a phone's 70. Noise of a still camera measures below 0.001."""
+
+GREY_SIDE_PX = 480
+SHARPNESS_SIDE_PX = 960
+"""Longer side of the copies on which motion and sharpness are measured."""
+
+JPEG_QUALITY = 95
+USUAL_RATE = 30.0
+"""Frames per second, for files that state neither a rate nor times."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame of a video that may become a photograph.
+
+    Attributes:
+        video: position of its video among those given.
+        number: position of the frame among the sound ones of its video.
+        time_s: when it is shown.
+        sharpness: variance of the Laplacian.
+        grey: small copy, as stored (not turned).
+    """
+
+    video: int
+    number: int
+    time_s: float
+    sharpness: float
+    grey: UInt8[np.ndarray, "h w"]
+
+
+@dataclass
+class Decoding:
+    """What decoding a video found.
+
+    Attributes:
+        stated_s: length that the file states; None if it states none.
+        decoded_s: when its last sound frame is shown.
+        num_frames: sound frames.
+        num_damaged: packets and frames that could not be decoded.
+    """
+
+    stated_s: float | None = None
+    decoded_s: float = 0.0
+    num_frames: int = 0
+    num_damaged: int = 0
+
+
+def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str]:
+    """Write the frames of videos that serve as photographs into a folder, and `origin.json`.
+
+    The camera's way through all videos is divided into `count` equal stretches, measured by the displacement
+    of image corners, and the sharpest frame of each is taken (variance of the Laplacian, Pech-Pacheco et al.
+    2000). Where the camera rests, one frame is taken; a short way gives fewer frames. Frames are turned
+    upright by the stream's display matrix and stored as 0001.jpg, 0002.jpg, ... at full size and quality 95.
+
+    A video is decoded twice, once to choose and once to write, so that only small copies are held in memory.
+    The same videos give the same bytes.
+
+    Args:
+        videos: files, in the order of their frames.
+        folder: an existing, empty folder.
+        count: largest number of frames.
+
+    Returns:
+        What a person should know: damaged parts, frames left out.
+
+    Raises:
+        SceneError: a video cannot be read or has no sound frame.
+    """
+    notes: list[str] = []
+    candidates: list[Frame] = []
+    decodings = []
+    for position, video in enumerate(videos):
+        decoding = Decoding()
+        candidates += _candidates(video, position, CANDIDATES_PER_FRAME * count, decoding)
+        if not decoding.num_frames:
+            raise SceneError(
+                f"video {video} has no frame that can be decoded",
+                found=f"{decoding.num_damaged} damaged packets, {video.stat().st_size} bytes",
+                fix="play it to see whether it is intact; copy it again, or convert it to H.264 in an .mp4",
+            )
+        decodings.append(decoding)
+        notes += _damage(video, decoding)
+    chosen = choose_frames(candidates, count)
+    if len(chosen) < count:
+        notes.append(
+            f"{len(chosen)} frames instead of {count}: no more of them differ enough from each other"
+        )
+    names = {(frame.video, frame.number): f"{row:04d}.jpg" for row, frame in enumerate(chosen, start=1)}
+    for position, video in enumerate(videos):
+        wanted = {number: name for (of_video, number), name in names.items() if of_video == position}
+        _write_frames(video, wanted, folder)
+    origin = {
+        "videos": [
+            {
+                "file": video.name,
+                "sha256": sha256_of_file(video),
+                "seconds": round(decoding.decoded_s, 3),
+                "frames": decoding.num_frames,
+                "damaged": decoding.num_damaged,
+            }
+            for video, decoding in zip(videos, decodings, strict=True)
+        ],
+        "settings": {"frames": count, "min_step": MIN_STEP, "jpeg_quality": JPEG_QUALITY},
+        "frames": {
+            names[frame.video, frame.number]: {
+                "video": videos[frame.video].name,
+                "seconds": round(frame.time_s, 3),
+                "sharpness": round(frame.sharpness, 2),
+            }
+            for frame in chosen
+        },
+        "notes": notes,
+    }
+    write_json(folder / "origin.json", origin)
+    return notes
+
+
+def _damage(video: Path, decoding: Decoding) -> list[str]:
+    """What is wrong with a video of which at least a part could be decoded."""
+    notes = []
+    if decoding.num_damaged:
+        notes.append(f"{video.name}: {decoding.num_damaged} damaged packets or frames were left out")
+    if decoding.stated_s is not None and decoding.decoded_s < 0.9 * decoding.stated_s - 1:
+        notes.append(
+            f"{video.name} breaks off after {decoding.decoded_s:.1f} of {decoding.stated_s:.1f} s: only that "
+            "part is used; copy it again if the rest matters"
+        )
+    return notes
+
+
+# ---- decoding -------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _opened(video: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
+    """The first video stream of a file.
+
+    Raises:
+        SceneError: it is no video, or its header is lost.
+    """
+    try:
+        container = av.open(str(video), metadata_errors="replace")
+    except (av.error.FFmpegError, OSError) as error:
+        raise SceneError(
+            f"video {video} cannot be read: {error.strerror or error}",
+            expected="an intact file with a video stream; an .mp4 or .mov that was cut has lost its index",
+            found=f"a file of {video.stat().st_size} bytes" if video.is_file() else "no file",
+            fix="copy it again from the camera, or convert it to H.264 in an .mp4",
+        ) from error
+    with container:
+        if not container.streams.video:
+            raise SceneError(
+                f"{video} has no video stream",
+                found=", ".join(stream.type for stream in container.streams) or "no stream",
+                fix="give the file of the video",
+            )
+        stream = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        yield container, stream
+
+
+def _stated_seconds(container: InputContainer, stream: VideoStream) -> float | None:
+    """Length that a file states; None if it states none, as recordings of browsers do."""
+    if stream.duration is not None and stream.time_base is not None:
+        return float(stream.duration * stream.time_base)
+    return container.duration / av.time_base if container.duration is not None else None
+
+
+def _decoded(
+    container: InputContainer, stream: VideoStream, decoding: Decoding
+) -> Iterator[tuple[av.VideoFrame, float]]:
+    """Sound frames of a video with their times in seconds, in the order in which they are shown.
+
+    Damaged packets are counted and passed over; a file that ends early gives its good part.
+    """
+    rate = float(stream.average_rate or USUAL_RATE)
+    start: float | None = None
+    packets = container.demux(stream)
+    while True:
+        try:
+            packet = next(packets, None)
+            if packet is None:
+                return
+            frames = packet.decode()
+        except av.error.EOFError:
+            return
+        except av.error.FFmpegError as error:
+            logger.debug("%s", error)
+            decoding.num_damaged += 1
+            continue
+        for frame in frames:
+            if not isinstance(frame, av.VideoFrame) or frame.is_corrupt:
+                decoding.num_damaged += 1
+                continue
+            time_s = frame.time if frame.time is not None else decoding.num_frames / rate
+            start = time_s if start is None else start
+            decoding.decoded_s = max(decoding.decoded_s, time_s - start)
+            decoding.num_frames += 1
+            yield frame, time_s - start
+
+
+def _candidates(video: Path, position: int, most: int, decoding: Decoding) -> list[Frame]:
+    """The sharpest frame of each of at most `most` equal spans of time.
+
+    The stated length may be missing or wrong, so spans double, and their frames compete, when there are too
+    many.
+    """
+    best: dict[int, Frame] = {}
+    with _opened(video) as (container, stream):
+        decoding.stated_s = _stated_seconds(container, stream)
+        span_s = max((decoding.stated_s or 0.0) / most, 1e-3)
+        expected = round((decoding.stated_s or 0.0) * float(stream.average_rate or USUAL_RATE)) or None
+        decoded = track(_decoded(container, stream, decoding), f"frames of {video.name}", expected)
+        for number, (frame, time_s) in enumerate(decoded):
+            row = int(time_s / span_s)
+            score = sharpness(_grey(frame, SHARPNESS_SIDE_PX))
+            if row in best and best[row].sharpness >= score:
+                continue
+            best[row] = Frame(position, number, time_s, score, _grey(frame, GREY_SIDE_PX))
+            while len(best) > most:
+                span_s *= 2
+                halved: dict[int, Frame] = {}
+                for row, candidate in best.items():
+                    rival = halved.get(row // 2)
+                    if rival is None or candidate.sharpness > rival.sharpness:
+                        halved[row // 2] = candidate
+                best = halved
+    return sorted(best.values(), key=lambda candidate: candidate.number)
+
+
+def _grey(frame: av.VideoFrame, side_px: int) -> UInt8[np.ndarray, "h w"]:
+    """A small grey copy of a frame as it is stored."""
+    scale = min(1.0, side_px / max(frame.width, frame.height))
+    size = {"width": max(2, round(frame.width * scale)), "height": max(2, round(frame.height * scale))}
+    return frame.reformat(**size, format="gray", interpolation="AREA", threads=1).to_ndarray()
+
+
+def _write_frames(video: Path, wanted: dict[int, str], folder: Path) -> None:
+    """Write chosen frames of a video upright, at full size."""
+    missing = dict(wanted)
+    with _opened(video) as (container, stream):
+        for number, (frame, _) in enumerate(_decoded(container, stream, Decoding())):
+            if number in missing:
+                pixels = upright(rgb_pixels(frame), frame.rotation)
+                Image.fromarray(pixels).save(folder / missing.pop(number), quality=JPEG_QUALITY)
+            if not missing:
+                break
+    if missing:
+        raise SceneError(
+            f"video {video} decoded differently the second time: {len(missing)} frames are gone",
+            fix="check that the file is not being written, and try again",
+        )
+
+
+def upright(pixels: UInt8[np.ndarray, "H W 3"], rotation_deg: int) -> UInt8[np.ndarray, "h w 3"]:
+    """Turn a stored frame as its display matrix says: anticlockwise, to the nearest quarter turn."""
+    return np.ascontiguousarray(np.rot90(pixels, round(rotation_deg / 90) % 4))
+
+
+# ---- choosing -------------------------------------------------------------------------------------
+
+
+def choose_frames(candidates: Sequence[Frame], count: int) -> list[Frame]:
+    """The sharpest candidate of each of at most `count` equal stretches of the camera's way.
+
+    Two frames less than `MIN_STEP` apart show the same, and only the sharper one stays. That also holds for
+    the jitter of a resting hand, whose way adds up though it leads nowhere.
+    """
+    kept: list[Frame] = []
+    if not candidates:
+        return kept
+    row_of = _stretches([_step(a, b) for a, b in pairwise(candidates)], count)
+    for _, group in groupby(zip(row_of.tolist(), candidates, strict=True), key=lambda item: item[0]):
+        best = max((frame for _, frame in group), key=lambda frame: frame.sharpness)
+        if not kept or _step(kept[-1], best) >= MIN_STEP:
+            kept.append(best)
+        elif best.sharpness > kept[-1].sharpness:
+            kept[-1] = best
+    return kept
+
+
+def _stretches(steps: Sequence[float], count: int) -> Int64[np.ndarray, " N"]:
+    """Number of the stretch in which each candidate lies, given the steps between them.
+
+    A stretch is as short as `count` of them allow, but not below `MIN_STEP`. A longer step cannot be divided,
+    so it counts as one stretch.
+    """
+
+    def rows(length: float) -> Int64[np.ndarray, " N"]:
+        way = np.concatenate([[0.0], np.cumsum(np.minimum(steps, length))])
+        return np.floor(way / length + 1e-9).astype(np.int64)
+
+    short, long = MIN_STEP, max(sum(steps), MIN_STEP) * 1.01
+    if rows(short)[-1] < count:
+        return rows(short)
+    for _ in range(40):
+        middle = (short + long) / 2
+        short, long = (short, middle) if rows(middle)[-1] < count else (middle, long)
+    return rows(long)
+
+
+def _step(one: Frame, other: Frame) -> float:
+    """Displacement between two frames as a share of the diagonal; frames of different videos share
+    nothing."""
+    if one.video != other.video or one.grey.shape != other.grey.shape:
+        return MIN_STEP
+    return displacement(one.grey, other.grey)

@@ -1,0 +1,185 @@
+"""Videos, archives and folders become a folder of photographs and a row of the sheet, or nothing at all."""
+
+import json
+import stat
+import zipfile
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hilsplat.base.errors import SceneError
+from hilsplat.scene import archive
+from hilsplat.scene.photos import add_scene
+from hilsplat.scene.sheet import read_sheet
+from tests.unit.scene.test_video import pan, write_video
+
+
+def write_photos(folder, count, suffix=".jpg"):
+    folder.mkdir(parents=True, exist_ok=True)
+    for number in range(count):
+        pixels = np.random.default_rng(number).integers(0, 256, (60, 80, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / f"{number}{suffix}")
+    return folder
+
+
+def zipped(path, entries):
+    """A zip archive of (name or ZipInfo, bytes)."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as opened:
+        for name, content in entries:
+            opened.writestr(name, content)
+    return path
+
+
+def photo_entries(folder, prefix=""):
+    return [(f"{prefix}{path.name}", path.read_bytes()) for path in sorted(folder.iterdir())]
+
+
+def sources(sheet):
+    return {row.scene: row.source for row in read_sheet(sheet)}
+
+
+@pytest.fixture
+def sheet(tmp_path):
+    (tmp_path / "project/config").mkdir(parents=True)
+    return tmp_path / "project/config/scenes.tsv"
+
+
+def test_a_video_becomes_photographs_in_the_project(tmp_path, sheet):
+    video = write_video(tmp_path / "walk.MP4", pan([0] + [6] * 40))
+    report = add_scene(sheet, "desk", video, frames=12)
+    assert (report.num_readable, report.sizes) == (12, {(240, 320): 12})
+    assert sources(sheet) == {"desk": "photos/desk"}
+    folder = tmp_path / "project/photos/desk"
+    assert sorted(path.name for path in folder.iterdir())[:2] == ["0001.jpg", "0002.jpg"]
+    assert json.loads((folder / "origin.json").read_text())["settings"]["frames"] == 12
+    assert "12 frames of walk.MP4 are in" in str(report)
+    with pytest.raises(SceneError, match="photos/desk is already in"):
+        add_scene(sheet, "desk", video)
+    assert len(list(folder.glob("*.jpg"))) == 12
+
+
+def test_a_folder_of_videos_is_one_capture(tmp_path, sheet):
+    (tmp_path / "clips").mkdir()
+    for number, left in enumerate((0, 300)):
+        write_video(tmp_path / "clips" / f"{number}.mp4", pan([left] + [6] * 20))
+    assert add_scene(sheet, "desk", tmp_path / "clips", frames=10).num_readable == 10
+
+
+def test_a_video_in_which_nothing_moves_leaves_nothing_behind(tmp_path, sheet):
+    video = write_video(tmp_path / "still.mp4", pan([0] * 20))
+    with pytest.raises(SceneError, match=r"too few photographs(.|\n)*1 different(.|\n)*film longer"):
+        add_scene(sheet, "desk", video)
+    assert not sheet.exists()
+    assert not (tmp_path / "project/photos/desk").exists()
+
+
+def test_what_is_in_the_way_stays(tmp_path, sheet):
+    mine = tmp_path / "project/photos/desk"
+    write_photos(mine, 1)
+    with pytest.raises(SceneError, match=r"photos/desk is in the way"):
+        add_scene(sheet, "desk", write_video(tmp_path / "walk.mp4", pan([0] + [6] * 20)))
+    assert len(list(mine.iterdir())) == 1
+
+
+def test_live_photos_are_read_as_photographs_and_said(tmp_path, sheet):
+    import pillow_heif
+
+    pillow_heif.register_heif_opener()
+    folder = write_photos(tmp_path / "phone", 4, ".HEIC")
+    (folder / "0.MOV").write_bytes(b"never opened")
+    report = add_scene(sheet, "desk", folder)
+    assert report.num_readable == 4
+    assert "1 videos beside the photographs (Live Photos) are not used" in str(report)
+    assert not (tmp_path / "project/photos").exists()  # a folder stays where it is
+
+
+def test_other_files_are_refused(tmp_path, sheet):
+    (tmp_path / "notes.txt").write_text("x")
+    with pytest.raises(SceneError, match=r"notes\.txt is a file of an unknown kind(.|\n)*a \.zip"):
+        add_scene(sheet, "desk", tmp_path / "notes.txt")
+
+
+# ---- archives -------------------------------------------------------------------------------------
+
+
+def test_a_zip_is_unpacked_and_its_only_folder_unwrapped(tmp_path, sheet):
+    photos = write_photos(tmp_path / "source", 4)
+    entries = photo_entries(photos, "Trip 1/best/")
+    junk = [("__MACOSX/Trip 1/._0.jpg", b"x"), ("Trip 1/.DS_Store", b"x"), ("Trip 1/run.sh", b"rm -rf")]
+    report = add_scene(sheet, "desk", zipped(tmp_path / "trip.ZIP", entries + junk))
+    assert report.num_readable == 4
+    assert sources(sheet) == {"desk": "photos/desk/Trip 1/best"}
+    unpacked = tmp_path / "project/photos/desk"
+    assert sorted(p.name for p in unpacked.rglob("*") if p.is_file()) == ["0.jpg", "1.jpg", "2.jpg", "3.jpg"]
+    assert (unpacked / "Trip 1/best/2.jpg").read_bytes() == (photos / "2.jpg").read_bytes()
+
+
+def link(name):
+    entry = zipfile.ZipInfo(name)
+    entry.external_attr = (stat.S_IFLNK | 0o777) << 16
+    return entry
+
+
+@pytest.mark.parametrize(
+    ("entry", "problem"),
+    [
+        ("../evil.jpg", "leads out"),
+        ("a/../../evil.jpg", "leads out"),
+        ("/tmp/evil.jpg", "leads out"),
+        ("..\\evil.jpg", "leads out"),
+        ("C:evil.jpg", "leads out"),
+        (link("evil.jpg"), "is a link"),
+        ("0.jpg", "is there twice"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_archives_that_could_write_elsewhere_are_refused_whole(tmp_path, sheet, entry, problem):
+    entries = photo_entries(write_photos(tmp_path / "source", 4))
+    bad = zipped(tmp_path / "bad.zip", [*entries, (entry, b"x")])
+    with pytest.raises(SceneError, match=rf"bad\.zip: entry '.*(evil|0)\.jpg' {problem}"):
+        add_scene(sheet, "desk", bad)
+    assert not (tmp_path / "project/photos/desk").exists()
+    assert not list(tmp_path.rglob("*evil*"))
+
+
+def test_archives_that_state_too_much_are_refused(tmp_path, sheet, monkeypatch):
+    entries = photo_entries(write_photos(tmp_path / "source", 4))
+    good = zipped(tmp_path / "good.zip", entries)
+    monkeypatch.setattr(archive, "MAX_FILES", 3)
+    with pytest.raises(SceneError, match=r"too large(.|\n)*at most 3 files(.|\n)*4 files"):
+        add_scene(sheet, "desk", good)
+    monkeypatch.setattr(archive, "MAX_FILES", 10)
+    monkeypatch.setattr(archive, "MAX_TOTAL_GIB", 1e-6)
+    with pytest.raises(SceneError, match=r"too large(.|\n)*GiB unpacked"):
+        add_scene(sheet, "desk", good)
+
+
+def test_an_archive_that_lies_about_a_size_writes_no_more_than_it_states(tmp_path):
+    bomb = zipped(tmp_path / "bomb.zip", [("a.jpg", bytes(1_000_000))])
+    content = bytearray(bomb.read_bytes())
+    at = content.index(b"PK\x01\x02") + 24  # uncompressed size in the central directory
+    content[at : at + 4] = (1000).to_bytes(4, "little")
+    bomb.write_bytes(content)
+    (tmp_path / "out").mkdir()
+    with pytest.raises(SceneError, match=r"bomb\.zip cannot be unpacked"):
+        archive.unpack_photographs(bomb, tmp_path / "out")
+    assert (tmp_path / "out/a.jpg").stat().st_size <= 1000
+
+
+def test_damaged_and_encrypted_archives_are_refused(tmp_path, sheet):
+    whole = zipped(tmp_path / "a.zip", photo_entries(write_photos(tmp_path / "source", 4))).read_bytes()
+    (tmp_path / "half.zip").write_bytes(whole[: len(whole) // 2])
+    hurt = bytearray(whole)
+    hurt[200:300] = bytes(100)
+    (tmp_path / "hurt.zip").write_bytes(hurt)
+    for name in ("half.zip", "hurt.zip"):
+        with pytest.raises(SceneError, match=rf"{name} cannot be unpacked"):
+            add_scene(sheet, "desk", tmp_path / name)
+    locked = bytearray(whole)
+    at = locked.index(b"PK\x01\x02") + 8
+    locked[at] |= 1
+    (tmp_path / "locked.zip").write_bytes(locked)
+    with pytest.raises(SceneError, match=r"locked\.zip: entry '0\.jpg' is encrypted"):
+        add_scene(sheet, "desk", tmp_path / "locked.zip")
+    assert not (tmp_path / "project/photos/desk").exists()

@@ -1,0 +1,111 @@
+"""What is likely to fail is told before the run, and sound photographs raise no doubt."""
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from hilsplat.scene.photo_check import CheckedPhoto, blur, photo_doubts
+from tests.unit.scene.test_poses import plane_views
+
+SIZE = 360
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory):
+    """Twelve pictures of a textured corner by a camera on an arc of 44 degrees."""
+    folder = tmp_path_factory.mktemp("moving") / "views"
+    plane_views(folder, views=12, size=SIZE, step_deg=4)
+    return [np.asarray(Image.open(folder / f"{number}.png").convert("L")) for number in range(12)]
+
+
+def turning(picture, steps_deg):
+    """Pictures of a camera with a narrower lens that turns in place before a picture."""
+    focal = 1.2 * SIZE
+    wide = np.array([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]])
+    narrow = wide * [[1.8, 1, 1], [1, 1.8, 1], [1, 1, 1]]
+    pictures = []
+    for angle in steps_deg:
+        rotation = cv2.Rodrigues(np.radians([angle / 5, angle, angle / 9]))[0]
+        homography = narrow @ rotation @ np.linalg.inv(wide)
+        turned = cv2.warpPerspective(picture, homography, (SIZE, SIZE), flags=cv2.INTER_CUBIC)
+        noise = np.random.default_rng(0).normal(0, 2, turned.shape)
+        pictures.append(np.clip(turned + noise, 0, 255).astype(np.uint8))
+    return pictures
+
+
+def doubts_of(pictures, focals=None, sizes=None, have_poses=False):
+    photos = [
+        CheckedPhoto(
+            f"{number}.jpg",
+            sizes[number] if sizes else picture.shape,
+            focals[number] if focals else None,
+            picture,
+        )
+        for number, picture in enumerate(pictures)
+    ]
+    return photo_doubts(photos, have_poses=have_poses)
+
+
+def test_a_moving_camera_raises_no_doubt(moving):
+    assert doubts_of(moving) == []
+
+
+def test_few_photographs_are_told(moving):
+    (doubt,) = doubts_of(moving[:9])
+    assert doubt.startswith("only 9 photographs: take 20 or more")
+
+
+def test_a_camera_that_turns_in_place_is_told_with_its_evidence(moving):
+    (doubt,) = doubts_of(turning(moving[0], np.linspace(-8, 8, 10)))
+    assert "turn in place: a rotation explains 9 of the 9 pairs" in doubt
+    assert "walk around the scene" in doubt
+    assert doubts_of(turning(moving[0], np.linspace(-8, 8, 10)), have_poses=True) == []
+
+
+def test_a_camera_that_also_moves_is_not_told_to_move(moving):
+    assert doubts_of([*turning(moving[0], np.linspace(-4, 4, 5)), *moving]) == []
+
+
+def test_blurred_dark_and_white_photographs_are_named(moving):
+    def with_third(change):
+        return doubts_of([change(picture) if row == 2 else picture for row, picture in enumerate(moving)])
+
+    (blurred,) = with_third(lambda picture: cv2.GaussianBlur(picture, (0, 0), 5))
+    assert blurred.startswith("1 of 12 photographs (2.jpg) is blurred")
+    (dark,) = with_third(lambda picture: (picture * 0.15).astype(np.uint8))
+    assert dark.startswith("1 of 12 photographs (2.jpg) is too dark")
+    (white,) = with_third(lambda picture: np.clip(picture * 4.0, 0, 255).astype(np.uint8))
+    assert white.startswith("1 of 12 photographs (2.jpg) is more than half white")
+
+
+def test_photographs_from_one_place_are_named(moving):
+    shifted = [np.roll(picture, 1, axis=1) for picture in moving]
+    pictures = [picture for pair in zip(moving, shifted, strict=True) for picture in pair]
+    (doubt,) = doubts_of(pictures)
+    assert doubt.startswith(
+        "12 of 24 photographs (1.jpg, 3.jpg, 5.jpg, 7.jpg, 9.jpg, ...) are nearly the same"
+    )
+
+
+def test_sizes_and_lenses_that_differ_are_told_but_not_a_turned_camera(moving):
+    assert doubts_of(moving, sizes=[(480, 640)] * 6 + [(640, 480)] * 6) == []
+    (sizes,) = doubts_of(moving, sizes=[(480, 640)] * 6 + [(600, 800)] * 6)
+    assert sizes.startswith("2 sizes of photographs (800 x 600, 640 x 480)")
+    (lenses,) = doubts_of(moving, focals=[500.0] * 8 + [900.0] * 4)
+    assert lenses.startswith("focal lengths from 500 to 900 px")
+    assert doubts_of(moving, focals=[500.0] * 8 + [510.0] * 4) == []
+
+
+def test_flat_photographs_do_not_break_the_check():
+    assert any("blurred" in doubt for doubt in doubts_of([np.full((60, 80), 128, np.uint8)] * 12))
+
+
+def test_blur_follows_its_definition():
+    """A box of 11 px spreads a step of 1 over 11 steps of 1/11, so that 10/11 of it are lost: 1/11 stays. A
+    picture that is blurred already has little to lose."""
+    picture = np.zeros((30, 30), np.uint8)
+    picture[15:, 15:] = 110
+    sharp = blur(picture)
+    assert sharp == pytest.approx(1 / 11, abs=0.02)
+    assert blur(cv2.GaussianBlur(picture, (0, 0), 4)) > 0.5
