@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 MODELS = Path("models")
-"""Where models lie, from the folder in which a command or a run starts."""
+"""Folder of the models, relative to the folder in which a command or a run starts."""
 
 AUTO = "auto"
 """Value of a setting: a real model if there is one."""
@@ -30,7 +30,7 @@ class Release:
         name: its folder in `models/`.
         family: "sam" or "clip".
         repository: on the model hub.
-        megabytes: about how much is fetched; the hub's own number is told before a transfer.
+        megabytes: approximate size of the download; the hub's own number is reported before a transfer.
         licence: of the weights.
         use: what it is good for.
     """
@@ -91,7 +91,7 @@ def is_embedded(config: Mapping[str, Any]) -> bool:
 
 
 def read_model(folder: Path) -> PresentModel | None:
-    """What a folder holds, by its config.json; None if it has no network or is no model we read."""
+    """What a folder holds, by its config.json; None if it has no network or is not a model that we read."""
     try:
         config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):

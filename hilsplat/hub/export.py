@@ -1,4 +1,4 @@
-"""PyTorch weights to ONNX networks, by optimum in a process of its own (the extra `export`)."""
+"""PyTorch weights to ONNX networks, by optimum in a separate process (the extra `export`)."""
 
 import importlib.util
 import logging

@@ -185,7 +185,7 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
         kind = None
     if kind not in PARTS:
         raise DownloadError(
-            f"{listing.repository} is no model that can be used here",
+            f"{listing.repository} does not hold a model that can be used here",
             expected=f"model_type {' or '.join(PARTS)} in config.json",
             found=f"model_type {kind!r}",
             fix="name a SAM or a CLIP (hilsplat models list)",
@@ -222,4 +222,4 @@ def _first(listing: Listing, places: tuple[str, ...], ending: str) -> str | None
 
 
 OUT_OF_REACH = (requests.ConnectionError, requests.Timeout, OfflineModeIsEnabled)
-"""Errors that say nothing about the repository: there is no way to the hub."""
+"""Errors of the way to the hub, which say nothing about the repository."""

@@ -53,4 +53,4 @@ def check_models(models: Path = MODELS) -> tuple[str, int]:
         except HilsplatError as error:
             texts.append(f"{model.folder} does not work: {error}")
             num_failed += 1
-    return "\n\n".join(texts) or f"there is no model in {models}", num_failed
+    return "\n\n".join(texts) or f"{models} does not hold any model", num_failed

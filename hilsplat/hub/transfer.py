@@ -40,8 +40,8 @@ def fetch(listing: Listing, file: HubFile, target: Path, tell: Callable[[int], N
     Args:
         listing: the repository.
         file: what to fetch.
-        target: where to; a part of it, kept from before, lies beside it and is continued.
-        tell: is told how many of the file's bytes are there.
+        target: where to; a part kept from before is beside it, and is continued.
+        tell: called with the number of bytes reached.
 
     Raises:
         DownloadError: the bytes are not those that the hub states; they are deleted.
@@ -97,7 +97,7 @@ def patiently(
 
 
 def _wait_s(error: requests.RequestException, failures: int) -> float | None:
-    """Seconds to wait after an error: what the hub asks for, else 1, 2, 4, ...; None if waiting is no use."""
+    """Seconds to wait after an error: what the hub asks for, else 1, 2, 4, ...; None if waiting does not help."""
     backoff = float(2 ** (failures - 1))
     if error.response is None:
         return backoff
@@ -146,7 +146,7 @@ def _continue(listing: Listing, file: HubFile, part: Path, tell: Callable[[int],
     )
     headers = {**build_hf_headers(), "Accept-Encoding": "identity"}
     if done:
-        logger.info("%s: going on at byte %d of %d", file.path, done, file.size)
+        logger.info("%s: resuming at byte %d of %d", file.path, done, file.size)
         headers["Range"] = f"bytes={done}-"
     timeout_s = huggingface_hub.constants.HF_HUB_DOWNLOAD_TIMEOUT
     with get_session().get(url, headers=headers, stream=True, timeout=timeout_s) as response:

@@ -22,7 +22,7 @@ def unpack_photographs(archive: Path, folder: Path) -> None:
     Nothing is written before every entry was checked. No more is written than the archive states.
 
     Raises:
-        SceneError: it is no zip archive, is damaged or encrypted, states too much, or holds links or names
+        SceneError: it is not a zip archive, is damaged or encrypted, states too much, or holds links or names
         that
             lead out of the folder.
         DiskSpaceError: the disk cannot hold it.

@@ -1,4 +1,4 @@
-"""How sharp a picture is, and how far two pictures of one camera lie apart."""
+"""How sharp a picture is, and how far two pictures of one camera are apart."""
 
 import cv2
 import numpy as np

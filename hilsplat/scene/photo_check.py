@@ -20,7 +20,7 @@ FEATURE_SIDE_PX = 640
 """Longer side of the grey copies on which blur and light, and motion, are measured."""
 
 BLURRED = 0.55
-"""Blur above which a photograph is told; measured: photographs 0.16 to 0.40, frames of video up to 0.50,
+"""Blur above which a photograph is reported; measured: photographs 0.16 to 0.40, frames of video up to 0.50,
 blurred by a Gaussian of 4 px (of 800) 0.58 to 0.77."""
 
 REBLUR_PX = 11
@@ -115,7 +115,7 @@ def _lens_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
     if len(sizes) > 1:
         listed = ", ".join(f"{long} x {short}" for long, short in sizes[:NAMED])
         return [
-            f"{len(sizes)} sizes of photographs ({listed}): each size gets a lens of its own, which few "
+            f"{len(sizes)} sizes of photographs ({listed}): each size gets its own lens, which few "
             "photographs cannot determine; use one camera, without cropping"
         ]
     focals = sorted(photo.focal_px for photo in photos if photo.focal_px is not None)

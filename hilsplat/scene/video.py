@@ -166,7 +166,7 @@ def _opened(video: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     """The first video stream of a file.
 
     Raises:
-        SceneError: it is no video, or its header is lost.
+        SceneError: it is not a video, or its header is lost.
     """
     try:
         container = av.open(str(video), metadata_errors="replace")
@@ -310,7 +310,7 @@ def choose_frames(candidates: Sequence[Frame], count: int) -> list[Frame]:
 
 
 def _stretches(steps: Sequence[float], count: int) -> Int64[np.ndarray, " N"]:
-    """Number of the stretch in which each candidate lies, given the steps between them.
+    """Number of the stretch that each candidate is in, given the steps between them.
 
     A stretch is as short as `count` of them allow, but not below `MIN_STEP`. A longer step cannot be divided,
     so it counts as one stretch.
