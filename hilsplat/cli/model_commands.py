@@ -18,12 +18,15 @@ from hilsplat.cli.stage import (
 
 
 @models_app.command("check")
-def models_check(folder: Annotated[Path, typer.Argument(help="model folder")]) -> None:
+def models_check(
+    folder: Annotated[Path, typer.Argument(help="model folder")],
+    variant: Annotated[str, typer.Option(help="ending of the networks' names, such as fp16")] = "",
+) -> None:
     """Describe a model folder, and time one image."""
     start_logging(None)
     from hilsplat.embed.model_check import check_model
 
-    typer.echo(check_model(folder))
+    typer.echo(check_model(folder, variant))
 
 
 @models_app.command("split")
