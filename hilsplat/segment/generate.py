@@ -95,10 +95,8 @@ def _upscale(
     official: bool,
 ) -> HierarchicalMasks:
     """Masks of the given candidates in the view, without empty ones and those cut by the crop's edge."""
-    along_y, along_x = (
-        sam.taps(int(candidates.low_hw[axis]), frame.padded_hw[axis], frame.resized_hw[axis], length)
-        for axis, length in enumerate(frame.original_hw)
-    )
+    low_h, low_w = candidates.low_hw.tolist()
+    along_y, along_x = sam.frame_taps((low_h, low_w), frame)
     runs, offsets = upscaled_runs(
         candidates.logits,
         candidates.offsets,

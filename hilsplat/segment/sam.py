@@ -39,11 +39,13 @@ class Frame:
         original_hw: the image, px.
         resized_hw: its size in the input, at the top left, px.
         padded_hw: the whole input, px.
+        stretched: the image fills the input, and masks are enlarged in one step (SAM 2).
     """
 
     original_hw: tuple[int, int]
     resized_hw: tuple[int, int]
     padded_hw: tuple[int, int]
+    stretched: bool = False
 
 
 @dataclass(frozen=True)
@@ -145,8 +147,9 @@ class SamModel:
 
     def frame(self, original_hw: tuple[int, int]) -> Frame:
         """Where an image of this size is in the network's input."""
-        resized = self.padded_hw if self.stretches else resized_size(original_hw, self.longest_edge)
-        return Frame(original_hw, resized, self.padded_hw)
+        if self.stretches:
+            return Frame(original_hw, self.padded_hw, self.padded_hw, stretched=True)
+        return Frame(original_hw, resized_size(original_hw, self.longest_edge), self.padded_hw)
 
     def prepare(self, image: UInt8[np.ndarray, "H W 3"]) -> tuple[Float32[np.ndarray, "1 3 h w"], Frame]:
         """Resize, normalise, pad with zeros at the right and bottom."""
@@ -254,12 +257,7 @@ def full_stability(
 ) -> Float32[np.ndarray, " K"]:
     """Stability counted at the size of the image, on logits that are not rounded, as SAM does."""
     number, height, width = logits.shape
-    axes = [
-        taps(low, padded, resized, original)
-        for low, padded, resized, original in zip(
-            (height, width), frame.padded_hw, frame.resized_hw, frame.original_hw, strict=True
-        )
-    ]
+    along_y, along_x = frame_taps((height, width), frame)
     areas = []
     for threshold in (offset, -offset):
         runs, offsets = upscaled_runs(
@@ -267,14 +265,25 @@ def full_stability(
             np.arange(number + 1) * (height * width),
             np.tile(np.array([0, 0, width, height], np.int32), (number, 1)),
             np.arange(number),
-            *axes[0],
-            *axes[1],
+            *along_y,
+            *along_x,
             0,
             0,
             *frame.original_hw,
         )
         areas.append(areas_and_boxes(runs, offsets, frame.original_hw[1])[0])
     return (areas[0] / np.maximum(areas[1], 1)).astype(np.float32)
+
+
+def frame_taps(
+    low_hw: tuple[int, int], frame: Frame
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """How the image's rows and columns are blended from low-resolution ones (`taps`)."""
+    padded, resized = (low_hw, low_hw) if frame.stretched else (frame.padded_hw, frame.resized_hw)
+    along_y, along_x = (
+        taps(low_hw[axis], padded[axis], resized[axis], frame.original_hw[axis]) for axis in (0, 1)
+    )
+    return along_y, along_x
 
 
 @lru_cache(maxsize=16)
