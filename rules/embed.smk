@@ -21,4 +21,4 @@ rule clip:
         code=PLAN.code("clip"),
     shell:
         "hilsplat clip --scene {input.scene} --masks {input.masks} --settings {params.settings:q}"
-        " --threads {threads} --memory {resources.mem_mb} --cache {params.cache} --out {output.clip} --log {log}"
+        " --threads {threads} --memory {resources.mem_mib} --cache {params.cache} --out {output.clip} --log {log}"

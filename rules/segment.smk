@@ -22,7 +22,7 @@ rule masks:
         code=PLAN.code(PLAN.masks_stage),
     shell:
         "hilsplat masks --scene {input.scene} --settings {params.settings:q} {params.truth}"
-        " --threads {threads} --memory {resources.mem_mb} --cache {params.cache} --out {output.masks} --log {log}"
+        " --threads {threads} --memory {resources.mem_mib} --cache {params.cache} --out {output.masks} --log {log}"
 
 
 rule coverage_tree:

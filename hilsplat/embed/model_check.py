@@ -12,6 +12,7 @@ from hilsplat.base.onnx_models import (
     require_three_heads,
 )
 from hilsplat.embed.clip import ClipModel
+from hilsplat.segment.sam import own_thresholds
 
 
 def check_model(folder: Path, variant: str = "") -> str:
@@ -32,6 +33,7 @@ def check_model(folder: Path, variant: str = "") -> str:
     pixels = np.zeros((1, 3, side, side), dtype=np.float32)
     lines = [f"folder     {model.folder}", f"kind       {model.layout}", f"image      {side} x {side} px"]
     if model.kind == "sam":
+        own = own_thresholds(model)
         encoder, decoder = (model.network(name) for name in model.networks)
         start = time.perf_counter()
         features = dict(zip(encoder.spec.outputs, encoder(pixel_values=pixels), strict=True))
@@ -48,6 +50,8 @@ def check_model(folder: Path, variant: str = "") -> str:
         require_three_heads(decoder.path, scores, masks)
         lines += [
             f"embedding  {', '.join(' x '.join(map(str, value.shape[1:])) for value in features.values())}",
+            f"thresholds predicted IoU {own.predicted_iou_min}, stability {own.stability_min}, "
+            f"score {own.nms_score}",
             f"masks      3 heads (subpart, part, whole) of {masks.shape[-2]} x {masks.shape[-1]} px",
             f"time       {encode_s:.3f} s for one image, {decode_s / prompts:.4f} s for one prompt",
         ]

@@ -423,7 +423,7 @@ class Plan:
 @functools.cache
 def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int) -> int:
     """Memory of a stage with a model; 0 if its folder cannot be read, which the stage reports."""
-    from hilsplat.base.model_memory import machine_mib, needs_of  # onnxruntime takes a while to import
+    from hilsplat.base.model_memory import MIB, machine_mib, needs_of  # onnxruntime takes a while to import
     from hilsplat.base.onnx_models import open_model_folder
     from hilsplat.segment.sam import own_thresholds
 
@@ -433,7 +433,8 @@ def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int)
     except ModelError:
         return 0
     needs = needs_of(model, prompts)
-    return needs.total_mib(needs.views_at_once(threads, SHARE_OF_MACHINE * machine_mib()))
+    views = needs.views_at_once(threads, SHARE_OF_MACHINE * machine_mib())
+    return round(needs.total_mib(views) * MIB / 1e6)
 
 
 def scopes_of(row: SceneRow) -> tuple[str, str]:

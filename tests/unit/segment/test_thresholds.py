@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hilsplat.base.errors import ModelError
+from hilsplat.embed.model_check import check_model
 from hilsplat.segment.candidates import decode_candidates
 from hilsplat.segment.generate import masks_from_candidates
 from hilsplat.segment.sam import REAL_SAM, Encoded, SamModel, Thresholds
@@ -27,6 +28,11 @@ def test_a_released_sam_has_langsplats_thresholds(make_disc_sam, tmp_path):
 def test_the_embedded_sam_brings_its_own():
     model = SamModel.load(PROJECT / "models/sam-tiny")
     assert model.thresholds(MasksSettings()) == OWN_THRESHOLDS == Thresholds(0.35, 0.5, 0.0, 64)
+
+
+def test_check_prints_the_thresholds_of_a_model():
+    text = check_model(PROJECT / "models/sam-tiny")
+    assert "thresholds predicted IoU 0.35, stability 0.5, score 0.0" in text
 
 
 def test_a_setting_wins_over_the_model(disc_sam):
