@@ -78,8 +78,7 @@ class CannedSam(SamModel):
     def encode(self, image: np.ndarray) -> Encoded:
         """Prepare the image without encoding it."""
         _, frame = self.prepare(image)
-        nothing = np.zeros((1, 1, 1, 1), np.float32)
-        return Encoded(nothing, nothing, frame)
+        return Encoded({}, frame)
 
     def decode(self, encoded: Encoded, points_xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Scores and logits of the blobs nearest to each point; its time is not counted."""

@@ -19,7 +19,9 @@ from hilsplat.segment.graph import segment_graph
 from hilsplat.segment.suppression import suppress_masks
 from hilsplat.settings import MasksSettings
 
-SETTINGS = MasksSettings(predicted_iou_min=0.7, stability_min=0.5, min_area_px=100)
+SETTINGS = MasksSettings(
+    points_per_batch=64, predicted_iou_min=0.7, stability_min=0.5, nms_score=0, min_area_px=100
+)
 """The filters drop nothing, so that 1024 candidates per level reach the suppression."""
 
 VIEW_HW = (600, 800)

@@ -4,7 +4,8 @@ import difflib
 import json
 import re
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_origin
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -288,6 +289,24 @@ def config_schema() -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
+def _choices(annotation: Any) -> list[str]:
+    """Words that a knob accepts, also beside numbers."""
+    if get_origin(annotation) is Literal:
+        return list(get_args(annotation))
+    if get_origin(annotation) is UnionType or get_origin(annotation) is Union:
+        return [word for part in get_args(annotation) for word in _choices(part)]
+    return []
+
+
+def _limits_inside(annotation: Any) -> list[Any]:
+    """Limits of a number that a knob accepts beside words."""
+    if get_origin(annotation) is UnionType or get_origin(annotation) is Union:
+        return [limit for part in get_args(annotation) for limit in _limits_inside(part)]
+    if get_origin(annotation) is Annotated:
+        return [limit for info in get_args(annotation)[1:] for limit in getattr(info, "metadata", [])]
+    return []
+
+
 def knob_table() -> str:
     """Every knob as text: name, default, choices or range, unit, origin, meaning."""
     lines = []
@@ -300,11 +319,11 @@ def knob_table() -> str:
             assert isinstance(extra, dict), name  # every field is a knob
             limits = ", ".join(
                 f"{symbol} {getattr(limit, attribute)}"
-                for limit in field.metadata
+                for limit in [*field.metadata, *_limits_inside(field.annotation)]
                 for attribute, symbol in (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
                 if hasattr(limit, attribute)
             )
-            choices = "|".join(get_args(field.annotation)) if get_origin(field.annotation) is Literal else ""
+            choices = "|".join(_choices(field.annotation))
             facts = [choices, limits, extra["unit"], f"origin: {extra['origin']}"]
             place = f"{section}.{name}" if section else name
             lines.append(f"{place} = {field.default!r}  ({'; '.join(str(fact) for fact in facts if fact)})")

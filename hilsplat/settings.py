@@ -27,6 +27,7 @@ class Section(BaseModel):
 
 
 Probability = Annotated[float, Field(ge=0, le=1)]
+Auto = Literal["auto"]
 
 
 class WorldSettings(Section):
@@ -162,8 +163,18 @@ class MasksSettings(Section):
         "folder of a SAM in the Hugging Face ONNX export layout; auto: the best real one in models/, else "
         "models/sam-tiny",
     )
+    variant: str = knob(
+        "",
+        "ending of the networks' names, such as fp16 for vision_encoder_fp16.onnx; empty: the plain names",
+        pattern=r"^[A-Za-z0-9_.-]*$",
+    )
     points_per_side: int = knob(32, "point prompts per image side", ge=1, le=128, origin="LangSplat: 32")
-    points_per_batch: int = knob(64, "prompts per decoder call", ge=1, le=4096, origin="LangSplat: 64")
+    points_per_batch: Annotated[int, Field(ge=1, le=4096)] | Auto = knob(
+        "auto",
+        "prompts per decoder call; auto: the number in the model folder, else 8, since a real SAM takes 60 "
+        "MB for each",
+        origin="LangSplat: 64",
+    )
     crop_layers: int = knob(
         0,
         "layers of overlapping crops that are segmented besides the whole image",
@@ -171,11 +182,27 @@ class MasksSettings(Section):
         le=2,
         origin="LangSplat: 1",
     )
-    predicted_iou_min: float = knob(
-        0.35, "masks with a lower predicted IoU are dropped", ge=0, le=1, origin="SAM: 0.88, LangSplat: 0.7"
+    predicted_iou_min: Annotated[float, Field(ge=0, le=2)] | Auto = knob(
+        "auto",
+        "only masks with a higher predicted IoU, which may exceed 1, are kept; 0: all; auto: the number in "
+        "the model folder, else 0.7",
+        origin="SAM: 0.88, LangSplat: 0.7",
     )
-    stability_min: float = knob(
-        0.5, "masks with a lower stability are dropped", ge=0, le=1, origin="SAM: 0.95, LangSplat: 0.85"
+    stability_min: Probability | Auto = knob(
+        "auto",
+        "masks with a lower stability are dropped; auto: the number in the model folder, else 0.85",
+        origin="SAM: 0.95, LangSplat: 0.85",
+    )
+    stability: Literal["estimate", "full"] = knob(
+        "estimate",
+        "where stability counts pixels; estimate: in the network's small masks; full: at the view's size",
+        origin="SAM: full",
+    )
+    generator: Literal["hilsplat", "official"] = knob(
+        "hilsplat",
+        "official: every rule of SAM's automatic generator as published, with stability: full "
+        "(docs/segment.md lists what differs)",
+        origin="SAM, LangSplat: official",
     )
     stability_offset: float = knob(1.0, "shift of the logits in the stability test", gt=0, origin="SAM")
     box_nms_iou: float = knob(0.7, "box IoU above which the worse mask is dropped", gt=0, le=1, origin="SAM")
@@ -189,8 +216,11 @@ class MasksSettings(Section):
     nms_iou: float = knob(
         0.8, "mask IoU above which the worse mask is dropped", gt=0, le=1, origin="LangSplat"
     )
-    nms_score: float = knob(
-        0.0, "masks with a lower predicted IoU x stability are dropped", ge=0, le=1, origin="LangSplat: 0.7"
+    nms_score: Annotated[float, Field(ge=0, le=2)] | Auto = knob(
+        "auto",
+        "only masks with a higher predicted IoU x stability are kept; 0: all; auto: the number in the model "
+        "folder, else 0.7",
+        origin="LangSplat: 0.7",
     )
     nms_inner: float = knob(
         0.5, "threshold of the suppression of inner masks", ge=0, le=1, origin="LangSplat"
@@ -262,6 +292,17 @@ class ClipSettings(Section):
         "models/clip-tiny",
         "folder of a CLIP in the Hugging Face ONNX export layout; auto: the best real one in models/, else "
         "models/clip-tiny",
+    )
+    variant: str = knob(
+        "",
+        "ending of the networks' names, such as fp16 for vision_model_fp16.onnx; empty: the plain names",
+        pattern=r"^[A-Za-z0-9_.-]*$",
+    )
+    crop: Literal["box", "langsplat"] = knob(
+        "box",
+        "box: the whole box of a mask, shrunk by area; langsplat: without its last row and column, shrunk by "
+        "bilinear sampling",
+        origin="LangSplat",
     )
     background: Literal["black", "keep"] = knob(
         "black", "pixels of a crop outside its mask: painted black, or kept", origin="LangSplat: black"

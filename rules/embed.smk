@@ -13,7 +13,7 @@ rule clip:
         ENVIRONMENT
     threads: THREADS
     resources:
-        mem_mb=3000,
+        mem_mb=PLAN.memory_mb("clip", THREADS),
     params:
         settings=PLAN.settings("clip"),
         model=PLAN.model("clip"),
@@ -21,4 +21,4 @@ rule clip:
         code=PLAN.code("clip"),
     shell:
         "hilsplat clip --scene {input.scene} --masks {input.masks} --settings {params.settings:q}"
-        " --threads {threads} --cache {params.cache} --out {output.clip} --log {log}"
+        " --threads {threads} --memory {resources.mem_mib} --cache {params.cache} --out {output.clip} --log {log}"

@@ -13,7 +13,7 @@ rule masks:
         ENVIRONMENT
     threads: THREADS
     resources:
-        mem_mb=4000,
+        mem_mb=PLAN.memory_mb("masks", THREADS),
     params:
         settings=PLAN.settings("masks"),
         model=PLAN.model("masks"),
@@ -22,7 +22,7 @@ rule masks:
         code=PLAN.code(PLAN.masks_stage),
     shell:
         "hilsplat masks --scene {input.scene} --settings {params.settings:q} {params.truth}"
-        " --threads {threads} --cache {params.cache} --out {output.masks} --log {log}"
+        " --threads {threads} --memory {resources.mem_mib} --cache {params.cache} --out {output.masks} --log {log}"
 
 
 rule coverage_tree:

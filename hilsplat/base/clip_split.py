@@ -1,7 +1,7 @@
 """Split the single network of an exported CLIP into the two that we read.
 
-Optimum writes a CLIP as `model.onnx`, which takes an image and a text together. Its image vectors depend on
-the image alone and its text vectors on the text alone, so each half is a subgraph.
+Optimum writes a CLIP or a SigLIP as `model.onnx`, which takes an image and a text together. Its image vectors
+depend on the image alone and its text vectors on the text alone, so each half is a subgraph.
 """
 
 from pathlib import Path
@@ -18,6 +18,9 @@ HALVES = {
 }
 """Inputs and outputs of each half."""
 
+OPTIONAL = {"attention_mask"}
+"""Inputs that a network may lack; SigLIP's reads the padding."""
+
 
 def whole_clip(folder: Path) -> Path | None:
     """The network that holds both halves, if a folder has one."""
@@ -28,8 +31,11 @@ def whole_clip(folder: Path) -> Path | None:
 def split_clip(folder: Path) -> list[Path]:
     """Write `vision_model.onnx` and `text_model.onnx` beside a CLIP's `model.onnx`.
 
+    A network above 2 GiB keeps its weights in a file of their own (`model.onnx_data`). They are not read or
+    copied: both halves name their places in that file.
+
     Returns:
-        the two files; `model.onnx` stays and is no longer needed.
+        the two files; `model.onnx` stays and is no longer needed, its file of weights is.
 
     Raises:
         ModelError: there is no `model.onnx`, it cannot be read, or it lacks an input or output.
@@ -44,14 +50,14 @@ def split_clip(folder: Path) -> list[Path]:
             fix="export the model first: optimum-cli export onnx --model NAME FOLDER (docs/models.md)",
         )
     try:
-        model = onnx.load(str(whole))
+        model = onnx.load(str(whole), load_external_data=False)
     except Exception as error:  # protobuf and onnx raise errors without a common base
         raise ModelError(f"network {whole} cannot be read: {error}", fix="export it again") from error
     inputs, outputs = ({value.name for value in part} for part in (model.graph.input, model.graph.output))
     missing = [
         name
         for wanted, given in HALVES.values()
-        for name in [*(set(wanted) - inputs), *(set(given) - outputs)]
+        for name in [*(set(wanted) - inputs - OPTIONAL), *(set(given) - outputs)]
     ]
     if missing:
         raise ModelError(
@@ -66,7 +72,8 @@ def split_clip(folder: Path) -> list[Path]:
     for name, (wanted, given) in HALVES.items():
         path = whole.with_name(f"{name}.onnx")
         with atomic_path(path) as temporary:
-            onnx.save(extractor.extract_model(list(wanted), list(given)), str(temporary))
+            half = extractor.extract_model([input for input in wanted if input in inputs], list(given))
+            temporary.write_bytes(half.SerializeToString())
         written.append(path)
     return written
 

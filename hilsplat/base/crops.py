@@ -41,9 +41,13 @@ def square_crop(
 
 
 def crop_to_square(
-    box: UInt8[np.ndarray, "h w 3"], inside: Bool[np.ndarray, "h w"], background: str, size: int
+    box: UInt8[np.ndarray, "h w 3"],
+    inside: Bool[np.ndarray, "h w"],
+    background: str,
+    size: int,
+    as_langsplat: bool = False,
 ) -> UInt8[np.ndarray, "size size 3"]:
-    """Centre a mask's box in a black square and resize it (LangSplat's preprocessing).
+    """Centre a mask's box in a black square and resize it.
 
     The side of the square is the longer side of the box. Shrinking averages areas; enlarging is bilinear.
 
@@ -52,16 +56,20 @@ def crop_to_square(
         inside: the mask in it.
         background: pixels outside the mask: `black`, `keep` (unchanged), or `dim` (0.35 of their brightness).
         size: side of the result, px.
+        as_langsplat: as LangSplat's preprocessing does it: without the last row and column of the box (but
+            never nothing), and bilinear also when it shrinks.
     """
     if background not in BACKGROUNDS:
         raise ValueError(f"background {background!r} is not one of {', '.join(BACKGROUNDS)}")
     if background != "keep":
         outside = (box * DIM + 0.5).astype(np.uint8) if background == "dim" else np.uint8(0)
         box = np.where(inside[..., None], box, outside)
+    if as_langsplat:
+        box = box[: max(1, box.shape[0] - 1), : max(1, box.shape[1] - 1)]
     height, width = box.shape[:2]
     side = max(height, width)
     square = np.zeros((side, side, 3), np.uint8)
     top, left = (side - height) // 2, (side - width) // 2
     square[top : top + height, left : left + width] = box
-    method = cv2.INTER_AREA if side > size else cv2.INTER_LINEAR
+    method = cv2.INTER_AREA if side > size and not as_langsplat else cv2.INTER_LINEAR
     return cv2.resize(square, (size, size), interpolation=method)

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hilsplat.base.model_layouts import LAYOUTS, layout_of
+
 MODELS = Path("models")
 """Folder of the models, relative to the folder in which a command or a run starts."""
 
@@ -17,9 +19,6 @@ AUTO = "auto"
 
 EMBEDDED = {"sam": "models/sam-tiny", "clip": "models/clip-tiny"}
 """The models of the synthetic world that come with the project."""
-
-FAMILY_OF = {"sam": "sam", "clip": "clip"}
-"""`model_type` in config.json -> what the model does here: segment (sam), or embed crops and words (clip)."""
 
 
 @dataclass(frozen=True)
@@ -96,10 +95,10 @@ def read_model(folder: Path) -> PresentModel | None:
         config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    family = FAMILY_OF.get(str(config.get("model_type"))) if isinstance(config, dict) else None
-    if family is None or not any(folder.rglob("*.onnx")):
+    layout = layout_of(config)
+    if layout is None or not any(folder.rglob("*.onnx")):
         return None
-    return PresentModel(folder, family, is_embedded(config))
+    return PresentModel(folder, LAYOUTS[layout].kind, is_embedded(config))
 
 
 def present_models(models: Path = MODELS) -> list[PresentModel]:

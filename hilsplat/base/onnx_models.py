@@ -1,13 +1,14 @@
-"""Model folders in the layout of the Hugging Face ONNX exports: finding, checking, running.
+"""Model folders in the layouts of published ONNX exports: finding, checking, running.
 
-A folder holds `config.json`, `preprocessor_config.json`, for CLIP `tokenizer.json`, and the networks as
-`<name>.onnx`, either beside them or under `onnx/`. Everything needed to turn a photograph into a network's
-input is read from the folder, so its digest identifies the model.
+A folder holds `config.json`, what prepares its inputs, and its networks as `.onnx` files
+(`model_layouts.LAYOUTS`). Everything needed to turn a photograph into a network's input is read from the
+folder, so its digest identifies the model.
 """
 
 import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import mmap
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,59 +19,19 @@ import onnxruntime
 from hilsplat.base.artifacts import read_json, sha256_of_file, sha256_of_json
 from hilsplat.base.clip_split import whole_clip
 from hilsplat.base.errors import ArtifactError, ModelError
+from hilsplat.base.model_layouts import (
+    LAYOUTS,
+    OTHER_TYPES,
+    SECTIONS,
+    SUPPORTED,
+    TORCH_SUFFIXES,
+    Axes,
+    NetworkSpec,
+    layout_of,
+)
 
 logger = logging.getLogger(__name__)
 
-
-Axes = tuple[int | None, ...]
-"""Axes of an array: their lengths if the layout fixes them, None if any will do."""
-
-
-@dataclass(frozen=True)
-class NetworkSpec:
-    """Inputs and outputs of one network of a model.
-
-    Attributes:
-        inputs: names and axes of required inputs.
-        outputs: names and axes of required outputs; others are ignored.
-        optional: names of inputs that are passed if the network has them.
-    """
-
-    inputs: Mapping[str, Axes]
-    outputs: Mapping[str, Axes]
-    optional: tuple[str, ...] = ()
-
-
-_ANY2, _ANY3, _ANY4 = (None,) * 2, (None,) * 3, (None,) * 4
-_IMAGE: Axes = (None, 3, None, None)
-
-KINDS: dict[str, dict[str, NetworkSpec]] = {
-    "sam": {
-        "vision_encoder": NetworkSpec(
-            {"pixel_values": _IMAGE}, {"image_embeddings": _ANY4, "image_positional_embeddings": _ANY4}
-        ),
-        "prompt_encoder_mask_decoder": NetworkSpec(
-            {
-                "input_points": (None, None, None, 2),
-                "input_labels": _ANY3,
-                "image_embeddings": _ANY4,
-                "image_positional_embeddings": _ANY4,
-            },
-            {"iou_scores": (None, None, 3), "pred_masks": (None, None, 3, None, None)},
-        ),
-    },
-    "clip": {
-        "vision_model": NetworkSpec({"pixel_values": _IMAGE}, {"image_embeds": _ANY2}),
-        "text_model": NetworkSpec({"input_ids": _ANY2}, {"text_embeds": _ANY2}, optional=("attention_mask",)),
-    },
-}
-"""Networks of each kind of model, by the `model_type` in its config.json."""
-
-DESCRIPTIONS = {
-    "sam": ("config.json", "preprocessor_config.json"),
-    "clip": ("config.json", "preprocessor_config.json", "tokenizer.json"),
-}
-"""Files beside the networks, by kind."""
 
 SWITCHES = ("do_resize", "do_rescale", "do_normalize")
 """Preprocessing steps that our code always performs."""
@@ -93,19 +54,29 @@ class ModelFolder:
 
     Attributes:
         folder: as the settings name it.
-        kind: "sam" or "clip".
+        layout: key of `LAYOUTS`.
         config: content of `config.json`.
-        preprocessing: content of `preprocessor_config.json`.
+        preprocessing: how a picture becomes an input, in the words of `preprocessor_config.json`.
         networks: file of each network by name.
         files: all files that count for the digest.
     """
 
     folder: Path
-    kind: str
+    layout: str
     config: dict[str, Any]
     preprocessing: dict[str, Any]
     networks: dict[str, Path]
     files: tuple[Path, ...]
+
+    @property
+    def kind(self) -> str:
+        """ "sam" or "clip"."""
+        return LAYOUTS[self.layout].kind
+
+    @property
+    def tokenizer(self) -> Path:
+        """File of a CLIP's tokenizer."""
+        return self.folder / LAYOUTS[self.layout].tokenizer
 
     @cached_property
     def digest(self) -> str:
@@ -120,95 +91,208 @@ class ModelFolder:
         Raises:
             ModelError: it cannot be read, or its inputs or outputs have other names or axes than expected.
         """
-        return Network(self.networks[name], KINDS[self.kind][name], threads)
+        return Network(self.networks[name], LAYOUTS[self.layout].networks[name], threads)
 
 
-def open_model_folder(folder: Path, kind: str | None = None, *, fix: str = "") -> ModelFolder:
+def open_model_folder(
+    folder: Path, kind: str | None = None, *, variant: str = "", fix: str = ""
+) -> ModelFolder:
     """Find a model's files.
 
     Args:
         folder: the model folder.
         kind: "sam" or "clip"; None accepts either.
+        variant: ending of the networks' names, such as `fp16` for `vision_encoder_fp16.onnx`; "": none.
         fix: another way out, added to the message about a missing folder.
 
     Raises:
         ModelError: the folder or some of its files are missing, or it holds another kind of model.
     """
     folder = Path(folder)
-    way_out = "name a folder in the layout of the Hugging Face ONNX exports" + (f", or {fix}" if fix else "")
+    way_out = "name a folder in a layout that docs/models.md lists" + (f", or {fix}" if fix else "")
     if not folder.is_dir():
         raise ModelError(f"model folder {folder} is missing", fix=way_out)
-    try:
-        config = read_json(folder / "config.json")
-    except ArtifactError as error:
-        raise ModelError(
-            f"model folder {folder} has no readable config.json",
-            expected="config.json with model_type sam or clip",
-            found=", ".join(sorted(path.name for path in folder.iterdir())[:12]) or "an empty folder",
-            fix=way_out,
-        ) from error
-    found_kind = config.get("model_type") if isinstance(config, dict) else None
-    if found_kind not in KINDS or (kind is not None and found_kind != kind):
-        raise ModelError(
-            f"model folder {folder} holds another kind of model",
-            expected=f"model_type {kind or ' or '.join(KINDS)} in config.json",
-            found=f"model_type {found_kind!r}",
-            fix=way_out,
-        )
-    networks = {}
-    missing = []
-    for name in KINDS[found_kind]:
-        places = [folder / f"{name}.onnx", folder / "onnx" / f"{name}.onnx"]
-        present = [place for place in places if place.is_file()]
-        if present:
-            networks[name] = present[0]
-        else:
-            missing.append(f"onnx/{name}.onnx")
-    described = [folder / name for name in DESCRIPTIONS[found_kind]]
-    missing += [path.name for path in described if not path.is_file()]
-    if missing:
-        if found_kind == "clip" and whole_clip(folder):
-            fix = f"split its single network into the two that are needed: hilsplat models split {folder}"
-        found = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
-        raise ModelError(
-            f"model folder {folder} lacks {', '.join(missing)}",
-            expected=", ".join(
-                [*DESCRIPTIONS[found_kind], *(f"onnx/{name}.onnx" for name in KINDS[found_kind])]
-            ),
-            found=", ".join(found[:20]),
-            fix=f"complete the folder (files such as {next(iter(KINDS[found_kind]))}_quantized.onnx must be "
-            "copied to the plain name)" + (f", or {fix}" if fix else ""),
-        )
-    optional = [folder / name for name in ("tokenizer_config.json", "special_tokens_map.json")]
-    beside = [path for path in optional if found_kind == "clip" and path.is_file()]
-    # Large exports keep their weights in files named after the network.
-    weights = [
-        path
-        for network in networks.values()
-        for path in sorted(network.parent.glob(f"{network.name}?data*"))
-        if path.is_file()
+    name, config = _layout_of(folder, kind, way_out)
+    layout = LAYOUTS[name]
+    networks = {
+        network: found
+        for network, spec in layout.networks.items()
+        if (found := _network_file(folder, spec, variant)) is not None
+    }
+    missing = [
+        f"{spec.places[-1]}{_ending(variant)}.onnx"
+        for network, spec in layout.networks.items()
+        if network not in networks
     ]
-    try:
-        preprocessing = read_json(folder / "preprocessor_config.json")
-    except ArtifactError as error:
-        raise ModelError(
-            f"{folder / 'preprocessor_config.json'} cannot be read: {error}", fix="fetch a whole copy"
-        ) from error
-    switched_off = [key for key in SWITCHES if preprocessing.get(key) is False]
-    if switched_off:
-        raise ModelError(
-            f"{folder / 'preprocessor_config.json'} switches off {', '.join(switched_off)}",
-            expected="images resized, divided by 255 and normalised, as in the released models",
-            fix="export the model again with its own preprocessor",
-        )
+    missing += [file for file in layout.described if not (folder / file).is_file()]
+    if missing:
+        raise _incomplete(folder, name, missing, variant, fix)
+    preprocessing = _preprocessing_of(folder / layout.preprocessing)
+    weights = {path for network in networks.values() for path in external_weights(network, folder)}
+    beside = [folder / file for file in layout.beside if (folder / file).is_file()]
+    described = [folder / file for file in layout.described]
     return ModelFolder(
         folder,
-        found_kind,
+        name,
         config,
         preprocessing,
         networks,
         tuple(sorted({*described, *beside, *networks.values(), *weights})),
     )
+
+
+def _layout_of(folder: Path, kind: str | None, way_out: str) -> tuple[str, dict[str, Any]]:
+    """Layout and configuration of a folder.
+
+    Raises:
+        ModelError: it holds no model that can be read, or one of another kind.
+    """
+    supported = "; ".join(SUPPORTED[each] for each in ([kind] if kind else SUPPORTED))
+    try:
+        config = read_json(folder / "config.json")
+    except ArtifactError as error:
+        raise ModelError(
+            f"model folder {folder} has no readable config.json",
+            expected=f"config.json of {supported}",
+            found=", ".join(sorted(path.name for path in folder.iterdir())[:12]) or "an empty folder",
+            fix=way_out,
+        ) from error
+    name, config = layout_of(config), config if isinstance(config, dict) else {}
+    model_type = config.get("model_type", name)
+    if name is None or (kind is not None and LAYOUTS[name].kind != kind):
+        raise ModelError(
+            f"model folder {folder} holds another kind of model",
+            expected=supported,
+            found=f"model_type {model_type!r}",
+            fix=OTHER_TYPES.get(str(model_type), way_out),
+        )
+    return name, config
+
+
+def _ending(variant: str) -> str:
+    """Ending of a network's name."""
+    return f"_{variant}" if variant else ""
+
+
+def _network_file(folder: Path, spec: NetworkSpec, variant: str) -> Path | None:
+    """The file of a network, if it is there."""
+    places = (folder / f"{place}{_ending(variant)}.onnx" for place in spec.places)
+    return next((place for place in places if place.is_file()), None)
+
+
+def _incomplete(folder: Path, name: str, missing: list[str], variant: str, fix: str) -> ModelError:
+    """The message about a folder that lacks files: what it holds instead, and what to do."""
+    layout = LAYOUTS[name]
+    found = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    variants = variants_of(folder, name)
+    if any(file.endswith(".onnx") for file in missing) and variants:
+        listed = ", ".join(repr(each) for each in variants)
+        way_out = f"its networks come as variants: set {SECTIONS[layout.kind]}.variant to one of {listed}"
+    elif layout.kind == "clip" and whole_clip(folder):
+        way_out = f"split its single network into the two that are needed: hilsplat models split {folder}"
+    elif not any(file.endswith(".onnx") for file in found) and any(
+        file.endswith(TORCH_SUFFIXES) for file in found
+    ):
+        way_out = (
+            "these are PyTorch's weights, and hilsplat runs ONNX networks: get an ONNX export of the model "
+            "(hilsplat models get), or export it (docs/models.md)"
+        )
+    else:
+        way_out = "complete the folder from where it came"
+    return ModelError(
+        f"model folder {folder} lacks {', '.join(missing)}",
+        expected=", ".join(
+            [*layout.described, *(f"{spec.places[-1]}.onnx" for spec in layout.networks.values())]
+        ),
+        found=", ".join(found[:20]),
+        fix=way_out + (f", or {fix}" if fix else ""),
+    )
+
+
+def variants_of(folder: Path, layout: str) -> list[str]:
+    """Endings that all networks of a folder have, such as `fp16`; "" for the plain names."""
+    endings: set[str] | None = None
+    for spec in LAYOUTS[layout].networks.values():
+        have = set()
+        for place in spec.places:
+            stem = Path(place).name
+            for path in (folder / place).parent.glob(f"{stem}*.onnx"):
+                rest = path.stem[len(stem) :]
+                if not rest or rest.startswith("_"):
+                    have.add(rest[1:])
+        endings = have if endings is None else endings & have
+    return sorted(endings or ())
+
+
+def _preprocessing_of(path: Path) -> dict[str, Any]:
+    """How a picture becomes an input; open_clip's words are translated.
+
+    Raises:
+        ModelError: the file cannot be read, or switches off a step.
+    """
+    try:
+        found = read_json(path)
+    except ArtifactError as error:
+        raise ModelError(f"{path} cannot be read: {error}", fix="fetch a whole copy") from error
+    found = {key: value for key, value in found.items() if value is not None}
+    switched_off = [key for key in SWITCHES if found.get(key) is False]
+    if switched_off:
+        raise ModelError(
+            f"{path} switches off {', '.join(switched_off)}",
+            expected="images resized, divided by 255 and normalised, as in the released models",
+            fix="export the model again with its own preprocessor",
+        )
+    if path.name == "preprocess_cfg.json":
+        size = found.get("size", 224)
+        found["size"] = size[0] if isinstance(size, list) else size
+        for ours, theirs in (("image_mean", "mean"), ("image_std", "std")):
+            if theirs in found:
+                found[ours] = found[theirs]
+    return found
+
+
+def external_weights(network: Path, folder: Path) -> list[Path]:
+    """Files beside a network that hold its weights, as its graph names them; the weights are not read.
+
+    Raises:
+        ModelError: the graph cannot be read, or such a file is missing or outside the model folder.
+    """
+    if not network.stat().st_size:
+        return []  # opening it says what is wrong
+    with network.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        if content.find(b"location") < 0:  # the key that every tensor outside the graph has
+            return []
+    import onnx
+    from google.protobuf.message import DecodeError
+    from onnx.external_data_helper import ExternalDataInfo, uses_external_data
+
+    try:
+        graph = onnx.load(str(network), load_external_data=False).graph
+    except DecodeError:
+        return []  # a damaged copy: opening it says so
+    named = {ExternalDataInfo(tensor).location for tensor in _tensors(graph) if uses_external_data(tensor)}
+    found = []
+    for name in sorted(named):
+        path = network.parent / name
+        if not path.is_file() or not path.resolve().is_relative_to(folder.resolve()):
+            raise ModelError(
+                f"network {network} cannot be opened: its weights are missing",
+                expected=f"the file {name} beside it",
+                found=", ".join(sorted(other.name for other in network.parent.iterdir())),
+                fix="fetch a whole copy",
+            )
+        found.append(path)
+    return found
+
+
+def _tensors(graph: Any) -> Iterator[Any]:
+    """All weights and constants of a graph and of the graphs inside it."""
+    yield from graph.initializer
+    for node in graph.node:
+        for attribute in node.attribute:
+            yield from (attribute.t, *attribute.tensors)
+            for inner in (attribute.g, *attribute.graphs):
+                yield from _tensors(inner)
 
 
 def execution_providers() -> list[str]:
@@ -226,7 +310,6 @@ class Network:
 
     def __init__(self, path: Path, spec: NetworkSpec, threads: int = 1) -> None:
         self.path = path
-        self.spec = spec
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
@@ -244,10 +327,18 @@ class Network:
             raise ModelError(
                 f"network {path} cannot be opened: {error}",
                 found=f"a file of {path.stat().st_size} bytes",
-                fix="export it again, or fetch a whole copy (with its .onnx_data file, if it has one)",
+                fix="export it again, or fetch a whole copy (with its file of weights, if it has one)",
             ) from error
         self.inputs = {item.name: item for item in self.session.get_inputs()}
         self.outputs = {item.name: item for item in self.session.get_outputs()}
+        names = {
+            name: other
+            for name, other in spec.synonyms.items()
+            if name not in self.outputs and other in self.outputs
+        }
+        self.spec = spec = replace(
+            spec, outputs={names.get(name, name): axes for name, axes in spec.outputs.items()}
+        )
         self._check("inputs", spec.inputs, self.inputs, spec.optional)
         self._check("outputs", spec.outputs, self.outputs, tuple(self.outputs))
         self.providers = self.session.get_providers()
@@ -335,7 +426,7 @@ def side_px(size: Any, default: int) -> int:
 
 def input_side_px(model: ModelFolder) -> int:
     """Side of the square that the image network takes, px."""
-    keys = ("pad_size", "size") if model.kind == "sam" else ("crop_size", "size")
+    keys = ("pad_size", "size") if model.layout == "sam" else ("crop_size", "size")
     default = 1024 if model.kind == "sam" else 224
     for key in keys:
         if model.preprocessing.get(key):

@@ -10,6 +10,7 @@ from hilsplat.cli.stage import (
     DEFAULT_CACHE,
     Cache,
     Log,
+    Memory,
     PathIn,
     PathOut,
     Settings,
@@ -27,6 +28,7 @@ def clip(
     settings: Settings = "{}",
     cache: Cache = DEFAULT_CACHE,
     threads: Threads = 1,
+    memory: Memory = None,
     log: Log = None,
 ) -> None:
     """Embed each mask with CLIP."""
@@ -35,7 +37,7 @@ def clip(
     with stage("clip", out, log, settings=section, threads=threads, inputs=inputs):
         from hilsplat.embed.stage import run_clip
 
-        run_clip(scene, masks, out, cache, section, threads)
+        run_clip(scene, masks, out, cache, section, threads, memory)
 
 
 @langsplat_app.command("read")

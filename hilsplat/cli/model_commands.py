@@ -56,13 +56,14 @@ def models_list(folder: Annotated[Path, typer.Option(help="folder of the models"
 @models_app.command("check")
 def models_check(
     folder: Annotated[Path | None, typer.Argument(help="model folder; default: all in models/")] = None,
+    variant: Annotated[str, typer.Option(help="ending of the networks' names, such as fp16")] = "",
 ) -> None:
     """Describe a model folder, or all that are here, and time one image."""
     start_logging(None)
     from hilsplat.embed.model_check import check_model
     from hilsplat.hub.overview import check_models
 
-    text, num_failed = (check_model(folder), 0) if folder is not None else check_models()
+    text, num_failed = (check_model(folder, variant), 0) if folder is not None else check_models()
     typer.echo(text)
     if num_failed:
         raise typer.Exit(1)

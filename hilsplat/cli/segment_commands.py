@@ -11,6 +11,7 @@ from hilsplat.cli.stage import (
     DEFAULT_CACHE,
     Cache,
     Log,
+    Memory,
     PathIn,
     PathOut,
     Settings,
@@ -32,6 +33,7 @@ def masks(
     perturb: Annotated[str, typer.Option(help="faults of truth-perturbed, as JSON")] = "{}",
     cache: Cache = DEFAULT_CACHE,
     threads: Threads = 1,
+    memory: Memory = None,
     log: Log = None,
 ) -> None:
     """Segment each training view at three levels."""
@@ -48,7 +50,7 @@ def masks(
     with stage("masks", out, log, settings=section, threads=threads, inputs={"scene": scene}):
         from hilsplat.segment.stage import run_masks
 
-        run_masks(scene, out, cache, section, threads)
+        run_masks(scene, out, cache, section, threads, memory)
 
 
 def _masks_from_truth(

@@ -20,6 +20,12 @@ Settings = Annotated[
     str, typer.Option(help="settings of the stage as JSON; missing keys take their defaults")
 ]
 Threads = Annotated[int, typer.Option(min=1, help="number of threads; results do not depend on it")]
+Memory = Annotated[
+    float | None,
+    typer.Option(
+        min=1, help="memory for views at once, MiB; default: what is free; results do not depend on it"
+    ),
+]
 Seed = Annotated[int, typer.Option(min=0, help="seed for everything random")]
 Log = Annotated[Path | None, typer.Option(help="also write the log to this file")]
 Cache = Annotated[Path, typer.Option(help="folder of the caches of finished views, for resuming")]

@@ -2,12 +2,13 @@
 
 import logging
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float16, Float32, UInt8
 from tokenizers import Tokenizer
 
-from hilsplat.base.artifacts import read_full_index
+from hilsplat.base.artifacts import read_full_index, read_json
 from hilsplat.base.crops import crop_to_square
 from hilsplat.base.errors import MisalignedArtifactError, ModelError
 from hilsplat.base.onnx_models import ModelFolder, input_side_px, open_model_folder, require_one_space
@@ -19,6 +20,9 @@ logger = logging.getLogger(__name__)
 
 INSTALLED = Path(__file__).resolve().parents[2]
 """The project that this package runs from; a checkout has its `models/` there."""
+
+SIGLIP_TOKENS = 64
+"""Length of every text of a SigLIP whose configuration names none."""
 
 MODEL_PATTERNS = ("*/config.json", "*/*/config.json")
 """Places of model folders under `models/`."""
@@ -41,10 +45,10 @@ class ClipModel:
         self.digest = model.digest
         self.vision = model.network("vision_model")
         self.text = model.network("text_model")
+        self.pixels, self.ids = next(iter(self.vision.spec.inputs)), next(iter(self.text.spec.inputs))
+        (self.vector,), (words,) = self.vision.spec.outputs, self.text.spec.outputs
         require_one_space(
-            model.folder,
-            self.vision.declared_axis("image_embeds", 1),
-            self.text.declared_axis("text_embeds", 1),
+            model.folder, self.vision.declared_axis(self.vector, 1), self.text.declared_axis(words, 1)
         )
         self.side_px = input_side_px(model)
         # CLIP's own statistics if the folder names none, as in transformers
@@ -52,43 +56,55 @@ class ClipModel:
         self.mean = np.array(preprocessing.get("image_mean", (0.48145466, 0.4578275, 0.40821073)), np.float32)
         self.std = np.array(preprocessing.get("image_std", (0.26862954, 0.26130258, 0.27577711)), np.float32)
         self.rescale = np.float32(preprocessing.get("rescale_factor", 1 / 255))
-        path = model.folder / "tokenizer.json"
+        path = model.tokenizer
         try:
             self.tokenizer = Tokenizer.from_file(str(path))
         except Exception as error:  # the tokenizers package raises bare Exception
             raise ModelError(f"{path} cannot be read: {error}", fix="fetch a whole copy") from error
-        fixed = self.text.fixed_axis("input_ids", 1)
-        declared = model.config.get("text_config", {}).get("max_position_embeddings")
+        fixed = self.text.fixed_axis(self.ids, 1)
+        text_config = model.config.get("text_config", {})
+        self.siglip = model.layout == "siglip"
+        declared = text_config.get("max_position_embeddings", SIGLIP_TOKENS if self.siglip else None)
         truncation = self.tokenizer.truncation or {}
         self.max_tokens: int | None = fixed or declared or truncation.get("max_length")
         if self.max_tokens:
             self.tokenizer.enable_truncation(self.max_tokens)
-        if fixed:
-            pad = (self.tokenizer.padding or {}).get(
-                "pad_id", model.config.get("text_config", {}).get("pad_token_id")
-            )
-            self.tokenizer.enable_padding(length=fixed, pad_id=int(pad or 0))
+        if fixed or self.siglip:  # SigLIP was trained on padded texts and reads the padding
+            self.tokenizer.enable_padding(length=self.max_tokens, pad_id=self._pad_id(text_config))
         else:
             self.tokenizer.no_padding()
 
+    def _pad_id(self, text_config: dict[str, Any]) -> int:
+        """Token that fills a text up: what the tokenizer names, else its configuration, else the model's."""
+        named = (self.tokenizer.padding or {}).get("pad_id")
+        beside = self.model.tokenizer.with_name("tokenizer_config.json")
+        if named is None and beside.is_file():
+            token = read_json(beside).get("pad_token")
+            token = token.get("content") if isinstance(token, dict) else token
+            named = self.tokenizer.token_to_id(token) if token else None
+        if named is None:
+            named = text_config.get("pad_token_id", 1 if self.siglip else 0)
+        return int(named or 0)
+
     @staticmethod
-    def load(folder: Path, threads: int = 1, template: str = "{}") -> "ClipModel":
+    def load(folder: Path, threads: int = 1, template: str = "{}", variant: str = "") -> "ClipModel":
         """Open a model folder.
 
         Args:
-            folder: in the layout of the Hugging Face ONNX exports.
+            folder: in a layout of `base.model_layouts`.
             threads: batches of crops embedded at once; results do not depend on it.
             template: sentence around every text, which replaces `{}`.
+            variant: ending of the networks' names, such as `fp16`.
 
         Raises:
             ModelError: it is missing, incomplete or not a CLIP, or its networks do not belong together.
         """
-        return ClipModel(open_model_folder(folder, "clip"), threads, template)
+        return ClipModel(open_model_folder(folder, "clip", variant=variant), threads, template)
 
     @property
     def width(self) -> int:
         """Numbers in a vector."""
-        return self.vision.declared_axis("image_embeds", 1) or self.embed_texts(["object"]).shape[1]
+        return self.vision.declared_axis(self.vector, 1) or self.embed_texts(["object"]).shape[1]
 
     def require_width(self, numbers: int, what: str) -> None:
         """Refuse something made for vectors of another width.
@@ -111,8 +127,9 @@ class ClipModel:
 
     def embed_crops(self, crops: UInt8[np.ndarray, "B side side 3"]) -> Float32[np.ndarray, "B C"]:
         """Unit vectors of square crops of `side_px`."""
-        (vectors,) = self.vision(pixel_values=self.prepare(crops))
-        return unit(vectors)
+        step = self.vision.fixed_axis(self.pixels, 0) or len(crops)  # open_clip's exports take one picture
+        pieces = np.split(self.prepare(crops), range(step, len(crops), step))
+        return unit(np.concatenate([self.vision(**{self.pixels: piece})[0] for piece in pieces]))
 
     def embed_masks(
         self,
@@ -135,7 +152,10 @@ class ClipModel:
                 # Only the box is unpacked: a photograph may have 40 million pixels.
                 x0, y0, x1, y1 = box = tuple(masks.box_xyxy[row].tolist())
                 inside = masks.window(row, box)
-                crops.append(crop_to_square(image[y0:y1, x0:x1], inside, settings.background, self.side_px))
+                box_image, as_langsplat = image[y0:y1, x0:x1], settings.crop == "langsplat"
+                crops.append(
+                    crop_to_square(box_image, inside, settings.background, self.side_px, as_langsplat)
+                )
             return self.embed_crops(np.stack(crops))
 
         parts = list(in_order(embed, range(0, len(masks), settings.batch), self.threads))
@@ -159,15 +179,17 @@ class ClipModel:
 
     def _embed_text(self, text: str) -> Float32[np.ndarray, " C"]:
         """The unit vector of one text."""
-        if not sum(self.tokenizer.encode(text).attention_mask):
+        if not text.strip() or not sum(self.tokenizer.encode(text).attention_mask):
             raise ModelError(f"text {text!r} has no token", fix="give each query at least one word")
-        encoding = self.tokenizer.encode(self.template.replace("{}", text))
+        sentence = self.template.replace("{}", text)
+        if self.siglip:  # trained on lower-case texts
+            sentence = sentence.lower()
+        encoding = self.tokenizer.encode(sentence)
         if encoding.overflowing:
             logger.warning("text cut off after %d tokens: %r", self.max_tokens, text)
-        (vector,) = self.text(
-            input_ids=np.array([encoding.ids], dtype=np.int64),
-            attention_mask=np.array([encoding.attention_mask], dtype=np.int64),
-        )
+        mask = np.array([encoding.attention_mask], dtype=np.int64)
+        ids = np.array([encoding.ids], dtype=np.int64)
+        (vector,) = self.text(**{self.ids: ids, "attention_mask": mask})
         return unit(vector)[0]
 
 
@@ -194,6 +216,7 @@ def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> C
     """
     index = read_full_index(clip_folder, "model", "model_sha256")
     recorded, wanted = Path(index["model"]), index["model_sha256"]
+    variant = index.get("model_variant", "")
     roots = list(dict.fromkeys([Path.cwd(), *Path(clip_folder).resolve().parents, INSTALLED]))
     stores = [root / "models" for root in roots if (root / "models").is_dir()]
     configs = [config for store in stores for pattern in MODEL_PATTERNS for config in store.glob(pattern)]
@@ -203,7 +226,7 @@ def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> C
         if place in seen or not place.is_dir():
             continue
         try:
-            model = open_model_folder(folder, "clip")
+            model = open_model_folder(folder, "clip", variant=variant)
         except ModelError:
             continue  # SAM, or half a copy
         if model.digest == wanted:

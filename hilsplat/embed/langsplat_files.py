@@ -160,7 +160,7 @@ def read_clip(scene_folder: Path, files: Path, out: Path, resize: bool, settings
             embeds the texts.
     """
     scene = Scene.load(scene_folder)
-    model = ClipModel.load(Path(settings.model))
+    model = ClipModel.load(Path(settings.model), variant=settings.variant)
     with stage_log("langsplat clip", scene.name) as counts, atomic_folder(out) as folder:
         index = {}
         for view, (_, vectors) in _read_all(scene, files, resize).items():
@@ -173,6 +173,7 @@ def read_clip(scene_folder: Path, files: Path, out: Path, resize: bool, settings
             scene=scene.name,
             dim=model.width,
             model=settings.model,
+            model_variant=settings.variant,
             model_sha256=model.digest,
             background="langsplat",
             context=0.0,

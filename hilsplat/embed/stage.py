@@ -1,5 +1,6 @@
 """The stage `clip`: one CLIP vector per mask of every training view."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from hilsplat.base.artifacts import (
 )
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.identity import code_digest
+from hilsplat.base.model_memory import available_mib, needs_of
 from hilsplat.base.parallel import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel
@@ -24,7 +26,13 @@ from hilsplat.settings import ClipSettings
 
 
 def run_clip(
-    scene_folder: Path, masks_folder: Path, out: Path, cache: Path, settings: ClipSettings, threads: int
+    scene_folder: Path,
+    masks_folder: Path,
+    out: Path,
+    cache: Path,
+    settings: ClipSettings,
+    threads: int,
+    memory_mib: float | None = None,
 ) -> None:
     """Embed every mask of every training view.
 
@@ -35,14 +43,17 @@ def run_clip(
             `index.json` with the number C and the model.
         cache: folder of the view cache.
         settings: model and cropping.
-        threads: views embedded at once; the result does not depend on it.
+        threads: views embedded at once, if they fit into the memory; the result does not depend on it.
+        memory_mib: memory that the stage may use; None: what is free.
 
     Raises:
         MisalignedArtifactError: the masks belong to other views, or have other sizes, than the scene's.
     """
     scene = Scene.load(scene_folder)
     views = list(read_index(masks_folder)["views"])
-    model = ClipModel.load(Path(settings.model))
+    model = ClipModel.load(Path(settings.model), variant=settings.variant)
+    needs = needs_of(model.model, settings.batch)
+    threads = needs.views_at_once(threads, min(memory_mib or math.inf, available_mib()))
     view_cache = ViewCache(Path(cache) / "clip")
 
     def embed(view: str) -> np.ndarray:
@@ -53,7 +64,7 @@ def run_clip(
                 "masks": sha256_of_file(masks_path),
                 "model": model.digest,
                 "providers": model.vision.providers,
-                "settings": settings.model_dump(exclude={"model"}),
+                "settings": settings.model_dump(exclude={"model", "variant"}),
                 "code": code_digest(ClipModel),
             }
         )
@@ -93,6 +104,7 @@ def run_clip(
             scene=scene.name,
             dim=dimensions,
             model=settings.model,
+            model_variant=settings.variant,
             model_sha256=model.digest,
             background=settings.background,
         )

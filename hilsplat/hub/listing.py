@@ -9,9 +9,9 @@ import huggingface_hub
 import requests
 from huggingface_hub.errors import CacheNotFound, OfflineModeIsEnabled
 
-from hilsplat.base.clip_split import HALVES, WHOLE
+from hilsplat.base.clip_split import WHOLE
 from hilsplat.base.errors import DownloadError
-from hilsplat.base.onnx_models import DESCRIPTIONS, KINDS
+from hilsplat.base.model_layouts import LAYOUTS, SUPPORTED, layout_of
 
 WEIGHTS = ("model.safetensors", "pytorch_model.bin")
 """PyTorch weights that can be exported, the preferred one first. Of the second, a pickle, transformers runs
@@ -38,8 +38,8 @@ class Parts:
 
     networks: tuple[tuple[str, ...], ...]
     described: tuple[str, ...]
-    whole: tuple[str, ...] = ()
-    beside: tuple[str, ...] = ("tokenizer_config.json", "special_tokens_map.json")
+    whole: tuple[str, ...]
+    beside: tuple[str, ...]
 
     @property
     def usual(self) -> tuple[str, ...]:
@@ -48,14 +48,15 @@ class Parts:
 
 
 PARTS = {
-    kind: Parts(
-        tuple((f"onnx/{name}", name) for name in networks),
-        DESCRIPTIONS[kind],
-        WHOLES if set(networks) == set(HALVES) else (),
+    name: Parts(
+        tuple(spec.places[::-1] for spec in layout.networks.values()),
+        layout.described,
+        WHOLES if name in ("clip", "siglip") else (),
+        layout.beside,
     )
-    for kind, networks in KINDS.items()
+    for name, layout in LAYOUTS.items()
 }
-"""By the `model_type` in config.json."""
+"""By the layout of the model."""
 
 
 @dataclass(frozen=True)
@@ -180,14 +181,17 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
         DownloadError: the model is of no kind that is read here, or it has neither networks nor weights.
     """
     try:
-        kind = json.loads(config).get("model_type")
-    except (ValueError, AttributeError):
-        kind = None
-    if kind not in PARTS:
+        described = json.loads(config)
+    except ValueError:
+        described = None
+    kind = layout_of(described)
+    if kind is None:
         raise DownloadError(
             f"{listing.repository} does not hold a model that can be used here",
-            expected=f"model_type {' or '.join(PARTS)} in config.json",
-            found=f"model_type {kind!r}",
+            expected="; ".join(SUPPORTED.values()),
+            found=f"model_type {described.get('model_type')!r}"
+            if isinstance(described, dict)
+            else "no JSON object",
             fix="name a SAM or a CLIP (hilsplat models list)",
         )
     parts, ending = PARTS[kind], f"_{variant}" if variant else ""

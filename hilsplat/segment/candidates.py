@@ -1,5 +1,6 @@
 """What the networks predict for a view: the costly, cached half of automatic mask generation."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,15 @@ from hilsplat.base.artifacts import sha256_of_json
 from hilsplat.base.identity import code_digest
 from hilsplat.segment.logit_kernels import edge_windows
 from hilsplat.segment.masks import join_rows
-from hilsplat.segment.sam import HEADS, Frame, SamModel, point_grid, read_logits
+from hilsplat.segment.sam import (
+    HEADS,
+    Frame,
+    SamModel,
+    Thresholds,
+    full_stability,
+    point_grid,
+    read_logits,
+)
 from hilsplat.settings import MasksSettings
 
 LOOSE = 0.1
@@ -26,10 +35,10 @@ CROP_OVERLAP = 512 / 1500
 class Candidates:
     """K masks as the decoder gave them, before any threshold that a user may change.
 
-    A mask's logits are kept inside a window around it, in steps of `sam.LOGIT_STEP`, and set to
-    +-127 wherever no edge is within `BAND_PX`: the two bilinear resizings up to the view read logits
-    at most three pixels apart, so no pixel of any mask changes, and the window is constant almost
-    everywhere and compresses well. Outside the window logits are -127.
+    A mask's logits are kept inside a window around it, in steps of `sam.LOGIT_STEP` (for the official
+    generator as they are), and set to +-127 wherever no edge is within `BAND_PX`: the two bilinear
+    resizings up to the view read logits at most three pixels apart, so no pixel of any mask changes, and
+    the window is constant almost everywhere and compresses well. Outside the window logits are -127.
 
     Attributes:
         logits: the windows one after the other, row by row.
@@ -37,12 +46,12 @@ class Candidates:
         window_xyxy: low-resolution px, end exclusive.
         low_hw: height and width of the decoder's masks.
         head: row of `HEADS`.
-        predicted_iou: as the network gives it, clipped to [0, 1].
-        stability: `sam.read_logits`.
+        predicted_iou: as the network gives it; a released SAM exceeds 1 at its surest masks.
+        stability: `sam.read_logits` or `sam.full_stability`.
         crop: row of the view's crop boxes.
     """
 
-    logits: Int8[np.ndarray, " R"]
+    logits: Int8[np.ndarray, " R"] | Float32[np.ndarray, " R"]
     offsets: Int64[np.ndarray, " K_and_1"]
     window_xyxy: Int32[np.ndarray, "K 4"]
     low_hw: Int32[np.ndarray, " 2"]
@@ -91,6 +100,7 @@ def crop_boxes(
 
 def candidates_key(image_sha256: str, model: SamModel, settings: MasksSettings) -> str:
     """Cache key of a view's candidates: everything that `decode_candidates` depends on."""
+    thresholds = model.thresholds(settings)
     return sha256_of_json(
         {
             "image": image_sha256,
@@ -98,19 +108,27 @@ def candidates_key(image_sha256: str, model: SamModel, settings: MasksSettings) 
             "providers": model.encoder.providers,
             "points_per_side": settings.points_per_side,
             "points_per_batch": model.prompts_per_call(
-                settings.points_per_batch, settings.points_per_side**2
+                thresholds.points_per_batch, settings.points_per_side**2
             ),
             "crop_layers": settings.crop_layers,
             "stability_offset": settings.stability_offset,
-            "floors": floors(settings),
+            "full_size": needs_full_size(settings),
+            "official": settings.generator == "official",
+            "floors": floors(thresholds),
             "code": code_digest(decode_candidates),
         }
     )
 
 
-def floors(settings: MasksSettings) -> tuple[float, float]:
-    """Predicted IoU and stability below which candidates are not kept."""
-    return min(LOOSE, settings.predicted_iou_min), min(LOOSE, settings.stability_min)
+def floors(thresholds: Thresholds) -> tuple[float, float]:
+    """Predicted IoU and stability below which candidates are not kept; a threshold of 0 drops nothing."""
+    lowest = (min(LOOSE, thresholds.predicted_iou_min), min(LOOSE, thresholds.stability_min))
+    return lowest[0] or -math.inf, lowest[1]
+
+
+def needs_full_size(settings: MasksSettings) -> bool:
+    """Whether stability counts pixels at the size of the view."""
+    return settings.stability == "full" or settings.generator == "official"
 
 
 def decode_candidates(
@@ -119,7 +137,8 @@ def decode_candidates(
     """Prompt the network at every grid point of the image and of its crops."""
     boxes, _ = crop_boxes((image.shape[0], image.shape[1]), settings.crop_layers)
     grid = point_grid(settings.points_per_side)
-    batch = model.prompts_per_call(settings.points_per_batch, len(grid))
+    thresholds = model.thresholds(settings)
+    batch = model.prompts_per_call(thresholds.points_per_batch, len(grid))
     parts = []
     for crop, (left, top, right, bottom) in enumerate(boxes):
         encoded = model.encode(np.ascontiguousarray(image[top:bottom, left:right]))
@@ -131,7 +150,9 @@ def decode_candidates(
             padded = np.concatenate([asked, np.repeat(asked[-1:], batch - len(asked), axis=0)])
             scores, logits = model.decode(encoded, padded)
             parts.append(
-                keep_candidates(scores[: len(asked)], logits[: len(asked)], encoded.frame, crop, settings)
+                keep_candidates(
+                    scores[: len(asked)], logits[: len(asked)], encoded.frame, crop, settings, thresholds
+                )
             )
     return Candidates.concatenate(parts)
 
@@ -142,15 +163,20 @@ def keep_candidates(
     frame: Frame,
     crop: int,
     settings: MasksSettings,
+    thresholds: Thresholds,
 ) -> Candidates:
     """The masks of one decoder call that are above the floors."""
-    iou_floor, stability_floor = floors(settings)
-    predicted_iou = np.clip(scores.reshape(-1), 0, 1)
-    steps, stability, boxes = read_logits(
-        logits.reshape(-1, *logits.shape[2:]), settings.stability_offset, frame
-    )
-    keep = (predicted_iou >= iou_floor) & (stability >= stability_floor) & boxes.any(axis=1)
-    rows = np.flatnonzero(keep)
+    iou_floor, stability_floor = floors(thresholds)
+    predicted_iou = scores.reshape(-1)
+    flat = logits.reshape(-1, *logits.shape[2:])
+    steps: np.ndarray
+    steps, stability, boxes = read_logits(flat, settings.stability_offset, frame)
+    if settings.generator == "official":
+        steps, boxes = np.ascontiguousarray(flat), positive_boxes(flat)
+    likely = (predicted_iou >= iou_floor) & boxes.any(axis=1)
+    if needs_full_size(settings):
+        stability[likely] = full_stability(flat[likely], settings.stability_offset, frame)
+    rows = np.flatnonzero(likely & (stability >= stability_floor))
     values, offsets, windows = edge_windows(steps, rows, boxes, BAND_PX)
     return Candidates(
         values,
@@ -162,3 +188,14 @@ def keep_candidates(
         stability[rows],
         np.full(len(rows), crop, np.uint8),
     )
+
+
+def positive_boxes(logits: Float32[np.ndarray, "K h w"]) -> Int32[np.ndarray, "K 4"]:
+    """Box (xyxy, end exclusive) of what is above 0 in each picture, all 0 if nothing is."""
+    above = np.greater(logits, 0)
+    boxes = np.zeros((len(logits), 4), np.int32)
+    for low, high, along in ((0, 2, above.any(axis=1)), (1, 3, above.any(axis=2))):
+        boxes[:, low] = along.argmax(axis=1)
+        boxes[:, high] = along.shape[1] - along[:, ::-1].argmax(axis=1)
+    boxes[~above.any(axis=(1, 2))] = 0
+    return boxes

@@ -3,11 +3,12 @@
 Two halves. `candidates.decode_candidates` runs the networks and depends on few settings; what it
 returns is cached. `masks_from_candidates` filters, upscales and suppresses; changing its knobs costs
 no network call. The steps are SAM's automatic generator, run separately for the three heads as in
-LangSplat, then LangSplat's mask suppression.
+LangSplat, then LangSplat's mask suppression. With `generator: official`, each step is as published
+(docs/segment.md lists what differs).
 """
 
 import numpy as np
-from jaxtyping import Bool, Int32, Int64
+from jaxtyping import Bool, Float64, Int32, Int64
 
 from hilsplat.base.levels import Level
 from hilsplat.segment import sam
@@ -15,7 +16,12 @@ from hilsplat.segment.candidates import Candidates, crop_boxes
 from hilsplat.segment.kernels import mended_runs, upscaled_runs
 from hilsplat.segment.masks import HierarchicalMasks, take_runs
 from hilsplat.segment.sam import HEADS, Frame, SamModel
-from hilsplat.segment.suppression import suppress_boxes, suppress_masks
+from hilsplat.segment.suppression import (
+    last_inside,
+    suppress_boxes,
+    suppress_boxes_officially,
+    suppress_masks,
+)
 from hilsplat.settings import MasksSettings
 
 CROP_EDGE_PX = 20
@@ -31,45 +37,52 @@ def masks_from_candidates(
     Returns:
         masks in `content_order`; a level may be empty.
     """
+    thresholds = model.thresholds(settings)
+    official = settings.generator == "official"
     boxes, layer_of = crop_boxes(size_hw, settings.crop_layers)
-    enough = (candidates.predicted_iou >= settings.predicted_iou_min) & (
-        candidates.stability >= settings.stability_min
-    )
+    # smaller crops saw more detail (SAM); officially the smaller crop wins, here the deeper layer
+    preferred = 1 / np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) if official else layer_of
+    enough = (candidates.predicted_iou > thresholds.predicted_iou_min) | (thresholds.predicted_iou_min == 0)
+    enough &= candidates.stability >= thresholds.stability_min
     streams = []
     for head, level in enumerate(HEADS):
-        per_crop, layers = [], []
+        per_crop, ranks = [], []
         for crop, crop_box in enumerate(boxes):
             rows = np.flatnonzero(enough & (candidates.head == head) & (candidates.crop == crop))
             frame = _frame(crop_box, model)
-            masks = _upscale(candidates, rows, frame, crop_box, size_hw, level)
-            keep = suppress_boxes(masks.box_xyxy, masks.predicted_iou, settings.box_nms_iou)
-            per_crop.append(masks.take(keep))
-            layers.append(np.full(len(keep), layer_of[crop]))
-        masks, layer = HierarchicalMasks.concatenate(per_crop, size_hw), np.concatenate(layers)
-        if settings.crop_layers:  # smaller crops saw more detail (SAM)
-            masks = masks.take(
-                suppress_boxes(masks.box_xyxy, layer + masks.predicted_iou / 2, settings.box_nms_iou)
-            )
+            masks = _upscale(candidates, rows, frame, crop_box, size_hw, level, official)
+            masks = _suppressed(masks, None, settings)
+            per_crop.append(masks)
+            ranks.append(np.full(len(masks), preferred[crop], np.float64))
+        masks = HierarchicalMasks.concatenate(per_crop, size_hw)
+        if settings.crop_layers:
+            masks = _suppressed(masks, np.concatenate(ranks), settings)
         # Mending costs most, so it comes after suppression by boxes, as in SAM.
-        masks, changed = mend_masks(masks, settings.min_area_px)
+        masks, changed = mend_masks(masks, settings.min_area_px, keep_small=official)
         if changed.any():  # mending moved boxes; masks that needed none are better (SAM)
-            keep = suppress_boxes(masks.box_xyxy, ~changed + masks.predicted_iou / 2, settings.box_nms_iou)
-            masks = masks.take(keep)
+            masks = _suppressed(masks, (~changed).astype(np.float64), settings)
         streams.append(masks)
     pooled = HierarchicalMasks.concatenate(streams, size_hw)
     return suppress_masks(
         pooled,
         iou_max=settings.nms_iou,
-        score_min=settings.nms_score,
+        score_min=thresholds.nms_score,
         inner=settings.nms_inner,
     )
+
+
+def _suppressed(
+    masks: HierarchicalMasks, first: Float64[np.ndarray, " M"] | None, settings: MasksSettings
+) -> HierarchicalMasks:
+    """Masks that repeat no better one by their boxes: higher in `first`, then in predicted IoU."""
+    suppress = suppress_boxes_officially if settings.generator == "official" else suppress_boxes
+    return masks.take(suppress(masks.box_xyxy, masks.predicted_iou, settings.box_nms_iou, first))
 
 
 def _frame(crop_box: Int32[np.ndarray, " 4"], model: SamModel) -> Frame:
     """Where a crop was in the network's input."""
     left, top, right, bottom = (int(number) for number in crop_box)
-    original = (bottom - top, right - left)
-    return Frame(original, sam.resized_size(original, model.longest_edge), model.padded_hw)
+    return model.frame((bottom - top, right - left))
 
 
 def _upscale(
@@ -79,12 +92,11 @@ def _upscale(
     crop_box: Int32[np.ndarray, " 4"],
     size_hw: tuple[int, int],
     level: Level,
+    official: bool,
 ) -> HierarchicalMasks:
     """Masks of the given candidates in the view, without empty ones and those cut by the crop's edge."""
-    along_y, along_x = (
-        sam.taps(int(candidates.low_hw[axis]), frame.padded_hw[axis], frame.resized_hw[axis], length)
-        for axis, length in enumerate(frame.original_hw)
-    )
+    low_h, low_w = candidates.low_hw.tolist()
+    along_y, along_x = sam.frame_taps((low_h, low_w), frame)
     runs, offsets = upscaled_runs(
         candidates.logits,
         candidates.offsets,
@@ -107,15 +119,21 @@ def _upscale(
         candidates.stability[rows[keep]],
         size_hw,
     )
-    return masks.take(np.flatnonzero(~cut_by_crop(masks.box_xyxy, crop_box, size_hw)))
+    met = last_inside(masks.box_xyxy) if official else masks.box_xyxy
+    return masks.take(np.flatnonzero(~cut_by_crop(met, crop_box, size_hw)))
 
 
 def mend_masks(
-    masks: HierarchicalMasks, min_area_px: int
+    masks: HierarchicalMasks, min_area_px: int, keep_small: bool = False
 ) -> tuple[HierarchicalMasks, Bool[np.ndarray, " m"]]:
     """Fill holes and drop islands below `min_area_px` (8-connected), and masks that are small as a whole.
 
     The largest island of a mask always stays.
+
+    Args:
+        masks: to mend.
+        min_area_px: see above.
+        keep_small: keep masks that are small as a whole, which then count as changed (SAM).
 
     Returns:
         the masks left, and which of them were changed.
@@ -124,7 +142,10 @@ def mend_masks(
     mended = HierarchicalMasks.from_runs(
         runs, offsets, masks.level, masks.predicted_iou, masks.stability, masks.size_hw
     )
-    large = np.flatnonzero(mended.area_px >= min_area_px)
+    is_small = mended.area_px < min_area_px
+    if keep_small:
+        return mended, changed | is_small
+    large = np.flatnonzero(~is_small)
     return mended.take(large), changed[large]
 
 

@@ -61,14 +61,14 @@ def edge_windows(steps, rows, boxes, reach):
     """The part of each mask's logits that says where its edge is, flat wherever no edge is near.
 
     Args:
-        steps: int8 (K, h, w).
+        steps: int8 or float32 (K, h, w).
         rows: masks to take; none is empty.
         boxes: box (xyxy) of the pixels above 0 of every mask.
         reach: pixels on either side of a change of sign that keep their value; all others become
             127 or -127. The window is the box with this margin, inside the picture.
 
     Returns:
-        int8 values of all windows one after the other, offsets, windows (xyxy).
+        values of all windows one after the other, in the type of `steps`; offsets, windows (xyxy).
     """
     _, height, width = steps.shape
     windows = np.empty((len(rows), 4), np.int32)
@@ -83,7 +83,7 @@ def edge_windows(steps, rows, boxes, reach):
         )
         x0, y0, x1, y1 = windows[place]
         offsets[place + 1] = offsets[place] + (y1 - y0) * (x1 - x0)
-    out = np.empty(offsets[-1], np.int8)
+    out = np.empty(offsets[-1], steps.dtype)
     for place in range(len(rows)):
         mask = steps[rows[place]]
         x0, y0, x1, y1 = windows[place]
@@ -112,11 +112,11 @@ def edge_windows(steps, rows, boxes, reach):
             rows_seen = min(y0 + y + reach + 1, height) - max(y0 + y - reach, 0)
             for x in range(wide):
                 seen = rows_seen * (min(x0 + x + reach + 1, width) - max(x0 + x - reach, 0))
-                value = mask[y0 + y, x0 + x]
                 if around[x] == 0:
-                    value = np.int8(-127)
+                    out[at] = -127
                 elif around[x] == seen:
-                    value = np.int8(127)
-                out[at] = value
+                    out[at] = 127
+                else:
+                    out[at] = mask[y0 + y, x0 + x]
                 at += 1
     return out, offsets, windows

@@ -90,7 +90,7 @@ class HierarchicalMasks:
         runs: run lengths of all masks (see `encode_runs`).
         offsets: where each mask's runs begin, and where the last ones end.
         level: `Level` of each mask as the segmenter gave it.
-        predicted_iou: the segmenter's own estimate of each mask's quality, in [0, 1].
+        predicted_iou: the segmenter's own estimate of each mask's quality; SAM's may exceed 1 a little.
         stability: stability of each mask under a changed threshold, in [0, 1].
         area_px: pixels of each mask.
         box_xyxy: box of each mask, px, end exclusive.

@@ -5,16 +5,22 @@ exports are read here. The rounding of logits (`read_logits`) is ours.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int8, Int32, Int64, UInt8
 from PIL import Image
 
+from hilsplat.base.errors import ModelError
 from hilsplat.base.levels import Level
 from hilsplat.base.onnx_models import ModelFolder, open_model_folder, require_three_heads, side_px
+from hilsplat.segment.kernels import areas_and_boxes, upscaled_runs
 from hilsplat.segment.logit_kernels import quantise_logits
+from hilsplat.settings import MasksSettings
 
 HEADS: tuple[Level, Level, Level] = (Level.SUBPART, Level.PART, Level.WHOLE)
 """What the decoder's three outputs mean, in its order: fine to coarse."""
@@ -33,20 +39,44 @@ class Frame:
         original_hw: the image, px.
         resized_hw: its size in the input, at the top left, px.
         padded_hw: the whole input, px.
+        stretched: the image fills the input, and masks are enlarged in one step (SAM 2).
     """
 
     original_hw: tuple[int, int]
     resized_hw: tuple[int, int]
     padded_hw: tuple[int, int]
+    stretched: bool = False
 
 
 @dataclass(frozen=True)
 class Encoded:
-    """One image after the vision encoder."""
+    """One image after the vision encoder.
 
-    embeddings: Float32[np.ndarray, "1 C h w"]
-    positional: Float32[np.ndarray, "1 D h w"]
+    Attributes:
+        features: what the encoder hands to the decoder, by name, float32 (1, C, h, w).
+        frame: how the image sits in the input.
+    """
+
+    features: Mapping[str, np.ndarray]
     frame: Frame
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Settings of `masks` whose best value depends on the model, resolved (`SamModel.thresholds`)."""
+
+    predicted_iou_min: float
+    stability_min: float
+    nms_score: float
+    points_per_batch: int
+
+
+REAL_SAM = Thresholds(predicted_iou_min=0.7, stability_min=0.85, nms_score=0.7, points_per_batch=8)
+"""LangSplat's thresholds for a released SAM. A call of ViT-B takes 60 MB per prompt, and calls of more than 8
+prompts are no faster."""
+
+OWN = "mask_generation"
+"""Key of `config.json` under which a model names its own `Thresholds`."""
 
 
 def resized_size(original_hw: tuple[int, int], longest_edge: int) -> tuple[int, int]:
@@ -66,10 +96,20 @@ def point_grid(points_per_side: int) -> Float[np.ndarray, "P 2"]:
 
 
 class SamModel:
-    """A SAM folder, ready to run."""
+    """A SAM folder, ready to run.
+
+    Attributes:
+        own: thresholds that come with the model.
+        stretches: whether pictures are stretched to a square, as for SAM 2, or padded, as for SAM.
+    """
+
+    own: Thresholds = REAL_SAM
+    stretches: bool = False
 
     def __init__(self, model: ModelFolder) -> None:
         self.model = model
+        self.own = own_thresholds(model)
+        self.stretches = model.layout == "sam2"
         self.digest = model.digest
         self.encoder = model.network("vision_encoder")
         self.decoder = model.network("prompt_encoder_mask_decoder")
@@ -87,33 +127,48 @@ class SamModel:
         self.rescale = np.float32(preprocessing.get("rescale_factor", 1 / 255))
 
     @staticmethod
-    def load(folder: Path) -> "SamModel":
+    def load(folder: Path, variant: str = "") -> "SamModel":
         """Open a model folder.
+
+        Args:
+            folder: in a layout of `base.model_layouts`.
+            variant: ending of the networks' names, such as `fp16`.
 
         Raises:
             ModelError: it is missing, incomplete or not a SAM.
         """
-        return SamModel(
-            open_model_folder(folder, "sam", fix="set masks.segmenter: graph, which needs no model")
-        )
+        way_out = "set masks.segmenter: graph, which needs no model"
+        return SamModel(open_model_folder(folder, "sam", variant=variant, fix=way_out))
+
+    def thresholds(self, settings: MasksSettings) -> Thresholds:
+        """The settings' thresholds; those that are `auto` come with the model."""
+        chosen = {name: getattr(settings, name) for name in vars(self.own)}
+        return replace(self.own, **{name: value for name, value in chosen.items() if value != "auto"})
+
+    def frame(self, original_hw: tuple[int, int]) -> Frame:
+        """Where an image of this size is in the network's input."""
+        if self.stretches:
+            return Frame(original_hw, self.padded_hw, self.padded_hw, stretched=True)
+        return Frame(original_hw, resized_size(original_hw, self.longest_edge), self.padded_hw)
 
     def prepare(self, image: UInt8[np.ndarray, "H W 3"]) -> tuple[Float32[np.ndarray, "1 3 h w"], Frame]:
-        """Resize to the longest edge, normalise, pad with zeros at the right and bottom."""
+        """Resize, normalise, pad with zeros at the right and bottom."""
         original = (image.shape[0], image.shape[1])
-        resized = resized_size(original, self.longest_edge)
+        frame = self.frame(original)
+        resized = frame.resized_hw
         if resized != original:
             shrunk = Image.fromarray(image).resize((resized[1], resized[0]), self.resample)
             image = np.asarray(shrunk)
         values = (image.astype(np.float32) * self.rescale - self.mean) / self.std
         padded = np.zeros((1, 3, *self.padded_hw), dtype=np.float32)
         padded[0, :, : resized[0], : resized[1]] = values.transpose(2, 0, 1)
-        return padded, Frame(original, resized, self.padded_hw)
+        return padded, frame
 
     def encode(self, image: UInt8[np.ndarray, "H W 3"]) -> Encoded:
         """Run the vision encoder."""
         pixels, frame = self.prepare(image)
-        embeddings, positional = self.encoder(pixel_values=pixels)
-        return Encoded(embeddings, positional, frame)
+        names = self.encoder.spec.outputs
+        return Encoded(dict(zip(names, self.encoder(pixel_values=pixels), strict=True)), frame)
 
     def prompts_per_call(self, wanted: int, asked: int) -> int:
         """Prompts of one decoder call: the number the network fixes, if any, else at most `asked`."""
@@ -137,11 +192,30 @@ class SamModel:
         scores, logits = self.decoder(
             input_points=(points_xy * scale)[None, :, None, :],
             input_labels=np.ones((1, len(points_xy), 1)),
-            image_embeddings=encoded.embeddings,
-            image_positional_embeddings=encoded.positional,
+            input_boxes=np.zeros((1, 0, 4)),
+            **encoded.features,
         )
         require_three_heads(self.decoder.path, scores, logits)
         return scores[0], logits[0]
+
+
+def own_thresholds(model: ModelFolder) -> Thresholds:
+    """Thresholds that a model folder names in its `config.json`, else `REAL_SAM`.
+
+    Raises:
+        ModelError: it names something else, or a value out of range.
+    """
+    own: Any = model.config.get(OWN, {})
+    known = vars(REAL_SAM)
+    try:
+        if not isinstance(own, dict) or not own.keys() <= known.keys():
+            raise ValueError(f"known keys are {', '.join(known)}")
+        read = MasksSettings(**own)
+        return replace(REAL_SAM, **{name: getattr(read, name) for name in own})
+    except ValueError as error:  # pydantic's is one too
+        raise ModelError(
+            f"{model.folder / 'config.json'}: {OWN} cannot be used: {error}", fix="correct or remove it"
+        ) from error
 
 
 def valid_low_resolution(low_hw: tuple[int, int], frame: Frame) -> tuple[int, int]:
@@ -158,8 +232,8 @@ def read_logits(
     """Round logits, and measure the stability and the box of each mask.
 
     Stability is the IoU of the masks at logit thresholds +offset and -offset; 0 if the larger one
-    is empty. Departs: SAM counts pixels of the full-size mask; we count low-resolution ones, which
-    saves the upscaling of masks that are dropped.
+    is empty. Departs: SAM counts pixels of the full-size mask (`full_stability`); we count low-resolution
+    ones, which saves the upscaling of masks that are dropped.
 
     Returns:
         logits in steps of `LOGIT_STEP`, clipped to +-127 steps; stability; box (xyxy, low-resolution
@@ -178,6 +252,41 @@ def read_logits(
     return rounded, (small / np.maximum(large, 1)).astype(np.float32), boxes
 
 
+def full_stability(
+    logits: Float32[np.ndarray, "K h w"], offset: float, frame: Frame
+) -> Float32[np.ndarray, " K"]:
+    """Stability counted at the size of the image, on logits that are not rounded, as SAM does."""
+    number, height, width = logits.shape
+    along_y, along_x = frame_taps((height, width), frame)
+    areas = []
+    for threshold in (offset, -offset):
+        runs, offsets = upscaled_runs(
+            (logits - np.float32(threshold)).reshape(-1),
+            np.arange(number + 1) * (height * width),
+            np.tile(np.array([0, 0, width, height], np.int32), (number, 1)),
+            np.arange(number),
+            *along_y,
+            *along_x,
+            0,
+            0,
+            *frame.original_hw,
+        )
+        areas.append(areas_and_boxes(runs, offsets, frame.original_hw[1])[0])
+    return (areas[0] / np.maximum(areas[1], 1)).astype(np.float32)
+
+
+def frame_taps(
+    low_hw: tuple[int, int], frame: Frame
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """How the image's rows and columns are blended from low-resolution ones (`taps`)."""
+    padded, resized = (low_hw, low_hw) if frame.stretched else (frame.padded_hw, frame.resized_hw)
+    along_y, along_x = (
+        taps(low_hw[axis], padded[axis], resized[axis], frame.original_hw[axis]) for axis in (0, 1)
+    )
+    return along_y, along_x
+
+
+@lru_cache(maxsize=16)
 def taps(
     low: int, padded: int, resized: int, original: int
 ) -> tuple[Int64[np.ndarray, " N"], Float32[np.ndarray, "N T"]]:

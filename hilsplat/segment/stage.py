@@ -1,6 +1,7 @@
 """The stage `masks`: three levels of masks for every training view."""
 
 import logging
+import math
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from hilsplat.base.artifacts import (
 from hilsplat.base.errors import SceneError
 from hilsplat.base.identity import code_digest
 from hilsplat.base.levels import LEVELS
+from hilsplat.base.model_memory import available_mib, needs_of
 from hilsplat.base.parallel import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.scene.scene import Scene
@@ -39,7 +41,14 @@ def train_views(scene: Scene) -> list[str]:
     return views
 
 
-def run_masks(scene_folder: Path, out: Path, cache: Path, settings: MasksSettings, threads: int) -> None:
+def run_masks(
+    scene_folder: Path,
+    out: Path,
+    cache: Path,
+    settings: MasksSettings,
+    threads: int,
+    memory_mib: float | None = None,
+) -> None:
     """Segment every training view at three levels.
 
     Args:
@@ -48,19 +57,27 @@ def run_masks(scene_folder: Path, out: Path, cache: Path, settings: MasksSetting
         cache: folder of the view cache. With SAM it holds the decoder's candidates, so a change of
             thresholds runs no network.
         settings: which segmenter, and how.
-        threads: views worked on at once; the result does not depend on it.
+        threads: views worked on at once, if they fit into the memory; the result does not depend on it.
+        memory_mib: memory that the stage may use; None: what is free.
     """
     scene = Scene.load(scene_folder)
     views = train_views(scene)
     view_cache = ViewCache(Path(cache) / "masks")
     with stage_log("masks", scene.name) as counts:
         if settings.segmenter == "sam":
-            model = SamModel.load(Path(settings.model))
+            model = SamModel.load(Path(settings.model), settings.variant)
             identity: dict[str, str | None] = {
                 "segmenter": "sam",
                 "model": settings.model,
                 "model_sha256": model.digest,
             }
+
+            batch = model.prompts_per_call(
+                model.thresholds(settings).points_per_batch, settings.points_per_side**2
+            )
+            needs = needs_of(model.model, batch)
+            threads = needs.views_at_once(threads, min(memory_mib or math.inf, available_mib()))
+            logger.info("masks %s: %d views at once, %.0f MiB each", scene.name, threads, needs.view_mib)
 
             def segment(view: str) -> HierarchicalMasks:
                 return sam_masks(scene, view, model, view_cache, settings)

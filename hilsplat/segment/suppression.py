@@ -29,21 +29,52 @@ def box_iou(boxes_a: Int[np.ndarray, "A 4"], boxes_b: Int[np.ndarray, "B 4"]) ->
     return np.where(union > 0, shared / np.where(union > 0, union, 1), 0.0)
 
 
+def last_inside(boxes_xyxy: Int[np.ndarray, "M 4"]) -> Int[np.ndarray, "M 4"]:
+    """Boxes that name the last row and column inside, as SAM's do, instead of the first outside."""
+    return boxes_xyxy - np.array([0, 0, 1, 1], boxes_xyxy.dtype)
+
+
 def suppress_boxes(
-    boxes_xyxy: Int[np.ndarray, "M 4"], score: Float[np.ndarray, " M"], iou_max: float
+    boxes_xyxy: Int[np.ndarray, "M 4"],
+    score: Float[np.ndarray, " M"],
+    iou_max: float,
+    first: Float[np.ndarray, " M"] | None = None,
 ) -> Int64[np.ndarray, " k"]:
     """Greedy suppression, as SAM's automatic generator does it.
 
     The best box stays and drops every other whose IoU with it exceeds `iou_max`; then the best of
-    the rest, and so on. Equal scores go by larger area, then by the box's numbers, then by row.
+    the rest, and so on. A box is better by its rank in `first`, if given, then by score. Equal ones go by
+    larger area, then by the box's numbers, then by row.
 
     Returns:
         rows kept, ascending.
     """
     width_height = (boxes_xyxy[:, 2:] - boxes_xyxy[:, :2]).astype(np.int64)
     area = width_height[:, 0] * width_height[:, 1]
-    order = np.lexsort((*boxes_xyxy.T[::-1], -area, -score))
-    boxes = boxes_xyxy[order]
+    ranks = [] if first is None else [-first]
+    order = np.lexsort((*boxes_xyxy.T[::-1], -area, -score, *ranks))
+    return np.sort(order[_greedy(boxes_xyxy[order], iou_max)])
+
+
+def suppress_boxes_officially(
+    boxes_xyxy: Int[np.ndarray, "M 4"],
+    score: Float[np.ndarray, " M"],
+    iou_max: float,
+    first: Float[np.ndarray, " M"] | None = None,
+) -> Int64[np.ndarray, " k"]:
+    """`suppress_boxes` as published: on boxes that end at the last pixel inside.
+
+    A box is better by `first` alone, if given, else by score; equal ones go by row.
+
+    Returns:
+        rows kept, the best first.
+    """
+    order = np.argsort(-(score if first is None else first), kind="stable")
+    return order[_greedy(last_inside(boxes_xyxy)[order], iou_max)]
+
+
+def _greedy(boxes: Int[np.ndarray, "M 4"], iou_max: float) -> Bool[np.ndarray, " M"]:
+    """Which boxes stay if each that stays drops the following ones whose IoU with it exceeds `iou_max`."""
     alive = np.ones(len(boxes), dtype=bool)
     for start in range(0, len(boxes), BOXES_AT_ONCE):
         block = np.flatnonzero(alive[start : start + BOXES_AT_ONCE]) + start
@@ -51,7 +82,7 @@ def suppress_boxes(
         for place, row in zip(block, allowed, strict=True):
             if alive[place]:
                 alive[place + 1 :] &= row[place + 1 - start :]
-    return np.sort(order[alive])
+    return alive
 
 
 def keep_best_masks(
@@ -65,7 +96,7 @@ def keep_best_masks(
     """LangSplat's mask suppression inside one level, for rows that are already in a fixed order.
 
     With I shared pixels and areas a, row j is dropped if any of these holds:
-    - its score is below `score_min`;
+    - its score is not above `score_min`, unless that is 0;
     - a row of better score (of equal score: a lower row) has an IoU with it above `iou_max`;
     - it sits inside a row i: `I / a_j >= 0.85`, `I / a_i < 0.5` and
       `1 - (I / a_i) (I / a_j) > 1 - inner`. The left side exceeds 0.5, so `inner = 0.5` drops every
@@ -84,7 +115,7 @@ def keep_best_masks(
     share = overlap_px / area_px[:, None]  # [i, j]: share of i inside j
     inside = (share.T >= INNER_COVERED) & (share < INNER_COVERS)  # [i, j]: j sits in i
     contained = (inside & (share * share.T < inner)).any(axis=0)
-    return (score >= score_min) & ~repeated & ~contained
+    return ((score > score_min) | (score_min == 0)) & ~repeated & ~contained
 
 
 def suppress_masks(

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Protocol, runtime_checkable
 
-from hilsplat.base.errors import SettingsError
+from hilsplat.base.errors import ModelError, SettingsError
 from hilsplat.configuration import UPSTREAM, StageSettings, parse_run
 from hilsplat.datasets.registry import readers_of
 from hilsplat.datasets.sources import (
@@ -34,6 +34,12 @@ from hilsplat.workflow.model_digests import model_digest
 from hilsplat.workflow.stages import stage_code
 
 CACHE = Path("results/.cache")
+
+LEAST_MB = 4000
+"""Memory that the stages with a model declare at least."""
+
+SHARE_OF_MACHINE = 0.8
+"""Of the memory of the machine, for one stage."""
 
 
 @runtime_checkable
@@ -170,6 +176,21 @@ class Plan:
             lines.append(f"{some(names)}: {models}")
             lines += [doubt] if doubt else []
         return lines
+
+    def memory_mb(self, section: str, threads: int) -> Callable[[Job], int]:
+        """Resource: memory of a stage that runs a model, with as many views at once as this machine can hold.
+
+        The stage runs fewer at once if it is given less (`--set-resources masks:mem_mb=...`).
+        """
+
+        def estimate(job: Job) -> int:
+            settings = getattr(self.stages(job), section)
+            if section == "masks" and settings.segmenter != "sam":
+                return LEAST_MB
+            batch = settings.batch if section == "clip" else settings.points_per_batch
+            return max(LEAST_MB, _model_memory_mb(Path(settings.model), settings.variant, batch, threads))
+
+        return estimate
 
     def shared(self, stage: str, path: str) -> Callable[[VariantJob], str]:
         """Input: a stage's output, from the first variant with the same settings up to that stage.
@@ -411,6 +432,23 @@ class Plan:
             pictures = ["panel", *(["masks"] if row.world else []), *(["comparison"] if compared else [])]
             found += [f"results/figures/{row.dataset}/{row.scene}/{picture}.png" for picture in pictures]
         return found
+
+
+@functools.cache
+def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int) -> int:
+    """Memory of a stage with a model; 0 if its folder cannot be read, which the stage reports."""
+    from hilsplat.base.model_memory import MIB, machine_mib, needs_of  # onnxruntime takes a while to import
+    from hilsplat.base.onnx_models import open_model_folder
+    from hilsplat.segment.sam import own_thresholds
+
+    try:
+        model = open_model_folder(folder, variant=variant)
+        prompts = own_thresholds(model).points_per_batch if isinstance(batch, str) else batch
+    except ModelError:
+        return 0
+    needs = needs_of(model, prompts)
+    views = needs.views_at_once(threads, SHARE_OF_MACHINE * machine_mib())
+    return round(needs.total_mib(views) * MIB / 1e6)
 
 
 def scopes_of(row: SceneRow) -> tuple[str, str]:

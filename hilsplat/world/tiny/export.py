@@ -12,6 +12,7 @@ from tokenizers import Tokenizer
 from torch import Tensor, nn
 
 from hilsplat.base.artifacts import atomic_path, write_json
+from hilsplat.segment.sam import OWN, Thresholds
 from hilsplat.world.tiny.clip import CROP_PX, DIMENSIONS, ClipText, ClipVision
 from hilsplat.world.tiny.sam import (
     FRAME_PX,
@@ -25,6 +26,8 @@ from hilsplat.world.tiny.sam import (
 MEAN = (0.485, 0.456, 0.406)
 STD = (0.229, 0.224, 0.225)
 OPSET = 18
+OWN_THRESHOLDS = Thresholds(predicted_iou_min=0.35, stability_min=0.5, nms_score=0.0, points_per_batch=64)
+"""What suits the small segmenter (docs/experiments.md); it goes into its `config.json`."""
 HALF_FROM = 64
 """Initialisers with at least this many numbers are stored as float16."""
 
@@ -143,6 +146,7 @@ def export_sam(encoder: SamEncoder, decoder: SamDecoder, folder: Path) -> None:
             "mask_size": FRAME_PX // MASK_STRIDE,
             "num_multimask_outputs": 3,
             "world_only": True,
+            OWN: vars(OWN_THRESHOLDS),
         },
     )
     write_json(

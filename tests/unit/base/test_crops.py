@@ -1,9 +1,10 @@
 """The crop that CLIP sees, on images small enough to check by eye."""
 
+import cv2
 import numpy as np
 import pytest
 
-from hilsplat.base.crops import square_crop
+from hilsplat.base.crops import crop_to_square, square_crop
 from hilsplat.base.errors import EmptyMaskError
 
 
@@ -41,3 +42,35 @@ def test_the_margin_ends_at_the_border_of_the_image():
 def test_an_empty_mask_is_refused():
     with pytest.raises(EmptyMaskError, match="without pixels"):
         square_crop(np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4), bool), "black", 0.0, 2)
+
+
+def published(image: np.ndarray, mask: np.ndarray, size: int) -> np.ndarray:
+    """LangSplat's `get_seg_img` and `pad_img`: the box of SAM's masks ends before its last row and column."""
+    ys, xs = np.nonzero(mask)
+    x, y, w, h = xs.min(), ys.min(), xs.max() - xs.min(), ys.max() - ys.min()
+    black = np.where(mask[..., None], image, np.uint8(0))[y : y + h, x : x + w]
+    side = max(w, h)
+    square = np.zeros((side, side, 3), np.uint8)
+    if h > w:
+        square[:, (h - w) // 2 : (h - w) // 2 + w] = black
+    else:
+        square[(w - h) // 2 : (w - h) // 2 + h] = black
+    return cv2.resize(square, (size, size))
+
+
+@pytest.mark.parametrize(("height", "width"), [(90, 40), (41, 83), (60, 60), (13, 9)])
+def test_crops_as_langsplat_equal_the_published_ones(height, width):
+    generator = np.random.default_rng(height)
+    image = generator.integers(0, 255, (100, 100, 3), dtype=np.uint8)
+    mask = np.zeros((100, 100), bool)
+    mask[5 : 5 + height, 7 : 7 + width] = generator.random((height, width)) > 0.3
+    ys, xs = np.nonzero(mask)
+    box = np.s_[ys.min() : ys.max() + 1, xs.min() : xs.max() + 1]
+    found = crop_to_square(image[box], mask[box], "black", 24, as_langsplat=True)
+    np.testing.assert_array_equal(found, published(image, mask, 24))
+    assert (found != crop_to_square(image[box], mask[box], "black", 24)).any()
+
+
+def test_a_mask_of_one_column_has_a_crop_as_langsplat():
+    column = np.full((5, 1, 3), 9, np.uint8)
+    assert crop_to_square(column, np.ones((5, 1), bool), "black", 4, as_langsplat=True).max() > 0

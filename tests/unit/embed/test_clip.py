@@ -14,7 +14,7 @@ from hilsplat.base.errors import MisalignedArtifactError, ModelError, SettingsEr
 from hilsplat.base.images import write_png
 from hilsplat.base.onnx_models import Network
 from hilsplat.configuration import parse_section
-from hilsplat.embed.clip import ClipModel, unit
+from hilsplat.embed.clip import ClipModel, open_clip_of, unit
 from hilsplat.embed.model_check import check_model
 from hilsplat.embed.stage import run_clip
 from hilsplat.scene.cameras import Cameras
@@ -117,6 +117,19 @@ def test_a_thin_box_is_padded_to_a_centred_square(colour_clip, monkeypatch):
     expected = np.zeros((4, 4), dtype=np.uint8)
     expected[1] = 255
     np.testing.assert_array_equal(seen[0][0, ..., 0], expected)
+
+
+def test_langsplats_crop_leaves_out_the_last_row_and_column_of_the_box(colour_clip):
+    image = np.zeros((8, 8, 3), dtype=np.uint8)
+    image[:5, :5, 1] = 255  # green, but for a red square of 4 x 4 at its top left
+    image[:4, :4] = (255, 0, 0)
+    mask = np.zeros((8, 8), dtype=bool)
+    mask[:5, :5] = True
+    model = ClipModel.load(colour_clip)
+    (langsplat,) = model.embed_masks(image, pack(mask), ClipSettings(crop="langsplat"))
+    assert langsplat.tolist() == [1, 0, 0]
+    (box,) = model.embed_masks(image, pack(mask))
+    np.testing.assert_allclose(box, np.array([16, 9, 0]) / np.hypot(16, 9), atol=1e-2)
 
 
 @pytest.mark.parametrize(("batch", "threads"), [(1, 1), (2, 3), (64, 1)])
@@ -248,3 +261,12 @@ def test_masks_of_other_views_are_refused(red_scene, colour_clip, tmp_path):
     (masks / "index.json").write_text(json.dumps({"scene": "set/scene", "views": {"7.png": {}}}))
     with pytest.raises(MisalignedArtifactError, match=r"7\.png"):
         run_clip(scene, masks, tmp_path / "out", tmp_path / "cache", ClipSettings(model=str(colour_clip)), 1)
+
+
+def test_the_clip_of_an_artifact_is_found_with_its_variant(red_scene, colour_clip, tmp_path):
+    scene, masks = red_scene
+    for name in ("vision_model", "text_model"):
+        (colour_clip / f"{name}.onnx").rename(colour_clip / f"{name}_fp16.onnx")
+    settings = ClipSettings(model=str(colour_clip), variant="fp16")
+    run_clip(scene, masks, tmp_path / "vectors", tmp_path / "cache", settings, threads=1)
+    assert open_clip_of(tmp_path / "vectors").text.path.name == "text_model_fp16.onnx"

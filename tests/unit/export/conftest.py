@@ -119,3 +119,180 @@ def photograph() -> np.ndarray:
     image = np.stack([2.5 * x, 4 * y, 128 + 100 * np.sin(x / 9) * np.cos(y / 7)], axis=2)
     image[10:40, 20:50] = (200, 40, 90)
     return np.clip(image + generator.normal(0, 8, image.shape), 0, 255).astype(np.uint8)
+
+
+def trace(module, inputs: dict, outputs: list[str], dynamic: dict, path: Path) -> None:
+    """`torch.onnx.export` by tracing, as the scripts do that made the published exports."""
+    import torch
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            module.eval(),
+            tuple(inputs.values()),
+            str(path),
+            input_names=list(inputs),
+            output_names=outputs,
+            dynamic_axes=dynamic,
+            opset_version=18,
+            dynamo=False,
+        )
+
+
+def as_module(model, function):
+    """A module that holds a model and calls a function."""
+    import torch
+
+    class Called(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.model = model
+
+        def forward(self, *inputs):
+            return function(*inputs)
+
+    return Called()
+
+
+@pytest.fixture(scope="session")
+def sam2_parts(tmp_path_factory):
+    """A SAM 2 for images of 64 px: transformers' model, and its folder with the names of transformers.js."""
+    transformers = pytest.importorskip("transformers", reason="needs the extra export-tests")
+    import torch
+
+    folder = tmp_path_factory.mktemp("sam2")
+    backbone = transformers.Sam2HieraDetConfig(
+        hidden_size=8,
+        num_attention_heads=1,
+        image_size=[64, 64],
+        blocks_per_stage=[1, 1, 2, 1],
+        embed_dim_per_stage=[8, 16, 32, 64],
+        num_attention_heads_per_stage=[1, 2, 4, 8],
+        window_size_per_stage=[8, 4, 4, 2],
+        global_attention_blocks=[3],
+        window_positional_embedding_background_size=[4, 4],
+    )
+    vision = transformers.Sam2VisionConfig(
+        backbone_config=backbone,
+        backbone_channel_list=[64, 32, 16, 8],
+        backbone_feature_sizes=[[16, 16], [8, 8], [4, 4]],
+        fpn_hidden_size=16,
+    )
+    config = transformers.Sam2Config(
+        vision,
+        {"hidden_size": 16, "image_size": 64, "patch_size": 16, "mask_input_channels": 4},
+        {"hidden_size": 16, "mlp_dim": 32, "num_attention_heads": 2, "iou_head_hidden_dim": 16},
+    )
+    model = transformers.Sam2Model(config).eval()
+    enliven(model)
+    names = [f"image_embeddings.{level}" for level in range(3)]
+    pixels = torch.zeros(1, 3, 64, 64)
+
+    def encode(pixel_values):
+        return tuple(model.get_image_embeddings(pixel_values))
+
+    def decode(points, labels, boxes, *embeddings):
+        found = model(input_points=points, input_labels=labels, image_embeddings=list(embeddings))
+        # the published decoder takes boxes too, here none
+        return found.iou_scores + boxes.sum(), found.pred_masks, found.object_score_logits
+
+    trace(as_module(model, encode), {"pixel_values": pixels}, names, {}, folder / "onnx/vision_encoder.onnx")
+    prompts = {1: "prompts", 2: "points"}
+    inputs = {
+        "input_points": torch.full((1, 3, 2, 2), 32.0),
+        "input_labels": torch.ones((1, 3, 2), dtype=torch.int64),
+        "input_boxes": torch.zeros(1, 0, 4),
+        **dict(zip(names, model.get_image_embeddings(pixels), strict=True)),
+    }
+    dynamic = {"input_points": prompts, "input_labels": prompts, "input_boxes": {1: "boxes"}}
+    outputs = ["iou_scores", "pred_masks", "object_score_logits"]
+    path = folder / "onnx/prompt_encoder_mask_decoder.onnx"
+    trace(as_module(model, decode), inputs, outputs, dynamic, path)
+    config.save_pretrained(folder)
+    preprocessing = {
+        "image_processor_type": "Sam2ImageProcessorFast",
+        "size": {"height": 64, "width": 64},
+        "image_mean": [0.485, 0.456, 0.406],
+        "image_std": [0.229, 0.224, 0.225],
+        "resample": 2,
+        "pad_size": None,
+    }
+    (folder / "preprocessor_config.json").write_text(json.dumps(preprocessing))
+    return model, folder
+
+
+@pytest.fixture(scope="session")
+def siglip_parts(tmp_path_factory):
+    """A SigLIP for crops of 32 px: transformers' model, its folder with the names of transformers.js, and its
+    single network by optimum."""
+    transformers = pytest.importorskip("transformers", reason="needs the extra export-tests")
+    import torch
+    from tokenizers import Tokenizer, models, pre_tokenizers, processors
+
+    folder = tmp_path_factory.mktemp("siglip")
+    small = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2}
+    config = transformers.SiglipConfig(
+        {"vocab_size": 8, "max_position_embeddings": 64, **small},
+        {"image_size": 32, "patch_size": 8, **small},
+    )
+    model = transformers.SiglipModel(config).eval()
+    enliven(model)
+    words = {"<unk>": 0, "red": 1, "mug": 2, "on": 3, "</s>": 4}
+    tokenizer = Tokenizer(models.WordLevel(words, "<unk>"))
+    tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
+    tokenizer.post_processor = processors.TemplateProcessing("$A </s>", special_tokens=[("</s>", 4)])
+    images = transformers.SiglipImageProcessor(size={"height": 32, "width": 32})
+    for place in (folder / "js", folder / "optimum"):
+        place.mkdir()
+        tokenizer.save(str(place / "tokenizer.json"))
+        (place / "tokenizer_config.json").write_text(json.dumps({"pad_token": "</s>"}))
+        images.save_pretrained(place)
+        config.save_pretrained(place)
+    output = ["last_hidden_state", "pooler_output"]
+    batch = {name: {0: "batch"} for name in ("pixel_values", "input_ids", *output)}
+    for name, part, inputs in (
+        ("vision_model", model.vision_model, {"pixel_values": torch.zeros(2, 3, 32, 32)}),
+        ("text_model", model.text_model, {"input_ids": torch.ones((2, 64), dtype=torch.int64)}),
+    ):
+        wrapped = as_module(part, lambda value, part=part: tuple(part(value).to_tuple()[:2]))
+        trace(wrapped, inputs, output, batch, folder / f"js/onnx/{name}.onnx")
+
+    def whole(ids, pixels):
+        found = model(input_ids=ids, pixel_values=pixels)
+        return found.text_embeds, found.image_embeds
+
+    inputs = {"input_ids": torch.ones((2, 64), dtype=torch.int64), "pixel_values": torch.zeros(2, 3, 32, 32)}
+    vectors = ["text_embeds", "image_embeds"]
+    batch = {name: {0: "batch"} for name in (*inputs, *vectors)}
+    trace(as_module(model, whole), inputs, vectors, batch, folder / "optimum/model.onnx")
+    return model, images, folder
+
+
+@pytest.fixture(scope="session")
+def open_clip_folder(clip_parts, tmp_path_factory):
+    """The CLIP of `clip_parts` in open_clip's two folders, with one picture and one text per call."""
+    import shutil
+
+    import torch
+
+    model, processor, exported = clip_parts
+    folder = tmp_path_factory.mktemp("open_clip")
+    visual = as_module(model, lambda image: torch.nn.functional.normalize(model.get_image_features(image)))
+    trace(visual, {"image": torch.zeros(1, 3, 32, 32)}, ["embedding"], {}, folder / "visual/model.onnx")
+    textual = as_module(model, lambda text: torch.nn.functional.normalize(model.get_text_features(text)))
+    ids = torch.full((1, 16), model.config.text_config.eos_token_id, dtype=torch.int32)
+    trace(textual, {"text": ids}, ["embedding"], {}, folder / "textual/model.onnx")
+    for name in ("tokenizer.json", "tokenizer_config.json", "special_tokens_map.json"):
+        shutil.copy(exported / name, folder / "textual" / name)
+    config = {"embed_dim": 12, "vision_cfg": {"image_size": 32, "patch_size": 8}, "text_cfg": {}}
+    (folder / "config.json").write_text(json.dumps(config))
+    images = processor.image_processor
+    preprocessing = {
+        "size": [32, 32],
+        "mean": images.image_mean,
+        "std": images.image_std,
+        "interpolation": "bicubic",
+    }
+    (folder / "visual/preprocess_cfg.json").write_text(json.dumps(preprocessing))
+    return folder

@@ -84,7 +84,8 @@ def write_disc_sam(folder: Path, points_name: str = "input_points", heads: int =
             "scores": np.array((SCORES + SCORES)[:heads], np.float32),
         },
     )
-    (folder / "config.json").write_text(json.dumps({"model_type": "sam"}))
+    own = {"predicted_iou_min": 0.35, "stability_min": 0.5, "nms_score": 0.0, "points_per_batch": 64}
+    (folder / "config.json").write_text(json.dumps({"model_type": "sam", "mask_generation": own}))
     (folder / "preprocessor_config.json").write_text(
         json.dumps(
             {

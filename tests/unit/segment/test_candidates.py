@@ -7,19 +7,20 @@ import pytest
 
 from hilsplat.segment.candidates import Candidates, keep_candidates
 from hilsplat.segment.generate import masks_from_candidates
-from hilsplat.segment.sam import Frame, SamModel, resized_size
+from hilsplat.segment.sam import Frame, SamModel, Thresholds, resized_size
 from hilsplat.settings import MasksSettings
 from tests.unit.segment.plain import flatten_far, quantise, restore, smooth_logits, unpacked
 
 EVERYTHING = MasksSettings(
-    predicted_iou_min=0, stability_min=0, min_area_px=1, box_nms_iou=1, nms_iou=1, nms_inner=0
+    predicted_iou_min=0, stability_min=0, nms_score=0, min_area_px=1, box_nms_iou=1, nms_iou=1, nms_inner=0
 )
+NOTHING_DROPPED = Thresholds(predicted_iou_min=0.0, stability_min=0.0, nms_score=0.0, points_per_batch=64)
 
 
 def candidates_of(logits: np.ndarray, frame: Frame) -> Candidates:
     """All heads of all prompts, none dropped."""
     scores = np.linspace(0.5, 1, len(logits) * 3, dtype=np.float32).reshape(-1, 3)
-    return keep_candidates(scores, logits, frame, 0, EVERYTHING)
+    return keep_candidates(scores, logits, frame, 0, EVERYTHING, NOTHING_DROPPED)
 
 
 def test_windows_hold_the_band_and_outside_is_the_lowest_logit() -> None:

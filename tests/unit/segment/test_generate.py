@@ -10,7 +10,7 @@ from hilsplat.base.levels import Level
 from hilsplat.segment.candidates import Candidates, candidates_key, crop_boxes, decode_candidates, floors
 from hilsplat.segment.generate import masks_from_candidates, mend_masks
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.segment.sam import SamModel
+from hilsplat.segment.sam import SamModel, Thresholds
 from hilsplat.settings import MasksSettings
 from tests.unit.segment.plain import mend
 
@@ -186,4 +186,4 @@ def test_cache_key_covers_what_the_network_sees_and_no_more(model):
 
 
 def test_floors_follow_thresholds_below_the_loose_one():
-    assert floors(MasksSettings(predicted_iou_min=0.35, stability_min=0.02)) == (0.1, 0.02)
+    assert floors(Thresholds(0.35, 0.02, 0.0, 64)) == (0.1, 0.02)

@@ -60,6 +60,18 @@ def test_masks_do_not_depend_on_the_number_of_threads(make_scene, tmp_path, sett
     assert sha256_of_path(tmp_path / "masks-1") == sha256_of_path(tmp_path / "masks-3")
 
 
+def test_masks_do_not_depend_on_memory_which_decides_how_many_views_run_at_once(
+    make_scene, tmp_path, settings, caplog
+):
+    scene = make_scene(views=3)
+    for memory in (1.0, 8000.0):
+        folders = tmp_path / f"masks-{memory}", tmp_path / f"cache-{memory}"
+        with caplog.at_level("INFO"):
+            run_masks(scene, *folders, settings, threads=2, memory_mib=memory)
+    assert [line.split(":")[1][:2] for line in caplog.messages if "at once" in line] == [" 1", " 2"]
+    assert sha256_of_path(tmp_path / "masks-1.0") == sha256_of_path(tmp_path / "masks-8000.0")
+
+
 def test_index_names_the_model_and_test_views_stay_out(make_scene, tmp_path, settings, disc_sam):
     run_masks(make_scene(views=3), tmp_path / "masks", tmp_path / "cache", settings, threads=1)
     index = read_index(tmp_path / "masks")

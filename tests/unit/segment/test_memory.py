@@ -22,7 +22,9 @@ def status_mib(name: str) -> float:
 @pytest.mark.skipif(not CLEAR.exists(), reason="needs /proc of Linux to reset the peak of memory")
 def test_three_thousand_candidates_stay_below_the_bound():
     model = CannedSam(NetworkClock())
-    settings = MasksSettings(predicted_iou_min=0.7, stability_min=0.5, min_area_px=100)
+    settings = MasksSettings(
+        points_per_batch=64, predicted_iou_min=0.7, stability_min=0.5, nms_score=0, min_area_px=100
+    )
     image = np.random.default_rng(0).integers(0, 255, (728, 986, 3), dtype=np.uint8)
     CLEAR.write_text("5")
     before = status_mib("VmRSS")

@@ -1,0 +1,172 @@
+"""What a released SAM and CLIP cost per photograph, measured with random weights at their real size. By hand:
+
+    python -m benchmarks.real_size                      # SAM ViT-B and CLIP B/16 on three photographs
+    python -m benchmarks.real_size --huge PHOTOGRAPHS   # SAM ViT-H; a folder of your own
+
+Networks of random weights cost what trained ones cost. They are exported once into --models (extra
+export-tests; ViT-B needs 8 GB for that, ViT-H more). A random SAM is sure of no mask, so the work on masks
+outside the network is not in these numbers (`make bench` measures it), and CLIP embeds the graph segmenter's.
+Each step runs in a process of its own, on one core, and prints processor seconds and its peak of memory.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+PHOTOGRAPHS = Path(__file__).resolve().parents[1].parent / "shared/data/plush_bedroom/images"
+MAX_SIDE_PX = 800
+"""As the group `photos` of the configuration."""
+
+SIZES = {
+    "base": {},
+    "huge": {
+        "hidden_size": 1280,
+        "num_hidden_layers": 32,
+        "num_attention_heads": 16,
+        "global_attn_indexes": [7, 15, 23, 31],
+        "mlp_dim": 5120,
+    },
+}
+"""What a SAM's vision encoder has other than ViT-B."""
+
+
+def export_sam(size: str, out: Path) -> None:
+    """A SAM of random weights in the layout of the Hugging Face ONNX exports."""
+    import torch
+    import transformers
+    from optimum.exporters.onnx import main_export
+
+    torch.manual_seed(0)
+    config = transformers.SamConfig(transformers.SamVisionConfig(**SIZES[size]).to_dict())
+    transformers.SamModel(config).save_pretrained(out / "torch")
+    transformers.SamImageProcessor().save_pretrained(out / "torch")
+    main_export(str(out / "torch"), output=out, task="feature-extraction", do_validation=False)
+
+
+def export_clip(out: Path) -> None:
+    """The picture network of a CLIP B/16 of random weights."""
+    import torch
+    import transformers
+
+    torch.manual_seed(0)
+    vision = transformers.CLIPVisionConfig(
+        hidden_size=768, intermediate_size=3072, num_hidden_layers=12, num_attention_heads=12, patch_size=16
+    )
+    model = transformers.CLIPVisionModelWithProjection(vision).eval()
+    out.mkdir(parents=True, exist_ok=True)
+    batch = {"pixel_values": {0: "batch"}, "image_embeds": {0: "batch"}}
+    torch.onnx.export(
+        model,
+        (torch.zeros(2, 3, 224, 224),),
+        str(out / "vision_model.onnx"),
+        input_names=["pixel_values"],
+        output_names=["image_embeds", "last_hidden_state"],
+        dynamic_axes=batch,
+        opset_version=18,
+        dynamo=False,
+    )
+
+
+def measure(step: str, models: Path, photograph: Path, points: int) -> dict[str, float]:
+    """Processor seconds and peak of memory of one step on one photograph, in this process."""
+    from hilsplat.base.images import read_image, resize_to_fit
+    from hilsplat.base.model_layouts import LAYOUTS
+    from hilsplat.base.onnx_models import Network
+    from hilsplat.segment.candidates import decode_candidates
+    from hilsplat.segment.graph import segment_graph
+    from hilsplat.segment.sam import SamModel
+    from hilsplat.settings import ClipSettings, MasksSettings
+
+    image = resize_to_fit(read_image(photograph), MAX_SIDE_PX)
+    found: dict[str, float] = {}
+
+    def clocked(name: str, work):
+        start = time.process_time()
+        result = work()
+        found[f"{name}_s"] = time.process_time() - start
+        return result
+
+    if step == "clip":
+        masks = segment_graph(image, MasksSettings().graph_scales, MasksSettings().min_area_px)
+        clip = _picture_half(Network(models / "vision_model.onnx", LAYOUTS["clip"].networks["vision_model"]))
+        clocked("clip", lambda: clip.embed_masks(image, masks, ClipSettings()))
+        found["masks"] = len(masks)
+    else:
+        model, settings = SamModel.load(models), MasksSettings(points_per_side=points)
+        encode = model.encode
+        model.encode = lambda image: clocked("encode", lambda: encode(image))  # type: ignore[method-assign]
+        clocked("view", lambda: decode_candidates(image, model, settings))
+    with Path("/proc/self/status").open() as status:
+        (peak,) = [line.split()[1] for line in status if line.startswith("VmHWM")]
+    return found | {"peak_mib": int(peak) / 1024}
+
+
+def _picture_half(network):
+    """A `ClipModel` that knows pictures only."""
+    from hilsplat.embed.clip import ClipModel
+
+    model = object.__new__(ClipModel)
+    model.vision, model.pixels, model.vector = network, "pixel_values", "image_embeds"
+    model.threads, model.side_px = 1, 224
+    model.mean, model.std, model.rescale = (
+        np.zeros(3, np.float32),
+        np.ones(3, np.float32),
+        np.float32(1 / 255),
+    )
+    return model
+
+
+def main() -> None:
+    """Export what is missing, then measure every photograph, each step in a process of its own."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("photographs", type=Path, nargs="?", default=PHOTOGRAPHS)
+    parser.add_argument("--huge", action="store_true", help="SAM ViT-H instead of ViT-B")
+    parser.add_argument("--views", type=int, default=3, help="number of photographs")
+    parser.add_argument("--points", type=int, default=32, help="prompts per image side")
+    parser.add_argument("--models", type=Path, default=Path("results/.cache/real-size"))
+    parser.add_argument("--step", help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    if asked.step == "export-clip":
+        export_clip(asked.models)
+        return
+    if asked.step and asked.step.startswith("export-"):
+        export_sam(asked.step.removeprefix("export-"), asked.models)
+        return
+    if asked.step:
+        print(json.dumps(measure(asked.step, asked.models, asked.photographs, asked.points)))
+        return
+    if not asked.photographs.is_dir():
+        sys.exit(f"skipped: there are no photographs in {asked.photographs}; name a folder")
+    size = "huge" if asked.huge else "base"
+    places = {"sam": asked.models / f"sam-{size}", "clip": asked.models / "clip"}
+    for kind, step, done in (
+        ("sam", f"export-{size}", "vision_encoder.onnx"),
+        ("clip", "export-clip", "vision_model.onnx"),
+    ):
+        if not (places[kind] / done).is_file():
+            _run(step, places[kind], asked.photographs)
+    for photograph in sorted(asked.photographs.iterdir())[: asked.views]:
+        for kind in ("sam", "clip"):
+            line = json.loads(_run(kind, places[kind], photograph, asked.points).splitlines()[-1])
+            told = ", ".join(f"{name} {value:.1f}" for name, value in line.items())
+            print(f"{photograph.name} {kind}: {told}", flush=True)
+
+
+def _run(step: str, models: Path, photograph: Path, points: int = 32) -> str:
+    """One step in a process of its own, without the model hub; what it printed."""
+    command = [sys.executable, "-m", "benchmarks.real_size", "--step", step, "--models", str(models)]
+    command += ["--points", str(points)]
+    environment = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+    return subprocess.run(
+        [*command, str(photograph)], env=environment, stdout=subprocess.PIPE, text=True, check=True
+    ).stdout
+
+
+if __name__ == "__main__":
+    main()

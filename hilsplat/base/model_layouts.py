@@ -1,0 +1,152 @@
+"""Layouts of published ONNX exports of SAM and CLIP: which files, with which inputs and outputs."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+Axes = tuple[int | None, ...]
+"""Axes of an array: their lengths if the layout fixes them, None if any will do."""
+
+
+@dataclass(frozen=True)
+class NetworkSpec:
+    """Inputs and outputs of one network of a model.
+
+    Attributes:
+        inputs: names and axes of required inputs.
+        outputs: names and axes of required outputs; others are ignored.
+        optional: names of inputs that are passed if the network has them.
+        places: the file without `.onnx`, relative to the folder; the first that exists is taken.
+        synonyms: other name of an output, under which some exports have it.
+    """
+
+    inputs: Mapping[str, Axes]
+    outputs: Mapping[str, Axes]
+    optional: tuple[str, ...] = ()
+    places: tuple[str, ...] = ()
+    synonyms: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How the files of a model are named.
+
+    Attributes:
+        kind: what the model is for: "sam" segments, "clip" compares pictures with texts.
+        networks: by the names that our code gives them.
+        preprocessing: file that says how a picture becomes an input.
+        tokenizer: file that turns texts into tokens; "" if the model reads none.
+        beside: further files that count for the digest, if they exist.
+    """
+
+    kind: str
+    networks: Mapping[str, NetworkSpec]
+    preprocessing: str = "preprocessor_config.json"
+    tokenizer: str = ""
+    beside: tuple[str, ...] = ()
+
+    @property
+    def described(self) -> tuple[str, ...]:
+        """Files that must be beside the networks."""
+        return ("config.json", self.preprocessing, *([self.tokenizer] if self.tokenizer else []))
+
+
+_ANY2, _ANY3, _ANY4 = (None,) * 2, (None,) * 3, (None,) * 4
+_IMAGE: Axes = (None, 3, None, None)
+_POINTS: dict[str, Axes] = {"input_points": (None, None, None, 2), "input_labels": _ANY3}
+_MASKS: dict[str, Axes] = {"iou_scores": (None, None, 3), "pred_masks": (None, None, 3, None, None)}
+
+
+def _places(name: str) -> tuple[str, ...]:
+    return name, f"onnx/{name}"
+
+
+def _segmenter(features: Sequence[str], optional: tuple[str, ...] = ()) -> Layout:
+    """A SAM whose encoder hands the named features to its decoder."""
+    encoded = dict.fromkeys(features, _ANY4)
+    decoder = "prompt_encoder_mask_decoder"
+    return Layout(
+        "sam",
+        {
+            "vision_encoder": NetworkSpec(
+                {"pixel_values": _IMAGE}, encoded, places=_places("vision_encoder")
+            ),
+            decoder: NetworkSpec(_POINTS | encoded, _MASKS, optional, _places(decoder)),
+        },
+    )
+
+
+def _image_and_text(image: str, text: str, optional: tuple[str, ...] = ()) -> Layout:
+    """A CLIP of the Hugging Face exports whose networks return vectors under the given names."""
+    synonyms = {"pooler_output": ("image_embeds", "text_embeds")}
+    others = [{image: synonyms[image][0]}, {text: synonyms[text][1]}] if image in synonyms else [{}, {}]
+    return Layout(
+        "clip",
+        {
+            "vision_model": NetworkSpec(
+                {"pixel_values": _IMAGE}, {image: _ANY2}, (), _places("vision_model"), others[0]
+            ),
+            "text_model": NetworkSpec(
+                {"input_ids": _ANY2}, {text: _ANY2}, optional, _places("text_model"), others[1]
+            ),
+        },
+        tokenizer="tokenizer.json",
+        beside=("tokenizer_config.json", "special_tokens_map.json"),
+    )
+
+
+LAYOUTS: dict[str, Layout] = {
+    "sam": _segmenter(("image_embeddings", "image_positional_embeddings")),
+    "sam2": _segmenter(tuple(f"image_embeddings.{level}" for level in range(3)), ("input_boxes",)),
+    "clip": _image_and_text("image_embeds", "text_embeds", ("attention_mask",)),
+    "siglip": _image_and_text("pooler_output", "pooler_output"),
+    "open_clip": Layout(
+        "clip",
+        {
+            "vision_model": NetworkSpec({"image": _IMAGE}, {"embedding": _ANY2}, (), ("visual/model",)),
+            "text_model": NetworkSpec({"text": _ANY2}, {"embedding": _ANY2}, (), ("textual/model",)),
+        },
+        preprocessing="visual/preprocess_cfg.json",
+        tokenizer="textual/tokenizer.json",
+        beside=("textual/tokenizer_config.json", "textual/special_tokens_map.json"),
+    ),
+}
+"""Layouts that are read: SAM, SAM 2 and 2.1, CLIP and SigLIP as transformers.js and optimum name their parts,
+and open_clip's two folders, as Immich publishes them."""
+
+MODEL_TYPES = {"sam": "sam", "sam2": "sam2", "sam2_video": "sam2", "clip": "clip", "siglip": "siglip"}
+"""`model_type` of a config.json -> layout. open_clip's has `vision_cfg` and `text_cfg` instead."""
+
+
+def layout_of(config: object) -> str | None:
+    """Layout of a model by the content of its config.json; None if it is not one that we read."""
+    if not isinstance(config, dict):
+        return None
+    if {"vision_cfg", "text_cfg"} <= config.keys():
+        return "open_clip"
+    model_type = config.get("model_type")
+    return MODEL_TYPES.get(model_type) if isinstance(model_type, str) else None
+
+
+SUPPORTED = {
+    "sam": "SAM (model_type sam), SAM 2 or 2.1 (sam2)",
+    "clip": "CLIP (model_type clip), SigLIP or SigLIP 2 of fixed resolution (siglip), open_clip (folders "
+    "visual/ and textual/)",
+}
+"""What can be read, by kind."""
+
+OTHER_TYPES = {
+    "siglip2": "this is a SigLIP 2 of variable resolution (NaFlex); take one of fixed resolution, such as "
+    "siglip2-base-patch16-224",
+    "sam_hq": "take SAM, or SAM 2.1",
+    "sam3": "take SAM 2.1",
+    "sam3_tracker": "take SAM 2.1",
+    "edgetam": "take SAM 2.1",
+    "chinese_clip": "take CLIP, SigLIP 2 (many languages) or an open_clip in two folders",
+}
+"""What to take instead of models that look alike."""
+
+SECTIONS = {"sam": "masks", "clip": "clip"}
+"""Section of the settings that names the model, by kind."""
+
+TORCH_SUFFIXES = (".safetensors", ".bin", ".pt", ".pth")
+"""Files that hold PyTorch's weights."""

@@ -1,0 +1,113 @@
+"""How much memory a model takes at run time, so that as many views run at once as fit."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hilsplat.base.onnx_models import ModelFolder, input_side_px
+
+PROCESS_MIB = 1500
+"""A stage without its networks: libraries, images, candidates, masks."""
+
+MIB = 2**20
+ATTENTION_COPIES = 3.5
+"""Arrays as large as all attention weights of a layer that are alive at once. Measured: 2615 MiB for a
+picture in SAM ViT-B, whose weights of attention take 768 MiB."""
+
+PROMPT_MIB = 64
+"""Memory of a prompt in SAM's decoder at a picture of 1024 px. Measured: 507 MiB for 8 prompts of ViT-B."""
+
+UNKNOWN_BYTES_PER_PX = 400
+"""Memory of a picture's encoding per pixel, if the configuration does not describe the network (sam-tiny)."""
+
+
+@dataclass(frozen=True)
+class Needs:
+    """Memory of a model.
+
+    Attributes:
+        weights_mib: of the networks once they are open.
+        view_mib: of each view that runs at the same time.
+    """
+
+    weights_mib: float
+    view_mib: float
+
+    def total_mib(self, views: int) -> int:
+        """Memory of a stage that works on so many views at once."""
+        return round(PROCESS_MIB + self.weights_mib + views * self.view_mib)
+
+    def views_at_once(self, threads: int, memory_mib: float) -> int:
+        """Views that fit into the memory, at most one per thread and at least one."""
+        fitting = int((memory_mib - PROCESS_MIB - self.weights_mib) // self.view_mib)
+        return max(1, min(threads, fitting))
+
+
+def needs_of(model: ModelFolder, batch: int) -> Needs:
+    """Memory of a model, from its configuration and the size of its files.
+
+    Args:
+        model: the folder.
+        batch: prompts (SAM) or crops (CLIP) per call.
+    """
+    files = {*model.networks.values(), *(path for path in model.files if "onnx" in path.name)}
+    weights = 1.2 * sum(path.stat().st_size for path in files) / MIB
+    side = input_side_px(model)
+    vision = model.config.get("vision_config", model.config.get("vision_cfg"))
+    if not isinstance(vision, dict):
+        picture = side * side * UNKNOWN_BYTES_PER_PX / MIB
+    elif model.kind == "clip":
+        picture = _crop_mib(vision, side)
+    else:
+        picture = ATTENTION_COPIES * _attention_mib(vision, side)
+    if model.kind == "clip":
+        return Needs(weights, batch * picture)
+    return Needs(weights, picture + batch * PROMPT_MIB * (side / 1024) ** 2)
+
+
+def _attention_mib(vision: dict[str, Any], side_px: int) -> float:
+    """Weights of attention among all patches of a picture, in one layer.
+
+    What a configuration leaves out has the default of transformers: patches of 16 px, 12 heads; for SAM 2 the
+    stage that attends to the whole picture has a stride of 16 px and 4 heads.
+    """
+    stages = (vision.get("backbone_config") or {}).get("num_attention_heads_per_stage")
+    heads = stages[2] if stages else vision.get("num_attention_heads", 12)
+    return heads * (side_px / _patch_px(vision)) ** 4 * 4 / MIB
+
+
+def _patch_px(vision: dict[str, Any]) -> int:
+    """Side of a patch."""
+    return vision.get("patch_size", 16)
+
+
+def _crop_mib(vision: dict[str, Any], side_px: int) -> float:
+    """Memory of a crop in a CLIP. Measured: 521 MiB for 64 crops of ViT-B/16."""
+    tokens = (side_px / _patch_px(vision)) ** 2
+    return 2 * _attention_mib(vision, side_px) + 0.03 * tokens
+
+
+def machine_mib() -> float:
+    """Memory of this machine, or of the container or job that we are in."""
+    physical = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / MIB
+    return min(physical, _cgroup_mib())
+
+
+def available_mib() -> float:
+    """Memory that is free to use now."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+    except OSError:  # not Linux
+        return machine_mib()
+    (found,) = [line.split()[1] for line in lines if line.startswith("MemAvailable:")]
+    return min(int(found) / 1024, _cgroup_mib())
+
+
+def _cgroup_mib() -> float:
+    """Limit of the control group, as clusters and containers set it; infinite without one."""
+    try:
+        limit = Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii").strip()
+    except OSError:
+        return float("inf")
+    return int(limit) / MIB if limit.isdigit() else float("inf")
