@@ -50,6 +50,22 @@ RELEASES = (
     Release(
         "sam-vit-base", "sam", "Xenova/sam-vit-base", 376, "Apache-2.0", "masks of photographs, on a CPU"
     ),
+    Release(
+        "sam2.1-hiera-small",
+        "sam",
+        "onnx-community/sam2.1-hiera-small-ONNX",
+        184,
+        "Apache-2.0",
+        "a smaller, newer encoder",
+    ),
+    Release(
+        "sam2.1-hiera-base-plus",
+        "sam",
+        "onnx-community/sam2.1-hiera-base-plus-ONNX",
+        328,
+        "Apache-2.0",
+        "between small and ViT-B",
+    ),
     Release("slimsam-77", "sam", "Xenova/slimsam-77-uniform", 40, "Apache-2.0", "little memory or time"),
     Release(
         "clip-vit-b-16-laion2b",

@@ -191,7 +191,7 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
             expected="; ".join(SUPPORTED.values()),
             found=f"model_type {described.get('model_type')!r}"
             if isinstance(described, dict)
-            else "no JSON object",
+            else "no object",
             fix="name a SAM or a CLIP (hilsplat models list)",
         )
     parts, ending = PARTS[kind], f"_{variant}" if variant else ""
