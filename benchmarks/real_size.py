@@ -44,7 +44,14 @@ def export_sam(size: str, out: Path) -> None:
 
     torch.manual_seed(0)
     config = transformers.SamConfig(transformers.SamVisionConfig(**SIZES[size]).to_dict())
-    transformers.SamModel(config).save_pretrained(out / "torch")
+    model = transformers.SamModel(config)
+    # Positions and biases start at zero; then the padding of a picture gives denormal numbers, which cost
+    # several times as much as others.
+    with torch.no_grad():
+        for parameter in model.parameters():
+            if not parameter.any():
+                parameter.normal_(0, 0.02)
+    model.save_pretrained(out / "torch")
     transformers.SamImageProcessor().save_pretrained(out / "torch")
     main_export(str(out / "torch"), output=out, task="feature-extraction", do_validation=False)
 
