@@ -97,7 +97,7 @@ def patiently(
 
 
 def _wait_s(error: requests.RequestException, failures: int) -> float | None:
-    """Seconds to wait after an error: what the hub asks for, else 1, 2, 4, ...; None if waiting is useless."""
+    """Seconds to wait after an error: what the hub asks for, else 1, 2, 4, ...; None if it is useless."""
     backoff = float(2 ** (failures - 1))
     if error.response is None:
         return backoff
