@@ -1,8 +1,7 @@
 """The identity of code: a digest over the definitions that a function can reach.
 
 One mechanism decides which rules rerun, which cache entries are valid, and which compiled loops are stale. It
-reads syntax trees, never runs the code, and follows names from definition to definition: functions, classes
-and
+reads syntax trees, never runs the code, and follows names from definition to definition: functions, classes and
 module-level statements of this package. What cannot change a result does not count:
 
 - comments, formatting, docstrings and other bare strings;
@@ -18,6 +17,7 @@ too, and so do definitions whose decorators may register them, because importing
 import ast
 import functools
 import hashlib
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +27,9 @@ from hilsplat.base.errors import HilsplatError
 
 PACKAGE = "hilsplat"
 ROOT = Path(__file__).resolve().parents[1]
+_PARSING = threading.Lock()
+"""Kernels ask for digests from several threads, and before 3.11.8 Python's parser fails (SystemError) if two
+threads parse at once (python/cpython#106905)."""
 
 NEUTRAL_DECORATORS = frozenset(
     [
@@ -70,7 +73,8 @@ def code_digest(*roots: Code, root: Path = ROOT) -> str:
     Raises:
         HilsplatError: a root, or a name that reached code imports, does not exist.
     """
-    return _digest(tuple(_place(each) for each in roots), root)
+    with _PARSING:
+        return _digest(tuple(_place(each) for each in roots), root)
 
 
 @functools.cache
