@@ -1,8 +1,8 @@
 """The identity of code: a digest over the definitions that a function can reach.
 
 One mechanism decides which rules rerun, which cache entries are valid, and which compiled loops are stale. It
-reads syntax trees, never runs the code, and follows names from definition to definition: functions, classes and
-module-level statements of this package. What cannot change a result does not count:
+reads syntax trees, never runs the code, and follows names from definition to definition: functions, classes
+and module-level statements of this package. What cannot change a result does not count:
 
 - comments, formatting, docstrings and other bare strings;
 - the words of `raise` statements and of log messages (the names in them do count);
