@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.model_store import AUTO, EMBEDDED, read_model, real_model
+from hilsplat.base.names import NAME_RULE, name_problem
 from hilsplat.settings import (
     AutoencoderSettings,
     ClipSettings,
@@ -276,6 +277,13 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
         run = RunSettings.model_validate(config)
     except ValidationError as error:
         raise settings_error(error, "", RunSettings) from error
+    for name in dict.fromkeys([*run.variants, *run.groups]):
+        if (problem := name_problem(name)) is not None:
+            raise SettingsError(
+                f"{name!r} cannot be the name of a variant or group: {problem}",
+                expected=NAME_RULE,
+                fix="rename it in the configuration",
+            )
     for variant in dict.fromkeys([*run.variant_names(), *run.variants]):
         run.stages(variant)
     for scope in run.overrides:

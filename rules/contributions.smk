@@ -20,6 +20,6 @@ rule contributions:
         cache="results/.cache",
         code=PLAN.code("contributions"),
     shell:
-        "hilsplat contributions --scene {input.scene} --gaussians {input.gaussians} --masks {input.masks}"
-        " --settings {params.settings:q} --threads {threads} --cache {params.cache}"
-        " --out {output.contributions} --log {log}"
+        "hilsplat contributions --scene {input.scene:q} --gaussians {input.gaussians:q} --masks {input.masks:q}"
+        " --settings {params.settings:q} --threads {threads} --cache {params.cache:q}"
+        " --out {output.contributions:q} --log {log:q}"

@@ -20,5 +20,5 @@ rule clip:
         cache="results/.cache",
         code=PLAN.code("clip"),
     shell:
-        "hilsplat clip --scene {input.scene} --masks {input.masks} --settings {params.settings:q}"
-        " --threads {threads} --memory {resources.mem_mib} --cache {params.cache} --out {output.clip} --log {log}"
+        "hilsplat clip --scene {input.scene:q} --masks {input.masks:q} --settings {params.settings:q}"
+        " --threads {threads} --memory {resources.mem_mib} --cache {params.cache:q} --out {output.clip:q} --log {log:q}"

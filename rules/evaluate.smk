@@ -26,11 +26,11 @@ rule evaluate:
         code=PLAN.code("evaluate", PLAN.label_readers),
         truth=PLAN.truth_option,
     shell:
-        "hilsplat evaluate --scene {input.scene} {params.truth} --gaussians {input.gaussians}"
-        " --semantic-tree {input.semantic_tree} --field {input.field}"
-        " --autoencoder {input.autoencoder} --clip {input.clip} --masks {input.masks}"
-        " --dataset {wildcards.dataset} --name {wildcards.scene} --variant {wildcards.variant}"
-        " --settings {params.settings:q} --threads {threads} --out {output.scores} --log {log}"
+        "hilsplat evaluate --scene {input.scene:q} {params.truth} --gaussians {input.gaussians:q}"
+        " --semantic-tree {input.semantic_tree:q} --field {input.field:q}"
+        " --autoencoder {input.autoencoder:q} --clip {input.clip:q} --masks {input.masks:q}"
+        " --dataset {wildcards.dataset:q} --name {wildcards.scene:q} --variant {wildcards.variant:q}"
+        " --settings {params.settings:q} --threads {threads} --out {output.scores:q} --log {log:q}"
 
 
 rule table:
@@ -62,8 +62,8 @@ rule table:
         absent=lambda wildcards: PLAN.absent_options(wildcards.table),
         code=PLAN.code("table"),
     shell:
-        "hilsplat table {wildcards.table} --published {input.published} --labels {params.labels:q}"
-        " {params.absent} --out {output.csv} --log {log} {input.scores}"
+        "hilsplat table {wildcards.table:q} --published {input.published:q} --labels {params.labels:q}"
+        " {params.absent} --out {output.csv:q} --log {log:q} {input.scores:q}"
 
 
 rule tables:

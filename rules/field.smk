@@ -20,9 +20,9 @@ rule autoencoder:
         seed=PLAN.seed,
         code=PLAN.code("autoencoder"),
     shell:
-        "hilsplat autoencoder --clip {input.clip} --semantic-tree {input.semantic_tree}"
-        " --contributions {input.contributions} --settings {params.settings:q} --seed {params.seed}"
-        " --out {output.autoencoder} --log {log}"
+        "hilsplat autoencoder --clip {input.clip:q} --semantic-tree {input.semantic_tree:q}"
+        " --contributions {input.contributions:q} --settings {params.settings:q} --seed {params.seed:q}"
+        " --out {output.autoencoder:q} --log {log:q}"
 
 
 rule field:
@@ -47,6 +47,6 @@ rule field:
         settings=PLAN.settings("field"),
         code=PLAN.code("field"),
     shell:
-        "hilsplat field --contributions {input.contributions} --coverage-tree {input.coverage_tree}"
-        " --autoencoder {input.autoencoder} --settings {params.settings:q}"
-        " --threads {threads} --out {output.field} --log {log}"
+        "hilsplat field --contributions {input.contributions:q} --coverage-tree {input.coverage_tree:q}"
+        " --autoencoder {input.autoencoder:q} --settings {params.settings:q}"
+        " --threads {threads} --out {output.field:q} --log {log:q}"

@@ -24,7 +24,7 @@ rule method:
         seed=PLAN.seed,
         code=PLAN.code("method", PLAN.baseline),
     shell:
-        "hilsplat method --scene {input.scene} --gaussians {input.gaussians} --masks {input.masks}"
-        " --contributions {input.contributions} --autoencoder {input.autoencoder}"
-        " --settings {params.settings:q} --seed {params.seed} --threads {threads}"
-        " --out {output.field} --log {log}"
+        "hilsplat method --scene {input.scene:q} --gaussians {input.gaussians:q} --masks {input.masks:q}"
+        " --contributions {input.contributions:q} --autoencoder {input.autoencoder:q}"
+        " --settings {params.settings:q} --seed {params.seed:q} --threads {threads}"
+        " --out {output.field:q} --log {log:q}"

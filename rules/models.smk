@@ -16,4 +16,4 @@ rule train_models:
         code=PLAN.code("models"),
     shell:
         "hilsplat models train --out results/models --cache results/.cache/models"
-        " --settings {params.settings:q} --seed {params.seed} --threads {threads} --log {log}"
+        " --settings {params.settings:q} --seed {params.seed:q} --threads {threads} --log {log:q}"

@@ -48,12 +48,12 @@ rule figures:
         truth=PLAN.figure_truth_option,
         code=PLAN.code("figures", PLAN.label_readers),
     shell:
-        "hilsplat figures --scene {input.scene} {params.truth} --gaussians {input.gaussians}"
-        " --fit {input.fit} --masks {input.masks} --clip {input.clip}"
-        " --semantic-tree {input.semantic_tree} --field {input.field}"
-        " --autoencoder {input.autoencoder} --queries {params.queries:q}"
+        "hilsplat figures --scene {input.scene:q} {params.truth} --gaussians {input.gaussians:q}"
+        " --fit {input.fit:q} --masks {input.masks:q} --clip {input.clip:q}"
+        " --semantic-tree {input.semantic_tree:q} --field {input.field:q}"
+        " --autoencoder {input.autoencoder:q} --queries {params.queries:q}"
         " --settings {params.settings:q} --evaluate {params.evaluate:q}"
-        " --threads {threads} --out {output.panel} --log {log}"
+        " --threads {threads} --out {output.panel:q} --log {log:q}"
 
 
 rule mask_truth:
@@ -82,7 +82,7 @@ rule mask_truth:
     params:
         code=PLAN.code("mask_truth"),
     shell:
-        "hilsplat world masks {wildcards.dataset}/{wildcards.scene} --out {output.picture} --log {log}"
+        "hilsplat world masks {wildcards.dataset:q}/{wildcards.scene:q} --out {output.picture:q} --log {log:q}"
 
 
 rule comparison:
@@ -137,10 +137,10 @@ rule comparison:
         truth=PLAN.figure_truth_option,
         code=PLAN.code("comparison", PLAN.label_readers),
     shell:
-        "hilsplat comparison --folder {params.folder} --variants {params.variants:q}"
+        "hilsplat comparison --folder {params.folder:q} --variants {params.variants:q}"
         " --names {params.names:q} {params.truth} --queries {params.queries:q}"
         " --settings {params.settings:q} --evaluate {params.evaluate:q}"
-        " --threads {threads} --out {output.methods} --log {log}"
+        " --threads {threads} --out {output.methods:q} --log {log:q}"
 
 
 rule sweep_plot:
@@ -166,4 +166,4 @@ rule sweep_plot:
     params:
         code=PLAN.code("sweep"),
     shell:
-        "hilsplat sweep {wildcards.sweep} --table {input.table} --out {output.plot} --log {log}"
+        "hilsplat sweep {wildcards.sweep:q} --table {input.table:q} --out {output.plot:q} --log {log:q}"

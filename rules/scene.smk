@@ -18,7 +18,7 @@ rule source:
         root=str(Path(PLAN.run.data_root)),
         code=PLAN.code("source", PLAN.source_reader),
     shell:
-        "hilsplat datasets export {params.name:q} --data-root {params.root:q} --out {output} --log {log}"
+        "hilsplat datasets export {params.name:q} --data-root {params.root:q} --out {output:q} --log {log:q}"
 
 
 rule poses:
@@ -43,6 +43,6 @@ rule poses:
         seed=PLAN.run.seed,
         code=PLAN.code("poses"),
     shell:
-        "hilsplat poses --images {params.images:q} --name {wildcards.dataset}/{wildcards.scene}"
-        " --unit {params.unit} {params.lens} --settings {params.settings:q} --seed {params.seed}"
-        " --threads {threads} --out {output.scene} --log {log}"
+        "hilsplat poses --images {params.images:q} --name {wildcards.dataset:q}/{wildcards.scene:q}"
+        " --unit {params.unit:q} {params.lens} --settings {params.settings:q} --seed {params.seed:q}"
+        " --threads {threads} --out {output.scene:q} --log {log:q}"

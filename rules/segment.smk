@@ -21,8 +21,8 @@ rule masks:
         cache="results/.cache",
         code=PLAN.code(PLAN.masks_stage),
     shell:
-        "hilsplat masks --scene {input.scene} --settings {params.settings:q} {params.truth}"
-        " --threads {threads} --memory {resources.mem_mib} --cache {params.cache} --out {output.masks} --log {log}"
+        "hilsplat masks --scene {input.scene:q} --settings {params.settings:q} {params.truth}"
+        " --threads {threads} --memory {resources.mem_mib} --cache {params.cache:q} --out {output.masks:q} --log {log:q}"
 
 
 rule coverage_tree:
@@ -43,5 +43,5 @@ rule coverage_tree:
         settings=PLAN.settings("coverage_tree"),
         code=PLAN.code("coverage_tree"),
     shell:
-        "hilsplat coverage-tree --masks {input.masks} --settings {params.settings:q}"
-        " --out {output.coverage_tree} --log {log}"
+        "hilsplat coverage-tree --masks {input.masks:q} --settings {params.settings:q}"
+        " --out {output.coverage_tree:q} --log {log:q}"

@@ -19,6 +19,6 @@ rule semantic_tree:
         settings=PLAN.settings("semantic_tree"),
         code=PLAN.code("semantic_tree"),
     shell:
-        "hilsplat semantic-tree --contributions {input.contributions} --masks {input.masks}"
-        " --clip {input.clip} --settings {params.settings:q} --threads {threads}"
-        " --out {output.semantic_tree} --log {log}"
+        "hilsplat semantic-tree --contributions {input.contributions:q} --masks {input.masks:q}"
+        " --clip {input.clip:q} --settings {params.settings:q} --threads {threads}"
+        " --out {output.semantic_tree:q} --log {log:q}"

@@ -23,6 +23,6 @@ rule gaussians:
         cache="results/.cache",
         code=PLAN.code("gaussians"),
     shell:
-        "hilsplat gaussians --scene {input.scene} --settings {params.settings:q} --seed {params.seed}"
-        " {params.brought} --threads {threads} --cache {params.cache} --report {output.report}"
-        " --out {output.ply} --log {log}"
+        "hilsplat gaussians --scene {input.scene:q} --settings {params.settings:q} --seed {params.seed:q}"
+        " {params.brought} --threads {threads} --cache {params.cache:q} --report {output.report:q}"
+        " --out {output.ply:q} --log {log:q}"

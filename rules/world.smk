@@ -19,4 +19,4 @@ rule world:
         out="results/{dataset}/{scene}/world",
     shell:
         "hilsplat world make --source {params.source:q} --settings {params.settings:q}"
-        " --threads {threads} --out {params.out} --log {log}"
+        " --threads {threads} --out {params.out:q} --log {log:q}"

@@ -10,6 +10,7 @@ import cv2
 from hilsplat.base.errors import ImageError, SceneError
 from hilsplat.base.files import list_images
 from hilsplat.base.images import open_image, read_image, resize_to_fit
+from hilsplat.base.names import NAME_RULE, name_problem
 from hilsplat.base.progress import track
 from hilsplat.scene.features import EXIF_ORIENTATION, exif_focal_px
 from hilsplat.scene.intake import brought_photographs
@@ -18,12 +19,10 @@ from hilsplat.scene.photo_check import CHECK_SIDE_PX, CheckedPhoto, photo_doubts
 from hilsplat.scene.sheet import (
     COLUMNS,
     MIN_PHOTOS,
-    NAME_RULE,
     NOTHING,
     PHOTOS,
     UNITS,
     content_lines,
-    name_problem,
     project_root,
     read_sheet,
 )

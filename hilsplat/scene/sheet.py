@@ -11,6 +11,7 @@ from pathlib import Path
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, list_images
+from hilsplat.base.names import NAME_RULE, name_problem
 from hilsplat.scene.layouts import has_known_poses, photo_folder
 
 COLUMNS = ("dataset", "scene", "group", "source", "unit")
@@ -36,11 +37,6 @@ PHOTOS = "photos"
 MIN_PHOTOS = 3
 """Structure from motion needs at least this many."""
 
-MAX_NAME = 100
-"""Longest name of a data set or scene; folders and files are named after it."""
-
-NAME_RULE = "letters a-z A-Z, digits, dot, dash and underscore, beginning with a letter or digit"
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 DATA_PREFIX = "data:"
 """Prefix of a source below the folder of real data sets (`data_root`)."""
 WORLD_SOURCE = re.compile(r"world:([a-z][a-z0-9_-]*):([0-9]{1,9})")
@@ -79,22 +75,6 @@ class SceneRow:
         """Kind and seed of a synthetic world, else None."""
         match = WORLD_SOURCE.fullmatch(self.source)
         return (match[1], int(match[2])) if match else None
-
-
-def name_problem(name: str) -> str | None:
-    """What is wrong with the name of a data set or scene, or None."""
-    if not name:
-        return "it is empty"
-    if len(name) > MAX_NAME:
-        return f"it is longer than {MAX_NAME} characters"
-    if ".." in name:
-        return 'it contains ".."'
-    if NAME.fullmatch(name):
-        return None
-    if not re.fullmatch("[A-Za-z0-9]", name[0]):
-        return f"it begins with {name[0]!r}"
-    bad = sorted({letter for letter in name if not re.fullmatch("[A-Za-z0-9._-]", letter)})
-    return f"it contains {', '.join(repr(letter) for letter in bad)}"
 
 
 def project_root(sheet: Path) -> Path:

@@ -51,6 +51,13 @@ def test_errors_inside_variants_name_the_variant() -> None:
         parse_run({"variants": {"x": {"coverage_tree": {"theta": 3}}}})
 
 
+@pytest.mark.parametrize("name", ["$(touch PWNED)", "a b", "../up", "-rf", "a;b", ""])
+@pytest.mark.parametrize("where", ["variants", "groups"])
+def test_names_that_a_shell_or_a_folder_could_misread_are_refused(where: str, name: str) -> None:
+    with pytest.raises(SettingsError, match="cannot be the name of a variant or group"):
+        parse_run({where: {name: {}} if where == "variants" else [name]})
+
+
 def test_an_unknown_variant_is_named() -> None:
     with pytest.raises(SettingsError, match="variant 'nope' is not defined"):
         parse_run({"main_variants": ["nope"]})

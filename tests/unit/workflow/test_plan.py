@@ -1,6 +1,7 @@
 """What the rules ask the plan of a run."""
 
 import json
+import re
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -286,3 +287,15 @@ def test_memory_grows_with_the_model_and_with_views_at_once(tmp_path, monkeypatc
 def test_a_model_that_is_missing_is_left_to_the_stage(tmp_path):
     found = plan(tmp_path, masks={"model": str(tmp_path / "nowhere")})
     assert found.memory_mb("masks", 2)(Job("synthetic", "one")) == 4000
+
+
+READY = {"params.truth", "params.brought", "params.absent", "params.lens", "resources.mem_mib", "threads"}
+"""What commands take unquoted: options that the plan has quoted, and numbers."""
+
+
+def test_every_rule_quotes_what_it_puts_into_a_command(project):
+    rules = sorted((project / "rules").glob("*.smk"))
+    commands = [part.split("\nrule ")[0] for path in rules for part in path.read_text().split("shell:")[1:]]
+    assert len(commands) > 15
+    placed = [place for command in commands for place in re.findall(r"{([^}]*)}", command)]
+    assert {place for place in placed if not place.endswith(":q")} <= READY
