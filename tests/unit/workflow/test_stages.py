@@ -1,0 +1,15 @@
+"""What starting a stage loads."""
+
+import subprocess
+import sys
+
+from hilsplat.workflow.stages import STAGES
+
+TRAINING = {"field", "field_reference", "models"}
+"""Stages whose losses are torch's."""
+
+
+def test_only_stages_that_train_load_torch_which_takes_longer_than_most_of_them():
+    modules = sorted({place.partition(":")[0] for stage, place in STAGES.items() if stage not in TRAINING})
+    code = f"import sys, {', '.join(modules)}; print('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "False\n"
