@@ -18,9 +18,9 @@ from benchmarks.scenes import random_scene
 from hilsplat.base.levels import LEVELS
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.quadratic import StackedWeights
-from hilsplat.field.autoencoder import train_autoencoder
 from hilsplat.field.language_field import LanguageField
 from hilsplat.field.linear_code import LinearCode
+from hilsplat.field.network_code import train_autoencoder
 from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Cameras
@@ -49,7 +49,7 @@ def open_scene(code_name: str, threads: int = 1) -> LanguageScene:
     """A scene whose latents have three numbers (network) or sixteen (pca)."""
     gaussians, camera = random_scene(200_000, SIZE_HW, sh_degree=0)
     rng = np.random.default_rng(0)
-    place = gaussians.means.numpy() @ camera.K.T
+    place = gaussians.means @ camera.K.T
     x, y = (place[:, k] / place[:, 2] / SIZE_HW[1 - k] for k in (0, 1))
     node_of_gaussian = np.zeros((len(gaussians), 3), np.int32)
     level, parent, first = [], [], 0

@@ -21,7 +21,7 @@ CLASSES = ClassSet("blocks", "drawn", (7, 9), ("chest", "bear"))
 def points_of(block_world, count=1):
     """The Gaussians themselves as labelled points, `count` of each: class 9 is bear, 7 is chest."""
     node = np.repeat(block_world.answers.tree.node_of_gaussian[:, 0], count)
-    xyz = np.repeat(block_world.answers.gaussians.means.numpy().astype(np.float64), count, axis=0)
+    xyz = np.repeat(block_world.answers.gaussians.means.astype(np.float64), count, axis=0)
     ids = np.array([9, 7, 0])[np.where(node < 0, 2, np.minimum(node, 1))].astype(np.int32)
     return LabelledPoints(xyz, ids, (node + 1).astype(np.int32), "drawn"), ids
 
