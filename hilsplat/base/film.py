@@ -8,6 +8,9 @@ import av
 import numpy as np
 from jaxtyping import UInt8
 
+OPTIONS = {"crf": "20", "preset": "fast", "x264-params": "threads=1:mbtree=0"}
+"""Macroblock-tree rate control gave other bytes each time, also on one thread (x264 in PyAV 18.1)."""
+
 
 def write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_second: int) -> None:
     """Encode frames of one size; the same frames give the same bytes on the same version of PyAV.
@@ -22,9 +25,8 @@ def write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_sec
     first = next(frames)
     height, width = (side // 2 * 2 for side in first.shape[:2])
     with av.open(path, "w", format="mp4", options={"movflags": "faststart", "fflags": "bitexact"}) as film:
-        stream = film.add_stream("libx264", rate=per_second, options={"crf": "20", "preset": "fast"})
+        stream = film.add_stream("libx264", rate=per_second, options=OPTIONS)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        stream.codec_context.thread_count = 1
         stream.codec_context.flags |= av.codec.context.Flags.bitexact
         for frame in chain([first], frames):
             even = np.ascontiguousarray(frame[:height, :width])

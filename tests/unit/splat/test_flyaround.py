@@ -91,13 +91,20 @@ def test_the_film_shows_every_frame_and_the_sheet_every_tenth(tmp_path):
     assert Image.open(tmp_path / "flyaround.png").size == (4 * 52, 3 * 52)
 
 
-def test_frames_of_odd_sides_lose_a_row_and_give_the_same_bytes(tmp_path):
-    frames = np.random.default_rng(0).integers(0, 255, (3, 47, 61, 3), np.uint8)
-    for name in ("a.mp4", "b.mp4"):
-        write_film(tmp_path / name, frames, 24)
+def test_frames_of_odd_sides_lose_a_row_or_column(tmp_path):
+    write_film(tmp_path / "a.mp4", np.random.default_rng(0).integers(0, 255, (3, 47, 61, 3), np.uint8), 24)
     with av.open(tmp_path / "a.mp4") as film:
         assert [frame.to_ndarray(format="rgb24").shape for frame in film.decode(video=0)] == [(46, 60, 3)] * 3
-    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
+
+
+def test_the_same_frames_give_the_same_bytes(tmp_path):
+    tile = np.random.default_rng(0).integers(0, 255, (6, 6, 3)).repeat(8, axis=0).repeat(8, axis=1)
+    frames = [np.roll(tile, 3 * shift, axis=1).astype(np.uint8) for shift in range(40)]
+    written = set()
+    for _ in range(8):
+        write_film(tmp_path / "film.mp4", frames, 24)
+        written.add((tmp_path / "film.mp4").read_bytes())
+    assert len(written) == 1
 
 
 def test_sheet_shrinks_by_averages():
