@@ -30,5 +30,7 @@ def write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_sec
         stream.codec_context.flags |= av.codec.context.Flags.bitexact
         for frame in chain([first], frames):
             even = np.ascontiguousarray(frame[:height, :width])
-            film.mux(stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")))
+            # converted here: the encoder's own conversion gives other bytes now and then
+            picture = av.VideoFrame.from_ndarray(even, format="rgb24").reformat(format="yuv420p")
+            film.mux(stream.encode(picture))
         film.mux(stream.encode())

@@ -98,7 +98,7 @@ def test_frames_of_odd_sides_lose_a_row_or_column(tmp_path):
 
 
 def test_the_same_frames_give_the_same_bytes(tmp_path):
-    tile = np.random.default_rng(0).integers(0, 255, (6, 6, 3)).repeat(8, axis=0).repeat(8, axis=1)
+    tile = np.random.default_rng(0).integers(0, 255, (15, 20, 3)).repeat(8, axis=0).repeat(8, axis=1)
     frames = [np.roll(tile, 3 * shift, axis=1).astype(np.uint8) for shift in range(40)]
     written = set()
     for _ in range(8):
