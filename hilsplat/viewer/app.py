@@ -371,6 +371,7 @@ def run_view(
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listening.bind(("127.0.0.1", port))
+        listening.listen()  # before the address is told: who connects at once waits instead of being refused
     except OSError as error:
         raise SettingsError(
             f"port {port} cannot be used: {error}", fix="choose another, or leave it out"

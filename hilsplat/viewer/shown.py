@@ -191,7 +191,7 @@ class ShownScene:
 
         camera = self.scene.cameras[self.scene.cameras.names[0]].scaled((8, 8))
         painted(self.gaussians, camera, None, self.threads)
-        pick(self.gaussians, None, camera, 4, 4, self.threads)
+        pick(self.gaussians, None, camera, 4.0, 4.0, self.threads)
         if self.first in self.variants:
             try:
                 self.answering(self.first)

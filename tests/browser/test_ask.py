@@ -5,6 +5,7 @@ import pytest
 
 import hilsplat
 from hilsplat.base.artifacts import read_json
+from hilsplat.base.images import write_png
 from hilsplat.splat.ply import load_ply
 from tests.browser.conftest import drawn, pixels, wire_camera
 
@@ -142,6 +143,28 @@ def test_what_is_like_the_choice_is_listed(opened, desk_address, scene):
     answers(page).first.wait_for()
     expected = scene.like_node(handle)[0].node
     assert page.locator("#answers li").first.get_attribute("data-node") == str(expected)
+
+
+def test_a_picture_or_a_frame_drawn_over_the_view_is_asked_for(opened, desk_address, scene, tmp_path):
+    page = opened(desk_address)
+    book = scene.query("book", "whole")[0].node
+    write_png(tmp_path / "blue.png", np.full((40, 30, 3), (0, 0, 250), np.uint8))
+    page.get_by_label("Picture to look for").set_input_files(tmp_path / "blue.png")
+    page.locator(f"#answers li[data-node='{book}']").first.wait_for()
+    assert page.locator("#answers li").first.get_attribute("data-node") == str(book)
+    page.locator("#view").press("Escape")
+    wire, view = wire_camera(page), page.locator("#view").bounding_box()
+    K, pose = np.array(wire["K"]), np.array(wire["cam_from_world"])
+    corners = (K @ (pose[:3, :3] @ np.array([[18, 18, 0], [34, 22, 0]]).T + pose[:3, 3:])).T  # of the book
+    (x0, y0), (x1, y1) = corners[:, :2] / corners[:, 2:] + (view["x"], view["y"])
+    page.keyboard.down("Alt")
+    page.mouse.move(x0, y0)
+    page.mouse.down()
+    page.mouse.move(x1, y1, steps=4)
+    page.mouse.up()
+    page.keyboard.up("Alt")
+    answers(page).first.wait_for()
+    assert page.locator("#answers li").first.get_attribute("data-node") == str(book)
 
 
 def test_two_answerers_stand_side_by_side(opened, desk_address):

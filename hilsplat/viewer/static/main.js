@@ -426,8 +426,9 @@ async function begin() {
   painter = made;
   redraw();
   if (api.offline) onlyWhatIsHere();
-  if (scene.variants.length) await useVariants();
-  else {
+  if (scene.variants.length) {
+    try { await useVariants(); } catch (error) { tell(`There are no answers: ${error.message}`, true); }   // the Gaussians can still be looked at
+  } else {
     fillVariants();
     $("about").textContent = `${scene.name}: ${counted(scene.gaussians, "Gaussian")}.`;
     tell("The run goes on: you can look around; questions will be answered when the tree and the field are there.");

@@ -1,0 +1,49 @@
+"""The command: it prints an address that opens the page, on this machine alone, and ends on Ctrl-C."""
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+from urllib.error import HTTPError
+from urllib.request import urlopen
+
+import pytest
+
+from hilsplat.base.errors import SettingsError
+from hilsplat.viewer.app import run_view
+from tests.conftest import PROJECT
+from tests.unit.finished_desk import SCENE
+
+
+def test_the_printed_address_opens_the_page_and_no_other_does(built_desk):
+    words = ["view", "photos/desk", "--results", "results", "--no-browser"]
+    code = "from hilsplat.cli.main import main; main()"
+    environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
+    command = [sys.executable, "-u", "-c", code, *words]
+    server = subprocess.Popen(command, cwd=built_desk, env=environment, stdout=subprocess.PIPE, text=True)
+    try:
+        line = server.stdout.readline()
+        assert line.startswith("photos/desk: 864 Gaussians at ")
+        address = re.search(r"http://127\.0\.0\.1:\d+/\?token=\S{20,}", line).group()
+        with urlopen(address, timeout=60) as page:
+            assert b"<title>hilsplat</title>" in page.read()
+        with pytest.raises(HTTPError, match="403"):
+            urlopen(address.partition("?")[0], timeout=60)
+        server.send_signal(signal.SIGINT)
+        server.wait(timeout=60)
+    finally:
+        server.kill()
+        server.communicate()
+
+
+def test_a_port_that_is_taken_is_refused_with_advice(built_desk):
+    with (
+        socket.create_server(("127.0.0.1", 0)) as taken,
+        pytest.raises(SettingsError, match="choose another"),
+    ):
+        port = taken.getsockname()[1]
+        run_view(
+            built_desk / SCENE, variant="default", port=port, browser=False, threads=1, told=lambda text: None
+        )
