@@ -93,6 +93,7 @@ def test_the_outline_is_walked_by_keys(opened, desk_address, scene):
     page = opened(desk_address)
     tree = page.get_by_role("tree")
     items = tree.get_by_role("treeitem")
+    items.last.wait_for()
     assert items.count() == len(scene.tree)
     items.first.focus()
     focused = "document.activeElement.dataset.node"
