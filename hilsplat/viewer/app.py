@@ -345,6 +345,26 @@ def _picture(text: str) -> np.ndarray:
     return np.ascontiguousarray(pixels[..., ::-1])
 
 
+def listening_at(port: int) -> socket.socket:
+    """A socket that listens on this machine alone; 0: at any free port.
+
+    Raises:
+        SettingsError: the port is taken.
+    """
+    # Named as TCP, or asyncio leaves Nagle's algorithm on, and answers wait 40 ms for an acknowledgement.
+    made = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        made.bind(("127.0.0.1", port))
+    except OSError as error:
+        made.close()
+        raise SettingsError(
+            f"port {port} cannot be used: {error}", fix="choose another, or leave it out"
+        ) from error
+    made.listen()  # before the address is told: who connects at once waits instead of being refused
+    return made
+
+
 def run_view(
     folder: Path, *, variant: str, port: int, browser: bool, threads: int, told: Callable[[str], None]
 ) -> None:
@@ -367,15 +387,7 @@ def run_view(
     shown = ShownScene(folder, variant, threads)
     viewer, token = Viewer(shown), secrets.token_urlsafe(24)
     viewer.worker.submit(shown.warm_up).result()
-    listening = socket.socket()
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listening.bind(("127.0.0.1", port))
-        listening.listen()  # before the address is told: who connects at once waits instead of being refused
-    except OSError as error:
-        raise SettingsError(
-            f"port {port} cannot be used: {error}", fix="choose another, or leave it out"
-        ) from error
+    listening = listening_at(port)
     address = f"http://127.0.0.1:{listening.getsockname()[1]}/?token={token}"
     config = uvicorn.Config(viewer.app(token), log_level="warning", access_log=False, server_header=False)
     told(f"{shown.scene.name}: {len(shown.gaussians)} Gaussians at {address}\nCtrl-C ends it")

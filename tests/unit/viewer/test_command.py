@@ -1,5 +1,6 @@
 """The command: it prints an address that opens the page, on this machine alone, and ends on Ctrl-C."""
 
+import asyncio
 import os
 import re
 import signal
@@ -12,9 +13,8 @@ from urllib.request import urlopen
 import pytest
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.viewer.app import run_view
+from hilsplat.viewer.app import listening_at
 from tests.conftest import PROJECT
-from tests.unit.finished_desk import SCENE
 
 
 def test_the_printed_address_opens_the_page_and_no_other_does(built_desk):
@@ -38,12 +38,25 @@ def test_the_printed_address_opens_the_page_and_no_other_does(built_desk):
         server.communicate()
 
 
-def test_a_port_that_is_taken_is_refused_with_advice(built_desk):
-    with (
-        socket.create_server(("127.0.0.1", 0)) as taken,
-        pytest.raises(SettingsError, match="choose another"),
-    ):
-        port = taken.getsockname()[1]
-        run_view(
-            built_desk / SCENE, variant="default", port=port, browser=False, threads=1, told=lambda text: None
-        )
+def test_a_port_that_is_taken_is_refused_with_advice():
+    with listening_at(0) as taken, pytest.raises(SettingsError, match="choose another"):
+        listening_at(taken.getsockname()[1])
+
+
+def test_answers_do_not_wait_for_acknowledgements():
+    async def nodelay() -> int:
+        found = asyncio.get_running_loop().create_future()
+
+        class Server(asyncio.Protocol):
+            def connection_made(self, transport: asyncio.Transport) -> None:
+                accepted = transport.get_extra_info("socket")
+                found.set_result(accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
+
+        with listening_at(0) as listening:
+            server = await asyncio.get_running_loop().create_server(Server, sock=listening)
+            with socket.create_connection(listening.getsockname()):
+                value = await found
+            server.close()
+            return value
+
+    assert asyncio.run(nodelay())
