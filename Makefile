@@ -21,7 +21,7 @@ setup: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,export]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,export,browser-tests]'
 	touch $(STAMP)
 
 lint: $(STAMP)
@@ -33,7 +33,7 @@ lint: $(STAMP)
 	snakemake --lint --configfile config/ci.yaml
 
 test: lint
-	python -m pytest --numprocesses $(CORES) --dist loadfile --no-loadscope-reorder tests/workflow tests/unit
+	python -m pytest --numprocesses $(CORES) --dist loadfile --no-loadscope-reorder tests/workflow tests/browser tests/unit
 
 bench: $(STAMP)
 	OMP_NUM_THREADS=1 python -m pytest -c benchmarks/pytest.ini benchmarks

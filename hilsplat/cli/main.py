@@ -1,4 +1,4 @@
-"""The `hilsplat` command: one subcommand per stage, plus new, query, export, world, models, datasets, cache.
+"""The `hilsplat` command: one subcommand per stage, plus those that people use on scenes and models.
 
 A command here is thin: it reads its settings, takes the lock of its output, calls one function of the
 package and writes the provenance. Heavy libraries are imported by the functions, not by these files.
@@ -23,7 +23,7 @@ from hilsplat.cli.apps import app  # noqa: E402
 # isort: off
 from hilsplat.cli import scene_commands, segment_commands, embed_commands  # noqa: E402, F401
 from hilsplat.cli import field_commands  # noqa: E402, F401
-from hilsplat.cli import evaluate_commands, user_commands, cache_commands  # noqa: E402, F401
+from hilsplat.cli import evaluate_commands, user_commands, view_command, cache_commands  # noqa: E402, F401
 from hilsplat.cli import world_commands, model_commands, dataset_commands  # noqa: E402, F401
 # isort: on
 

@@ -57,7 +57,7 @@ def query(
     from hilsplat.query.answer import answer
 
     for found in answer(
-        _folder(scene, results),
+        scene_folder(scene, results),
         text,
         level=level,
         variant=variant,
@@ -85,10 +85,10 @@ def export(
     start_logging(None)
     from hilsplat.query.tree_picture import export_tree
 
-    typer.echo(export_tree(_folder(scene, results), variant, out, threads))
+    typer.echo(export_tree(scene_folder(scene, results), variant, out, threads))
 
 
-def _folder(scene: str, results: Path) -> Path:
+def scene_folder(scene: str, results: Path) -> Path:
     """Folder of a scene, given as dataset/scene or as a path."""
     named, path = results / scene, Path(scene)
     return path if path.is_dir() and not named.is_dir() else named

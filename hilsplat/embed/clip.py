@@ -131,6 +131,11 @@ class ClipModel:
         pieces = np.split(self.prepare(crops), range(step, len(crops), step))
         return unit(np.concatenate([self.vision(**{self.pixels: piece})[0] for piece in pieces]))
 
+    def embed_picture(self, picture: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, " C"]:
+        """Unit vector of a whole picture, centred in a black square like the crops of masks."""
+        inside = np.ones(picture.shape[:2], np.bool_)
+        return self.embed_crops(crop_to_square(picture, inside, "keep", self.side_px)[None])[0]
+
     def embed_masks(
         self,
         image: UInt8[np.ndarray, "H W 3"],

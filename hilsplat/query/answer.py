@@ -6,7 +6,8 @@ from pathlib import Path
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.query.hits import Hit, counted, doubts_of, hits_of
-from hilsplat.query.language_scene import PATH_SEPARATOR, LanguageScene, path_of
+from hilsplat.query.language_scene import LanguageScene, path_of
+from hilsplat.query.names import PATH_SEPARATOR
 from hilsplat.query.node_search import NodeHits
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.segment.origin import made_from_truth, masks_label
@@ -52,8 +53,7 @@ def answer(
         DeviceError: cuda was asked for and torch finds no device.
     """
     found = FinishedScene.locate(Path(folder), variant)
-    settings = found.evaluate_settings()
-    scene = LanguageScene.from_parts(found.parts, settings, threads=threads, device=device)
+    scene = LanguageScene.of(found, threads=threads, device=device)
     nodes = scene.find(text, level, answerer=answerer, view=view)
     hits = hits_of(scene, nodes, LISTED)
     label = masks_label(found.parts.masks)
@@ -99,6 +99,7 @@ def report(scene: LanguageScene, text: str, found: NodeHits, view: str | None = 
         views = ", ".join(hit.best_views)
         lines.append(
             f"{hit.node:>5}  {hit.level.label:<8} {hit.score:>5.2f}  {position:<24} {size:<20} {views}"
+            + (f"  named {hit.name!r}" if hit.name else "")
         )
     if more := len(found.ids) - len(hits):
         lines.append(f"and {counted(more, 'weaker answer')}, which the pictures show too")

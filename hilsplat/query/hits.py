@@ -46,13 +46,15 @@ class Hit:
     Attributes:
         node: row of the semantic tree.
         level: its level.
-        score: relevancy in (0, 1); 0.5 is no better than a generic word.
+        score: relevancy in (0, 1), where 0.5 is no better than a generic word; of what looks like a node or a
+            picture (route "like"), the cosine.
         centroid: scene units.
         box: axis-aligned, lower and upper corner, scene units.
         oriented_box: the box along the node's own axes.
         best_views: up to three train views that show it largest.
-        route: as in `NodeHits`.
+        route: as in `NodeHits`, or "like".
         doubts: texts of the query that nothing answers; a path is no better than its first text.
+        name: that a person gave the node, or empty.
     """
 
     node: int
@@ -64,6 +66,7 @@ class Hit:
     best_views: tuple[str, ...]
     route: str
     doubts: tuple[Doubt, ...]
+    name: str
     _scene: "LanguageScene" = field(repr=False, compare=False)
 
     @property
@@ -82,27 +85,30 @@ class Hit:
 
 def hits_of(scene: "LanguageScene", found: NodeHits, limit: int) -> list[Hit]:
     """Describe the best nodes that answered, at most `limit`."""
-    tree, doubts = scene.tree, doubts_of(scene, found)
-    hits = []
-    for node, margin in zip(found.ids[:limit].tolist(), found.margins[:limit], strict=True):
-        area = tree.view_area_px[node]
-        order = np.lexsort((np.arange(len(area)), -area))[:BEST_VIEWS]
-        low, high = tree.box[node].tolist()
-        hits.append(
-            Hit(
-                node,
-                Level(int(tree.level[node])),
-                scene.score(margin),
-                tuple(tree.centroid[node].tolist()),
-                (tuple(low), tuple(high)),
-                OrientedBox.from_array(tree.oriented_box[node]),
-                tuple(tree.view_names[row] for row in order if area[row] > 0),
-                found.route,
-                doubts,
-                scene,
-            )
-        )
-    return hits
+    doubts = doubts_of(scene, found)
+    best = zip(found.ids[:limit].tolist(), found.margins[:limit], strict=True)
+    return [hit_of(scene, node, scene.score(margin), found.route, doubts) for node, margin in best]
+
+
+def hit_of(scene: "LanguageScene", node: int, score: float, route: str, doubts: tuple[Doubt, ...]) -> Hit:
+    """Describe one node that answered."""
+    tree = scene.tree
+    area = tree.view_area_px[node]
+    order = np.lexsort((np.arange(len(area)), -area))[:BEST_VIEWS]
+    low, high = tree.box[node].tolist()
+    return Hit(
+        node,
+        Level(int(tree.level[node])),
+        score,
+        tuple(tree.centroid[node].tolist()),
+        (tuple(low), tuple(high)),
+        OrientedBox.from_array(tree.oriented_box[node]),
+        tuple(tree.view_names[row] for row in order if area[row] > 0),
+        route,
+        doubts,
+        scene.names.of_node.get(node, ""),
+        scene,
+    )
 
 
 def doubts_of(scene: "LanguageScene", found: NodeHits) -> tuple[Doubt, ...]:

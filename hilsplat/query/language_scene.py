@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 
 from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.device import ComputeDevice, compute_device
-from hilsplat.base.errors import SettingsError
+from hilsplat.base.errors import ModelError, SettingsError
 from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.model_store import is_embedded, meaningless
@@ -26,8 +26,9 @@ from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.field.code import Code, autoencoder_file, load_code
 from hilsplat.field.language_field import LanguageField
 from hilsplat.query.field_colours import field_colours
-from hilsplat.query.hits import Hit, hits_of
+from hilsplat.query.hits import Hit, hit_of, hits_of
 from hilsplat.query.latent_relevancy import LatentRelevancy
+from hilsplat.query.names import PATH_SEPARATOR, NodeNames, read_names
 from hilsplat.query.node_search import NodeHits, search
 from hilsplat.query.relevancy import margins, relevancy_of_margins
 from hilsplat.query.view_nodes import ViewNodes
@@ -42,7 +43,8 @@ from hilsplat.splat.gaussians import Gaussians
 
 logger = logging.getLogger(__name__)
 
-PATH_SEPARATOR = ">"
+NAMED = 2.0
+"""Cosine margin of a node for the name that a person gave it: the largest there is, so it comes first."""
 
 MIN_SHOWN_SHARE = 1e-4
 """Least share of a view that shows a node: 14 px of 384 x 384 show nothing."""
@@ -51,6 +53,7 @@ MIN_LATENT_SHARE = 0.5
 """A pixel has a latent at a level if Gaussians with one make up more than this share of it."""
 
 TextEncoder = Callable[[list[str]], np.ndarray]
+PictureEncoder = Callable[[np.ndarray], np.ndarray]
 Answerer = Literal["tree", "field"]
 
 
@@ -83,7 +86,9 @@ class LanguageScene:
         settings: canonical phrases, scale of the relevancy, and how nodes are selected.
         threads: number of threads for look-ups.
         device: "cpu" or "cuda", for look-ups of the field.
-        caution: why no answer of this scene means anything, in a sentence; empty: no such reason.
+        caution: why no answer of CLIP means anything here, in a sentence; empty: no such reason.
+        names: names that a person gave to nodes, which answer texts first.
+        encode_picture: unit CLIP vector of an RGB image; None: pictures cannot be looked for.
     """
 
     scene: Scene
@@ -97,6 +102,8 @@ class LanguageScene:
     threads: int = 1
     device: ComputeDevice = "cpu"
     caution: str = ""
+    names: NodeNames = field(default_factory=NodeNames)
+    encode_picture: PictureEncoder | None = field(default=None, repr=False)
     _views: ViewStore = field(default_factory=ViewStore, repr=False)
     _texts: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
 
@@ -121,12 +128,24 @@ class LanguageScene:
             ModelError: the CLIP that embedded its masks is not found.
             DeviceError: the device is cuda, and torch finds none.
         """
-        found = FinishedScene.locate(Path(folder), variant)
-        settings = found.evaluate_settings()
-        scene = LanguageScene.from_parts(found.parts, settings, threads=threads, device=device)
+        scene = LanguageScene.of(FinishedScene.locate(Path(folder), variant), threads=threads, device=device)
         if scene.caution:
             logger.warning("%s: %s", scene.scene.name, scene.caution)
         return scene
+
+    @staticmethod
+    def of(
+        found: FinishedScene, *, threads: int = 1, device: str = "cpu", opened: Opened | None = None
+    ) -> "LanguageScene":
+        """Open a finished scene that was located, with its own settings and the names given to its nodes."""
+        return LanguageScene.from_parts(
+            found.parts,
+            found.evaluate_settings(),
+            threads=threads,
+            device=device,
+            opened=opened,
+            names=read_names(found.folder, found.parts.semantic_tree),
+        )
 
     @staticmethod
     def from_parts(
@@ -136,6 +155,7 @@ class LanguageScene:
         threads: int = 1,
         device: str = "cpu",
         opened: Opened | None = None,
+        names: NodeNames | None = None,
     ) -> "LanguageScene":
         """Read a scene's artifacts, each once, and check that they belong together.
 
@@ -145,6 +165,7 @@ class LanguageScene:
             threads: as in `open`.
             device: as in `open`.
             opened: artifacts that other variants of the scene opened before.
+            names: names of nodes; None: none, as in evaluation, which scores the models alone.
 
         Raises:
             MisalignedArtifactError: the tree or field was made for other Gaussians, or the field for
@@ -188,6 +209,8 @@ class LanguageScene:
             meaningless(clip.model.folder.name)
             if is_embedded(clip.model.config) and not is_drawn(parts.scene)
             else "",
+            names=names or NodeNames(),
+            encode_picture=clip.embed_picture,
         )
 
     # -- answers ----------------------------------------------------------------------------------
@@ -221,6 +244,36 @@ class LanguageScene:
         """
         found = self.find(text, level, answerer=answerer, view=view, threshold=threshold)
         return hits_of(self, found, limit)
+
+    def like_node(self, node: int, *, limit: int = 10) -> list[Hit]:
+        """Nodes of a node's own level that look most like it, best first; scores are cosines.
+
+        It compares averaged CLIP vectors of masks, so it needs no text.
+
+        Raises:
+            SettingsError: there is no such node.
+        """
+        if not 0 <= node < len(self.tree):
+            raise SettingsError(f"there is no node {node}", expected=f"0 to {len(self.tree) - 1}")
+        same = self.tree.nodes_of(Level(int(self.tree.level[node])))
+        return self._nearest(self.tree.clip[node], same[same != node], limit)
+
+    def like_picture(self, picture: UInt8[np.ndarray, "H W 3"], *, limit: int = 10) -> list[Hit]:
+        """Nodes of any level that look most like a picture or a crop, best first; scores are cosines.
+
+        Raises:
+            ModelError: the CLIP of this scene embeds no pictures.
+        """
+        if self.encode_picture is None:
+            raise ModelError(f"{self.scene.name} was opened without a model that embeds pictures")
+        return self._nearest(self.encode_picture(picture), np.arange(len(self.tree)), limit)
+
+    def _nearest(
+        self, vector: Float32[np.ndarray, " C"], nodes: Int64[np.ndarray, " n"], limit: int
+    ) -> list[Hit]:
+        cosine = self.tree.clip[nodes] @ vector
+        order = np.lexsort((nodes, -cosine))[:limit]
+        return [hit_of(self, int(nodes[row]), float(cosine[row]), "like", ()) for row in order]
 
     def find(
         self,
@@ -351,11 +404,17 @@ class LanguageScene:
         return np.stack([self._texts[text] for text in texts])
 
     def node_margins(self, texts: Sequence[str], answerer: Answerer = "tree") -> Float32[np.ndarray, "T n"]:
-        """Cosine margin of every node for every text, over this scene's canonical phrases."""
+        """Cosine margin of every node for every text, over this scene's canonical phrases.
+
+        A node has the margin `NAMED` for the name that a person gave it.
+        """
         if not len(texts):
             return np.zeros((0, len(self.tree)), np.float32)
         canonical = self.text_vectors(self.settings.canonical)
-        return margins(self.node_vectors(answerer), self.text_vectors(texts), canonical)
+        found = margins(self.node_vectors(answerer), self.text_vectors(texts), canonical)
+        for row, text in zip(found, texts, strict=True):
+            row[self.names.nodes_of(text)] = NAMED
+        return found
 
     def node_relevancy(self, texts: Sequence[str], answerer: Answerer = "tree") -> Float32[np.ndarray, "T n"]:
         """Relevancy of every node to every text."""
@@ -418,6 +477,19 @@ class LanguageScene:
                     level_map[:] = row.min()
                     level_map[pixels] = row
         return maps.reshape(len(texts), len(LEVELS), height, width)
+
+    def gaussian_relevancy(self, text: str, level: str = "auto") -> Float32[np.ndarray, " N"]:
+        """The field's relevancy of every Gaussian at a level, or at its best; 0 without a latent."""
+        named = [each for each in LEVELS if level in ("auto", each.label)]
+        out = np.zeros(len(self.gaussians), np.float32)
+        vector = self.text_vectors([text])
+        for each in named:
+            latents = np.ascontiguousarray(self.language.features[:, each.index], np.float32)
+            has = np.flatnonzero((latents != 0).any(axis=1))
+            if len(has):
+                own = self._latent_relevancy.exact(latents[has], vector)[0]
+                out[has] = np.maximum(out[has], own)
+        return out
 
     def field_image(self, view: str, level: Level) -> UInt8[np.ndarray, "H W 3"]:
         """The field of a level as colours (see `field_colours`); uncovered pixels are black."""

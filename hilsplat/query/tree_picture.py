@@ -44,7 +44,7 @@ def export_tree(folder: Path, variant: str, out: Path | None, threads: int) -> s
     """
     found = FinishedScene.locate(folder, variant)
     out = out or found.folder / "export" / variant
-    scene = LanguageScene.from_parts(found.parts, found.evaluate_settings(), threads=threads)
+    scene = LanguageScene.of(found, threads=threads)
     write_json(out / "tree.json", {"scene": scene.scene.name, "nodes": readable_nodes(scene.tree)})
     write_tree_ply(found.parts.gaussians, scene.tree, out / "tree.ply")
     write_png(out / "tree.png", tree_picture(scene))

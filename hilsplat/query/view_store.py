@@ -8,9 +8,10 @@ VIEW_CACHE_MIB = 1024.0
 
 
 class ViewStore:
-    """Results per view; the least recently used go first when they exceed `VIEW_CACHE_MIB`."""
+    """Results per view; the least recently used go first when they exceed `most_mib`."""
 
-    def __init__(self) -> None:
+    def __init__(self, most_mib: float = VIEW_CACHE_MIB) -> None:
+        self._most_bytes = most_mib * 2**20
         self._kept: dict[tuple, tuple[Any, int]] = {}
 
     def get(self, key: tuple, compute: Callable[[], Any], size: Callable[[Any], int]) -> Any:
@@ -20,8 +21,6 @@ class ViewStore:
             return self._kept[key][0]
         value = compute()
         self._kept[key] = (value, size(value))
-        while (
-            len(self._kept) > 1 and sum(bytes_ for _, bytes_ in self._kept.values()) > VIEW_CACHE_MIB * 2**20
-        ):
+        while len(self._kept) > 1 and sum(bytes_ for _, bytes_ in self._kept.values()) > self._most_bytes:
             self._kept.pop(next(iter(self._kept)))
         return value

@@ -75,7 +75,7 @@ class FinishedScene:
         if not (folder / variant).exists():
             raise ArtifactError(
                 f"{folder} has no variant {variant!r}",
-                expected=f"one of {', '.join(_variants(folder)) or 'none yet'}",
+                expected=f"one of {', '.join(finished_variants(folder)) or 'none yet'}",
                 fix="name it under ablation_variants and run the workflow",
             )
         field = folder / variant / "field.safetensors"
@@ -140,7 +140,8 @@ def _section(section: type[Section], found: dict[str, Any]) -> Any:
     return section(**{name: value for name, value in found.items() if name in section.model_fields})
 
 
-def _variants(folder: Path) -> list[str]:
+def finished_variants(folder: Path) -> list[str]:
+    """Variants of a scene that have a field of their own."""
     return sorted(path.parent.name for path in folder.glob("*/field.safetensors"))
 
 

@@ -1,0 +1,123 @@
+"""Names that a person gave to nodes: they answer texts before CLIP does, and need no model.
+
+`names.json` in a scene's folder keeps them per semantic tree, by the digest of its `tree.npz`: rows of one
+tree mean nothing in another, so names of a tree that was made anew wait until that tree is back.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from hilsplat.base.artifacts import output_lock, read_json, sha256_of_bytes, sha256_of_file, write_json
+from hilsplat.base.errors import ArtifactError, SettingsError
+
+FILE = "names.json"
+FORMAT = "hilsplat-names-1"
+PATH_SEPARATOR = ">"
+LONGEST = 80
+"""Most characters of a name."""
+
+NO_FILE = "none"
+"""Version of a file that does not exist."""
+
+
+@dataclass(frozen=True)
+class NodeNames:
+    """Names of nodes of one semantic tree.
+
+    Attributes:
+        of_node: row of the tree -> its name.
+        version: of the file they were read from; a change must name it.
+    """
+
+    of_node: Mapping[int, str] = field(default_factory=lambda: MappingProxyType({}))
+    version: str = NO_FILE
+
+    def nodes_of(self, text: str) -> list[int]:
+        """Nodes with this name, whatever its capitals and spaces."""
+        wanted = _plain(text)
+        return [node for node, name in self.of_node.items() if _plain(name) == wanted]
+
+
+def tree_digest(semantic_tree: Path) -> str:
+    """What identifies a semantic tree."""
+    return sha256_of_file(Path(semantic_tree) / "tree.npz")
+
+
+def read_names(folder: Path, semantic_tree: Path) -> NodeNames:
+    """Names of a tree; none if nobody gave any.
+
+    Args:
+        folder: of the scene.
+        semantic_tree: the artifact whose nodes are named.
+
+    Raises:
+        ArtifactError: the file is damaged or of another version.
+    """
+    path = Path(folder) / FILE
+    kept = _kept(path)["trees"].get(tree_digest(semantic_tree), {})
+    return NodeNames(MappingProxyType({int(node): name for node, name in kept.items()}), _version(path))
+
+
+def write_names(
+    folder: Path, semantic_tree: Path, names: Mapping[int, str], num_nodes: int, version: str
+) -> NodeNames:
+    """Replace the names of a tree, unless the file has changed since `version` was read.
+
+    Args:
+        folder: of the scene.
+        semantic_tree: the artifact whose nodes are named.
+        names: row of the tree -> name; all of them, empty names are taken away.
+        num_nodes: of the tree.
+        version: as in `NodeNames`.
+
+    Raises:
+        StaleNamesError: someone else changed the names.
+        SettingsError: a name is too long or holds the separator of paths, or there is no such node.
+    """
+    path = Path(folder) / FILE
+    given = {node: " ".join(name.split()) for node, name in names.items()}
+    for node, name in given.items():
+        if not 0 <= node < num_nodes:
+            raise SettingsError(f"there is no node {node} to name", expected=f"0 to {num_nodes - 1}")
+        if len(name) > LONGEST or PATH_SEPARATOR in name or not name.isprintable():
+            raise SettingsError(
+                f"{name!r} cannot be a name",
+                expected=f"at most {LONGEST} letters, without {PATH_SEPARATOR!r}, which separates a path",
+            )
+    with output_lock(path):
+        if _version(path) != version:
+            raise StaleNamesError(
+                f"the names in {path} have changed meanwhile", fix="read them again, then change them"
+            )
+        found = _kept(path)
+        found["trees"][tree_digest(semantic_tree)] = {
+            str(node): name for node, name in sorted(given.items()) if name
+        }
+        write_json(path, found)
+    return read_names(folder, semantic_tree)
+
+
+class StaleNamesError(ArtifactError):
+    """Names were changed by someone else since they were read."""
+
+
+def _plain(text: str) -> str:
+    return " ".join(text.split()).casefold()
+
+
+def _version(path: Path) -> str:
+    return sha256_of_bytes(path.read_bytes())[:16] if path.is_file() else NO_FILE
+
+
+def _kept(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        return {"format": FORMAT, "trees": {}}
+    found = read_json(path)
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        raise ArtifactError(
+            f"{path} is of another version", expected=FORMAT, fix="move it away to start anew"
+        )
+    return found

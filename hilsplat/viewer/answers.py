@@ -1,0 +1,98 @@
+"""Answers as the page reads them: hits, relevancy of every node, doubts, masks, boxes."""
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from hilsplat.query.hits import Hit, doubts_of, hits_of
+from hilsplat.query.language_scene import LanguageScene, path_of
+from hilsplat.viewer.payload import box_corners
+
+LISTED = 24
+"""Most answers to list."""
+
+
+def answer(
+    scene: LanguageScene,
+    text: str,
+    level: str = "auto",
+    answerer: str = "tree",
+    view: str | None = None,
+    threshold: float | None = None,
+) -> dict[str, Any]:
+    """Ask a scene for a text: hits, relevancy of every node to the last text, doubts."""
+    begin = time.perf_counter()
+    found = scene.find(text, level, answerer=answerer, view=view, threshold=threshold)
+    hits, path = hits_of(scene, found, LISTED), path_of(text)
+    relevancy = scene.node_relevancy([path[-1]], "field" if answerer == "field" else "tree")[0]
+    named = all(scene.names.nodes_of(part) for part in path)
+    return {
+        "text": text,
+        "level": found.level.label,
+        "hits": [described_hit(scene, hit) for hit in hits],
+        "total": len(found.ids),
+        "relevancy": np.round(relevancy, 4).tolist(),
+        "doubts": [str(doubt) for doubt in doubts_of(scene, found)],
+        "caution": "" if named else scene.caution,
+        "route": found.route,
+        "ms": round(1e3 * (time.perf_counter() - begin), 2),
+    }
+
+
+def alike(scene: LanguageScene, hits: Sequence[Hit], what: str, also: Sequence[int] = ()) -> dict[str, Any]:
+    """What looks like a node or a picture; `also` are nodes that belong to the answer anyway."""
+    relevancy = np.zeros(len(scene.tree))
+    relevancy[[hit.node for hit in hits]] = [max(hit.score, 0.0) for hit in hits]
+    relevancy[list(also)] = 1
+    return {
+        "text": what,
+        "level": hits[0].level.label if hits else "",
+        "hits": [described_hit(scene, hit) for hit in hits],
+        "total": len(hits),
+        "relevancy": np.round(relevancy, 4).tolist(),
+        "doubts": [],
+        "caution": "",
+        "route": "like",
+        "ms": 0,
+    }
+
+
+def described_hit(scene: LanguageScene, hit: Hit) -> dict[str, Any]:
+    """One answer."""
+    return {
+        "node": hit.node,
+        "level": hit.level.label,
+        "score": round(hit.score, 4),
+        "name": hit.name,
+        "best_views": [scene.views.index(view) for view in hit.best_views],
+    }
+
+
+def boxes(scene: LanguageScene, nodes: Sequence[int]) -> dict[str, Any]:
+    """Boxes of nodes, for other programs."""
+    tree = scene.tree
+    return {
+        "format": "hilsplat-boxes-1",
+        "scene": scene.scene.name,
+        "unit": scene.scene.unit,
+        "axes": "right-handed; cameras in OpenCV axes (x right, y down, z forward)",
+        "scene_from_source": scene.scene.scene_from_source.tolist(),
+        "boxes": [
+            {
+                "node": node,
+                "name": scene.names.of_node.get(node, ""),
+                "level": int(tree.level[node]),
+                "parent": int(tree.parent[node]),
+                "centre": tree.oriented_box[node][0].tolist(),
+                "axes": tree.oriented_box[node][1:4].tolist(),
+                "size": tree.oriented_box[node][4].tolist(),
+                "corners": box_corners(tree.oriented_box[node]),
+                "lower": tree.box[node][0].tolist(),
+                "upper": tree.box[node][1].tolist(),
+                "centroid": tree.centroid[node].tolist(),
+            }
+            for node in nodes
+        ],
+    }

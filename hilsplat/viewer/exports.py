@@ -1,0 +1,209 @@
+"""Files that the page offers: Gaussians, boxes, masks of all views, films, crops."""
+
+import io
+import json
+import zipfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, UInt8
+from PIL import Image
+
+from hilsplat.base.film import write_film
+from hilsplat.query.language_scene import LanguageScene
+from hilsplat.scene.cameras import Camera
+from hilsplat.scene.scene import Scene
+from hilsplat.semantic_tree.export import write_selection_ply
+from hilsplat.splat.flyaround import closed_path
+from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.rasterise.cpu import blend_forward, project_gaussians
+from hilsplat.viewer.frames import Paint, painted
+
+FRAMES_PER_S = 24
+GIF_FRAMES_PER_S = 12
+CROP_PX = 160
+CROP_MARGIN = 0.15
+LEAST_ALPHA = 0.1
+"""A pixel that Gaussians cover by less belongs to no node; small things are enlarged, so gaps open."""
+DIMMED = 0.3
+"""Brightness of a crop outside the node."""
+
+
+def encoded(pixels: UInt8[np.ndarray, "H W 3"], kind: str = "jpeg", quality: int = 80) -> bytes:
+    """An image as the bytes of a JPEG or PNG."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if kind == "jpeg" else []
+    made, data = cv2.imencode(".jpg" if kind == "jpeg" else ".png", pixels[..., ::-1], options)
+    assert made
+    return data.tobytes()
+
+
+def selection_ply(gaussians_ply: Path, rows: np.ndarray) -> bytes:
+    """Some Gaussians as a 3DGS PLY."""
+    with TemporaryDirectory() as folder:
+        out = Path(folder) / "selection.ply"
+        write_selection_ply(gaussians_ply, rows, out)
+        return out.read_bytes()
+
+
+# -- masks ----------------------------------------------------------------------------------------
+
+
+def masks_zip(scene: LanguageScene, nodes: Sequence[int]) -> bytes:
+    """Masks of nodes in all views: a PNG per node and view that shows it, and one COCO file."""
+    held = io.BytesIO()
+    coco: dict[str, Any] = {
+        "info": {"description": f"{scene.scene.name}: masks of nodes, by hilsplat"},
+        "images": [],
+        "categories": [
+            {"id": node, "name": scene.names.of_node.get(node) or f"node {node}"} for node in nodes
+        ],
+        "annotations": [],
+    }
+    with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
+        for number, view in enumerate(scene.views):
+            height, width = scene.scene.cameras[view].size_hw
+            coco["images"].append({"id": number, "file_name": view, "height": height, "width": width})
+            for node in nodes:
+                mask = scene.node_masks(view, [node])
+                if not mask.any():
+                    continue
+                archive.writestr(
+                    f"masks/{Path(view).stem}/{node}.png", _png(mask), compress_type=zipfile.ZIP_STORED
+                )
+                rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+                box = (columns[0], rows[0], np.ptp(columns) + 1, np.ptp(rows) + 1)
+                coco["annotations"].append(
+                    {
+                        "id": len(coco["annotations"]) + 1,
+                        "image_id": number,
+                        "category_id": node,
+                        "iscrowd": 0,
+                        "area": int(mask.sum()),
+                        "bbox": [int(side) for side in box],
+                        "segmentation": {"size": [height, width], "counts": coco_counts(mask)},
+                    }
+                )
+        archive.writestr("coco.json", json.dumps(coco, ensure_ascii=False))
+    return held.getvalue()
+
+
+def coco_counts(mask: Bool[np.ndarray, "H W"]) -> list[int]:
+    """COCO's uncompressed run lengths: column by column, beginning with the zeros."""
+    flat = mask.T.ravel()
+    edges = np.flatnonzero(flat[1:] != flat[:-1]) + 1
+    runs = np.diff(np.concatenate([[0], edges, [len(flat)]])).tolist()
+    return [0, *runs] if flat[0] else runs
+
+
+def _png(mask: Bool[np.ndarray, "H W"]) -> bytes:
+    held = io.BytesIO()
+    Image.fromarray(mask).save(held, format="PNG")
+    return held.getvalue()
+
+
+# -- crops ----------------------------------------------------------------------------------------
+
+
+def crop(scene: LanguageScene, node: int, threads: int = 1) -> UInt8[np.ndarray, "S S 3"]:
+    """A square of the photograph that shows a node largest, with the rest of it dimmed.
+
+    Only the square is drawn: a camera whose picture is the square sees which of its pixels are the node's.
+    """
+    tree = scene.tree
+    view = tree.view_names[int(tree.view_area_px[node].argmax())]
+    camera, photograph = scene.scene.cameras[view], scene.image(view)
+    rows = scene.gaussians_of([node])
+    x, y, side = _square_around(scene.gaussians.means[rows], camera)
+    shift = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
+    scale = np.diag([CROP_PX / side, CROP_PX / side, 1.0])
+    inside = Camera("crop", camera.cam_from_world, scale @ shift @ camera.K, (CROP_PX, CROP_PX))
+    member = np.zeros((len(scene.gaussians), 1), np.float32)
+    member[rows] = 1
+    drawn = project_gaussians(scene.gaussians, inside, 0, threads)
+    shares, alpha = blend_forward(drawn, member, threads)
+    is_node = shares[..., 0] > 0.5 * np.maximum(alpha, LEAST_ALPHA)
+    pixels = resampled(photograph, x, y, side)
+    return np.where(is_node[..., None], pixels, (pixels * DIMMED).astype(np.uint8))
+
+
+def resampled(image: UInt8[np.ndarray, "H W 3"], x: float, y: float, side: float) -> np.ndarray:
+    """The square (x, y, side) of an image at `CROP_PX` px; black beyond its borders."""
+    shrink = max(1.0, side / CROP_PX)  # warping does not average areas: shrink first
+    if shrink > 1:
+        image = cv2.resize(image, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
+    scale = CROP_PX * shrink / side
+    # pixel centres lie at .5 here, at 0 in OpenCV
+    move = np.array([[scale, 0, -scale * x / shrink], [0, scale, -scale * y / shrink]])
+    move[:, 2] += 0.5 * scale - 0.5
+    return cv2.warpAffine(image, move, (CROP_PX, CROP_PX), flags=cv2.INTER_LINEAR)
+
+
+def _square_around(points: np.ndarray, camera: Camera) -> tuple[float, float, float]:
+    """Left, top and side of a square around most of some points, px."""
+    local = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    local = local[local[:, 2] > 0.01]
+    height, width = camera.size_hw
+    if not len(local):
+        return 0.0, 0.0, float(max(height, width))
+    places = local @ camera.K.T
+    xy = places[:, :2] / places[:, 2:]
+    low, high = np.percentile(xy, (3, 97), axis=0)
+    low, high = np.clip(low, 0, (width, height)), np.clip(high, 0, (width, height))
+    side = float((high - low).max()) * (1 + 2 * CROP_MARGIN) + 4
+    x, y = ((low + high) / 2 - side / 2).tolist()
+    return x, y, side
+
+
+# -- films ----------------------------------------------------------------------------------------
+
+
+def film(
+    gaussians: Gaussians,
+    scene: Scene,
+    paint: Paint | None,
+    *,
+    kind: str = "mp4",
+    frames: int = 120,
+    side_px: int = 640,
+    threads: int = 1,
+) -> bytes:
+    """A closed flight around what the training cameras saw, in the colours of a style."""
+    cameras = [scene.cameras[view] for view in scene.views("train") or scene.views()]
+    height, width = cameras[0].size_hw
+    scale = side_px / max(height, width)
+    size_hw = (max(2, round(height * scale / 2) * 2), max(2, round(width * scale / 2) * 2))
+    path = [camera.scaled(size_hw) for camera in closed_path(cameras, frames)]
+
+    def pictures() -> Iterator[np.ndarray]:
+        for camera in path:
+            yield painted(gaussians, camera, paint, threads)
+
+    with TemporaryDirectory() as folder:
+        out = Path(folder) / f"film.{kind}"
+        if kind == "mp4":
+            write_film(out, pictures(), FRAMES_PER_S)
+        else:
+            write_gif(out, pictures())
+        return out.read_bytes()
+
+
+def write_gif(path: Path, frames: Iterator[np.ndarray]) -> None:
+    """Every other frame as a GIF that repeats, with 128 colours chosen from the whole film."""
+    kept = [Image.fromarray(frame) for number, frame in enumerate(frames) if number % 2 == 0]
+    sheet = Image.new("RGB", (kept[0].width, kept[0].height * min(len(kept), 8)))
+    for number in range(min(len(kept), 8)):
+        sheet.paste(kept[number * len(kept) // min(len(kept), 8)], (0, number * kept[0].height))
+    palette = sheet.quantize(128)
+    first, *others = [frame.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for frame in kept]
+    first.save(
+        path,
+        save_all=True,
+        append_images=others,
+        duration=round(1000 / GIF_FRAMES_PER_S),
+        loop=0,
+        optimize=False,
+    )

@@ -1,0 +1,99 @@
+"""Pictures painted by the pipeline's own rasteriser, where the browser has no WebGL worth the name.
+
+It is also what films and stills are made with, and what a test compares the page's WebGL with.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float32, Int32, UInt8
+
+from hilsplat.base.images import to_uint8
+from hilsplat.scene.cameras import Camera
+from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.rasterise.cpu import blend_forward, project_gaussians
+from hilsplat.viewer.wire import Style
+
+GREY = np.array([0.299, 0.587, 0.114], np.float32)
+TINT = np.float32(0.35)
+"""Brightness of grey that `tint` leaves to what was not chosen. The page's shader has the same numbers."""
+GHOST = np.float32(0.08)
+"""Share of its opacity that `ghost` leaves to what was not chosen."""
+
+
+@dataclass(frozen=True)
+class Paint:
+    """A style, Gaussian by Gaussian.
+
+    Attributes:
+        rgb: colour that is mixed in.
+        share: how much of it, in [0, 1]; 0: not chosen.
+        mode: what becomes of those not chosen.
+    """
+
+    rgb: Float32[np.ndarray, "N 3"]
+    share: Float32[np.ndarray, " N"]
+    mode: str
+
+    @staticmethod
+    def of(
+        style: Style,
+        node_of_gaussian: Int32[np.ndarray, "N 3"] | None,
+        num_nodes: int,
+        relevancy: UInt8[np.ndarray, " N"] | None = None,
+        count: int = 0,
+    ) -> "Paint":
+        """Look a style up: the finest used level whose node has an alpha above 0 decides.
+
+        Args:
+            style: as the page sends it.
+            node_of_gaussian: of the tree; None: the scene has none yet.
+            num_nodes: of the tree.
+            relevancy: of every Gaussian in steps of 1/255, for a style with a ramp.
+            count: number of Gaussians, for a scene without a tree.
+
+        Raises:
+            ValueError: the table has another number of rows, or the ramp nothing to paint.
+        """
+        if style.ramp:
+            if relevancy is None:
+                raise ValueError("no field relevancy was asked for")
+            share = np.full(len(relevancy), 0.8, np.float32)
+            return Paint(style.colours()[relevancy].astype(np.float32) / 255, share, "plain")
+        if node_of_gaussian is None:
+            return Paint(np.zeros((count, 3), np.float32), np.zeros(count, np.float32), "plain")
+        table = style.rgba(num_nodes).astype(np.float32) / 255
+        found = np.zeros((len(node_of_gaussian), 4), np.float32)
+        for level in range(3):  # coarse to fine: a finer one replaces what is there
+            if style.use[level]:
+                own = table[node_of_gaussian[:, level] + 1]
+                found = np.where(own[:, 3:] > 0, own, found)
+        return Paint(found[:, :3], np.ascontiguousarray(found[:, 3]), style.mode)
+
+
+def painted(
+    gaussians: Gaussians, camera: Camera, paint: Paint | None = None, threads: int = 1
+) -> UInt8[np.ndarray, "H W 3"]:
+    """A view over black, as `render` draws it, in the colours of a style.
+
+    A chosen Gaussian's colour c becomes c (1 - share) + rgb share. Others: `plain` leaves them, `tint` makes
+    them dark grey, `ghost` nearly transparent, `isolate` invisible.
+    """
+    degree = min(gaussians.sh_degree, 3)
+    if paint is None:
+        view = project_gaussians(gaussians, camera, degree, threads)
+        return to_uint8(blend_forward(view, view.colours, threads)[0])
+    others = paint.share == 0
+    if paint.mode in ("ghost", "isolate"):
+        opacity = gaussians.opacities.astype(np.float32)
+        opacity[others] *= GHOST if paint.mode == "ghost" else np.float32(0)
+        with np.errstate(divide="ignore"):
+            logits = np.log(opacity) - np.log1p(-np.minimum(opacity, np.float32(1 - 1e-6)))
+        gaussians = replace(gaussians, opacity_logits=np.maximum(logits, np.float32(-30)))
+    view = project_gaussians(gaussians, camera, degree, threads)
+    colours = view.colours
+    if paint.mode == "tint":
+        colours = np.where(others[:, None], (TINT * (colours @ GREY))[:, None], colours)
+    share = paint.share[:, None]
+    colours = np.ascontiguousarray(colours * (1 - share) + paint.rgb * share, np.float32)
+    return to_uint8(blend_forward(view, colours, threads)[0])

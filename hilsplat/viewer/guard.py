@@ -1,0 +1,94 @@
+"""Who may talk to the page's server: a browser on this machine that was given the printed address.
+
+Loopback alone keeps nobody out: other users of the machine reach it, and so does any web page that the same
+browser shows. So every request needs a cookie that only the printed address sets, a Host that names this
+machine (against DNS rebinding), and, if it sends something, the page's own Origin and a content type that no
+form can send.
+"""
+
+import hmac
+import secrets
+from http.cookies import CookieError, SimpleCookie
+from urllib.parse import parse_qs
+
+from starlette.responses import PlainTextResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
+MAX_BODY_BYTES = 1 << 20
+HEADERS = {
+    "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' blob: data:; connect-src 'self'; worker-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "cross-origin-resource-policy": "same-origin",
+    "cross-origin-opener-policy": "same-origin",
+    "referrer-policy": "no-referrer",
+}
+
+
+class Guard:
+    """ASGI middleware that lets the owner's page in and nothing else.
+
+    Args:
+        app: what is guarded.
+        token: secret of the printed address.
+    """
+
+    def __init__(self, app: ASGIApp, token: str) -> None:
+        self.app = app
+        self.token = token
+        self.cookie = f"hilsplat-{secrets.token_hex(4)}"  # ports share cookies: a name for each server
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer 403 or 413, or pass the request on and add the headers to the answer."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
+        given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+        is_opening = scope["path"] == "/" and hmac.compare_digest(given.encode(), self.token.encode())
+        if refused := self._refusal(scope["method"], scope["path"], headers, is_opening):
+            await PlainTextResponse(refused, 403, HEADERS)(scope, receive, send)
+            return
+        if int(headers.get("content-length") or 0) > MAX_BODY_BYTES or "transfer-encoding" in headers:
+            await PlainTextResponse("too much was sent", 413, HEADERS)(scope, receive, send)
+            return
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                more = dict(HEADERS)
+                if is_opening:
+                    more["set-cookie"] = f"{self.cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+                message["headers"] = [
+                    *message["headers"],
+                    *((name.encode(), value.encode()) for name, value in more.items()),
+                ]
+            await send(message)
+
+        await self.app(scope, receive, send_with_headers)
+
+    def _refusal(self, method: str, path: str, headers: dict[str, str], is_opening: bool) -> str:
+        """Why a request is refused; empty if it is not."""
+        host = headers.get("host", "")
+        name = host.rpartition(":")[0] if host.rpartition(":")[2].isdigit() else host
+        if name not in LOCAL_NAMES:
+            return f"{host!r} is not this machine: open the printed address"
+        if headers.get("sec-fetch-site") == "cross-site" and not is_opening:
+            return "another site sent this"
+        if not is_opening and not self._has_cookie(headers.get("cookie", "")):
+            return "open the address that hilsplat view printed, with its token"
+        if method in ("GET", "HEAD"):
+            return ""
+        if headers.get("origin") not in (f"http://{host}",):
+            return "only the page itself may send something"
+        if headers.get("content-type", "").partition(";")[0].strip() != "application/json":
+            return "only JSON may be sent"
+        return ""
+
+    def _has_cookie(self, text: str) -> bool:
+        try:
+            found = SimpleCookie(text).get(self.cookie)
+        except CookieError:
+            return False
+        return found is not None and hmac.compare_digest(found.value.encode(), self.token.encode())

@@ -1,0 +1,98 @@
+"""A scene as one HTML file with its answers to some texts: no server, for papers and talks.
+
+The file is the page itself: its scripts as data addresses in an import map, `offline.js` in the place of
+`api.js`, and Gaussians, nodes, crops and small photographs as text. It asks the network for nothing.
+"""
+
+import base64
+import re
+import zlib
+from typing import TYPE_CHECKING, Any
+
+from hilsplat.base.images import resize_to_fit
+from hilsplat.viewer import answers, exports
+from hilsplat.viewer.payload import packed_gaussians, packed_nodes
+
+if TYPE_CHECKING:
+    from hilsplat.viewer.shown import ShownScene
+    from hilsplat.viewer.wire import Page
+
+PHOTO_PX = 320
+MAX_CROPS = 400
+"""A larger tree has crops of its wholes and of the answers alone."""
+
+POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' data: blob:; style-src 'unsafe-inline'; "
+    "img-src data: blob:; worker-src blob:"
+)
+
+
+def html_page(shown: "ShownScene", asked: "Page", static: dict[str, bytes]) -> bytes:
+    """The page of a scene, 8 MB for 60,000 Gaussians.
+
+    Args:
+        shown: the scene.
+        asked: variant, and the texts whose answers the page holds.
+        static: files of the page by name.
+
+    Raises:
+        SettingsError: a text is empty, or the variant cannot answer.
+    """
+    from hilsplat.viewer.shown import as_json
+
+    scene = shown.answering(asked.variant)
+    described: dict[str, Any] = {
+        "scene": {**shown.described(), "variants": [asked.variant]},
+        "variant": shown.described_variant(asked.variant),
+        "answers": [answers.answer(scene, text) for text in asked.texts],
+        "photos": [
+            _text(exports.encoded(resize_to_fit(scene.image(view), PHOTO_PX), quality=75))
+            for view in scene.views
+        ],
+    }
+    nodes = list(range(len(scene.tree)))
+    if len(nodes) > MAX_CROPS:
+        wholes = {int(node) for node in nodes if scene.tree.level[node] == 1}
+        nodes = sorted(wholes | {hit["node"] for answer in described["answers"] for hit in answer["hits"]})
+    crops = {node: _text(exports.encoded(exports.crop(scene, node, shown.threads))) for node in nodes}
+    described["crops"] = crops
+    scripts = {name: text.decode() for name, text in static.items() if name.endswith(".js")}
+    scripts["api.js"] = scripts.pop("offline.js")
+    sorter = scripts.pop("sorter.js")
+    imports = {
+        f"hilsplat/{name}": f"data:text/javascript;base64,{_text(_by_name(text).encode())}"
+        for name, text in scripts.items()
+    }
+    parts = {
+        "data": as_json(described).decode(),
+        "sorter": sorter,
+        "splats": _text(zlib.compress(packed_gaussians(shown.gaussians), 6)),
+        "nodes": _text(zlib.compress(packed_nodes(scene.tree), 6)),
+    }
+    held = "\n".join(
+        f'<script type="text/plain" id="{name}">{_inert(text)}</script>' for name, text in parts.items()
+    )
+    page = static["index.html"].decode()
+    head = (
+        f'<meta http-equiv="content-security-policy" content="{POLICY}">\n'
+        f"<style>\n{static['style.css'].decode()}</style>\n"
+        f'<script type="importmap">{_inert(as_json({"imports": imports}).decode())}</script>'
+    )
+    page = re.sub(r'<link rel="stylesheet"[^>]*>', lambda _: head, page)
+    page = re.sub(r'<script type="module"[^>]*></script>\n', "", page)
+    last = f'{held}\n<script type="module">import "hilsplat/main.js";</script>\n</body>'
+    return page.replace("</body>", last).encode()
+
+
+def _by_name(script: str) -> str:
+    """A module that imports its neighbours by name, because data addresses have no neighbours."""
+    return re.sub(r'from "\./', 'from "hilsplat/', script)
+
+
+def _inert(text: str) -> str:
+    """Text that cannot end the element it stands in; JSON reads it as before."""
+    return text.replace("</", "<\\/").replace("<!--", "<\\u0021--")
+
+
+def _text(data: bytes) -> str:
+    return base64.b64encode(data).decode()

@@ -1,0 +1,204 @@
+"""A scene's folder as the page shows it: Gaussians at once, each variant's answers when they exist."""
+
+import json
+import logging
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilsplat.base.artifacts import read_index, sha256_of_file
+from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError
+from hilsplat.query.language_scene import LanguageScene, Opened
+from hilsplat.query.view_store import ViewStore
+from hilsplat.scene.finished import FinishedScene, finished_variants
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.origin import masks_label
+from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.ply import load_ply
+from hilsplat.viewer import payload
+from hilsplat.viewer.frames import Paint
+from hilsplat.viewer.wire import Style
+
+VIEWS_MIB = 256.0
+"""Memory for what is kept of views, such as their compositing weights."""
+
+MAX_GAUSSIANS = 4_000_000
+"""More do not fit textures of 2048 x 8192 texels, nor a server of a few GiB."""
+
+logger = logging.getLogger(__name__)
+
+
+class ShownScene:
+    """What exists of a scene. Not made for threads: one thread calls it, and everything it returns.
+
+    Args:
+        folder: `results/<dataset>/<scene>`, or a copy of it anywhere.
+        variant: the one that answers first; it may not exist yet.
+        threads: number of threads for drawing.
+
+    Raises:
+        ArtifactError: the scene has no poses or no Gaussians yet, or too many to show.
+    """
+
+    def __init__(self, folder: Path, variant: str = "default", threads: int = 1) -> None:
+        self.folder, self.first, self.threads = Path(folder), variant, threads
+        self.opened = Opened()
+        ply = self.folder / "gaussians.ply"
+        if not self.folder.is_dir():
+            raise ArtifactError(
+                f"scene folder {folder} is missing",
+                expected="results/<dataset>/<scene> of a run, or a copy of it",
+                found=f"no such folder in {Path.cwd()}",
+                fix="correct the path, or name the results folder",
+            )
+        if not ply.exists():
+            raise ArtifactError(
+                f"{folder} has no Gaussians to show yet: {ply} is missing", fix=f"snakemake --cores 2 {ply}"
+            )
+        self.scene: Scene = self.opened.get(Scene.load, self.folder / "scene")
+        self.gaussians: Gaussians = self.opened.get(load_ply, ply)
+        if len(self.gaussians) > MAX_GAUSSIANS:
+            raise ArtifactError(
+                f"{ply} is too large for the page",
+                expected=f"at most {MAX_GAUSSIANS} Gaussians",
+                found=f"{len(self.gaussians)}",
+                fix="lower gaussians.max_gaussians",
+            )
+        self._variants: dict[str, LanguageScene] = {}
+        self._found: dict[str, FinishedScene] = {}
+        self._relevancy: dict[str, np.ndarray] = {}
+        self._painted: tuple[Any, Paint] | None = None
+
+    # -- variants ---------------------------------------------------------------------------------
+
+    @property
+    def variants(self) -> list[str]:
+        """Variants that answer by now, that of the start first."""
+        names = finished_variants(self.folder)
+        return sorted(names, key=lambda name: (name != self.first, name != "default", name))
+
+    def answering(self, variant: str) -> LanguageScene:
+        """The answers of a variant, opened at its first use.
+
+        Raises:
+            SettingsError: there is no such variant, or not yet.
+            HilsplatError: its parts cannot be opened.
+        """
+        if variant not in self._variants:
+            if variant not in self.variants:  # never a path: only what the folder lists
+                raise SettingsError(
+                    f"variant {variant!r} cannot answer here",
+                    expected=", ".join(self.variants) or "none yet: the run goes on",
+                )
+            found = FinishedScene.locate(self.folder, variant)
+            opened = LanguageScene.of(found, threads=self.threads, opened=self.opened)
+            if len(opened.tree) > payload.MAX_NODES:
+                raise ArtifactError(f"the tree of {variant} has {len(opened.tree)} nodes, too many to show")
+            self._variants[variant] = replace(opened, _views=ViewStore(VIEWS_MIB))
+            self._found[variant] = found
+        return self._variants[variant]
+
+    def found(self, variant: str) -> FinishedScene:
+        """Where the parts of a variant lie."""
+        self.answering(variant)
+        return self._found[variant]
+
+    def renamed(self, variant: str, names: Any) -> LanguageScene:
+        """Let new names answer, in every variant with the same tree."""
+        tree = self.found(variant).parts.semantic_tree.resolve()
+        for each, opened in list(self._variants.items()):
+            if self._found[each].parts.semantic_tree.resolve() == tree:
+                self._variants[each] = replace(opened, names=names)
+        return self._variants[variant]
+
+    # -- descriptions -----------------------------------------------------------------------------
+
+    def described(self) -> dict[str, Any]:
+        """The scene, and which variants answer by now."""
+        return {
+            **payload.described_scene(self.scene, self.gaussians),
+            "variants": self.variants,
+            "folder": self.folder.name,
+        }
+
+    def described_variant(self, variant: str) -> dict[str, Any]:
+        """The outline of a variant, and what made its masks and vectors."""
+        scene, parts = self.answering(variant), self.found(variant).parts
+        return {
+            "variant": variant,
+            **payload.described_nodes(scene.tree, scene.names),
+            "clip": Path(read_index(parts.clip)["model"]).name,
+            "masks": masks_label(parts.masks),
+            "caution": scene.caution,
+        }
+
+    @cached_property
+    def splats_tag(self) -> str:
+        """Digest of the Gaussians, for the browser's cache."""
+        return self.opened.get(sha256_of_file, self.folder / "gaussians.ply")[:32]
+
+    def view_name(self, number: int) -> str:
+        """The view with this number.
+
+        Raises:
+            SettingsError: there is none.
+        """
+        names = self.scene.cameras.names
+        if not 0 <= number < len(names):
+            raise SettingsError(f"there is no view {number}", expected=f"0 to {len(names) - 1}")
+        return names[number]
+
+    # -- painting ---------------------------------------------------------------------------------
+
+    def field_relevancy(self, variant: str, text: str, level: str) -> np.ndarray:
+        """The field's relevancy of every Gaussian to a text, as bytes; of all levels, the best.
+
+        Gaussians without a latent get 0.
+        """
+        scene = self.answering(variant)
+        found = scene.gaussian_relevancy(text, level)
+        self._relevancy = {variant: payload.as_steps(found)}
+        self._painted = None
+        return self._relevancy[variant]
+
+    def paint(self, variant: str, style: Style) -> Paint | None:
+        """A style, Gaussian by Gaussian; the last one is kept. None: the scene's own colours.
+
+        Raises:
+            SettingsError: the style does not fit the tree.
+        """
+        if not style.table and not style.ramp:
+            return None
+        key = (variant, style)
+        if self._painted is None or self._painted[0] != key:
+            try:
+                scene = self.answering(variant)
+                paint = Paint.of(
+                    style, scene.tree.node_of_gaussian, len(scene.tree), self._relevancy.get(variant)
+                )
+            except ValueError as error:
+                raise SettingsError(f"the style cannot be painted: {error}", fix="reload the page") from error
+            self._painted = (key, paint)
+        return self._painted[1]
+
+    def warm_up(self) -> None:
+        """Compile the loops of drawing and picking, so that the first frame does not wait for them."""
+        from hilsplat.viewer.frames import painted
+        from hilsplat.viewer.picking import pick
+
+        camera = self.scene.cameras[self.scene.cameras.names[0]].scaled((8, 8))
+        painted(self.gaussians, camera, None, self.threads)
+        pick(self.gaussians, None, camera, 4.0, 4.0, self.threads)
+        if self.first in self.variants:
+            try:
+                self.answering(self.first)
+            except HilsplatError as error:  # the Gaussians can still be looked at; the page shows why
+                logger.warning("no answers: %s", error)
+
+
+def as_json(value: Any) -> bytes:
+    """JSON as the page reads it."""
+    return json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()

@@ -1,0 +1,37 @@
+// The list of answers, and what is doubtful about them.
+
+import * as api from "./api.js";
+import { $, counted, make, nameOf } from "./elements.js";
+
+export function showAnswers(outline, answer, { choose, hover }) {
+  const list = $("answers");
+  $("answers-section").hidden = !answer?.hits.length;
+  $("caution").hidden = !(answer?.caution || outline?.caution);
+  $("caution").textContent = answer?.caution || outline?.caution || "";
+  list.replaceChildren(...(answer?.hits ?? []).map((hit, rank) => make("li", { "data-node": hit.node },
+    make("button", { type: "button", onclick: () => choose(hit.node), onpointerenter: () => hover(hit.node), onpointerleave: () => hover(-1), onfocus: () => hover(hit.node), onblur: () => hover(-1) },
+      make("img", { src: api.cropUrl(outline.variant, hit.node), alt: "", width: 44, height: 44 }),
+      make("span", { class: "name" }, nameOf(outline, hit.node), make("small", {}, `${rank + 1}. ${hit.level}`)),
+      bar(hit.score)))));
+}
+
+function bar(score) {
+  const filled = make("b");
+  filled.style.width = `${Math.round(100 * Math.max(0, Math.min(1, score)))}%`;
+  return make("span", { class: "score" }, score.toFixed(2), make("i", { "aria-hidden": "true" }, filled));
+}
+
+export function summary(answer) {
+  if (!answer.hits.length) return `Nothing answers to “${answer.text}”.`;
+  const best = answer.hits[0], alike = answer.route === "like";
+  const lines = [alike
+    ? `${counted(answer.hits.length, "node")}, most alike first; the best ${best.score.toFixed(2)}`
+    : `${counted(answer.total, "answer")}, best ${best.score.toFixed(2)}, ${answer.level}`];
+  if (!alike && best.score < 0.5) lines.push("Below 0.5: perhaps nothing of the kind.");
+  if (answer.route === "fallback") lines.push("No answer is part of anything that answers to the first text.");
+  return [...lines, ...answer.doubts.map((doubt) => doubt[0].toUpperCase() + doubt.slice(1) + ".")].join("\n");
+}
+
+export function markChosen(node) {
+  for (const item of $("answers").children) item.setAttribute("aria-current", String(Number(item.dataset.node) === node));
+}

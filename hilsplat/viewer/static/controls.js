@@ -1,0 +1,57 @@
+// Mouse, touch and wheel: drag orbits, two fingers or the right button move, wheel and pinch zoom, a tap picks,
+// and a frame drawn with Alt held asks for what is inside it.
+
+const TAP_PX = 4;
+
+export function attach(host, { camera, changed, rested, tapped, pointed, framed }) {
+  const pointers = new Map();
+  let moved = 0, rest = 0, apart = 0, start = null;
+  const touch = () => { clearTimeout(rest); changed(); rest = setTimeout(rested, 180); };
+  const place = (event) => { const box = host.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
+  const size = () => Math.min(host.clientWidth, host.clientHeight);
+
+  host.addEventListener("pointerdown", (event) => {
+    if (event.target.closest("button, select, details")) return;
+    host.setPointerCapture(event.pointerId);
+    pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, button: event.button });
+    if (pointers.size === 1) { moved = 0; start = event.altKey ? place(event) : null; }
+    apart = 0;
+  });
+
+  host.addEventListener("pointermove", (event) => {
+    const last = pointers.get(event.pointerId), box = host.getBoundingClientRect();
+    if (!last) { pointed(event.clientX - box.left, event.clientY - box.top); return; }
+    const dx = event.clientX - last.x, dy = event.clientY - last.y;
+    moved += Math.abs(dx) + Math.abs(dy);
+    Object.assign(last, { x: event.clientX, y: event.clientY });
+    if (moved < TAP_PX) return;
+    if (start) { framed(start, place(event), false); return; }
+    host.classList.add("dragging");
+    if (pointers.size === 2) {
+      const [a, b] = [...pointers.values()], now = Math.hypot(a.x - b.x, a.y - b.y);
+      if (apart) camera().zoom(apart / Math.max(now, 1));
+      apart = now;
+      camera().move(-dx / size() / 2, -dy / size() / 2, 0);
+    } else if (last.button === 2 || event.shiftKey) camera().move(-dx / size(), -dy / size(), 0);
+    else camera().orbit(-3.2 * dx / size(), 3.2 * dy / size());
+    touch();
+  });
+
+  const up = (event) => {
+    const last = pointers.get(event.pointerId), box = host.getBoundingClientRect();
+    pointers.delete(event.pointerId);
+    host.classList.remove("dragging");
+    if (start && moved >= TAP_PX) { framed(start, place(event), true); start = null; return; }
+    if (event.type === "pointerup" && last && moved < TAP_PX && last.button === 0) tapped(event.clientX - box.left, event.clientY - box.top);
+  };
+  host.addEventListener("pointerup", up);
+  host.addEventListener("pointercancel", up);
+  host.addEventListener("pointerleave", () => pointed(-1, -1));
+  host.addEventListener("contextmenu", (event) => event.preventDefault());
+  host.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    camera().zoom(Math.exp(0.0012 * event.deltaY * (event.deltaMode ? 30 : 1)));
+    touch();
+  }, { passive: false });
+  return touch;
+}

@@ -1,0 +1,12 @@
+// Latest wins: one request of a kind under way; a new one takes the place of the one that waits.
+export function latest(work) {
+  let busy = false, waiting = null;
+  return async function ask(...args) {
+    if (busy) { waiting = args; return; }
+    busy = true;
+    try { await work(...args); } finally {
+      busy = false;
+      if (waiting) { const next = waiting; waiting = null; ask(...next); }
+    }
+  };
+}

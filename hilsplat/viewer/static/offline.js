@@ -1,0 +1,35 @@
+// What takes the place of api.js in an exported page: everything is in the page itself.
+
+export const offline = true;
+
+export class Refused extends Error {}
+
+const held = (id) => document.getElementById(id).textContent.trim();
+const data = JSON.parse(held("data"));
+export const texts = data.answers.map((answer) => answer.text);
+
+async function unpacked(id) {
+  const bytes = Uint8Array.from(atob(held(id)), (c) => c.charCodeAt(0));
+  return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer();
+}
+
+const image = (text) => text ? `data:image/jpeg;base64,${text}` : "data:,";
+const none = async () => { throw new Refused("This page has no server."); };
+
+export const scene = async () => data.scene;
+export const variant = async () => data.variant;
+export const splats = () => unpacked("splats");
+export const nodes = () => unpacked("nodes");
+export const photoUrl = (number) => image(data.photos[number]);
+export const thumbUrl = photoUrl;
+export const cropUrl = (variant, node) => image(data.crops[node]);
+export const sorter = () => new Worker(URL.createObjectURL(new Blob([held("sorter")], { type: "text/javascript" })));
+
+export async function query({ text }) {
+  const plain = (words) => words.trim().toLowerCase().replace(/\s*>\s*/g, " > ");
+  const found = data.answers.find((answer) => plain(answer.text) === plain(text));
+  if (!found) throw new Refused(`This page was made with the answers to: ${texts.join(", ") || "nothing"}.`);
+  return found;
+}
+
+export const like = none, field = none, pick = none, frame = none, names = none, saved = none;

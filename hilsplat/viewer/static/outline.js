@@ -1,0 +1,108 @@
+// The semantic tree as a tree of the page: keys as in the ARIA practices, names and crops, folded when large.
+
+import * as api from "./api.js";
+import { $, counted, LEVELS, make, nameOf } from "./elements.js";
+
+const FOLD_FROM = 200;   // nodes: a larger tree is folded below its wholes
+
+export class Outline {
+  constructor({ choose, fly, hover }) {
+    this.root = $("outline");
+    this.items = new Map();
+    this.handlers = { choose, fly, hover };
+    this.root.addEventListener("keydown", (event) => this.key(event));
+    this.root.addEventListener("click", (event) => this.click(event));
+    this.root.addEventListener("pointerover", (event) => hover(this.nodeOf(event.target)));
+    this.root.addEventListener("pointerleave", () => hover(-1));
+  }
+
+  nodeOf(target) {
+    const item = target.closest("[role=treeitem]");
+    return item ? Number(item.dataset.node) : -1;
+  }
+
+  show(outline) {
+    this.outline = outline;
+    this.items.clear();
+    const children = new Map();
+    outline.nodes.forEach((node, row) => children.set(node.parent, [...(children.get(node.parent) ?? []), row]));
+    for (const rows of children.values()) rows.sort((a, b) => outline.nodes[b].gaussians - outline.nodes[a].gaussians);
+    const folded = outline.nodes.length >= FOLD_FROM;
+    const item = (row) => {
+      const node = outline.nodes[row], kids = children.get(row) ?? [];
+      const element = make("li", { role: "treeitem", tabindex: "-1", "data-node": row, "aria-selected": "false", "aria-level": node.level + 1,
+        "aria-expanded": kids.length ? String(!folded) : null, "aria-label": `${nameOf(outline, row)}, ${LEVELS[node.level]}` },
+      make("div", { class: "row" },
+        make("span", { class: "fold", "aria-hidden": "true" }, kids.length ? "▶" : ""),
+        make("img", { src: api.cropUrl(outline.variant, row), alt: "", loading: "lazy", width: 30, height: 30 }),
+        make("span", { class: "label" }, nameOf(outline, row)),
+        make("small", {}, counted(node.views, "view"))));
+      if (kids.length) element.append(make("ul", { role: "group" }, ...kids.map(item)));
+      this.items.set(row, element);
+      return element;
+    };
+    this.root.replaceChildren(...(children.get(-1) ?? []).map(item));
+    const first = this.root.querySelector("[role=treeitem]");
+    if (first) first.tabIndex = 0;
+    $("outline-section").hidden = !outline.nodes.length;
+    $("outline-title").textContent = `Outline: ${LEVELS.map((level, k) => counted(outline.nodes.filter((n) => n.level === k).length, level)).join(", ")}`;
+  }
+
+  renamed(row) {
+    const item = this.items.get(row);
+    item.querySelector(".label").textContent = nameOf(this.outline, row);
+    item.setAttribute("aria-label", `${nameOf(this.outline, row)}, ${LEVELS[this.outline.nodes[row].level]}`);
+  }
+
+  answered(nodes) {
+    for (const item of this.root.querySelectorAll(".answered")) item.classList.remove("answered");
+    for (const node of nodes) this.items.get(node)?.classList.add("answered");
+  }
+
+  select(node) {
+    for (const item of this.root.querySelectorAll("[aria-selected=true]")) item.setAttribute("aria-selected", "false");
+    const item = this.items.get(node);
+    if (!item) return;
+    item.setAttribute("aria-selected", "true");
+    for (let above = item.parentElement.closest("[role=treeitem]"); above; above = above.parentElement.closest("[role=treeitem]")) above.setAttribute("aria-expanded", "true");
+    this.rove(item);
+    item.querySelector(".row").scrollIntoView({ block: "nearest" });
+  }
+
+  rove(item, focus = false) {
+    for (const other of this.root.querySelectorAll("[tabindex='0']")) other.tabIndex = -1;
+    item.tabIndex = 0;
+    if (focus) { item.focus({ preventScroll: true }); item.querySelector(".row").scrollIntoView({ block: "nearest" }); }
+  }
+
+  click(event) {
+    const item = event.target.closest("[role=treeitem]");
+    if (!item) return;
+    if (event.target.closest(".fold")?.textContent) return this.fold(item, item.getAttribute("aria-expanded") !== "true");
+    this.handlers.choose(Number(item.dataset.node));
+  }
+
+  fold(item, open) { if (item.hasAttribute("aria-expanded")) item.setAttribute("aria-expanded", String(open)); }
+
+  get visible() {
+    return [...this.root.querySelectorAll("[role=treeitem]")].filter((item) => !item.parentElement.closest("[aria-expanded=false]"));
+  }
+
+  key(event) {
+    const item = event.target.closest("[role=treeitem]");
+    if (!item || event.ctrlKey || event.metaKey || event.altKey) return;
+    const shown = this.visible, at = shown.indexOf(item), open = item.getAttribute("aria-expanded");
+    const go = (to) => to && this.rove(to, true);
+    const actions = {
+      ArrowDown: () => go(shown[at + 1]), ArrowUp: () => go(shown[at - 1]), Home: () => go(shown[0]), End: () => go(shown.at(-1)),
+      ArrowRight: () => open === "false" ? this.fold(item, true) : go(item.querySelector("[role=treeitem]")),
+      ArrowLeft: () => open === "true" ? this.fold(item, false) : go(item.parentElement.closest("[role=treeitem]")),
+      Enter: () => { this.handlers.choose(Number(item.dataset.node)); if (event.shiftKey) this.handlers.fly(); },
+      " ": () => this.handlers.choose(Number(item.dataset.node)),
+    };
+    if (!actions[event.key]) return;
+    actions[event.key]();
+    event.preventDefault();
+    event.stopPropagation();
+  }
+}

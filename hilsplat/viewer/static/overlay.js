@@ -1,0 +1,32 @@
+// Boxes and labels over the picture, as SVG: always on top, crisp, and readable by tests.
+
+const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
+const NS = "http://www.w3.org/2000/svg";
+
+function element(name, attributes, text) {
+  const made = document.createElementNS(NS, name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  if (text) made.textContent = text;
+  return made;
+}
+
+// panes: [{boxes: [{corners, kind, label, node}]}], side by side in width x height CSS px.
+export function drawOverlay(svg, camera, panes, width, height) {
+  svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
+  const made = [], each = width / panes.length, k = camera.intrinsics(each, height);
+  panes.forEach((pane, number) => {
+    const group = element("g", { transform: `translate(${number * each} 0)` });
+    if (number) group.append(element("path", { class: "split", d: `M0 0V${height}` }));
+    for (const { corners, kind, label, node } of pane.boxes) {
+      const at = corners.map((corner) => camera.project(corner, k));
+      if (at.some((point) => !point)) continue;   // a corner behind the camera
+      const d = EDGES.map(([a, b]) => `M${at[a][0].toFixed(1)} ${at[a][1].toFixed(1)}L${at[b][0].toFixed(1)} ${at[b][1].toFixed(1)}`).join("");
+      group.append(element("path", { d, class: "shadow" }), element("path", { d, class: kind, "data-node": node }));
+      const top = at.reduce((best, point) => point[1] < best[1] ? point : best);
+      if (label) group.append(element("text", { x: Math.max(4, Math.min(each - 8 * label.length, top[0])), y: Math.max(14, top[1] - 6) }, label));
+    }
+    if (pane.label) group.append(element("text", { x: 12, y: height - 12 }, pane.label));
+    made.push(group);
+  });
+  svg.replaceChildren(...made);
+}

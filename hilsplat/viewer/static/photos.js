@@ -1,0 +1,46 @@
+// The strip of photographs, and the photograph laid over the view where the camera stands at it.
+
+import * as api from "./api.js";
+import { $, make } from "./elements.js";
+
+export class Photos {
+  constructor(views, stand) {
+    this.opacity = 0;
+    this.views = views;
+    $("views").replaceChildren(...views.map((view, number) => make("button", { type: "button", role: "option", "aria-selected": "false", tabindex: number ? "-1" : "0",
+      "aria-label": `${view.name}${view.split === "test" ? ", held out" : ""}`, title: view.name, class: view.split, onclick: () => stand(number) },
+    make("img", { src: api.thumbUrl(number), alt: "", loading: "lazy" }))));
+    $("views").addEventListener("keydown", (event) => {
+      const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+      if (!step) return;
+      const next = $("views").children[[...$("views").children].indexOf(document.activeElement) + step];
+      if (next) { next.focus(); next.click(); }
+      event.preventDefault(); event.stopPropagation();
+    });
+    $("photo").addEventListener("error", () => { $("photo").hidden = true; });
+  }
+
+  cycle() { this.opacity = (this.opacity + 1) % 3; }
+
+  // Put the photograph's frame exactly where the camera draws it.
+  place(camera, width, height, panes) {
+    const photo = $("photo"), number = camera.view;
+    const each = width / panes, { s, x, y } = camera.frame(each, height);
+    $("blend").setAttribute("aria-pressed", String(this.opacity > 0));
+    photo.hidden = !this.opacity || number < 0;
+    if (photo.hidden) return;
+    if (photo.dataset.number !== String(number)) { photo.src = api.photoUrl(number); photo.dataset.number = number; }
+    photo.classList.toggle("whole", this.opacity === 2);
+    Object.assign(photo.style, { left: `${x}px`, top: `${y}px`, width: `${s * camera.lens.w}px`, height: `${s * camera.lens.h}px` });
+  }
+
+  mark(number, shows = []) {
+    [...$("views").children].forEach((button, k) => {
+      const chosen = k === number;
+      if (chosen && button.getAttribute("aria-selected") !== "true") button.scrollIntoView({ block: "nearest", inline: "nearest" });
+      button.setAttribute("aria-selected", String(chosen));
+      button.tabIndex = chosen || (number < 0 && !k) ? 0 : -1;
+      button.classList.toggle("shows", shows.includes(k));
+    });
+  }
+}

@@ -1,0 +1,245 @@
+// The painter in the browser: WebGL2, one instanced quad per Gaussian, blended from back to front.
+
+import * as api from "./api.js";
+import { fragment, vertex } from "./shaders.js";
+
+const WIDTH = 2048;
+
+export function describe() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  if (!gl) return { works: false, name: "no WebGL2" };
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  const name = String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
+  const largest = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+  gl.getExtension("WEBGL_lose_context")?.loseContext();
+  return { works: true, name, largest, software: /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name) };
+}
+
+export class Renderer {
+  kind = "gl";
+  lastMs = 0;
+
+  constructor(host, onOrdered) {
+    this.canvas = document.createElement("canvas");
+    host.prepend(this.canvas);
+    this.gl = this.canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
+    this.onOrdered = onOrdered;
+    this.nodeTextures = new Map();
+    this.sorted = { count: 0, row: null, pending: false, number: 0 };
+    this.worker = api.sorter();
+    this.worker.onmessage = ({ data }) => this.ordered(data);
+  }
+
+  async load(buffer) {
+    const gl = this.gl, head = new DataView(buffer);
+    const n = head.getUint32(8, true), bases = head.getUint32(12, true), texels = head.getUint32(16, true);
+    const most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    if (Math.ceil(n * texels / WIDTH) > most) throw new Error(`${n} Gaussians do not fit the textures of this browser`);
+    this.count = n;
+    const geometry = new Uint32Array(buffer, 32, 8 * n), harmonics = new Uint32Array(buffer, 32 + 32 * n, 4 * texels * n);
+    this.program = this.link(vertex(bases, texels), fragment);
+    this.geometry = this.texture(gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT, geometry, 2 * n, 4);
+    this.harmonics = this.texture(gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT, harmonics, texels * n, 4);
+    this.nodeTextures.set("", this.texture(gl.RGBA16UI, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT, new Uint16Array(4 * n), n, 4));
+    this.style = gl.createTexture(); this.ramp = gl.createTexture();
+    this.styleBytes = null;
+    const means = new Float32Array(3 * n), floats = new Float32Array(buffer, 32, 8 * n);
+    for (let i = 0; i < n; i++) { means[3 * i] = floats[8 * i]; means[3 * i + 1] = floats[8 * i + 1]; means[3 * i + 2] = floats[8 * i + 2]; }
+    this.worker.postMessage({ means }, [means.buffer]);
+    this.arrays();
+  }
+
+  loadNodes(variant, buffer) {
+    const gl = this.gl, values = new Uint16Array(buffer);
+    this.nodeTextures.set(variant, this.texture(gl.RGBA16UI, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT, values, this.count, 4));
+    (this.nodeValues ??= new Map()).set(variant, values);
+  }
+
+  // Relevancy of each Gaussian, in the spare channel.
+  loadValues(variant, bytes) {
+    const values = this.nodeValues.get(variant);
+    for (let i = 0; i < bytes.length; i++) values[4 * i + 3] = bytes[i];
+    this.gl.deleteTexture(this.nodeTextures.get(variant));
+    this.loadNodes(variant, values.buffer);
+  }
+
+  link(vertexText, fragmentText) {
+    const gl = this.gl, program = gl.createProgram();
+    for (const [kind, text] of [[gl.VERTEX_SHADER, vertexText], [gl.FRAGMENT_SHADER, fragmentText]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, text);
+      gl.compileShader(shader);
+      gl.attachShader(program, shader);
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+    }
+    gl.bindAttribLocation(program, 0, "corner");
+    gl.bindAttribLocation(program, 1, "index");
+    gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
+    this.places = new Proxy({}, { get: (kept, name) => kept[name] ??= gl.getUniformLocation(program, name) });
+    return program;
+  }
+
+  texture(internal, format, type, data, texels, channels) {
+    const gl = this.gl, texture = gl.createTexture(), rows = Math.max(1, Math.ceil(texels / WIDTH));
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, internal, WIDTH, rows);
+    this.nearest();
+    const full = Math.floor(texels / WIDTH), rest = texels - full * WIDTH;   // the last row is not full
+    if (full) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, full, format, type, data, 0);
+    if (rest) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, full, rest, 1, format, type, data, full * WIDTH * channels);
+    return texture;
+  }
+
+  nearest() {
+    const gl = this.gl;
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
+    for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE);
+  }
+
+  arrays() {
+    const gl = this.gl;
+    gl.bindVertexArray(gl.createVertexArray());
+    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]), gl.STATIC_DRAW);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribPointer(0, 2, gl.FLOAT, false, 0, 0);
+    this.orderBuffer = gl.createBuffer();
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
+    gl.bufferData(gl.ARRAY_BUFFER, 4 * this.count, gl.DYNAMIC_DRAW);
+    gl.enableVertexAttribArray(1);
+    gl.vertexAttribIPointer(1, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(1, 1);
+  }
+
+  // Ask for the order of this camera; `ordered` draws again when it is there.
+  order(camera) {
+    const row = [...camera.R[2], camera.translation[2]], s = this.sorted;
+    s.wanted = row;
+    if (s.pending || (s.row && row.every((v, k) => v === s.row[k]))) return;
+    s.pending = true; s.row = row;
+    this.worker.postMessage({ row, order: s.spare }, s.spare ? [s.spare.buffer] : []);
+    s.spare = undefined;
+  }
+
+  ordered({ order, count }) {
+    const gl = this.gl, s = this.sorted;
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
+    gl.bufferSubData(gl.ARRAY_BUFFER, 0, order, 0, count);
+    Object.assign(s, { count, spare: order, pending: false });
+    this.onOrdered();
+  }
+
+  get settled() { return !this.sorted.pending && this.sorted.row && this.sorted.wanted.every((v, k) => v === this.sorted.row[k]); }
+
+  resize(width, height) {
+    if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
+  }
+
+  // panes: [{variant, style}], side by side with one camera. width and height: of the whole canvas, px.
+  draw(camera, panes, width, height) {
+    const gl = this.gl, begin = performance.now();
+    this.resize(width, height);
+    this.order(camera);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.disable(gl.SCISSOR_TEST);
+    gl.clearColor(0, 0, 0, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    const each = Math.floor(width / panes.length);
+    panes.forEach((pane, k) => this.pane(camera, pane, k * each, each, height, 0));
+    this.numbers = null;
+    this.lastMs = performance.now() - begin;
+  }
+
+  pane(camera, pane, left, width, height, numbering) {
+    const gl = this.gl, at = this.places, k = camera.intrinsics(width, height);
+    gl.viewport(left, 0, width, height);
+    gl.enable(gl.SCISSOR_TEST);
+    gl.scissor(left, 0, width, height);
+    gl.useProgram(this.program);
+    this.uploadStyle(pane.style);
+    const textures = [["geometry", this.geometry], ["harmonics", this.harmonics],
+      ["nodes", this.nodeTextures.get(pane.variant) ?? this.nodeTextures.get("")], ["style", this.style], ["ramp", this.ramp]];
+    textures.forEach(([name, texture], number) => {
+      gl.activeTexture(gl.TEXTURE0 + number);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+      gl.uniform1i(at[name], number);
+    });
+    const R = camera.R, margin = [0.15 * width / k.fx, 0.15 * height / k.fy];
+    gl.uniformMatrix3fv(at.rotation, true, R.flat());
+    gl.uniform3fv(at.translation, camera.translation);
+    gl.uniform3fv(at.centre, camera.c);
+    gl.uniform4f(at.lens, k.fx, k.fy, k.cx, k.cy);
+    gl.uniform4f(at.limits, -k.cx / k.fx - margin[0], (width - k.cx) / k.fx + margin[0], -k.cy / k.fy - margin[1], (height - k.cy) / k.fy + margin[1]);
+    gl.uniform2f(at.size, width, height);
+    gl.uniform3iv(at.use, pane.style.use.map(Number));
+    gl.uniform1i(at.mode, ["plain", "tint", "ghost", "isolate"].indexOf(pane.style.mode));
+    gl.uniform1i(at.ramped, Number(Boolean(pane.style.ramp)));
+    gl.uniform1i(at.numbering, numbering);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.sorted.count);
+  }
+
+  uploadStyle(style) {
+    const gl = this.gl, put = (texture, bytes, width, rows) => {
+      gl.activeTexture(gl.TEXTURE0);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, width, rows, 0, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+      this.nearest();
+    };
+    if (this.styleBytes === style.table && this.rampBytes === style.ramp) return;
+    this.styleBytes = style.table; this.rampBytes = style.ramp;
+    const rows = Math.max(1, Math.ceil(style.table.length / 4 / WIDTH)), full = new Uint8Array(4 * WIDTH * rows);
+    full.set(style.table);
+    put(this.style, full, WIDTH, rows);
+    const ramp = new Uint8Array(4 * 256).fill(255);
+    if (style.ramp) for (let i = 0; i < 256; i++) ramp.set(style.ramp.subarray(3 * i, 3 * i + 3), 4 * i);
+    put(this.ramp, ramp, 256, 1);
+  }
+
+  // The Gaussian that a pixel of a pane shows, or -1; drawn once per camera.
+  gaussianAt(camera, pane, x, y, width, height) {
+    const gl = this.gl, w = Math.max(1, Math.round(width / 2)), h = Math.max(1, Math.round(height / 2));
+    if (!this.numbers || this.numbers.w !== w || this.numbers.h !== h) {
+      if (!this.target) {
+        this.target = gl.createFramebuffer();
+        this.targetTexture = gl.createTexture();
+      }
+      gl.activeTexture(gl.TEXTURE7);
+      gl.bindTexture(gl.TEXTURE_2D, this.targetTexture);
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, w, h, 0, gl.RGBA, gl.UNSIGNED_BYTE, null);
+      this.nearest();
+      gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.targetTexture, 0);
+      gl.disable(gl.BLEND); gl.disable(gl.SCISSOR_TEST);
+      gl.clearColor(0, 0, 0, 0);
+      gl.clear(gl.COLOR_BUFFER_BIT);
+      this.pane(camera, { ...pane, style: { ...pane.style, mode: pane.style.mode === "isolate" ? "isolate" : "plain" } }, 0, w, h, 1);
+      this.numbers = { w, h };
+    }
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
+    const pixel = new Uint8Array(4);
+    gl.readPixels(Math.floor(x / 2), h - 1 - Math.floor(y / 2), 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    return pixel[3] ? pixel[0] + 256 * pixel[1] + 65536 * pixel[2] - 1 : -1;
+  }
+
+  nodesAt(variant, gaussian) {
+    const values = this.nodeValues?.get(variant);
+    return values && gaussian >= 0 ? [0, 1, 2].map((level) => values[4 * gaussian + level] - 1) : [-1, -1, -1];
+  }
+
+  // A picture must be drawn and read in one task: the canvas is not kept.
+  capture(camera, panes, width, height) {
+    this.draw(camera, panes, width, height);
+    return new Promise((done) => this.canvas.toBlob(done, "image/png"));
+  }
+
+  pixels(camera, panes, width, height) {
+    this.draw(camera, panes, width, height);
+    const data = new Uint8Array(4 * width * height);
+    this.gl.readPixels(0, 0, width, height, this.gl.RGBA, this.gl.UNSIGNED_BYTE, data);
+    return data;
+  }
+}

@@ -1,0 +1,59 @@
+// The painter on the server: JPEG frames by hilsplat's rasteriser, where WebGL is software or missing.
+
+import * as api from "./api.js";
+import { latest } from "./latest.js";
+import { wireStyle } from "./styles.js";
+
+export class ServerPainter {
+  kind = "server";
+  lastMs = 0;
+
+  constructor(host, onDrawn, onError) {
+    this.canvas = document.createElement("canvas");
+    host.prepend(this.canvas);
+    this.context = this.canvas.getContext("2d");
+    this.moving = false;
+    this.drawn = 0; this.asked = 0;
+    this.request = latest(async (...args) => {
+      try { await this.fetch(...args); onDrawn(); } catch (error) { onError(error); }
+    });
+  }
+
+  async load() {}
+  loadNodes() {}
+  loadValues() {}
+  get settled() { return this.drawn === this.asked; }
+
+  resize(width, height) {
+    if (this.canvas.width === width && this.canvas.height === height) return;
+    const before = this.canvas.width ? this.context.getImageData(0, 0, this.canvas.width, this.canvas.height) : null;
+    Object.assign(this.canvas, { width, height });
+    if (before) this.context.putImageData(before, 0, 0);
+  }
+
+  draw(camera, panes, width, height) {
+    this.resize(width, height);
+    this.request(camera.copy(), panes, width, height, this.moving, ++this.asked);
+  }
+
+  async fetch(camera, panes, width, height, moving, number) {
+    const begin = performance.now(), each = Math.floor(width / panes.length);
+    const scale = Math.min(moving ? 0.5 : 1, 4096 / Math.max(each, height));
+    const size = [Math.max(1, Math.round(each * scale)), Math.max(1, Math.round(height * scale))];
+    const pictures = await Promise.all(panes.map((pane) => this.picture(camera, pane, size, moving ? 60 : 85, "jpeg")));
+    pictures.forEach((picture, k) => { this.context.drawImage(picture, k * each, 0, each, height); picture.close(); });
+    this.lastMs = performance.now() - begin;
+    this.drawn = number;
+  }
+
+  async picture(camera, pane, [width, height], quality, image) {
+    const blob = await api.frame({ variant: pane.variant || "default", camera: camera.wire(width, height), style: wireStyle(pane.style), quality, image });
+    return createImageBitmap(blob);
+  }
+
+  async capture(camera, panes, width, height) {
+    const canvas = new OffscreenCanvas(width, height), context = canvas.getContext("2d"), each = Math.floor(width / panes.length);
+    for (const [k, pane] of panes.entries()) context.drawImage(await this.picture(camera, pane, [each, height], 95, "png"), k * each, 0);
+    return canvas.convertToBlob({ type: "image/png" });
+  }
+}

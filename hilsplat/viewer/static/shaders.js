@@ -1,0 +1,122 @@
+// What `hilsplat.splat.rasterise.api.render` documents, as shaders: EWA projection with the ray clamped to
+// 30 % beyond the image, 0.3 px^2 added, alpha below 1/255 dropped and cut at 0.999, colour max(0, 0.5 + SH).
+
+export const vertex = (bases, texels) => `#version 300 es
+precision highp float; precision highp int; precision highp usampler2D;
+#define BASES ${bases}
+#define TEXELS ${texels}
+uniform usampler2D geometry, harmonics, nodes;
+uniform sampler2D style, ramp;
+uniform mat3 rotation;
+uniform vec3 translation, centre;
+uniform vec4 lens, limits;
+uniform vec2 size;
+uniform ivec3 use;
+uniform int mode, ramped;
+in vec2 corner;
+in uint index;
+out vec2 place;
+flat out vec4 paint;
+flat out uint number;
+
+ivec2 at(uint texel) { return ivec2(int(texel & 2047u), int(texel >> 11)); }
+
+vec3 harmonic(uint gaussian, vec3 d) {
+  float h[8 * TEXELS];
+  for (int t = 0; t < TEXELS; t++) {
+    uvec4 w = texelFetch(harmonics, at(gaussian * uint(TEXELS) + uint(t)), 0);
+    vec2 a = unpackHalf2x16(w.x), b = unpackHalf2x16(w.y), c = unpackHalf2x16(w.z), e = unpackHalf2x16(w.w);
+    h[8*t] = a.x; h[8*t+1] = a.y; h[8*t+2] = b.x; h[8*t+3] = b.y;
+    h[8*t+4] = c.x; h[8*t+5] = c.y; h[8*t+6] = e.x; h[8*t+7] = e.y;
+  }
+  #define SH(k) vec3(h[3*k], h[3*k+1], h[3*k+2])
+  vec3 rgb = 0.5 + 0.28209479177387814 * SH(0);
+  float x = d.x, y = d.y, z = d.z;
+  #if BASES > 1
+  rgb += 0.4886025119029199 * (-y * SH(1) + z * SH(2) - x * SH(3));
+  #endif
+  #if BASES > 4
+  float xx = x*x, yy = y*y, zz = z*z;
+  rgb += 1.0925484305920792 * (x*y * SH(4) - y*z * SH(5) - x*z * SH(7))
+       + 0.31539156525252005 * (2.0*zz - xx - yy) * SH(6) + 0.5462742152960396 * (xx - yy) * SH(8);
+  #endif
+  #if BASES > 9
+  rgb += -0.5900435899266435 * (y*(3.0*xx - yy) * SH(9) + x*(xx - 3.0*yy) * SH(15)) + 2.890611442640554 * x*y*z * SH(10)
+       - 0.4570457994644658 * (4.0*zz - xx - yy) * (y * SH(11) + x * SH(13))
+       + 0.3731763325901154 * z*(2.0*zz - 3.0*xx - 3.0*yy) * SH(12) + 1.445305721320277 * z*(xx - yy) * SH(14);
+  #endif
+  return max(rgb, 0.0);
+}
+
+void main() {
+  gl_Position = vec4(2.0, 2.0, 2.0, 1.0);   // outside, until proven visible
+  place = vec2(0.0); paint = vec4(0.0); number = index + 1u;
+  uvec4 first = texelFetch(geometry, at(2u * index), 0);
+  float opacity = uintBitsToFloat(first.w);
+  uvec4 own = texelFetch(nodes, at(index), 0);
+
+  vec4 chosen = vec4(0.0);
+  if (ramped == 1) chosen = vec4(texelFetch(ramp, ivec2(int(own.w), 0), 0).rgb, 0.8);
+  else for (int level = 0; level < 3; level++) if (use[level] == 1) {
+    vec4 found = texelFetch(style, at(own[level]), 0);
+    if (found.a > 0.0) chosen = found;
+  }
+  bool other = chosen.a == 0.0;
+  if (other && mode == 3) return;
+  if (other && mode == 2) opacity *= 0.08;
+  if (opacity < 1.0 / 255.0) return;
+
+  vec3 mean = uintBitsToFloat(first.xyz), p = rotation * mean + translation;
+  if (p.z <= 0.01) return;
+  uvec4 second = texelFetch(geometry, at(2u * index + 1u), 0);
+  vec2 s01 = unpackHalf2x16(second.x);
+  vec3 scale = exp(vec3(s01, unpackHalf2x16(second.y).x));
+  vec2 wx = unpackHalf2x16(second.z), yz = unpackHalf2x16(second.w);
+  vec4 q = normalize(vec4(wx, yz));
+  float w = q.x, i = q.y, j = q.z, k = q.w;
+  mat3 turn = mat3(1.0 - 2.0*(j*j + k*k), 2.0*(i*j + w*k), 2.0*(i*k - w*j),
+                   2.0*(i*j - w*k), 1.0 - 2.0*(i*i + k*k), 2.0*(j*k + w*i),
+                   2.0*(i*k + w*j), 2.0*(j*k - w*i), 1.0 - 2.0*(i*i + j*j));
+  mat3 axes = rotation * turn;
+  vec2 ray = clamp(p.xy / p.z, limits.xz, limits.yw), f = lens.xy / p.z;
+  float xx = 0.3, xy = 0.0, yy = 0.3;
+  for (int a = 0; a < 3; a++) {
+    vec3 axis = axes[a] * scale[a];
+    vec2 uv = f * (axis.xy - ray * axis.z);
+    xx += uv.x * uv.x; xy += uv.x * uv.y; yy += uv.y * uv.y;
+  }
+  if (!(xx * yy - xy * xy > 0.0)) return;
+  vec2 middle = lens.xy * p.xy / p.z + lens.zw;
+  float reach = sqrt(2.0 * log(255.0 * opacity));
+  vec2 half_size = reach * sqrt(vec2(xx, yy));
+  if (any(lessThan(middle + half_size, vec2(0.0))) || any(greaterThan(middle - half_size, size))) return;
+  // the quad lies along the axes of the ellipse; place is in standard deviations
+  float mid = 0.5 * (xx + yy), apart = length(vec2(0.5 * (xx - yy), xy));
+  float wide = mid + apart, narrow = max(mid - apart, 1e-4);
+  vec2 along = apart < 1e-7 * mid ? vec2(1.0, 0.0) : normalize(abs(wide - xx) > abs(wide - yy) ? vec2(xy, wide - xx) : vec2(wide - yy, xy));
+  place = reach * corner;
+  vec2 px = middle + place.x * sqrt(wide) * along + place.y * sqrt(narrow) * vec2(-along.y, along.x);
+  gl_Position = vec4(2.0 * px.x / size.x - 1.0, 1.0 - 2.0 * px.y / size.y, 0.0, 1.0);
+
+  vec3 rgb = harmonic(index, normalize(mean - centre));
+  if (other && mode == 1) rgb = vec3(0.35 * dot(rgb, vec3(0.299, 0.587, 0.114)));
+  paint = vec4(mix(rgb, chosen.rgb, chosen.a), opacity);
+}`;
+
+export const fragment = `#version 300 es
+precision highp float; precision highp int;
+in vec2 place;
+flat in vec4 paint;
+flat in uint number;
+uniform int numbering;
+out vec4 colour;
+void main() {
+  float alpha = min(paint.a * exp(-0.5 * dot(place, place)), 0.999);
+  if (numbering == 1) {   // the last one written is the nearest that is opaque enough
+    if (alpha < 0.12) discard;
+    colour = vec4(float(number & 255u), float((number >> 8) & 255u), float((number >> 16) & 255u), 255.0) / 255.0;
+    return;
+  }
+  if (alpha < 1.0 / 255.0) discard;
+  colour = vec4(paint.rgb * alpha, alpha);
+}`;

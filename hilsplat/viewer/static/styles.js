@@ -1,0 +1,68 @@
+// One function decides how every node is painted, for both painters.
+
+export const ANSWER = [255, 122, 0], CHOSEN = [58, 150, 255], HOVER = [255, 225, 70];
+const STOPS = [[0, 0, 4], [31, 12, 72], [85, 15, 109], [136, 34, 106], [186, 54, 85], [227, 89, 51], [249, 140, 10], [249, 201, 50], [252, 255, 164]];
+
+export const RAMP = (() => {
+  const ramp = new Uint8Array(768);
+  for (let i = 0; i < 256; i++) {
+    const at = i / 255 * (STOPS.length - 1), k = Math.min(Math.floor(at), STOPS.length - 2);
+    for (let c = 0; c < 3; c++) ramp[3 * i + c] = Math.round(STOPS[k][c] + (at - k) * (STOPS[k + 1][c] - STOPS[k][c]));
+  }
+  return ramp;
+})();
+
+// A colour that neighbours in the table do not share.
+export function colourOf(node) {
+  const hue = (node * 0.61803398875) % 1, value = (n) => {
+    const k = (n + hue * 12) % 12;
+    return Math.round(255 * (0.58 - 0.36 * Math.max(-1, Math.min(k - 3, 9 - k, 1))));
+  };
+  return [value(0), value(8), value(4)];
+}
+
+/*
+ * outline: the nodes of a variant; answer: what was found, or null; colour, mode: the choices of the page;
+ * level: 0, 1, 2 for what is painted by level; chosen, hover: nodes, or -1.
+ */
+export function styleOf({ outline, answer, colour, mode, level, chosen, hover, hasField }) {
+  const nodes = outline?.nodes ?? [], table = new Uint8Array(4 * (nodes.length + 1));
+  const set = (node, rgb, a) => { if (node >= 0 && node < nodes.length) table.set([...rgb, Math.round(255 * a)], 4 * (node + 1)); };
+  let use = [true, true, true];
+  if (colour === "field" && answer && hasField) return { table, use, mode: "plain", ramp: RAMP };
+  if (colour === "nodes" || (colour === "relevancy" && answer)) {
+    use = [0, 1, 2].map((each) => each === level);
+    const own = nodes.map((_, node) => node).filter((node) => nodes[node].level === level);
+    const values = own.map((node) => answer?.relevancy[node] ?? 0), low = Math.min(...values), high = Math.max(...values);
+    own.forEach((node, k) => {
+      const step = high > low ? Math.round(255 * (values[k] - low) / (high - low)) : 128;
+      set(node, colour === "nodes" ? colourOf(node) : RAMP.subarray(3 * step, 3 * step + 3), colour === "nodes" ? 0.6 : 0.8);
+    });
+    mode = "plain";
+  } else if (colour === "answers" && answer) {
+    answer.hits.forEach((hit, rank) => set(hit.node, ANSWER, 0.72 - 0.42 * rank / Math.max(answer.hits.length, 4)));
+    if (!answer.hits.length) mode = "plain";
+  } else if (chosen < 0 || colour === "none") mode = "plain";
+  if (chosen >= 0 && colour !== "none") {
+    if (colour === "nodes" || colour === "relevancy") use = use.map((used, k) => used || k === nodes[chosen]?.level);
+    set(chosen, CHOSEN, 0.62);
+  }
+  if (hover >= 0 && hover !== chosen && colour !== "none") set(hover, HOVER, 0.45);
+  return { table, use, mode, ramp: null };
+}
+
+const base64 = (bytes) => {
+  let text = "";
+  for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
+  return btoa(text);
+};
+const sent = new WeakMap();
+
+// A style as the server reads it; one that leaves everything as it is, is empty.
+export function wireStyle(style) {
+  if (!sent.has(style)) {
+    const plain = !style.ramp && style.mode === "plain" && style.table.every((v, k) => k % 4 !== 3 || v === 0);
+    sent.set(style, plain ? {} : { table: base64(style.table), use: style.use, mode: style.mode, ramp: style.ramp ? base64(style.ramp) : "" });
+  }
+  return sent.get(style);
+}

@@ -1,0 +1,166 @@
+"""What the page may send: shapes, sizes and finiteness are checked here, before anything is computed."""
+
+import base64
+import binascii
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import UInt8
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from hilsplat.scene.cameras import Camera
+
+MAX_SIDE_PX = 4096
+MAX_TEXT = 200
+Row3 = tuple[float, float, float]
+Row4 = tuple[float, float, float, float]
+Text = Annotated[str, Field(min_length=1, max_length=MAX_TEXT)]
+Nodes = Annotated[list[Annotated[int, Field(ge=0)]], Field(max_length=65_534)]
+
+
+class Message(BaseModel):
+    """Any message: unknown keys, NaN and infinity are refused."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
+
+
+class WireCamera(Message):
+    """hilsplat's own camera: OpenCV axes, centre of the top-left pixel at (0.5, 0.5)."""
+
+    cam_from_world: tuple[Row4, Row4, Row4, Row4]
+    K: tuple[Row3, Row3, Row3]
+    size_hw: tuple[Annotated[int, Field(ge=1, le=MAX_SIDE_PX)], Annotated[int, Field(ge=1, le=MAX_SIDE_PX)]]
+
+    @field_validator("cam_from_world")
+    @classmethod
+    def _rotation(cls, value: tuple[Row4, ...]) -> tuple[Row4, ...]:
+        rotation = np.array(value)[:3, :3]
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+            raise ValueError("the upper left of cam_from_world is not a rotation")
+        return value
+
+    @field_validator("K")
+    @classmethod
+    def _focal(cls, value: tuple[Row3, ...]) -> tuple[Row3, ...]:
+        if value[0][0] <= 0 or value[1][1] <= 0:
+            raise ValueError("a focal length is not positive")
+        return value
+
+    def camera(self) -> Camera:
+        """The camera."""
+        return Camera("page", np.array(self.cam_from_world), np.array(self.K), self.size_hw)
+
+
+class Style(Message):
+    """How Gaussians are painted, by the node that they belong to; see `frames.painted`.
+
+    Attributes:
+        table: base64 of RGBA bytes, row 0 for Gaussians without a node, row n + 1 for node n.
+        use: which levels are looked up; the finest with an alpha above 0 decides.
+        mode: what becomes of Gaussians whose alpha is 0.
+        ramp: base64 of 256 RGB bytes; if given, Gaussians are painted by the field's relevancy instead.
+    """
+
+    table: Annotated[str, Field(max_length=400_000)] = ""
+    use: tuple[bool, bool, bool] = (True, True, True)
+    mode: Literal["plain", "tint", "ghost", "isolate"] = "plain"
+    ramp: Annotated[str, Field(max_length=1024)] = ""
+
+    def rgba(self, num_nodes: int) -> UInt8[np.ndarray, "T1 4"]:
+        """The table, (nodes + 1, 4); an empty one leaves every Gaussian as it is.
+
+        Raises:
+            ValueError: it has another number of rows.
+        """
+        return _rows(self.table, 4, num_nodes + 1)
+
+    def colours(self) -> UInt8[np.ndarray, "256 3"]:
+        """The ramp."""
+        return _rows(self.ramp, 3, 256)
+
+
+def _rows(text: str, width: int, count: int) -> np.ndarray:
+    if not text:
+        return np.zeros((count, width), np.uint8)
+    try:
+        values = np.frombuffer(base64.b64decode(text, validate=True), np.uint8)
+    except binascii.Error as error:
+        raise ValueError(f"not base64: {error}") from error
+    if len(values) != width * count:
+        raise ValueError(f"{len(values)} bytes where {count} rows of {width} were expected")
+    return values.reshape(count, width)
+
+
+class Asked(Message):
+    """A question to one variant of the scene."""
+
+    variant: Annotated[str, Field(max_length=100)] = "default"
+
+
+class Query(Asked):
+    """A text or a path."""
+
+    text: Text
+    level: Literal["auto", "whole", "part", "subpart"] = "auto"
+    answerer: Literal["tree", "field"] = "tree"
+    view: Annotated[int, Field(ge=0)] | None = None
+    threshold: Annotated[float, Field(ge=0, le=1)] | None = None
+
+
+class Like(Asked):
+    """What looks like a node, or like a picture (base64 of an image file)."""
+
+    node: Annotated[int, Field(ge=0)] | None = None
+    picture: Annotated[str, Field(max_length=900_000)] = ""
+
+
+class FieldRelevancy(Asked):
+    """The field's relevancy of every Gaussian to a text."""
+
+    text: Text
+    level: Literal["auto", "whole", "part", "subpart"] = "auto"
+
+
+class Pick(Asked):
+    """A pixel of the page's picture."""
+
+    camera: WireCamera
+    x: float
+    y: float
+
+
+class Frame(Asked):
+    """A picture painted by the server."""
+
+    camera: WireCamera
+    style: Style = Style()
+    quality: Annotated[int, Field(ge=20, le=100)] = 80
+    image: Literal["jpeg", "png"] = "jpeg"
+
+
+class Film(Asked):
+    """A fly-around around what the cameras saw."""
+
+    style: Style = Style()
+    format: Literal["mp4", "gif"] = "mp4"
+    side_px: Annotated[int, Field(ge=64, le=1920)] = 640
+    frames: Annotated[int, Field(ge=2, le=480)] = 120
+
+
+class Selection(Asked):
+    """Some nodes."""
+
+    nodes: Nodes
+
+
+class Names(Asked):
+    """All names of a tree's nodes."""
+
+    names: dict[int, Annotated[str, Field(max_length=200)]]
+
+
+class Page(Asked):
+    """A scene as one HTML file with the answers to some texts."""
+
+    texts: Annotated[list[Text], Field(max_length=40)]
+    start: WireCamera | None = None

@@ -1,0 +1,163 @@
+"""The real `hilsplat view` and a real browser: Debian's Chromium, headless, with WebGL by Mesa's llvmpipe."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.scene import Scene
+from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.ply import save_ply
+from tests.conftest import PROJECT
+from tests.unit.finished_desk import SCENE, build_finished_desk
+
+HOW = "apt-get install chromium libgl1-mesa-dri libegl1; pip install -e '.[browser-tests]'"
+ARGUMENTS = ["--use-angle=gl-egl", "--ignore-gpu-blocklist", "--no-sandbox", "--disable-dev-shm-usage"]
+WIDTH, HEIGHT = 740, 420
+PANEL_PX, STRIP_PX = 336, 72
+START_S = 240
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """One browser for all tests."""
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        pytest.skip(f"playwright is not installed: {HOW}")
+    found = shutil.which("chromium")
+    if not found:
+        pytest.skip(f"chromium is not installed: {HOW}")
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=found, args=ARGUMENTS)
+        yield opened
+        opened.close()
+
+
+@contextmanager
+def serving(folder: Path) -> Iterator[str]:
+    """Address of the page of a scene, served by the command."""
+    code = "from hilsplat.cli.main import main; main()"
+    command = [sys.executable, "-u", "-c", code, "view", str(folder), "--no-browser"]
+    environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as server:
+        try:
+            line = server.stdout.readline()
+            yield re.search(r"http://127\.0\.0\.1:\d+/\?token=\S+", line).group()
+        finally:
+            server.terminate()
+
+
+@pytest.fixture(scope="session")
+def desk(tmp_path_factory) -> Path:
+    """The folder of a finished scene."""
+    return build_finished_desk(tmp_path_factory.mktemp("project")) / SCENE
+
+
+@pytest.fixture(scope="session")
+def desk_address(browser, desk) -> Iterator[str]:
+    with serving(desk) as address:
+        yield address
+
+
+@pytest.fixture(scope="session")
+def cloud(tmp_path_factory) -> Path:
+    """A scene whose run has come as far as the Gaussians: 3,000 of degree 3, of every shape and opacity."""
+    folder = tmp_path_factory.mktemp("results") / "photos/cloud"
+    rng = np.random.default_rng(5)
+    n = 3000
+    gaussians = Gaussians(
+        means=rng.normal(size=(n, 3)).astype(np.float32),
+        log_scales=rng.normal(-3, 0.8, (n, 3)).astype(np.float32),
+        quats=rng.normal(size=(n, 4)).astype(np.float32),
+        opacity_logits=rng.normal(0, 2, n).astype(np.float32),
+        sh=(rng.normal(size=(n, 16, 3)) * np.array([1.0] + [0.2] * 15)[:, None]).astype(np.float32),
+    )
+    save_ply(folder / "gaussians.ply", gaussians)
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 2, 3] = 4.0
+    poses[:, 0, 3] = (-1, 0, 1)
+    K = np.array([[300.0, 0, 190], [0, 310, 150], [0, 0, 1]])
+    names = ("000.png", "001.png", "002.png")
+    cameras = Cameras(names, poses, np.tile(K, (3, 1, 1)), np.full((3, 2), (300, 400), np.int32))
+    points = np.zeros((0, 3), np.float32)
+    split = dict.fromkeys(names, "train")
+    scene = folder / "scene"
+    (scene / "images").mkdir(parents=True)
+    for name in names:
+        from hilsplat.base.images import write_png
+
+        write_png(scene / "images" / name, np.full((300, 400, 3), 90, np.uint8))
+    Scene(scene, "photos/cloud", "metre", cameras, split, points, points.astype(np.uint8), np.eye(4)).save()
+    return folder
+
+
+@pytest.fixture(scope="session")
+def cloud_address(browser, cloud) -> Iterator[str]:
+    with serving(cloud) as address:
+        yield address
+
+
+@pytest.fixture
+def opened(browser) -> Iterator[Callable]:
+    """Opens an address, waits for the first picture, and checks at the end that nothing went wrong.
+
+    A console error, an uncaught exception or a request to another address fails the test.
+    """
+    contexts = []
+    wrong: list[str] = []
+
+    def open_page(address: str, painter: str = "gl", fragment: str = "", **more):
+        viewport = {"width": WIDTH, "height": HEIGHT}
+        context = browser.new_context(viewport=viewport, reduced_motion="reduce", **more)
+        contexts.append(context)
+        page = context.new_page()
+        page.set_default_timeout(60_000)
+        origin = address.partition("/?")[0]
+        page.on("console", lambda said: said.type == "error" and wrong.append(said.text))
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on(
+            "request",
+            lambda asked: asked.url.startswith((origin, "blob:", "data:")) or wrong.append(asked.url),
+        )
+        page.goto(f"{address}&painter={painter}{fragment}")
+        page.locator("body[data-ready=yes]").wait_for()
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert not wrong, wrong
+
+
+def drawn(page, act: Callable[[], object]) -> None:
+    """Do something and wait until the picture was drawn anew."""
+    view = page.locator("#view")
+    before = int(view.get_attribute("data-drawn"))
+    act()
+    for _ in range(600):
+        if int(view.get_attribute("data-drawn")) > before:
+            return
+        page.wait_for_timeout(50)
+    raise AssertionError("nothing was drawn")
+
+
+def pixels(page) -> np.ndarray:
+    """What WebGL draws now, (height, width, 3) uint8."""
+    found = page.evaluate("hilsplat.pixels()")
+    values = np.array(found["data"], np.uint8).reshape(found["height"], found["width"], 4)
+    return values[::-1, :, :3]
+
+
+def wire_camera(page) -> dict:
+    """The page's camera, as the server reads it."""
+    code = "(() => { const v = document.getElementById('view'); "
+    return page.evaluate(code + "return hilsplat.camera.wire(v.clientWidth, v.clientHeight); })()")

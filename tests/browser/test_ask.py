@@ -1,0 +1,264 @@
+"""Asking, choosing, naming and saving by hand, in both painters, by role and label as people find them."""
+
+import numpy as np
+import pytest
+
+import hilsplat
+from hilsplat.base.artifacts import read_json
+from hilsplat.base.images import write_png
+from hilsplat.splat.ply import load_ply
+from tests.browser.conftest import drawn, pixels, wire_camera
+
+both = pytest.mark.parametrize("painter", ["gl", "server"])
+
+
+@pytest.fixture
+def scene(desk):
+    return hilsplat.open(desk)
+
+
+def ask(page, text: str) -> None:
+    page.locator("body").press("/")
+    page.keyboard.type(text)
+    page.keyboard.press("Enter")
+
+
+def answers(page):
+    return page.get_by_role("region", name="Answers").get_by_role("button")
+
+
+@both
+def test_a_text_is_asked_by_keyboard_and_lights_up(opened, desk_address, scene, painter):
+    page = opened(desk_address, painter)
+    assert page.evaluate("document.activeElement.id") == "text"  # the text box is first
+    page.locator("#view").focus()
+    drawn(page, lambda: ask(page, "mug > handle"))
+    answers(page).first.wait_for()
+    (hit,) = scene.query("mug > handle")
+    assert f"1 answer, best {hit.score:.2f}, part" in page.get_by_role("status").inner_text()
+    assert page.locator("#overlay path.answer").get_attribute("data-node") == str(hit.node)
+    page.wait_for_timeout(600)
+    if painter == "gl":
+        picture = pixels(page).astype(int)
+        orange = (picture[..., 0] - picture[..., 2] > 90) & (picture[..., 0] > 120)
+        assert 0.01 < orange.mean() < 0.4
+        grey = (np.ptp(picture, axis=2) < 8) & (picture.max(axis=2) > 8)
+        assert grey.mean() > 0.1 and (orange | grey | (picture.max(axis=2) <= 8)).mean() > 0.9
+
+
+@both
+def test_doubts_are_told(opened, desk_address, painter):
+    page = opened(desk_address, painter)
+    page.locator("#text").fill("unicorn")
+    page.keyboard.press("Enter")
+    answers(page).first.wait_for()
+    told = page.get_by_role("status").inner_text()
+    assert "Nothing here answers to 'unicorn' better than to a generic word" in told
+
+
+@both
+def test_a_click_chooses_the_whole_and_the_next_click_its_part(opened, desk_address, scene, painter):
+    page = opened(desk_address, painter)
+    wire, view = wire_camera(page), page.locator("#view").bounding_box()
+    K, pose = np.array(wire["K"]), np.array(wire["cam_from_world"])
+    place = K @ (pose[:3, :3] @ [6, 6, 0] + pose[:3, 3])  # a yellow pixel of the rim
+    x, y = (place[:2] / place[2]).tolist()
+    for text in ("mug", "mug > handle", "mug > handle > rim", "mug"):
+        page.mouse.click(view["x"] + x, view["y"] + y)
+        node = scene.query(text)[0].node
+        page.locator(f"#overlay path.chosen[data-node='{node}']").first.wait_for(state="attached")
+        assert page.locator(f"[role=treeitem][data-node='{node}']").get_attribute("aria-selected") == "true"
+    page.locator("#view").press("Escape")
+    assert page.locator("#overlay path.chosen").count() == 0
+
+
+def test_quick_picks_agree_with_exact_ones(opened, desk_address, scene):
+    page = opened(desk_address)
+    wire = wire_camera(page)
+    height, width = wire["size_hw"]
+    rng = np.random.default_rng(1)
+    agree = []
+    for x, y in rng.integers(0, (width, height), (60, 2)).tolist():
+        exact = page.request.post(
+            f"{page.url.partition('/?')[0]}/api/pick",
+            data={"camera": wire, "x": x, "y": y},
+            headers={"origin": page.url.partition("/?")[0]},
+        ).json()["nodes"]
+        if exact:
+            agree.append(page.evaluate(f"hilsplat.quickPick({x}, {y})")[0] == exact[0][0])
+    assert len(agree) > 20 and np.mean(agree) > 0.8
+
+
+def test_the_outline_is_walked_by_keys(opened, desk_address, scene):
+    page = opened(desk_address)
+    tree = page.get_by_role("tree")
+    items = tree.get_by_role("treeitem")
+    items.last.wait_for()
+    assert items.count() == len(scene.tree)
+    items.first.focus()
+    focused = "document.activeElement.dataset.node"
+    first = page.evaluate(focused)
+    page.keyboard.press("ArrowRight")
+    child = page.evaluate(focused)
+    assert scene.tree.parent[int(child)] == int(first)
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("ArrowLeft")
+    assert page.evaluate(focused) == first
+    assert items.first.get_attribute("aria-expanded") == "false"
+    page.keyboard.press("End")
+    page.keyboard.press("Home")
+    page.keyboard.press("Enter")
+    assert items.first.get_attribute("aria-selected") == "true"
+    card = page.get_by_role("region", name="Chosen node")
+    assert card.is_visible()
+    page.keyboard.press("j")  # down to its first child
+    page.locator(f"#overlay path.chosen[data-node='{child}']").wait_for(state="attached")
+
+
+def test_a_name_is_given_and_answers_here_and_in_python(opened, desk_address, desk, scene):
+    page = opened(desk_address)
+    book = scene.query("book")[0].node
+    page.locator(f"[role=treeitem][data-node='{book}'] > .row .label").click()
+    name = page.get_by_role("textbox", name="Name")
+    name.fill("Atlas <b")
+    name.press("Enter")
+    page.get_by_text("Named “Atlas <b”").wait_for()
+    ask(page, "atlas <B")
+    page.locator("#answers").get_by_text("Atlas <b").wait_for()
+    assert list(read_json(desk / "names.json")["trees"].values()) == [{str(book): "Atlas <b"}]
+    assert [hit.node for hit in hilsplat.open(desk).query("atlas <b")] == [book]
+    page.locator("#view").press("Escape")
+    page.locator(f"[role=treeitem][data-node='{book}'] > .row .label").click()
+    name.fill("")
+    name.press("Enter")
+    page.get_by_text("The name is taken away.").wait_for()
+    (desk / "names.json").unlink()
+
+
+def test_what_is_like_the_choice_is_listed(opened, desk_address, scene):
+    page = opened(desk_address)
+    handle = scene.query("mug > handle")[0].node
+    page.locator(f"[role=treeitem][data-node='{handle}'] > .row .label").click()
+    page.get_by_role("button", name="More like this").click()
+    answers(page).first.wait_for()
+    expected = scene.like_node(handle)[0].node
+    assert page.locator("#answers li").first.get_attribute("data-node") == str(expected)
+
+
+def test_a_picture_or_a_frame_drawn_over_the_view_is_asked_for(opened, desk_address, scene, tmp_path):
+    page = opened(desk_address)
+    book = scene.query("book", "whole")[0].node
+    write_png(tmp_path / "blue.png", np.full((40, 30, 3), (0, 0, 250), np.uint8))
+    page.get_by_label("Picture to look for").set_input_files(tmp_path / "blue.png")
+    page.locator(f"#answers li[data-node='{book}']").first.wait_for()
+    assert page.locator("#answers li").first.get_attribute("data-node") == str(book)
+    page.locator("#view").press("Escape")
+    wire, view = wire_camera(page), page.locator("#view").bounding_box()
+    K, pose = np.array(wire["K"]), np.array(wire["cam_from_world"])
+    corners = (K @ (pose[:3, :3] @ np.array([[18, 18, 0], [34, 22, 0]]).T + pose[:3, 3:])).T  # of the book
+    (x0, y0), (x1, y1) = corners[:, :2] / corners[:, 2:] + (view["x"], view["y"])
+    page.keyboard.down("Alt")
+    page.mouse.move(x0, y0)
+    page.mouse.down()
+    page.mouse.move(x1, y1, steps=4)
+    page.mouse.up()
+    page.keyboard.up("Alt")
+    answers(page).first.wait_for()
+    assert page.locator("#answers li").first.get_attribute("data-node") == str(book)
+
+
+def test_two_answerers_stand_side_by_side(opened, desk_address):
+    page = opened(desk_address)
+    ask_box = page.locator("#text")
+    ask_box.fill("mug")
+    ask_box.press("Enter")
+    answers(page).first.wait_for()
+    drawn(page, lambda: page.get_by_label("Beside").select_option("default|field"))
+    page.locator("#overlay .split").wait_for(state="attached")
+    page.wait_for_timeout(1500)
+    picture = pixels(page)
+    half = picture.shape[1] // 2
+    left, right = picture[:, :half].astype(int), picture[:, half : 2 * half].astype(int)
+    assert left.std() > 10 and np.abs(left - right).mean() < 12  # both answer the mug, from one camera
+
+
+def test_an_address_opens_the_same_view(opened, desk_address, scene):
+    page = opened(desk_address)
+    page.locator("#text").fill("mug > handle")
+    page.keyboard.press("Enter")
+    answers(page).first.wait_for()
+    page.locator("#view").focus()
+    for key in ("ArrowLeft", "ArrowUp", "+"):
+        page.keyboard.press(key)
+    page.wait_for_timeout(1200)
+    assert "token" not in page.url
+    fragment = "#" + page.url.partition("#")[2]
+    again = opened(desk_address, fragment=fragment)
+    answers(again).first.wait_for()
+    assert again.locator("#text").input_value() == "mug > handle"
+    found, expected = wire_camera(again), wire_camera(page)
+    np.testing.assert_allclose(found["cam_from_world"], expected["cam_from_world"], atol=1e-3)
+    np.testing.assert_allclose(found["K"], expected["K"], rtol=1e-3)
+
+
+def test_a_selection_is_saved_as_gaussians(opened, desk_address, scene, tmp_path):
+    page = opened(desk_address)
+    page.locator("#text").fill("mug > handle")
+    page.keyboard.press("Enter")
+    answers(page).first.wait_for()
+    page.locator("#save summary").click()
+    with page.expect_download() as started:
+        page.get_by_role("button", name="Gaussians, PLY").click()
+    started.value.save_as(tmp_path / "saved.ply")
+    (hit,) = scene.query("mug > handle")
+    np.testing.assert_array_equal(
+        load_ply(tmp_path / "saved.ply").means, scene.gaussians.means[hit.gaussians]
+    )
+
+
+def test_an_exported_page_opens_from_a_file_and_answers(opened, browser, desk_address, tmp_path, scene):
+    page = opened(desk_address)
+    page.locator("#text").fill("mug > handle")
+    page.keyboard.press("Enter")
+    answers(page).first.wait_for()
+    page.locator("#save summary").click()
+    with page.expect_download() as started:
+        page.get_by_role("button", name="Page with answers, HTML").click()
+    file = tmp_path / "page.html"
+    started.value.save_as(file)
+    context = browser.new_context(viewport={"width": 740, "height": 420}, offline=True)
+    alone, wrong = context.new_page(), []
+    alone.on("pageerror", lambda error: wrong.append(str(error)))
+    alone.on("console", lambda said: said.type == "error" and wrong.append(said.text))
+    alone.goto(file.as_uri())
+    alone.locator("body[data-ready=yes]").wait_for()
+    alone.locator("#text").fill("mug > handle")
+    alone.keyboard.press("Enter")
+    answers(alone).first.wait_for()
+    (hit,) = scene.query("mug > handle")
+    assert alone.locator("#answers li").get_attribute("data-node") == str(hit.node)
+    alone.locator("#text").fill("spoon")
+    alone.keyboard.press("Enter")
+    alone.get_by_text("This page was made with the answers to: mug > handle").wait_for()
+    assert not wrong
+    context.close()
+
+
+def test_a_telephone_has_everything_below_the_view(opened, desk_address):
+    page = opened(desk_address)
+    page.set_viewport_size({"width": 390, "height": 780})
+    view, panel = page.locator("#view").bounding_box(), page.locator("#panel").bounding_box()
+    assert view["width"] == 390 and panel["width"] == 390 and panel["y"] >= view["y"] + view["height"]
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def test_escape_and_letters_do_not_act_while_somebody_types(opened, desk_address):
+    page = opened(desk_address)
+    box = page.locator("#text")
+    box.fill("")
+    box.press_sequentially("o ? [")
+    assert box.input_value() == "o ? ["
+    assert not page.get_by_role("dialog").is_visible()
+    page.locator("#view").press("?")
+    assert page.get_by_role("dialog", name="Keys").is_visible()

@@ -1,0 +1,81 @@
+"""The page's two painters draw what the pipeline renders."""
+
+import numpy as np
+import pytest
+
+from hilsplat.base.images import to_uint8
+from hilsplat.splat.ply import load_ply
+from hilsplat.splat.rasterise.api import render
+from hilsplat.viewer.wire import WireCamera
+from tests.browser.conftest import drawn, pixels, wire_camera
+
+
+def psnr(found: np.ndarray, expected: np.ndarray) -> float:
+    error = np.square(found.astype(float) - expected.astype(float)).mean()
+    return float(10 * np.log10(255**2 / max(error, 1e-9)))
+
+
+def rendered(folder, page) -> np.ndarray:
+    camera = WireCamera.model_validate(wire_camera(page)).camera()
+    return to_uint8(render(load_ply(folder / "gaussians.ply"), camera).color)
+
+
+def test_webgl_is_the_one_that_these_tests_are_for(opened, cloud_address):
+    page = opened(cloud_address)
+    assert "llvmpipe" in page.locator("#view").get_attribute("data-gl")
+    assert page.locator("#view").get_attribute("data-painter") == "gl"
+
+
+def test_webgl_draws_what_the_pipeline_renders(opened, cloud, cloud_address):
+    page = opened(cloud_address)
+    for keys in ((), ("ArrowLeft", "ArrowLeft", "ArrowUp"), ("+",) * 9, ("w",) * 9):
+        for key in keys:
+            page.locator("#view").focus()
+            drawn(page, lambda key=key: page.keyboard.press(key))
+        page.wait_for_timeout(400)
+        found, expected = pixels(page), rendered(cloud, page)
+        assert expected.std() > 20
+        assert psnr(found, expected) > 40, keys
+
+
+def test_the_server_draws_what_the_pipeline_renders(opened, cloud, cloud_address):
+    page = opened(cloud_address, "server")
+    assert page.locator("#view").get_attribute("data-painter") == "server"
+    read = """(() => { const c = document.querySelector('#view canvas');
+        return [c.width, c.height, ...c.getContext('2d').getImageData(0, 0, c.width, c.height).data]; })()"""
+    width, height, *values = page.evaluate(read)
+    found = np.array(values, np.uint8).reshape(height, width, 4)[..., :3]
+    assert psnr(found, rendered(cloud, page)) > 30
+
+
+def test_software_webgl_leaves_the_painting_to_the_server(opened, cloud_address):
+    page = opened(cloud_address, "")
+    assert page.locator("#view").get_attribute("data-painter") == "server"
+
+
+def test_nothing_is_drawn_while_nothing_changes(opened, cloud_address):
+    page = opened(cloud_address)
+    page.wait_for_timeout(1000)
+    before = page.locator("#view").get_attribute("data-drawn")
+    page.wait_for_timeout(1500)
+    assert page.locator("#view").get_attribute("data-drawn") == before
+
+
+def test_a_scene_without_answers_says_that_the_run_goes_on(opened, cloud_address):
+    page = opened(cloud_address)
+    assert "The run goes on" in page.get_by_role("status").inner_text()
+    assert not page.get_by_role("tree").is_visible()
+
+
+@pytest.mark.parametrize("painter", ["gl", "server"])
+def test_a_photograph_lies_exactly_over_its_view(opened, desk_address, painter):
+    page = opened(desk_address, painter)
+    page.get_by_role("option", name="003.png").click()
+    page.get_by_role("button", name="photo", exact=True).click()
+    box = page.locator("#photo").bounding_box()
+    wire, view = wire_camera(page), page.locator("#view").bounding_box()
+    # the frame of the photograph, from the camera alone: its corners are pixel (0, 0) and (42, 24)
+    scale = wire["K"][0][0] / 30.0
+    left, top = wire["K"][0][2] - 0.5 * scale, wire["K"][1][2] - 0.5 * scale
+    found = (box["x"] - view["x"], box["y"] - view["y"], box["width"], box["height"])
+    np.testing.assert_allclose(found, (left, top, 42 * scale, 24 * scale), atol=0.6)

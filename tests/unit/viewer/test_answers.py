@@ -1,0 +1,236 @@
+"""Questions to the server, and the files that it gives away, against `LanguageScene` itself."""
+
+import base64
+import io
+import json
+import re
+import shutil
+import zipfile
+import zlib
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from pycocotools import mask as coco_masks
+from starlette.testclient import TestClient
+
+from hilsplat.base.artifacts import read_json
+from hilsplat.base.errors import ArtifactError
+from hilsplat.query.names import FILE
+from hilsplat.splat.ply import load_ply
+from hilsplat.viewer.app import Viewer
+from hilsplat.viewer.exports import coco_counts
+from hilsplat.viewer.payload import packed_gaussians
+from hilsplat.viewer.shown import ShownScene
+from tests.unit.finished_desk import SCENE
+from tests.unit.viewer.conftest import ADDRESS, TOKEN
+
+
+@pytest.fixture
+def scene(shown):
+    return shown.answering("default")
+
+
+def ask(client, text: str, **more) -> dict:
+    return client.post("/api/query", json={"text": text, **more}).json()
+
+
+@pytest.mark.parametrize("text", ["mug", "mug > handle", "handle", "unicorn > rim"])
+@pytest.mark.parametrize("answerer", ["tree", "field"])
+def test_the_page_gets_the_answers_of_the_scene(client, scene, text, answerer):
+    found, hits = ask(client, text, answerer=answerer), scene.query(text, answerer=answerer, limit=24)
+    assert [hit["node"] for hit in found["hits"]] == [hit.node for hit in hits]
+    assert [hit["score"] for hit in found["hits"]] == pytest.approx([hit.score for hit in hits], abs=1e-4)
+    assert found["doubts"] == [str(doubt) for doubt in hits[0].doubts] and found["route"] == hits[0].route
+    last = text.split(">")[-1].strip()
+    np.testing.assert_allclose(found["relevancy"], scene.node_relevancy([last], answerer)[0], atol=1e-4)
+
+
+def test_a_photograph_and_a_level_restrict_the_answers(client, scene):
+    view = 2
+    hits = scene.query("mug", "part", view=scene.views[view])
+    assert [hit["node"] for hit in ask(client, "mug", level="part", view=view)["hits"]] == [
+        hit.node for hit in hits
+    ]
+    assert client.post("/api/query", json={"text": "mug", "view": 99}).status_code == 422
+
+
+@pytest.mark.parametrize("text", ["", " ", "mug >", "x" * 201, "a > b > c > d"])
+def test_a_text_that_cannot_be_asked_gets_a_sentence(client, text):
+    sent = client.post("/api/query", json={"text": text})
+    assert sent.status_code in (400, 422) and sent.json()["error"]
+
+
+def test_texts_come_back_as_they_were_sent(client):
+    evil = "<img src=x onerror=alert(1)>"
+    assert "onerror" in client.post("/api/query", json={"text": evil.replace(">", "")}).json()["text"]
+
+
+def test_what_is_like_a_node_or_a_picture(client, scene):
+    (handle,) = ask(client, "mug > handle")["hits"]
+    found = client.post("/api/like", json={"node": handle["node"]}).json()
+    expected = scene.like_node(handle["node"], limit=24)
+    assert [hit["node"] for hit in found["hits"]] == [hit.node for hit in expected]
+    assert found["relevancy"][handle["node"]] == 1
+    made, data = cv2.imencode(".png", np.full((5, 9, 3), (250, 0, 0), np.uint8))
+    assert made
+    sent = {"picture": base64.b64encode(data.tobytes()).decode()}
+    (book,) = ask(client, "book", level="whole")["hits"]
+    assert client.post("/api/like", json=sent).json()["hits"][0]["node"] == book["node"]
+    for bad in ("", "AAAA", "?"):
+        assert client.post("/api/like", json={"picture": bad}).status_code == 422
+
+
+def test_the_field_s_relevancy_of_every_gaussian(client, scene):
+    values = np.frombuffer(
+        client.post("/api/field", json={"text": "mug", "level": "whole"}).content, np.uint8
+    )
+    nodes = scene.tree.node_of_gaussian[:, 0]
+    (mug,) = scene.query("mug", "whole")
+    assert len(values) == len(nodes)
+    assert values[nodes == mug.node].mean() > values[nodes != mug.node].mean() + 50
+
+
+def test_names_are_kept_and_answer_and_need_the_version_that_was_read(client, scene, built_desk):
+    names_file = built_desk / SCENE / FILE
+    outline = client.get("/api/variant/default").json()
+    (book,) = ask(client, "book", level="whole")["hits"]
+    node = book["node"]
+
+    def put(name: str, version: str):
+        body = {"names": {node: name}}
+        return client.put("/api/names", json=body, headers={"if-match": f'"{version}"'})
+
+    kept = put("atlas <b", outline["version"])
+    assert kept.status_code == 200 and kept.json()["names"] == {str(node): "atlas <b"}
+    assert put("other", outline["version"]).status_code == 412
+    assert put("a > b", kept.json()["version"]).status_code == 422
+    assert client.put("/api/names", json={"names": {}}).status_code == 412
+    found = ask(client, "ATLAS <B")
+    assert [hit["node"] for hit in found["hits"]] == [node] and found["hits"][0]["name"] == "atlas <b"
+    assert client.get("/api/variant/default").json()["nodes"][node]["name"] == "atlas <b"
+    assert list(read_json(names_file)["trees"].values()) == [{str(node): "atlas <b"}]
+    assert put("", kept.json()["version"]).json()["names"] == {}
+    names_file.unlink()
+
+
+def test_a_saved_selection_is_the_nodes_gaussians(client, scene, shown, tmp_path):
+    nodes = [hit["node"] for hit in ask(client, "mug > handle")["hits"]]
+    (tmp_path / "selection.ply").write_bytes(client.post("/api/export/ply", json={"nodes": nodes}).content)
+    saved = load_ply(tmp_path / "selection.ply")
+    rows = scene.gaussians_of(nodes)
+    np.testing.assert_array_equal(saved.means, shown.gaussians.means[rows])
+    np.testing.assert_array_equal(saved.sh, shown.gaussians.sh[rows])
+    (box,) = client.post("/api/export/boxes", json={"nodes": nodes}).json()["boxes"]
+    (hit,) = scene.query("mug > handle")
+    np.testing.assert_allclose(box["corners"], hit.oriented_box.corners(), atol=1e-4)
+    assert client.post("/api/export/ply", json={"nodes": [99]}).status_code == 422
+
+
+def test_saved_masks_are_those_of_the_hits_in_every_view(client, scene):
+    (hit,) = scene.query("mug > handle")
+    data = client.post("/api/export/masks", json={"nodes": [hit.node]}).content
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        coco = json.loads(archive.read("coco.json"))
+        assert [image["file_name"] for image in coco["images"]] == list(scene.views)
+        assert len(coco["annotations"]) == len(scene.views)
+        for number, view in enumerate(scene.views):
+            expected = hit.mask(view)
+            png = Image.open(io.BytesIO(archive.read(f"masks/{Path(view).stem}/{hit.node}.png")))
+            np.testing.assert_array_equal(np.asarray(png.convert("L")) > 0, expected)
+            (entry,) = [each for each in coco["annotations"] if each["image_id"] == number]
+            runs = coco_masks.frPyObjects(entry["segmentation"], *entry["segmentation"]["size"])
+            np.testing.assert_array_equal(coco_masks.decode(runs).astype(bool), expected)
+            assert entry["area"] == expected.sum() and entry["bbox"] == coco_masks.toBbox(runs).tolist()
+
+
+@pytest.mark.parametrize("mask", [np.eye(3) > 0, np.ones((2, 3)) > 0, np.zeros((2, 3)) > 0])
+def test_coco_runs_begin_with_zeros(mask):
+    runs = coco_masks.frPyObjects({"size": list(mask.shape), "counts": coco_counts(mask)}, *mask.shape)
+    np.testing.assert_array_equal(coco_masks.decode(runs).astype(bool), mask)
+
+
+def test_films_have_the_frames_that_were_asked_for(client, tmp_path):
+    sent = {"frames": 6, "side_px": 64}
+    (tmp_path / "film.mp4").write_bytes(client.post("/api/export/film", json=sent).content)
+    with av.open(str(tmp_path / "film.mp4")) as film:
+        frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+    assert len(frames) == 6 and frames[0].shape == (36, 64, 3) and frames[0].std() > 20
+    gif = Image.open(io.BytesIO(client.post("/api/export/film", json={**sent, "format": "gif"}).content))
+    durations = []
+    for number in range(gif.n_frames):  # equal neighbours are one frame that lasts longer
+        gif.seek(number)
+        durations.append(gif.info["duration"])
+    assert sum(durations) == pytest.approx(3 * 1000 / 12, abs=15) and gif.info["loop"] == 0
+
+
+def test_a_crop_shows_the_node_and_dims_the_rest(client, scene):
+    (hit,) = scene.query("mug > handle > rim")
+    crop = client.get(f"/api/crop/default/{hit.node}")
+    pixels = cv2.imdecode(np.frombuffer(crop.content, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
+    yellow = (pixels[..., 0] > 180) & (pixels[..., 1] > 180) & (pixels[..., 2] < 90)
+    assert yellow[70:90, 40:120].mean() > 0.8 and yellow.mean() < 0.6
+    assert pixels[:15].max() < 120
+    assert client.get("/api/crop/default/99").status_code == 422
+
+
+def test_photographs_are_given_by_number(client, scene):
+    image = Image.open(io.BytesIO(client.get("/api/photo/3").content))
+    np.testing.assert_array_equal(np.asarray(image.convert("RGB")), scene.image(scene.views[3]))
+    assert client.get("/api/thumb/3").headers["content-type"] == "image/jpeg"
+    assert client.get("/api/photo/99").status_code == 422
+
+
+def test_gaussians_are_sent_once(client, shown):
+    first = client.get("/api/splats")
+    assert first.content == packed_gaussians(shown.gaussians)
+    again = client.get("/api/splats", headers={"if-none-match": first.headers["etag"]})
+    assert again.status_code == 304 and not again.content
+
+
+def test_an_exported_page_holds_all_that_it_needs(client, shown):
+    evil = "mug </script><script>alert(1)</script>".replace(">", "")
+    page = client.post("/api/export/page", json={"texts": ["mug > handle", evil]}).text
+    assert not re.search(r"""(src|href)=["'](?!data:)""", page) and "http://127" not in page
+    held = dict(re.findall(r'<script type="text/plain" id="(\w+)">(.*?)</script>', page, re.S))
+    assert set(held) == {"data", "sorter", "splats", "nodes"}
+    assert zlib.decompress(base64.b64decode(held["splats"])) == packed_gaussians(shown.gaussians)
+    data = json.loads(held["data"])
+    assert [answer["text"] for answer in data["answers"]] == ["mug > handle", evil]
+    assert len(data["photos"]) == len(data["scene"]["views"])
+    imports = json.loads(re.search(r'<script type="importmap">(.*?)</script>', page, re.S)[1])["imports"]
+    for name, address in imports.items():
+        script = base64.b64decode(address.partition(",")[2]).decode()
+        for used in re.findall(r'from "([^"]+)"', script):
+            assert used in imports, (name, used)
+
+
+def test_gaussians_are_shown_while_the_run_goes_and_answers_come_later(built_desk, tmp_path):
+    whole, growing = built_desk / SCENE, tmp_path / "photos/desk"
+    shutil.copytree(whole, growing, ignore=shutil.ignore_patterns("field.safetensors*", "models"))
+    shutil.copytree(built_desk / "models", tmp_path / "models")
+    shown = ShownScene(growing)
+    with TestClient(Viewer(shown).app(TOKEN), base_url=ADDRESS, headers={"origin": ADDRESS}) as client:
+        client.get(f"/?token={TOKEN}")
+        assert client.get("/api/scene").json()["variants"] == []
+        camera = shown.scene.cameras[shown.scene.cameras.names[0]]
+        view = {"cam_from_world": camera.cam_from_world.tolist(), "K": camera.K.tolist(), "size_hw": [8, 8]}
+        assert client.post("/api/frame", json={"camera": view}).status_code == 200
+        assert client.post("/api/pick", json={"camera": view, "x": 3, "y": 3}).status_code == 200
+        early = client.post("/api/query", json={"text": "mug"})
+        assert early.status_code == 422 and "the run goes on" in early.json()["error"]
+        for part in whole.glob("default/field.safetensors*"):
+            shutil.copy(part, growing / "default")
+        assert client.get("/api/scene").json()["variants"] == ["default"]
+        assert ask(client, "mug")["hits"]
+
+
+def test_a_scene_without_gaussians_says_what_to_run(tmp_path):
+    with pytest.raises(ArtifactError, match=r"scene folder .* is missing"):
+        ShownScene(tmp_path / "nothing")
+    (tmp_path / "scene").mkdir()
+    with pytest.raises(ArtifactError, match=r"snakemake --cores 2 .*gaussians\.ply"):
+        ShownScene(tmp_path)

@@ -1,0 +1,64 @@
+"""The command: it prints an address that opens the page, on this machine alone, and ends on Ctrl-C."""
+
+import asyncio
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from urllib.error import HTTPError
+from urllib.request import urlopen
+
+import pytest
+
+from hilsplat.base.errors import SettingsError
+from hilsplat.viewer.app import listening_at
+from tests.conftest import PROJECT
+
+
+def test_the_printed_address_opens_the_page_and_no_other_does(built_desk):
+    words = ["view", "photos/desk", "--results", "results", "--no-browser"]
+    code = "from hilsplat.cli.main import main; main()"
+    environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
+    command = [sys.executable, "-u", "-c", code, *words]
+    server = subprocess.Popen(command, cwd=built_desk, env=environment, stdout=subprocess.PIPE, text=True)
+    try:
+        line = server.stdout.readline()
+        assert line.startswith("photos/desk: 864 Gaussians at ")
+        address = re.search(r"http://127\.0\.0\.1:\d+/\?token=\S{20,}", line).group()
+        with urlopen(address, timeout=60) as page:
+            assert b"<title>hilsplat</title>" in page.read()
+        with pytest.raises(HTTPError, match="403"):
+            urlopen(address.partition("?")[0], timeout=60)
+        server.send_signal(signal.SIGINT)
+        server.wait(timeout=60)
+    finally:
+        server.kill()
+        server.communicate()
+
+
+def test_a_port_that_is_taken_is_refused_with_advice():
+    with listening_at(0) as taken, pytest.raises(SettingsError, match="choose another"):
+        listening_at(taken.getsockname()[1])
+
+
+def test_answers_do_not_wait_for_acknowledgements():
+    async def nodelay() -> int:
+        found = asyncio.get_running_loop().create_future()
+
+        class Server(asyncio.Protocol):
+            def connection_made(self, transport: asyncio.Transport) -> None:
+                accepted = transport.get_extra_info("socket")
+                found.set_result(accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
+
+        with listening_at(0) as listening:
+            server = await asyncio.get_running_loop().create_server(Server, sock=listening)
+            with socket.create_connection(listening.getsockname()):
+                value = await found
+            server.close()
+            return value
+
+    with ThreadPoolExecutor(1) as pool:  # a browser test before this one leaves a loop running in this thread
+        assert pool.submit(lambda: asyncio.run(nodelay())).result()

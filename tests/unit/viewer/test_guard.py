@@ -1,0 +1,108 @@
+"""Who may talk to the server: foreign hosts, sites, pages and tokens are refused."""
+
+import pytest
+from starlette.testclient import TestClient
+
+from hilsplat.viewer.app import Viewer, static_files
+from tests.unit.viewer.conftest import ADDRESS, TOKEN
+
+QUERY = {"text": "mug"}
+
+
+def test_nothing_is_answered_without_the_token(shown):
+    with TestClient(Viewer(shown).app(TOKEN), base_url=ADDRESS) as stranger:
+        for path in (
+            "/",
+            "/?token=",
+            "/?token=wrong",
+            "/api/scene",
+            "/static/main.js",
+            f"/api/scene?token={TOKEN}",
+        ):
+            assert stranger.get(path).status_code == 403, path
+        opened = stranger.get(f"/?token={TOKEN}")
+        assert opened.status_code == 200
+        assert "HttpOnly; SameSite=Strict" in opened.headers["set-cookie"]
+        assert stranger.get("/api/scene").status_code == 200
+
+
+def test_two_servers_of_one_browser_have_cookies_of_different_names(shown):
+    assert Viewer(shown).app(TOKEN).cookie != Viewer(shown).app(TOKEN).cookie
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:4000", "127.0.0.1.evil.example", "", "[::2]:80"]
+)
+def test_a_foreign_host_is_refused(client, host):
+    assert client.get("/api/scene", headers={"host": host}).status_code == 403
+
+
+@pytest.mark.parametrize("host", ["localhost:9999", "127.0.0.1:1", "127.0.0.1", "[::1]:4000"])
+def test_this_machine_may_have_another_port_as_behind_a_tunnel(client, host):
+    assert client.get("/api/scene", headers={"host": host}).status_code == 200
+    tunnelled = {"host": host, "origin": f"http://{host}"}
+    assert client.post("/api/query", json=QUERY, headers=tunnelled).status_code == 200
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "null", "http://127.0.0.1:4001", "https://127.0.0.1:4000", ""]
+)
+def test_only_the_page_itself_may_send_something(client, origin):
+    assert client.post("/api/query", json=QUERY, headers={"origin": origin}).status_code == 403
+
+
+def test_another_site_is_refused_even_when_it_only_reads(client):
+    assert client.get("/api/scene", headers={"sec-fetch-site": "cross-site"}).status_code == 403
+
+
+@pytest.mark.parametrize(
+    "kind", ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data", ""]
+)
+def test_what_a_form_can_send_is_refused(client, kind):
+    sent = client.post("/api/query", content='{"text": "mug"}', headers={"content-type": kind})
+    assert sent.status_code == 403
+
+
+def test_too_much_is_refused_before_it_is_read(client):
+    assert client.post("/api/query", json={"text": "x" * (1 << 20)}).status_code == 413
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/static/../guard.py",
+        "/static/%2e%2e%2fguard.py",
+        "/static/..%5cguard.py",
+        "/static//etc/passwd",
+        "/api/photo/..%2fcameras.npz",
+        "/api/crop/default/..%2f..%2f",
+        "/api/photo/-1",
+    ],
+)
+def test_no_path_reaches_a_file(client, path):
+    assert client.get(path).status_code == 404
+
+
+@pytest.mark.parametrize("variant", ["..", "../default", "scene", "%2e%2e", "nothing"])
+def test_a_variant_is_a_name_that_the_folder_lists(client, variant):
+    assert client.get(f"/api/nodes/{variant}").status_code in (404, 422)
+    assert client.post("/api/query", json={**QUERY, "variant": variant}).status_code == 422
+
+
+def test_every_answer_carries_the_policy(client):
+    for path in ("/", "/api/scene", "/static/style.css", "/nothing"):
+        headers = client.get(path, headers={"origin": ADDRESS}).headers
+        assert "default-src 'none'" in headers["content-security-policy"]
+        assert "unsafe" not in headers["content-security-policy"]
+        assert headers["x-content-type-options"] == "nosniff"
+        assert headers["cross-origin-resource-policy"] == "same-origin"
+        assert "access-control-allow-origin" not in headers
+
+
+def test_the_page_is_small_and_asks_no_other_address():
+    files = static_files()
+    scripts = {name: text.decode() for name, text in files.items() if name.endswith(".js")}
+    assert sum(map(len, scripts.values())) < 200_000
+    for name, text in {**scripts, "index.html": files["index.html"].decode()}.items():
+        found = text.replace("http://www.w3.org/2000/svg", "")
+        assert "http://" not in found and "https://" not in found and "innerHTML" not in found, name

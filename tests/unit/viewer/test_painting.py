@@ -1,0 +1,160 @@
+"""Frames and picks of the server against the pipeline's own rendering."""
+
+import base64
+
+import cv2
+import numpy as np
+import pytest
+
+from hilsplat.base.images import to_uint8
+from hilsplat.base.levels import NONE
+from hilsplat.splat.rasterise.api import pixel_weights, render
+from hilsplat.viewer.frames import GHOST, GREY, TINT, Paint, painted
+from hilsplat.viewer.picking import pick, weights_at
+from hilsplat.viewer.wire import Style
+
+
+def wire_camera(camera) -> dict:
+    return {
+        "cam_from_world": camera.cam_from_world.tolist(),
+        "K": camera.K.tolist(),
+        "size_hw": list(camera.size_hw),
+    }
+
+
+@pytest.fixture(scope="module")
+def camera(shown):
+    return shown.scene.cameras[shown.scene.cameras.names[1]]
+
+
+def table(shown, **colours: tuple[int, int, int, int]) -> str:
+    rows = np.zeros((len(shown.answering("default").tree) + 1, 4), np.uint8)
+    for node, colour in colours.items():
+        rows[int(node[1:]) + 1] = colour
+    return base64.b64encode(rows.tobytes()).decode()
+
+
+def test_a_frame_without_style_is_the_pipeline_s_rendering(shown, client, camera):
+    expected = to_uint8(render(shown.gaussians, camera).color)
+    np.testing.assert_array_equal(painted(shown.gaussians, camera), expected)
+    sent = client.post("/api/frame", json={"camera": wire_camera(camera), "image": "png"})
+    assert sent.headers["content-type"] == "image/png"
+    got = cv2.imdecode(np.frombuffer(sent.content, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    np.testing.assert_array_equal(got, expected)
+
+
+def test_the_finest_used_level_with_a_colour_decides(shown):
+    nodes = shown.answering("default").tree.node_of_gaussian
+    whole, part = nodes[nodes[:, 1] >= 0][0, :2]
+    style = Style(
+        table=table(shown, **{f"n{whole}": (255, 0, 0, 255), f"n{part}": (0, 0, 255, 51)}), mode="tint"
+    )
+    paint = Paint.of(style, nodes, len(shown.answering("default").tree))
+    inside_part, only_whole = nodes[:, 1] == part, (nodes[:, 0] == whole) & (nodes[:, 1] != part)
+    assert np.allclose(paint.rgb[inside_part], (0, 0, 1)) and np.allclose(paint.share[inside_part], 0.2)
+    assert np.allclose(paint.rgb[only_whole], (1, 0, 0)) and np.allclose(paint.share[only_whole], 1)
+    assert not paint.share[nodes[:, 0] != whole].any()
+    coarse = Paint.of(
+        style.model_copy(update={"use": (True, False, False)}), nodes, len(shown.answering("default").tree)
+    )
+    assert np.allclose(coarse.rgb[nodes[:, 0] == whole], (1, 0, 0))
+
+
+@pytest.mark.parametrize("mode", ["plain", "tint", "ghost", "isolate"])
+def test_others_are_unchanged_grey_faint_or_gone(shown, camera, mode):
+    nodes = shown.answering("default").tree.node_of_gaussian
+    whole = int(nodes[0, 0])
+    style = Style(table=table(shown, **{f"n{whole}": (0, 255, 0, 255)}), mode=mode)
+    frame = painted(shown.gaussians, camera, Paint.of(style, nodes, len(shown.answering("default").tree)))
+    chosen = (nodes[:, 0] == whole).astype(np.float32)
+    own = render(shown.gaussians, camera, features=np.stack([chosen, 1 - chosen], axis=1)).features
+    plain = render(shown.gaussians, camera).color
+    inside, outside = own[..., 0] > 0.95, own[..., 1] > 0.95
+    assert inside.any() and outside.any()
+    assert np.abs(frame[inside].astype(int) - (0, 255, 0)).max() <= 0.06 * 255
+    wanted = {
+        "plain": plain,
+        "tint": np.repeat((TINT * (plain @ GREY))[..., None], 3, axis=2),
+        "isolate": np.zeros_like(plain),
+    }
+    if mode in wanted:
+        assert np.abs(frame[outside] / 255 - wanted[mode][outside]).max() < 0.08
+    else:
+        assert 0 < frame[outside].mean() < 3 * GHOST * 255 * plain[outside].mean()
+
+
+def test_a_style_that_does_not_fit_the_tree_is_refused(client, camera):
+    for bad in ("AAAA", "not base64!"):
+        sent = client.post("/api/frame", json={"camera": wire_camera(camera), "style": {"table": bad}})
+        assert sent.status_code == 422 and "reload the page" in sent.json()["error"]
+
+
+def test_a_pixel_s_weights_are_a_row_of_the_view_s(shown, camera):
+    every = pixel_weights(shown.gaussians, camera, min_weight=0.0)
+    rng = np.random.default_rng(3)
+    height, width = camera.size_hw
+    for x, y in rng.integers(0, (width, height), (40, 2)).tolist():
+        rows, weights = weights_at(shown.gaussians, camera, x, y)
+        expected = every[y * width + x].toarray()[0]
+        found = np.zeros(len(expected))
+        found[rows] = weights
+        np.testing.assert_allclose(found, expected, atol=2e-5)
+
+
+def test_a_pick_names_the_node_of_most_of_the_pixel_and_its_point(shown, client, camera):
+    tree = shown.answering("default").tree
+    every = pixel_weights(shown.gaussians, camera, min_weight=0.0)
+    width = camera.size_hw[1]
+    for x, y in ((6, 10), (25, 9), (10, 6), (30, 20)):
+        row = every[y * width + x].toarray()[0]
+        found = client.post(
+            "/api/pick", json={"camera": wire_camera(camera), "x": x + 0.4, "y": y + 0.7}
+        ).json()
+        assert found["alpha"] == pytest.approx(row.sum(), abs=1e-3)
+        np.testing.assert_allclose(found["point"], row @ shown.gaussians.means / row.sum(), atol=1e-2)
+        for level in range(3):
+            own = tree.node_of_gaussian[:, level]
+            shares = {int(node): row[own == node].sum() for node in np.unique(own) if node != NONE}
+            best = max(shares, key=lambda node: shares[node])
+            node, share = found["nodes"][level]
+            assert node == (best if shares[best] > 0 else NONE)
+            assert share == pytest.approx(shares[best] / row.sum(), abs=1e-3)
+
+
+def test_nothing_is_picked_outside_the_picture_or_in_the_void(shown, client, camera):
+    height, width = camera.size_hw
+    for x, y in ((-1.0, 3.0), (float(width), 3.0), (3.0, float(height))):
+        assert pick(shown.gaussians, None, camera, x, y) is None
+    assert (
+        client.post("/api/pick", json={"camera": wire_camera(camera), "x": width - 0.5, "y": 0.5}).json()[
+            "nodes"
+        ]
+        == []
+    )
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"size_hw": [5000, 5]},
+        {"size_hw": [0, 5]},
+        {"K": [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]},
+        {"cam_from_world": np.zeros((4, 4)).tolist()},
+        {"cam_from_world": np.diag([-1.0, 1, 1, 1]).tolist()},
+        {"cam_from_world": [[1, 0, 0]]},
+        {"more": 1},
+    ],
+)
+def test_a_camera_that_is_none_is_refused(client, camera, change):
+    sent = client.post("/api/frame", json={"camera": {**wire_camera(camera), **change}})
+    assert sent.status_code == 400 and sent.json()["error"]
+
+
+def test_numbers_that_are_not_finite_are_refused(client, camera):
+    text = '{"camera": {"cam_from_world": %s, "K": [[NaN,0,0],[0,1,0],[0,0,1]], "size_hw": [5, 5]}}'
+    sent = client.post(
+        "/api/frame",
+        content=text % np.eye(4).tolist(),
+        headers={"content-type": "application/json"},
+    )
+    assert sent.status_code == 400
