@@ -39,7 +39,7 @@ def test_a_scene_without_truth_is_refused(plain: Project) -> None:
     (plain.root / "desk").mkdir()
     for number in range(3):
         (plain.root / "desk" / f"{number}.jpg").write_bytes(b"")
-    plain.edit("config/config.yaml", "segmenter: graph", "segmenter: truth-perturbed")
+    plain.edit("config/config.yaml", "segmenter: auto", "segmenter: truth-perturbed")
     result = plain.snakemake("-n", "--config", "groups=[photos]", check=False)
     assert result.returncode != 0
     assert "photos/desk, variant default: masks.segmenter truth-perturbed needs the true labels" in (
