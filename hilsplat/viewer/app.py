@@ -309,7 +309,7 @@ def _plain(data: bytes, kind: str, status: int = 200, *, cached: bool = False) -
 
 
 def _told(status: int) -> Callable[[Request, Exception], Awaitable[Response]]:
-    """A handler that tells the page what is wrong, as text."""
+    """A handler that sends the error to the page, as text."""
 
     async def tell(request: Request, error: Exception) -> Response:
         if isinstance(error, ValidationError):
@@ -324,7 +324,7 @@ def _told(status: int) -> Callable[[Request, Exception], Awaitable[Response]]:
 
 def _node(scene: Any, node: int) -> int:
     if node >= len(scene.tree):
-        raise SettingsError(f"there is no node {node}", expected=f"0 to {len(scene.tree) - 1}")
+        raise SettingsError(f"node {node} does not exist", expected=f"0 to {len(scene.tree) - 1}")
     return node
 
 
@@ -361,7 +361,7 @@ def listening_at(port: int) -> socket.socket:
         raise SettingsError(
             f"port {port} cannot be used: {error}", fix="choose another, or leave it out"
         ) from error
-    made.listen()  # before the address is told: who connects at once waits instead of being refused
+    made.listen()  # before the address is printed: whoever connects at once waits instead of being refused
     return made
 
 

@@ -136,7 +136,7 @@ def resampled(image: UInt8[np.ndarray, "H W 3"], x: float, y: float, side: float
     if shrink > 1:
         image = cv2.resize(image, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
     scale = CROP_PX * shrink / side
-    # pixel centres lie at .5 here, at 0 in OpenCV
+    # pixel centres are at .5 here, at 0 in OpenCV
     move = np.array([[scale, 0, -scale * x / shrink], [0, scale, -scale * y / shrink]])
     move[:, 2] += 0.5 * scale - 0.5
     return cv2.warpAffine(image, move, (CROP_PX, CROP_PX), flags=cv2.INTER_LINEAR)

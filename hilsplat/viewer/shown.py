@@ -84,7 +84,7 @@ class ShownScene:
         """The answers of a variant, opened at its first use.
 
         Raises:
-            SettingsError: there is no such variant, or not yet.
+            SettingsError: the variant does not exist, or not yet.
             HilsplatError: its parts cannot be opened.
         """
         if variant not in self._variants:
@@ -102,7 +102,7 @@ class ShownScene:
         return self._variants[variant]
 
     def found(self, variant: str) -> FinishedScene:
-        """Where the parts of a variant lie."""
+        """Paths of the parts of a variant."""
         self.answering(variant)
         return self._found[variant]
 
@@ -148,7 +148,7 @@ class ShownScene:
         """
         names = self.scene.cameras.names
         if not 0 <= number < len(names):
-            raise SettingsError(f"there is no view {number}", expected=f"0 to {len(names) - 1}")
+            raise SettingsError(f"view {number} does not exist", expected=f"0 to {len(names) - 1}")
         return names[number]
 
     # -- painting ---------------------------------------------------------------------------------

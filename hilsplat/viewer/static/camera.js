@@ -102,7 +102,7 @@ export class Camera {
     return next;
   }
 
-  // Where the photograph's frame lies in a canvas: scaled to fit and centred.
+  // Place of the photograph's frame in a canvas: scaled to fit and centred.
   frame(width, height) {
     const s = Math.min(width / this.lens.w, height / this.lens.h);
     return { s, x: (width - s * this.lens.w) / 2, y: (height - s * this.lens.h) / 2 };

@@ -90,7 +90,7 @@ void main() {
   float reach = sqrt(2.0 * log(255.0 * opacity));
   vec2 half_size = reach * sqrt(vec2(xx, yy));
   if (any(lessThan(middle + half_size, vec2(0.0))) || any(greaterThan(middle - half_size, size))) return;
-  // the quad lies along the axes of the ellipse; place is in standard deviations
+  // the quad is aligned with the axes of the ellipse; place is in standard deviations
   float mid = 0.5 * (xx + yy), apart = length(vec2(0.5 * (xx - yy), xy));
   float wide = mid + apart, narrow = max(mid - apart, 1e-4);
   vec2 along = apart < 1e-7 * mid ? vec2(1.0, 0.0) : normalize(abs(wide - xx) > abs(wide - yy) ? vec2(xy, wide - xx) : vec2(wide - yy, xy));
