@@ -69,7 +69,7 @@ def test_a_click_chooses_the_whole_and_the_next_click_its_part(opened, desk_addr
         page.locator(f"#overlay path.chosen[data-node='{node}']").first.wait_for(state="attached")
         assert page.locator(f"[role=treeitem][data-node='{node}']").get_attribute("aria-selected") == "true"
     page.locator("#view").press("Escape")
-    assert page.locator("#overlay path.chosen").count() == 0
+    page.locator("#overlay path.chosen").first.wait_for(state="detached")
 
 
 def test_quick_picks_agree_with_exact_ones(opened, desk_address, scene):
