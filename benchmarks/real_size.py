@@ -4,7 +4,7 @@
     python -m benchmarks.real_size --huge PHOTOGRAPHS   # SAM ViT-H; a folder of your own
 
 Networks of random weights cost what trained ones cost. They are exported once into --models (extra
-export-tests; ViT-B needs 8 GB for that, ViT-H more). A random SAM is sure of no mask, so the work on masks
+export; ViT-B needs 8 GB for that, ViT-H more). A random SAM is sure of no mask, so the work on masks
 outside the network is not in these numbers (`make bench` measures it), and CLIP embeds the graph segmenter's.
 Each step runs in a process of its own, on one core, and prints processor seconds and its peak of memory.
 """
@@ -83,8 +83,8 @@ def export_clip(out: Path) -> None:
 def measure(step: str, models: Path, photograph: Path, points: int) -> dict[str, float]:
     """Processor seconds and peak of memory of one step on one photograph, in this process."""
     from hilsplat.base.images import read_image, resize_to_fit
-    from hilsplat.base.model_layouts import LAYOUTS
-    from hilsplat.base.onnx_models import Network
+    from hilsplat.models.folder import Network
+    from hilsplat.models.layouts import LAYOUTS
     from hilsplat.segment.candidates import decode_candidates
     from hilsplat.segment.graph import segment_graph
     from hilsplat.segment.sam import SamModel

@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.base.model_store import AUTO, EMBEDDED, read_model, real_model
 from hilsplat.base.names import NAME_RULE, name_problem
+from hilsplat.models.store import AUTO, EMBEDDED, read_model, real_model
 from hilsplat.settings import (
     AutoencoderSettings,
     ClipSettings,

@@ -5,7 +5,6 @@ from typing import Annotated
 
 import typer
 
-from hilsplat.base.model_store import MODELS
 from hilsplat.cli.apps import models_app
 from hilsplat.cli.stage import (
     DEFAULT_CACHE,
@@ -16,6 +15,7 @@ from hilsplat.cli.stage import (
     section_of,
     start_logging,
 )
+from hilsplat.models.store import MODELS
 
 
 @models_app.command("get")
@@ -73,7 +73,7 @@ def models_check(
 def models_split(folder: Annotated[Path, typer.Argument(help="folder of an exported CLIP")]) -> None:
     """Split the model.onnx of an exported CLIP into its image and text networks."""
     start_logging(None)
-    from hilsplat.base.clip_split import split_clip
+    from hilsplat.models.clip_split import split_clip
 
     for path in split_clip(folder):
         typer.echo(f"wrote {path}")

@@ -32,7 +32,7 @@ def new(
 ) -> None:
     """Add photographs, or the frames of a video, to the scene sheet, and say what is likely to fail."""
     start_logging(None)
-    from hilsplat.scene.photos import add_scene
+    from hilsplat.photos.add import add_scene
     from hilsplat.workflow.answering import models_of_photographs
 
     report = add_scene(sheet, name, photos, frames=frames)

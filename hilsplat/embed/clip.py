@@ -11,8 +11,8 @@ from tokenizers import Tokenizer
 from hilsplat.base.artifacts import read_full_index, read_json
 from hilsplat.base.crops import crop_to_square
 from hilsplat.base.errors import MisalignedArtifactError, ModelError
-from hilsplat.base.onnx_models import ModelFolder, input_side_px, open_model_folder, require_one_space
 from hilsplat.base.parallel import in_order
+from hilsplat.models.folder import ModelFolder, input_side_px, open_model_folder, require_one_space
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ClipSettings
 
@@ -91,7 +91,7 @@ class ClipModel:
         """Open a model folder.
 
         Args:
-            folder: in a layout of `base.model_layouts`.
+            folder: in a layout of `models.layouts`.
             threads: batches of crops embedded at once; results do not depend on it.
             template: sentence around every text, which replaces `{}`.
             variant: ending of the networks' names, such as `fp16`.

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
-from hilsplat.base.onnx_models import (
+from hilsplat.embed.clip import ClipModel
+from hilsplat.models.folder import (
     input_side_px,
     open_model_folder,
     require_one_space,
     require_three_heads,
 )
-from hilsplat.embed.clip import ClipModel
 from hilsplat.segment.sam import own_thresholds
 
 
@@ -19,7 +19,7 @@ def check_model(folder: Path, variant: str = "") -> str:
     """Describe a model folder after running each of its networks once on an empty input.
 
     Args:
-        folder: in a layout of `base.model_layouts`.
+        folder: in a layout of `models.layouts`.
         variant: ending of the networks' names, such as `fp16`.
 
     Returns:

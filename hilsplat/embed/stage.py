@@ -16,10 +16,10 @@ from hilsplat.base.artifacts import (
 )
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.identity import code_digest
-from hilsplat.base.model_memory import available_mib, needs_of
 from hilsplat.base.parallel import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel
+from hilsplat.models.memory import available_mib, needs_of
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ClipSettings

@@ -8,8 +8,8 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
-from hilsplat.base.clip_split import split_whole, whole_clip
 from hilsplat.base.errors import ModelError
+from hilsplat.models.clip_split import split_whole, whole_clip
 
 logger = logging.getLogger(__name__)
 

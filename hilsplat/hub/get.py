@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hilsplat.base.artifacts import full_disk_told, output_lock, read_json, write_json
-from hilsplat.base.clip_split import split_whole
 from hilsplat.base.errors import DiskSpaceError, DownloadError
-from hilsplat.base.model_store import MODELS, RECOMMENDED, real_model
 from hilsplat.base.progress import transfer_bar
 from hilsplat.embed.model_check import check_model
 from hilsplat.hub.export import export_networks, require_exporter
@@ -26,6 +24,8 @@ from hilsplat.hub.listing import (
 from hilsplat.hub.refusals import told_plainly
 from hilsplat.hub.transfer import fetch, partial, patiently
 from hilsplat.hub.wanted import Wanted
+from hilsplat.models.clip_split import split_whole
+from hilsplat.models.store import MODELS, RECOMMENDED, real_model
 
 logger = logging.getLogger(__name__)
 

@@ -9,9 +9,9 @@ import huggingface_hub
 import requests
 from huggingface_hub.errors import CacheNotFound, OfflineModeIsEnabled
 
-from hilsplat.base.clip_split import WHOLE
 from hilsplat.base.errors import DownloadError
-from hilsplat.base.model_layouts import LAYOUTS, SUPPORTED, layout_of
+from hilsplat.models.clip_split import WHOLE
+from hilsplat.models.layouts import LAYOUTS, SUPPORTED, layout_of
 
 WEIGHTS = ("model.safetensors", "pytorch_model.bin")
 """PyTorch weights that can be exported, the preferred one first. Of the second, a pickle, transformers runs

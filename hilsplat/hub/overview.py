@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from hilsplat.base.errors import HilsplatError
-from hilsplat.base.model_store import MODELS, RECOMMENDED, RELEASES, present_models, real_model
 from hilsplat.embed.model_check import check_model
+from hilsplat.models.store import MODELS, RECOMMENDED, RELEASES, present_models, real_model
 
 COLUMNS = "{:<24} {:<5} {:>8}  {:<11} {:<14} {}"
 

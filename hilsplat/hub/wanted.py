@@ -6,7 +6,7 @@ import huggingface_hub
 from huggingface_hub.errors import HFValidationError
 
 from hilsplat.base.errors import DownloadError
-from hilsplat.base.model_store import RELEASES, Release
+from hilsplat.models.store import RELEASES, Release
 
 
 @dataclass(frozen=True)

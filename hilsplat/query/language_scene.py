@@ -21,10 +21,10 @@ from hilsplat.base.device import ComputeDevice, compute_device
 from hilsplat.base.errors import ModelError, SettingsError
 from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.base.model_store import is_embedded, meaningless
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.field.code import Code, autoencoder_file, load_code
 from hilsplat.field.language_field import LanguageField
+from hilsplat.models.store import is_embedded, meaningless
 from hilsplat.query.field_colours import field_colours
 from hilsplat.query.hits import Hit, hit_of, hits_of
 from hilsplat.query.latent_relevancy import LatentRelevancy

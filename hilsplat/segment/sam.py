@@ -17,7 +17,7 @@ from PIL import Image
 
 from hilsplat.base.errors import ModelError
 from hilsplat.base.levels import Level
-from hilsplat.base.onnx_models import ModelFolder, open_model_folder, require_three_heads, side_px
+from hilsplat.models.folder import ModelFolder, open_model_folder, require_three_heads, side_px
 from hilsplat.segment.kernels import areas_and_boxes, upscaled_runs
 from hilsplat.segment.logit_kernels import quantise_logits
 from hilsplat.settings import MasksSettings
@@ -131,7 +131,7 @@ class SamModel:
         """Open a model folder.
 
         Args:
-            folder: in a layout of `base.model_layouts`.
+            folder: in a layout of `models.layouts`.
             variant: ending of the networks' names, such as `fp16`.
 
         Raises:

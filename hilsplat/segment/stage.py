@@ -15,9 +15,9 @@ from hilsplat.base.artifacts import (
 from hilsplat.base.errors import SceneError
 from hilsplat.base.identity import code_digest
 from hilsplat.base.levels import LEVELS
-from hilsplat.base.model_memory import available_mib, needs_of
 from hilsplat.base.parallel import in_order
 from hilsplat.base.progress import stage_log, track
+from hilsplat.models.memory import available_mib, needs_of
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.candidates import Candidates, candidates_key, decode_candidates
 from hilsplat.segment.generate import masks_from_candidates

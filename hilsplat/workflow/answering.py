@@ -4,8 +4,8 @@ from pathlib import Path
 
 import yaml
 
-from hilsplat.base.model_store import meaningless, read_model
 from hilsplat.configuration import StageSettings, parse_run
+from hilsplat.models.store import meaningless, read_model
 from hilsplat.scene.sheet import PHOTOS
 
 

@@ -437,8 +437,8 @@ class Plan:
 @functools.cache
 def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int) -> int:
     """Memory of a stage with a model; 0 if its folder cannot be read, which the stage reports."""
-    from hilsplat.base.model_memory import MIB, machine_mib, needs_of  # onnxruntime takes a while to import
-    from hilsplat.base.onnx_models import open_model_folder
+    from hilsplat.models.folder import open_model_folder
+    from hilsplat.models.memory import MIB, machine_mib, needs_of  # onnxruntime takes a while to import
     from hilsplat.segment.sam import own_thresholds
 
     try:

@@ -136,3 +136,11 @@ def test_every_place_in_the_architecture_exists() -> None:
             definitions = {each.name: each for each in ast.iter_child_nodes(scope) if hasattr(each, "name")}
             assert part in definitions, f"{place}: {path} does not define {part}"
             scope = definitions[part]
+
+
+def test_every_room_is_in_the_architecture_and_holds_at_most_twenty_files() -> None:
+    named = set(inline_code(PROJECT / "docs/architecture.md"))
+    rooms = {path.parent for path in (PROJECT / "hilsplat").glob("*/__init__.py")}
+    assert {f"hilsplat/{room.name}/" for room in rooms} <= named
+    folders = {path.parent for path in (PROJECT / "hilsplat").rglob("*.py")}
+    assert {folder: count for folder in folders if (count := len(list(folder.glob("*.py")))) > 20} == {}

@@ -5,7 +5,7 @@ import shutil
 import sys
 from pathlib import Path
 
-from hilsplat.base.model_store import RECOMMENDED, RELEASES
+from hilsplat.models.store import RECOMMENDED, RELEASES
 from tests.loopback_hub import LoopbackHub, loopback_hub
 from tests.workflow.conftest import Project, copy_project
 

@@ -12,11 +12,11 @@ from tokenizers import Tokenizer, models, pre_tokenizers
 from hilsplat.base.artifacts import read_index, read_npy, sha256_of_path
 from hilsplat.base.errors import MisalignedArtifactError, ModelError, SettingsError
 from hilsplat.base.images import write_png
-from hilsplat.base.onnx_models import Network
 from hilsplat.configuration import parse_section
 from hilsplat.embed.clip import ClipModel, open_clip_of, unit
 from hilsplat.embed.model_check import check_model
 from hilsplat.embed.stage import run_clip
+from hilsplat.models.folder import Network
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks

@@ -158,7 +158,7 @@ def as_module(model, function):
 @pytest.fixture(scope="session")
 def sam2_parts(tmp_path_factory):
     """A SAM 2 for images of 64 px: transformers' model, and its folder with the names of transformers.js."""
-    transformers = pytest.importorskip("transformers", reason="needs the extra export-tests")
+    transformers = pytest.importorskip("transformers", reason="needs the extra export")
     import torch
 
     folder = tmp_path_factory.mktemp("sam2")
@@ -226,7 +226,7 @@ def sam2_parts(tmp_path_factory):
 def siglip_parts(tmp_path_factory):
     """A SigLIP for crops of 32 px: transformers' model, its folder with the names of transformers.js, and its
     single network by optimum."""
-    transformers = pytest.importorskip("transformers", reason="needs the extra export-tests")
+    transformers = pytest.importorskip("transformers", reason="needs the extra export")
     import torch
     from tokenizers import Tokenizer, models, pre_tokenizers, processors
 

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilsplat.base.clip_split import split_clip
 from hilsplat.base.errors import ModelError
 from hilsplat.embed.clip import ClipModel
 from hilsplat.embed.model_check import check_model
+from hilsplat.models.clip_split import split_clip
 from hilsplat.segment.masks import HierarchicalMasks
 
 TOLERANCE = 1e-4

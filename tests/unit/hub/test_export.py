@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from hilsplat.base.errors import ModelError
-from hilsplat.base.model_store import RELEASES
 from hilsplat.embed.clip import ClipModel
 from hilsplat.hub import export
 from hilsplat.hub.get import get_models
+from hilsplat.models.store import RELEASES
 from tests.unit.export.conftest import clip_parts
 
 __all__ = ["clip_parts"]

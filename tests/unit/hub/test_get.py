@@ -14,10 +14,10 @@ from huggingface_hub.utils import reset_sessions
 
 from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import DiskSpaceError, DownloadError, ModelError
-from hilsplat.base.model_store import RELEASES, real_model
 from hilsplat.hub import get, transfer
 from hilsplat.hub.get import get_models
 from hilsplat.hub.overview import check_models, models_table
+from hilsplat.models.store import RELEASES, real_model
 from tests.loopback_hub import Refusal, git_sha1
 from tests.unit.export.conftest import clip_parts
 from tests.unit.hub.conftest import CLIP, SAM, point_at

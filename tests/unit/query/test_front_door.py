@@ -15,11 +15,11 @@ import pytest
 import hilsplat
 from hilsplat.base.artifacts import read_npy
 from hilsplat.base.errors import ArtifactError, ModelError, SettingsError
-from hilsplat.base.onnx_models import open_model_folder
 from hilsplat.base.provenance import provenance_path, write_provenance
 from hilsplat.evaluate.figures.comparison import open_variants
 from hilsplat.evaluate.figures.panel import run_figures
 from hilsplat.field.code import autoencoder_file
+from hilsplat.models.folder import open_model_folder
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, build_finished_desk, region_mask

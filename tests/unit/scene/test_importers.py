@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 
 from hilsplat.base.errors import RegistrationError, SceneError
+from hilsplat.photos.add import add_scene
 from hilsplat.scene import phone_exports
 from hilsplat.scene.colmap import pycolmap
-from hilsplat.scene.photos import add_scene
 from hilsplat.scene.poses import run_poses
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import PosesSettings

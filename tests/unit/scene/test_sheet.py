@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from hilsplat.base.errors import SceneError
-from hilsplat.scene.photos import add_scene, inspect_photos
+from hilsplat.photos.add import add_scene, inspect_photos
 from hilsplat.scene.sheet import choose_scenes, read_sheet
 
 HEADER = "dataset\tscene\tgroup\tsource\tunit\n"

@@ -8,7 +8,7 @@ import pytest
 from onnx import TensorProto, helper
 
 from hilsplat.base.errors import ModelError
-from hilsplat.base.onnx_models import open_model_folder, require_one_space, require_three_heads
+from hilsplat.models.folder import open_model_folder, require_one_space, require_three_heads
 from hilsplat.segment.sam import SamModel
 
 

@@ -270,7 +270,7 @@ def test_names_match_themselves_alone():
 
 
 def test_memory_grows_with_the_model_and_with_views_at_once(tmp_path, monkeypatch):
-    monkeypatch.setattr("hilsplat.base.model_memory.machine_mib", lambda: 12_000.0)
+    monkeypatch.setattr("hilsplat.models.memory.machine_mib", lambda: 12_000.0)
     folder = tmp_path / "models/sam"
     shutil.copytree(PROJECT / "models/sam-tiny", folder)
     config = json.loads((folder / "config.json").read_text())

@@ -10,9 +10,9 @@ from PIL import Image
 from hilsplat.base.artifacts import write_json
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
-from hilsplat.base.model_store import meaningless
 from hilsplat.base.provenance import provenance_path
 from hilsplat.evaluate.figures.panel import annotated_rows, draw_panel, free_rows, truths_of
+from hilsplat.models.store import meaningless
 from hilsplat.query.answer import file_name, report, views_of
 from hilsplat.query.hits import hits_of
 from hilsplat.query.pictures import ANSWER_RGB, TRUTH_RGB, outline, paint_answer, save_figure

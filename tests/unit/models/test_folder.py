@@ -9,9 +9,9 @@ import onnxruntime
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from hilsplat.base.clip_split import split_clip
 from hilsplat.base.errors import ModelError
-from hilsplat.base.onnx_models import external_weights, open_model_folder, variants_of
+from hilsplat.models.clip_split import split_clip
+from hilsplat.models.folder import external_weights, open_model_folder, variants_of
 from hilsplat.segment.sam import SamModel
 from tests.conftest import PROJECT
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilsplat.scene.photo_check import CheckedPhoto, blur, photo_doubts
+from hilsplat.photos.check import CheckedPhoto, blur, photo_doubts
 from tests.unit.scene.test_poses import plane_views
 
 SIZE = 360

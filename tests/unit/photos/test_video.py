@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from hilsplat.base.errors import SceneError
-from hilsplat.scene.motion import displacement
-from hilsplat.scene.video import MIN_STEP, extract_frames
-from hilsplat.scene.video_colours import _pq_light, srgb_from_hdr
+from hilsplat.photos.motion import displacement
+from hilsplat.photos.video import MIN_STEP, extract_frames
+from hilsplat.photos.video_colours import _pq_light, srgb_from_hdr
 
 
 def wall(width=900, height=240):
@@ -220,7 +220,7 @@ def test_ten_bit_hlg_video_is_mapped_to_srgb(tmp_path):
 @pytest.mark.parametrize(("size", "expected"), [((64, 48), (254, 0, 0)), ((1280, 720), (255, 24, 0))])
 def test_the_matrix_of_an_untagged_stream_follows_its_size(size, expected):
     """BT.601's pure red, (81, 90, 240), is read by BT.601 below 720 lines and by BT.709 from there on."""
-    from hilsplat.scene.video_colours import rgb_pixels
+    from hilsplat.photos.video_colours import rgb_pixels
 
     frame = av.VideoFrame(*size, "yuv420p")
     for plane, code in zip(frame.planes, (81, 90, 240), strict=True):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hilsplat.base.onnx_models import ModelFolder, input_side_px
+from hilsplat.models.folder import ModelFolder, input_side_px
 
 PROCESS_MIB = 1500
 """A stage without its networks: libraries, images, candidates, masks."""

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from hilsplat.base.model_memory import PROCESS_MIB, Needs, available_mib, machine_mib, needs_of
-from hilsplat.base.onnx_models import ModelFolder, open_model_folder
+from hilsplat.models.folder import ModelFolder, open_model_folder
+from hilsplat.models.memory import PROCESS_MIB, Needs, available_mib, machine_mib, needs_of
 from tests.conftest import PROJECT
 
 

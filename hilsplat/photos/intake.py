@@ -48,7 +48,7 @@ def brought_photographs(source: Path, target: Path, frames: int) -> Iterator[Bro
     if videos := _videos_of(source):
 
         def make(folder: Path) -> list[str]:
-            from hilsplat.scene.video import extract_frames  # PyAV takes time to load
+            from hilsplat.photos.video import extract_frames  # PyAV takes time to load
 
             named = ", ".join(video.name for video in videos)
             notes = extract_frames(videos, folder, frames)
@@ -62,7 +62,7 @@ def brought_photographs(source: Path, target: Path, frames: int) -> Iterator[Bro
     elif source.suffix.lower() in (".zip", ".r3d"):
 
         def make(folder: Path) -> list[str]:
-            from hilsplat.scene.archive import unpack_photographs
+            from hilsplat.photos.archive import unpack_photographs
 
             unpack_photographs(source, folder)
             return [f"{source.name} unpacked to {target}"]

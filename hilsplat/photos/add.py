@@ -12,10 +12,10 @@ from hilsplat.base.files import list_images
 from hilsplat.base.images import open_image, read_image, resize_to_fit
 from hilsplat.base.names import NAME_RULE, name_problem
 from hilsplat.base.progress import track
+from hilsplat.photos.check import CHECK_SIDE_PX, CheckedPhoto, photo_doubts
+from hilsplat.photos.intake import brought_photographs
 from hilsplat.scene.features import EXIF_ORIENTATION, exif_focal_px
-from hilsplat.scene.intake import brought_photographs
 from hilsplat.scene.layouts import has_known_poses, photo_folder
-from hilsplat.scene.photo_check import CHECK_SIDE_PX, CheckedPhoto, photo_doubts
 from hilsplat.scene.sheet import (
     COLUMNS,
     MIN_PHOTOS,
@@ -42,7 +42,7 @@ class PhotoReport:
         num_rotated: photographs that an EXIF flag turns upright.
         duplicates: groups of file names with identical bytes.
         passed_over: number of skipped files per suffix: photographs in formats that are not read.
-        doubts: what is likely to fail, and what to do about it (`photo_check`).
+        doubts: what is likely to fail, and what to do about it (`check`).
         notes: what was done to make the folder (`intake`).
     """
 

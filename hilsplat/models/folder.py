@@ -1,7 +1,7 @@
 """Model folders in the layouts of published ONNX exports: finding, checking, running.
 
 A folder holds `config.json`, what prepares its inputs, and its networks as `.onnx` files
-(`model_layouts.LAYOUTS`). Everything needed to turn a photograph into a network's input is read from the
+(`layouts.LAYOUTS`). Everything needed to turn a photograph into a network's input is read from the
 folder, so its digest identifies the model.
 """
 
@@ -17,9 +17,9 @@ import numpy as np
 import onnxruntime
 
 from hilsplat.base.artifacts import read_json, sha256_of_file, sha256_of_json
-from hilsplat.base.clip_split import whole_clip
 from hilsplat.base.errors import ArtifactError, ModelError
-from hilsplat.base.model_layouts import (
+from hilsplat.models.clip_split import whole_clip
+from hilsplat.models.layouts import (
     LAYOUTS,
     OTHER_TYPES,
     SECTIONS,

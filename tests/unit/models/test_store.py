@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from hilsplat.base.model_store import RECOMMENDED, RELEASES, present_models, read_model, real_model
 from hilsplat.configuration import with_models
+from hilsplat.models.store import RECOMMENDED, RELEASES, present_models, read_model, real_model
 from hilsplat.settings import ClipSettings, FieldSettings, MasksSettings
 
 AUTO = MasksSettings(segmenter="auto", model="auto")

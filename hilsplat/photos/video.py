@@ -17,8 +17,8 @@ from PIL import Image
 from hilsplat.base.artifacts import sha256_of_file, write_json
 from hilsplat.base.errors import SceneError
 from hilsplat.base.progress import track
-from hilsplat.scene.motion import displacement, sharpness
-from hilsplat.scene.video_colours import rgb_pixels
+from hilsplat.photos.motion import displacement, sharpness
+from hilsplat.photos.video_colours import rgb_pixels
 
 logger = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hilsplat.base.model_layouts import LAYOUTS, layout_of
+from hilsplat.models.layouts import LAYOUTS, layout_of
 
 MODELS = Path("models")
 """Folder of the models, relative to the folder in which a command or a run starts."""
