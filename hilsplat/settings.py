@@ -91,6 +91,12 @@ class GaussiansSettings(Section):
     image_scale: float = knob(
         1.0, "scale of the images that the fit sees; 0.5 halves their sides", gt=0, le=1
     )
+    quarter_until: float = knob(
+        0.15, "share of the iterations on images of a quarter of the size", ge=0, le=1, origin="3DGS: 0"
+    )
+    half_until: float = knob(
+        0.5, "share of the iterations after which images have their full size", ge=0, le=1, origin="3DGS: 0"
+    )
     sh_degree: int = knob(2, "degree of the spherical harmonics of the colours", ge=0, le=3, origin="3DGS: 3")
     ssim_weight: float = knob(
         0.2, "weight of D-SSIM in the photometric loss; L1 has the rest", ge=0, le=1, origin="3DGS"
@@ -105,6 +111,9 @@ class GaussiansSettings(Section):
     )
     scales_rate: float = knob(0.01, "step size of the log scales", gt=0, origin="3DGS: 5e-3")
     quats_rate: float = knob(0.004, "step size of the quaternions", gt=0, origin="3DGS: 1e-3")
+    sh_rate: float = knob(
+        5e-3, "step size of the constant harmonics; the others have a twentieth", gt=0, origin="3DGS: 2.5e-3"
+    )
     densify_from: float = knob(
         0.06,
         "share of the iterations after which densification begins",

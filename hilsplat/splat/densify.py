@@ -6,10 +6,12 @@ device coordinates), its length averaged over the steps in which the Gaussian wa
 """
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
+from hilsplat.base.compiled import compiled
 from hilsplat.base.rotations import rotate, unit_quaternions
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.gaussians import FIELDS
@@ -23,6 +25,17 @@ HUGE = 0.5
 """Gaussians with a larger axis, in units of the extent, are pruned (3DGS: 0.1, after the first
 opacity reset; here the walls of rooms are flat, wide Gaussians)."""
 RESET_OPACITY = 0.01  # 3DGS
+
+
+@compiled
+@no_type_check
+def _add_lengths(means_px, drawn, half_width, half_height, total, seen):
+    """Add the lengths of the rows of `means_px`, in half images, to `total` and count them in `seen`."""
+    for i in range(len(total)):
+        if drawn[i]:
+            x, y = half_width * means_px[i, 0], half_height * means_px[i, 1]
+            total[i] += np.sqrt(x * x + y * y)
+            seen[i] += 1
 
 
 @dataclass
@@ -44,9 +57,7 @@ class ScreenGradients:
 
     def add(self, means_px: Float32[np.ndarray, "N 2"], drawn: np.ndarray, size_hw: tuple[int, int]) -> None:
         """Add the gradients of one view's step."""
-        half = np.array([size_hw[1] / 2, size_hw[0] / 2], np.float32)
-        self.total += np.sqrt(np.square(means_px * half).sum(axis=1))
-        self.seen += drawn
+        _add_lengths(means_px, drawn, size_hw[1] / 2, size_hw[0] / 2, self.total, self.seen)
 
     def mean(self) -> Float64[np.ndarray, " N"]:
         """Average length; 0 if never drawn."""

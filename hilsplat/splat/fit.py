@@ -33,6 +33,8 @@ logger = logging.getLogger(__name__)
 
 CURVE_EVERY = 20
 """Steps between two points of the curves."""
+MIN_SIDE_PX = 32
+"""Images are not shrunk below this shorter side."""
 
 
 def fit_step(
@@ -52,10 +54,14 @@ def fit_step(
 
     device = choose_device(settings.device)
     seen = draw(state.adam.as_gaussians(), view.camera, degree, threads=threads, device=device)
-    shown = seen.image + (1 - seen.alpha)[..., None] * behind
+    shown, grad_alpha = seen.image, np.zeros_like(seen.alpha)
+    if behind.any():
+        shown = seen.image + (1 - seen.alpha)[..., None] * behind
     target = to_float(view.image)
     loss, grad = photometric_loss(shown, target, ssim_weight=settings.ssim_weight, threads=threads)
-    gradients = seen.gradients(grad, -(grad @ behind))
+    if behind.any():
+        grad_alpha = -(grad @ behind)
+    gradients = seen.gradients(grad, grad_alpha)
     is_frozen = settings.initial == "frozen"
     rate = 0.0 if is_frozen else extent * means_rate(settings, progress)
     if settings.strategy == "mcmc" and not is_frozen:
@@ -69,6 +75,19 @@ def fit_step(
         state.curve.append((state.step, loss, -10 * np.log10(max(error, 1e-12)), len(state.adam)))
     if not is_frozen:
         control_density(state, settings, progress, extent, threads)
+
+
+def scale_at(settings: GaussiansSettings, progress: float, side_px: int) -> float:
+    """Scale of the images, in units of their full size: coarse to fine.
+
+    Coarse images cost a fraction, and wide gradients bring Gaussians into place from further away.
+
+    Args:
+        progress: share of the iterations done, in [0, 1].
+        side_px: shorter side of the images at full size.
+    """
+    scale = 0.25 if progress < settings.quarter_until else 0.5 if progress < settings.half_until else 1.0
+    return scale if scale * side_px >= MIN_SIDE_PX else 1.0
 
 
 def control_density(
@@ -128,8 +147,12 @@ def fit_gaussians(
         state = FitState(adam, ScreenGradients.start(len(adam)), generator)
     else:
         logger.info("resuming from the checkpoint at step %d", state.step)
-    for _ in track(range(state.step, settings.iterations), "fit steps"):
-        fit_step(state, views, settings, extent, threads)
+    sizes = {1.0: views}
+    for step in track(range(state.step, settings.iterations), "fit steps"):
+        scale = scale_at(settings, step / settings.iterations, min(cameras[0].size_hw))
+        if scale not in sizes:
+            sizes[scale] = load_views(scene, "train", scale * settings.image_scale)
+        fit_step(state, sizes[scale], settings, extent, threads)
         if len(state.adam) == 0:
             raise SceneError(
                 f"all Gaussians of {scene.name} became transparent",

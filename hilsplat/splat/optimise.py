@@ -9,11 +9,13 @@ from hilsplat.base.compiled import compiled
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise.cpu import Gradients, over_ranges
+from hilsplat.splat.rasterise.lanes import WIDTH, lanes, load, root, store
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15  # 3DGS
 
 OPACITY_RATE = 0.05  # 3DGS
-SH_RATE, SH_REST_RATE = 2.5e-3, 2.5e-3 / 20  # constant term, other terms; 3DGS
+SH_REST_SHARE = 1 / 20
+"""Step size of the harmonics that depend on the view, as a share of that of the constant ones (3DGS)."""
 
 
 def means_rate(settings: GaussiansSettings, progress: float) -> float:
@@ -25,31 +27,38 @@ def means_rate(settings: GaussiansSettings, progress: float) -> float:
     return settings.means_rate ** (1 - progress) * settings.means_rate_last**progress
 
 
-@compiled(error_model="numpy")
+@compiled
 @no_type_check
-def _adam_rows(
-    begin, end, values, gradients, first, second, rate, rate_rest, columns, head, root, one_minus1
-):
-    """Adam for rows begin..end, in place.
+def _adam_chunks(begin, end, values, gradients, first, second, rates, root_of_rest2):
+    """Adam for chunks begin..end of 16 numbers, in place.
 
-    The first `head` of the `columns` numbers of a row step by `rate`, the others by `rate_rest`;
-    `root` is sqrt(1 - beta2^t), `one_minus1` 1 - beta1^t.
+    `rates` repeats: chunk k steps by rates 16 k ... of them, divided by 1 - beta1^t beforehand;
+    `root_of_rest2` is sqrt(1 - beta2^t).
     """
-    beta1, rest1 = np.float32(BETA1), np.float32(1.0 - BETA1)
-    beta2, rest2 = np.float32(BETA2), np.float32(1.0 - BETA2)
-    epsilon, inverse_root = np.float32(EPSILON), np.float32(1.0 / root)
-    for row in range(begin, end):
-        for part in range(2):
-            start = row * columns + (head if part else 0)
-            stop = row * columns + (columns if part else head)
-            step = np.float32((rate_rest if part else rate) / one_minus1)
-            for k in range(start, stop):
-                g = gradients[k]
-                m = beta1 * first[k] + rest1 * g
-                v = beta2 * second[k] + rest2 * g * g
-                first[k] = m
-                second[k] = v
-                values[k] -= step * m / (np.sqrt(v) * inverse_root + epsilon)
+    beta1, rest1 = lanes(np.float32(BETA1)), lanes(np.float32(1.0 - BETA1))
+    beta2, rest2 = lanes(np.float32(BETA2)), lanes(np.float32(1.0 - BETA2))
+    epsilon, scale = lanes(np.float32(EPSILON)), lanes(np.float32(1.0 / root_of_rest2))
+    for chunk in range(begin, end):
+        at = chunk * WIDTH
+        g = load(gradients, at)
+        m = beta1 * load(first, at) + rest1 * g
+        v = beta2 * load(second, at) + rest2 * g * g
+        store(first, at, m)
+        store(second, at, v)
+        store(values, at, load(values, at) - load(rates, at % len(rates)) * m / (root(v) * scale + epsilon))
+
+
+def _adam(arrays: list[np.ndarray], rates: list[float], t: int, threads: int) -> None:
+    """Step `t` of Adam for flat arrays (values, gradients, moments), in place; `rates` repeat."""
+    repeated = np.array(WIDTH * rates, np.float32) / np.float32(1 - BETA1**t)
+    root_of_rest2 = float(np.sqrt(1 - BETA2**t))
+    whole, rest = divmod(len(arrays[0]), WIDTH)
+    over_ranges(_adam_chunks, whole, threads, *arrays, repeated, root_of_rest2)
+    if rest:
+        last = [np.concatenate([array[-rest:], np.zeros(WIDTH - rest, np.float32)]) for array in arrays]
+        _adam_chunks(0, 1, *last, np.roll(repeated, -WIDTH * whole), root_of_rest2)
+        for array, chunk in zip(arrays, last, strict=True):
+            array[-rest:] = chunk[:rest]
 
 
 @dataclass
@@ -87,28 +96,21 @@ class Adam:
         """One step.
 
         Args:
-            settings: step sizes of scales and quaternions.
+            settings: step sizes of scales, quaternions and harmonics.
             rate_of_means: step size of the means, scene units.
         """
         self.steps += 1
-        rates = {
-            "means": (rate_of_means, rate_of_means),
-            "log_scales": (settings.scales_rate, settings.scales_rate),
-            "quats": (settings.quats_rate, settings.quats_rate),
-            "opacity_logits": (OPACITY_RATE, OPACITY_RATE),
-            "sh": (SH_RATE, SH_REST_RATE),
+        of_rest = SH_REST_SHARE * settings.sh_rate
+        rates: dict[str, list[float]] = {  # of the numbers of one Gaussian; they repeat
+            "means": [rate_of_means],
+            "log_scales": [settings.scales_rate],
+            "quats": [settings.quats_rate],
+            "opacity_logits": [OPACITY_RATE],
+            "sh": 3 * [settings.sh_rate] + (self.parameters["sh"].shape[1] - 1) * 3 * [of_rest],
         }
-        root, one_minus1 = float(np.sqrt(1 - BETA2**self.steps)), 1 - BETA1**self.steps
-        for name, (rate, rate_rest) in rates.items():
-            values = self.parameters[name]
-            columns = int(np.prod(values.shape[1:], dtype=int))
-            flat = [
-                array.reshape(-1)
-                for array in (values, getattr(gradients, name), self.first[name], self.second[name])
-            ]
-            head = 3 if name == "sh" else columns
-            sizes = (rate, rate_rest, columns, head, root, one_minus1)
-            over_ranges(_adam_rows, len(values), threads, *flat, *sizes)
+        for name, rate in rates.items():
+            arrays = (self.parameters[name], getattr(gradients, name), self.first[name], self.second[name])
+            _adam([array.reshape(-1) for array in arrays], rate, self.steps, threads)
 
     def keep(self, rows: np.ndarray) -> None:
         """Keep these rows (mask or indices), with their moments."""

@@ -177,7 +177,7 @@ def blend_forward(
     """Blend per-Gaussian channels: premultiplied image and alpha."""
     image = np.empty((*view.size_hw, channels.shape[1]), np.float32)
     alpha = np.empty(view.size_hw, np.float32)
-    t, blended = view.tiles, (view.geometry, view.box, channels, image, alpha)
+    t, blended = view.tiles, (view.geometry, channels, image, alpha)
     for band in tile_lists(view, threads):
         lists = (band.base, t.tiles_x, t.tile_start, band.gaussian)
         band.over_tiles(blend, threads, *lists, *blended)
@@ -203,7 +203,7 @@ def blend_gradients(
     t, p, n = view.tiles, gaussians, len(gaussians)
     columns = MOMENTS + channels.shape[1]
     sums = np.zeros((n, columns))
-    blended = (view.geometry, view.box, channels, image, alpha, grad_image, grad_alpha)
+    blended = (view.geometry, channels, image, alpha, grad_image, grad_alpha)
     for band in tile_lists(view, threads):
         slots = np.empty((len(band.gaussian), columns), np.float32)
         lists = (band.base, t.tiles_x, t.tile_start, band.gaussian)
@@ -211,11 +211,10 @@ def blend_gradients(
         # every range reads all entries, so there is one per thread
         edges = np.linspace(0, n, max(threads, 1) + 1).astype(int).tolist()
         over_edges(add_slots, edges, threads, band.gaussian, slots, sums)
-    # np.zeros leaves the zeroing to the threads that first write there; np.zeros_like would do it here
     out = Gradients(
-        **{name: np.zeros(getattr(p, name).shape, np.float32) for name in FIELDS},
+        **{name: np.empty(getattr(p, name).shape, np.float32) for name in FIELDS},
         features=sums[:, MOMENTS + 3 :].astype(np.float32),
-        means_px=np.zeros((n, 2), np.float32),
+        means_px=np.empty((n, 2), np.float32),
     )
     known = (p.means, p.log_scales, p.quats, p.sh, view.degree, view.camera, view.geometry, view.box)
     outputs = (out.means, out.log_scales, out.quats, out.opacity_logits, out.sh, out.means_px)
@@ -261,7 +260,7 @@ def sparse_weights(
     def walk(cursor: np.ndarray, columns: np.ndarray, weights: np.ndarray) -> None:
         rows = (np.float32(min_weight), cursor, columns, weights)
         for band in tile_lists(view, threads):
-            lists = (band.base, t.tiles_x, view.size_hw, t.tile_start, band.gaussian, view.geometry, view.box)
+            lists = (band.base, t.tiles_x, view.size_hw, t.tile_start, band.gaussian, view.geometry)
             band.over_tiles(blend_weights, threads, *lists, *rows)
 
     walk(count, np.empty(0, np.int32), np.empty(0, np.float32))

@@ -252,7 +252,8 @@ def project_backward(
 ):
     """Gradients of Gaussians begin..end from their moments and dL/dcolours (rows of `sums`).
 
-    The outputs must hold zeros. `grad_means_px` is dL/d(projected mean), per pixel.
+    The outputs are overwritten; Gaussians that are not drawn get zeros. `grad_means_px` is dL/d(projected
+    mean), per pixel.
     """
     fx, fy = camera[12], camera[13]
     axes, factor, grad_factor = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
@@ -261,6 +262,13 @@ def project_backward(
     bases = (degree + 1) * (degree + 1)
     for i in range(begin, end):
         if box[i, 1] < box[i, 0]:
+            for k in range(3):
+                grad_means[i, k] = grad_log_scales[i, k] = 0.0
+            for k in range(4):
+                grad_quats[i, k] = 0.0
+            grad_opacity_logits[i] = grad_means_px[i, 0] = grad_means_px[i, 1] = 0.0
+            for k in range(grad_sh.shape[1]):
+                grad_sh[i, k, 0] = grad_sh[i, k, 1] = grad_sh[i, k, 2] = 0.0
             continue
 
         # log alpha = ln opacity - (A dx^2 + 2 B dx dy + C dy^2) / 2, conic (A, B, C) = inverse covariance
@@ -372,6 +380,8 @@ def project_backward(
             grad_sh[i, k, 0] = basis[k] * red
             grad_sh[i, k, 1] = basis[k] * green
             grad_sh[i, k, 2] = basis[k] * blue
+        for k in range(bases, grad_sh.shape[1]):
+            grad_sh[i, k, 0] = grad_sh[i, k, 1] = grad_sh[i, k, 2] = 0.0
         if degree > 0:
             _sh_slope(vx, vy, vz, degree, slope)
             hx, hy, hz = 0.0, 0.0, 0.0

@@ -123,6 +123,16 @@ def test_frozen_points_must_be_there(scene):
             fit.fit_gaussians(bare, settings, seed=0)
 
 
+def test_images_grow_from_a_quarter_to_their_size():
+    def scales(side_px: int, **shares: float) -> list[float]:
+        settings = GaussiansSettings(**shares)
+        return [fit.scale_at(settings, at, side_px) for at in (0.0, 0.19, 0.2, 0.59, 0.6, 1.0)]
+
+    assert scales(400, quarter_until=0.2, half_until=0.6) == [0.25, 0.25, 0.5, 0.5, 1, 1]
+    assert scales(100, quarter_until=0.2, half_until=0.6) == [1, 1, 0.5, 0.5, 1, 1]  # a quarter is 25 px
+    assert scales(400, quarter_until=0, half_until=0) == [1] * 6
+
+
 def test_rate_of_the_means_falls_exponentially():
     settings = GaussiansSettings(means_rate=1e-2, means_rate_last=1e-4)
     assert means_rate(settings, 0.0) == pytest.approx(1e-2)
@@ -207,7 +217,7 @@ def test_first_adam_step_moves_by_the_rate_against_the_sign():
     gradients = Gradients(
         **ones, features=np.zeros((2, 0), np.float32), means_px=np.zeros((2, 2), np.float32)
     )
-    adam.step(gradients, GaussiansSettings(scales_rate=0.01), rate_of_means=3.2e-4, threads=1)
+    adam.step(gradients, GaussiansSettings(scales_rate=0.01, sh_rate=2.5e-3), rate_of_means=3.2e-4, threads=1)
     np.testing.assert_allclose(before["means"] - adam.parameters["means"], 3.2e-4, rtol=1e-3)
     np.testing.assert_allclose(before["log_scales"] - adam.parameters["log_scales"], 0.01, rtol=1e-3)
     np.testing.assert_allclose(before["sh"] - adam.parameters["sh"], 2.5e-3, rtol=1e-3)

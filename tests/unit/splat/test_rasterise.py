@@ -77,6 +77,25 @@ def test_image_agrees_with_reference(device, size_hw, degree, num_features):
     assert np.quantile(np.abs(out.alpha - alpha.numpy()), 0.999) < 1e-5
 
 
+@pytest.mark.parametrize("stretch", [0.0, 3.0])
+def test_long_lists_of_faint_needles_agree_with_the_reference(device, stretch):
+    # one tile holds them all, several chunks of its list; needles pass between the pixels of most blocks
+    gaussians, view = random_gaussians(500, seed=11, degree=0), camera(16, 16, focal=20.0)
+    gaussians.opacity_logits[:] -= 3
+    gaussians.log_scales[:, 0] += stretch
+    gaussians.log_scales[:, 1:] -= stretch
+    by_image = np.random.default_rng(0).standard_normal((16, 16, 3), np.float32)
+    seen = draw(gaussians, view, 0, threads=1, device=device)
+    found = seen.gradients(by_image, np.zeros((16, 16), np.float32))
+    parameters = leaves(gaussians)
+    image, _, _ = render_reference(Tensors(*parameters), view, 0)
+    (image * torch.from_numpy(by_image)).sum().backward()
+    assert np.quantile(np.abs(seen.image - image.detach().numpy()), 0.99) < 2e-5
+    for name, leaf in zip(FIELDS, parameters, strict=True):
+        error = np.linalg.norm(getattr(found, name) - leaf.grad.numpy()) / np.linalg.norm(leaf.grad.numpy())
+        assert error < 1e-3, f"{name}: relative error {error:.1e}"
+
+
 @pytest.mark.parametrize(("degree", "num_features"), [(0, 0), (1, 3), (2, 9), (3, 16)])
 def test_gradients_agree_with_autograd_of_reference(device, degree, num_features):
     view, gaussians = camera(37, 51), random_gaussians(60, seed=3, degree=degree)

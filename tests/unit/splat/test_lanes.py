@@ -1,0 +1,109 @@
+"""Sixteen lanes: each operation against numpy."""
+
+import numba
+import numpy as np
+
+from hilsplat.splat.rasterise.lanes import (
+    bits_ge,
+    exp2_negative,
+    first_bit,
+    lanes,
+    larger,
+    load,
+    reciprocal,
+    root,
+    smaller,
+    store,
+    store_sums,
+)
+
+MANY = np.exp(np.random.default_rng(0).uniform(-20, 10, 16 * 4000)).astype(np.float32)
+
+
+@numba.njit
+def _over(operation, values, out):
+    for at in range(0, len(values), 16):
+        store(out, at, operation(load(values, at)))
+
+
+def relative_error(operation, exact: np.ndarray, values: np.ndarray = MANY) -> float:
+    """Largest relative error of an operation on lanes."""
+    out = np.empty_like(values)
+    _over(operation, values, out)
+    return float(np.abs(out / exact - 1).max())
+
+
+def test_functions_of_one_number_are_right_to_float32():
+    exact = MANY.astype(np.float64)
+    assert relative_error(numba.njit(lambda x: reciprocal(x)), 1 / exact) < 3e-7
+    assert relative_error(numba.njit(lambda x: root(x)), np.sqrt(exact)) < 1e-7
+    exponents = np.linspace(-100, 0, 16 * 4000, dtype=np.float32)
+    assert (
+        relative_error(numba.njit(lambda x: exp2_negative(x)), np.exp2(exponents.astype(float)), exponents)
+        < 3e-7
+    )
+
+
+@numba.njit
+def _compare(left, right, low, high):
+    store(low, 0, smaller(load(left, 0), load(right, 0)))
+    store(high, 0, larger(load(left, 0), load(right, 0)))
+    return bits_ge(load(left, 0), load(right, 0))
+
+
+def test_comparisons_count_what_is_not_a_number_as_reached():
+    left, right = np.random.default_rng(1).normal(size=(2, 16)).astype(np.float32)
+    low, high = np.empty((2, 16), np.float32)
+    bits = _compare(left, right, low, high)
+    np.testing.assert_array_equal(low, np.minimum(left, right))
+    np.testing.assert_array_equal(high, np.maximum(left, right))
+    assert [bits >> lane & 1 for lane in range(16)] == (left >= right).astype(int).tolist()
+    left[3], right[:] = np.nan, np.inf
+    assert _compare(left, right, low, high) == 1 << 3
+
+
+@numba.njit
+def _bits(bits):
+    out = []
+    while bits != 0:
+        out.append(first_bit(bits))
+        bits &= bits - 1
+    return out
+
+
+def test_bits_are_visited_from_the_lowest():
+    assert _bits(0b1000_0000_0010_0101) == [0, 2, 5, 15]
+
+
+@numba.njit
+def _nine_sums(values, out, at):
+    store_sums(
+        out,
+        at,
+        (
+            load(values, 0),
+            load(values, 16),
+            load(values, 32),
+            load(values, 48),
+            load(values, 64),
+            load(values, 80),
+            load(values, 96),
+            load(values, 112),
+            load(values, 128),
+        ),
+    )
+
+
+def test_sums_of_several_vectors_fill_their_places_and_no_other():
+    values = np.random.default_rng(2).normal(size=(9, 16)).astype(np.float32)
+    out = np.full(16, 7.0, np.float32)
+    _nine_sums(values.reshape(-1), out, 2)
+    np.testing.assert_allclose(out[2:11], values.sum(axis=1), rtol=1e-5, atol=1e-6)
+    assert (out[:2] == 7).all()
+    assert (out[11:] == 7).all()
+
+
+def test_a_number_fills_all_lanes():
+    out = np.empty(16, np.float32)
+    numba.njit(lambda out: store(out, 0, lanes(np.float32(2.5))))(out)
+    assert (out == 2.5).all()
