@@ -77,6 +77,11 @@ def fit_step(
         control_density(state, settings, progress, extent, threads)
 
 
+def steps_of(settings: GaussiansSettings, num_views: int) -> int:
+    """Steps of a fit to this many training views; a few views overfit long before many are learnt."""
+    return min(settings.iterations, settings.steps_per_view * num_views)
+
+
 def scale_at(settings: GaussiansSettings, progress: float, side_px: int) -> float:
     """Scale of the images, in units of their full size: coarse to fine.
 
@@ -138,6 +143,7 @@ def fit_gaussians(
     views = load_views(scene, "train", settings.image_scale)
     if not views:
         raise SceneError(f"{scene.name} has no training view", fix="hold out fewer views (poses.test_every)")
+    settings = settings.model_copy(update={"iterations": steps_of(settings, len(views))})
     cameras = [view.camera for view in views]
     extent = camera_extent(cameras)
     state = FitState.load(checkpoint, key) if checkpoint else None
@@ -214,7 +220,7 @@ def run_gaussians(
             origin = {
                 "kind": "fitted",
                 "strategy": "frozen" if settings.initial == "frozen" else settings.strategy,
-                "iterations": settings.iterations,
+                "iterations": steps_of(settings, len(scene.views("train"))),
                 "seed": seed,
             }
         report = write_report(out_report, gaussians, scene, curve, origin, settings, threads)
