@@ -98,7 +98,7 @@ class GaussiansSettings(Section):
         0.15, "share of the iterations on images of a quarter of the size", ge=0, le=1, origin="3DGS: 0"
     )
     half_until: float = knob(
-        0.55, "share of the iterations after which images have their full size", ge=0, le=1, origin="3DGS: 0"
+        0.5, "share of the iterations after which images have their full size", ge=0, le=1, origin="3DGS: 0"
     )
     sh_degree: int = knob(2, "degree of the spherical harmonics of the colours", ge=0, le=3, origin="3DGS: 3")
     ssim_weight: float = knob(
@@ -107,15 +107,15 @@ class GaussiansSettings(Section):
     # We take a fifteenth of the published number of steps, so each step must go further (docs/splat.md).
     # config/paper.yaml takes all steps at the published sizes.
     means_rate: float = knob(
-        2e-3, "initial step size of the means", unit="extent of the cameras", gt=0, origin="3DGS: 1.6e-4"
+        1.5e-3, "initial step size of the means", unit="extent of the cameras", gt=0, origin="3DGS: 1.6e-4"
     )
     means_rate_last: float = knob(
-        2e-5, "final step size of the means", unit="extent of the cameras", gt=0, origin="3DGS: 1.6e-6"
+        1.5e-5, "final step size of the means", unit="extent of the cameras", gt=0, origin="3DGS: 1.6e-6"
     )
-    scales_rate: float = knob(0.015, "step size of the log scales", gt=0, origin="3DGS: 5e-3")
+    scales_rate: float = knob(0.01, "step size of the log scales", gt=0, origin="3DGS: 5e-3")
     quats_rate: float = knob(0.004, "step size of the quaternions", gt=0, origin="3DGS: 1e-3")
     sh_rate: float = knob(
-        5e-3, "step size of the constant harmonics; the others have a twentieth", gt=0, origin="3DGS: 2.5e-3"
+        4e-3, "step size of the constant harmonics; the others have a twentieth", gt=0, origin="3DGS: 2.5e-3"
     )
     densify_from: float = knob(
         0.06,
