@@ -28,9 +28,9 @@ def show_progress():
         )
         for job, number in needed.items()
     ]
-    run = RunProgress(
-        jobs, Pace(earlier_ratios(PLAN, THREADS)), workflow.cores or len(jobs)
-    )
+    # A cluster takes all that can start.
+    cores = CORES if workflow.local_exec else sum(job.threads for job in jobs)
+    run = RunProgress(jobs, Pace(earlier_ratios(PLAN, THREADS)), cores)
     logger.removeHandler(terminal)
     logger.addHandler(ProgressHandler(run, terminal))
     os.environ[IN_RUN] = "1"
