@@ -137,15 +137,22 @@ def measured_seconds(benchmark: Path) -> float | None:
 
 @dataclass
 class Pace:
-    """Ratios of measured to guessed seconds, by rule."""
+    """How long jobs take beside what was thought.
+
+    Attributes:
+        earlier: ratios of measured to guessed seconds in earlier runs, by rule.
+        now: the same of this run.
+        drift: seconds in this run to those of the same job in an earlier one: the machine may be busier now.
+    """
 
     earlier: Mapping[str, Collection[float]] = field(default_factory=dict)
     now: dict[str, list[float]] = field(default_factory=dict)
+    drift: list[float] = field(default_factory=list)
 
     def seconds(self, job: PlannedJob) -> float:
         """The best estimate of a job that has not begun."""
         if job.measured_s is not None:
-            return job.measured_s
+            return job.measured_s * median([1.0, *self.drift])
         own = [*self.earlier.get(job.rule, ()), *self.now.get(job.rule, ())]
         everything = [1.0, *(ratio for ratios in self.now.values() for ratio in ratios)]
         return job.guess_s * median(own or everything)
@@ -153,6 +160,8 @@ class Pace:
     def learn(self, job: PlannedJob, seconds: float) -> None:
         """A job of this run has ended."""
         self.now.setdefault(job.rule, []).append(seconds / job.guess_s)
+        if job.measured_s:
+            self.drift.append(seconds / job.measured_s)
 
 
 def left_of_running(estimate_s: float, elapsed_s: float, share: float) -> float:

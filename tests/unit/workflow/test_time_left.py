@@ -67,6 +67,13 @@ def test_an_earlier_run_of_the_same_job_counts_more_than_any_guess():
     assert pace.seconds(job(1, 10, rule="masks")) == 10
 
 
+def test_an_earlier_run_on_a_busier_machine_is_corrected():
+    pace = Pace()
+    for number in range(2):
+        pace.learn(job(number, 10, measured=100.0), 20.0)
+    assert pace.seconds(job(3, 10, rule="field", measured=50.0)) == 10
+
+
 def test_a_machine_that_turns_out_slower_makes_all_guesses_longer():
     pace = Pace()
     for number in range(3):
