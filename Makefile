@@ -14,7 +14,7 @@ export PATH := $(CURDIR)/$(BIN):$(PATH)
 .PHONY: run test lint bench report setup
 
 run: $(STAMP)
-	snakemake --cores $(CORES) --workflow-profile workflow/profiles/default
+	snakemake --cores $(CORES)
 
 setup: $(STAMP)
 
@@ -39,5 +39,5 @@ bench: $(STAMP)
 	OMP_NUM_THREADS=1 python -m pytest -c benchmarks/pytest.ini benchmarks
 
 report: $(STAMP)
-	snakemake --cores $(CORES) --workflow-profile workflow/profiles/default
+	snakemake --cores $(CORES)
 	snakemake --report results/report.html

@@ -13,6 +13,7 @@ report: "workflow/report/overview.rst"
 
 
 include: "rules/common.smk"
+include: "rules/progress.smk"
 
 
 wildcard_constraints:
@@ -44,6 +45,7 @@ rule all:
 onstart:
     for line in PLAN.answering():
         logger.info(line)
+    show_progress()
 
 
 onsuccess:

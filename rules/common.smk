@@ -1,4 +1,7 @@
 # Shared by all rules: the plan of the run (hilsplat/workflow/plan.py), threads, and the environment.
+#
+# Priorities lead to a scene's first answer: of the jobs that could start, the nearest to its semantic tree is
+# first, and fields, scores and pictures come after all trees. Gaussians are before masks: they can be looked at.
 import json
 from pathlib import Path
 

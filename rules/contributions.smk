@@ -10,6 +10,7 @@ rule contributions:
         "results/{dataset}/{scene}/{variant}/logs/contributions.log",
     benchmark:
         "results/{dataset}/{scene}/{variant}/benchmarks/contributions.jsonl"
+    priority: 60
     conda:
         ENVIRONMENT
     threads: THREADS

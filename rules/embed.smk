@@ -9,6 +9,7 @@ rule clip:
         "results/{dataset}/{scene}/{variant}/logs/clip.log",
     benchmark:
         "results/{dataset}/{scene}/{variant}/benchmarks/clip.jsonl"
+    priority: 50
     conda:
         ENVIRONMENT
     threads: THREADS

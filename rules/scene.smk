@@ -8,6 +8,7 @@ rule source:
         "results/{dataset}/{scene}/logs/source.log",
     benchmark:
         "results/{dataset}/{scene}/benchmarks/source.jsonl"
+    priority: 10
     conda:
         ENVIRONMENT
     threads: 1
@@ -30,6 +31,7 @@ rule poses:
         "results/{dataset}/{scene}/logs/poses.log",
     benchmark:
         "results/{dataset}/{scene}/benchmarks/poses.jsonl"
+    priority: 20
     conda:
         ENVIRONMENT
     threads: THREADS

@@ -9,6 +9,7 @@ rule masks:
         "results/{dataset}/{scene}/{variant}/logs/masks.log",
     benchmark:
         "results/{dataset}/{scene}/{variant}/benchmarks/masks.jsonl"
+    priority: 30
     conda:
         ENVIRONMENT
     threads: THREADS

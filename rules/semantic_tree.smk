@@ -10,6 +10,7 @@ rule semantic_tree:
         "results/{dataset}/{scene}/{variant}/logs/semantic_tree.log",
     benchmark:
         "results/{dataset}/{scene}/{variant}/benchmarks/semantic_tree.jsonl"
+    priority: 70
     conda:
         ENVIRONMENT
     threads: THREADS

@@ -11,6 +11,7 @@ rule gaussians:
         "results/{dataset}/{scene}/logs/gaussians.log",
     benchmark:
         "results/{dataset}/{scene}/benchmarks/gaussians.jsonl"
+    priority: 40
     conda:
         ENVIRONMENT
     threads: THREADS

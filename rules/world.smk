@@ -7,6 +7,7 @@ rule world:
         "results/{dataset}/{scene}/logs/world.log",
     benchmark:
         "results/{dataset}/{scene}/benchmarks/world.jsonl"
+    priority: 10
     conda:
         ENVIRONMENT
     threads: THREADS

@@ -1,6 +1,5 @@
 """Square crops of masked regions, as CLIP sees them in training and at run time."""
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
@@ -71,5 +70,7 @@ def crop_to_square(
     square = np.zeros((side, side, 3), np.uint8)
     top, left = (side - height) // 2, (side - width) // 2
     square[top : top + height, left : left + width] = box
+    import cv2  # takes a while
+
     method = cv2.INTER_AREA if side > size and not as_langsplat else cv2.INTER_LINEAR
     return cv2.resize(square, (size, size), interpolation=method)

@@ -12,6 +12,7 @@ import typer
 
 from hilsplat.base.artifacts import output_lock, require_free_space
 from hilsplat.base.errors import HilsplatError
+from hilsplat.base.progress import in_run, share_told
 from hilsplat.workflow.stages import stage_code
 
 PathIn = Annotated[Path, typer.Option(help="input artifact", show_default=False)]
@@ -38,12 +39,18 @@ MIN_FREE_MIB = 200.0
 
 
 def start_logging(log: Path | None) -> None:
-    """Send log records to the terminal (short) and, if given, to a file (with times)."""
+    """Send log records to the terminal (short) and, if given, to a file (with times).
+
+    A run that shows the progress leaves warnings and errors to the terminal; the file has everything.
+    """
     root = logging.getLogger()
     root.setLevel(logging.INFO)
     root.handlers.clear()
     terminal = logging.StreamHandler(sys.stderr)
-    terminal.setFormatter(logging.Formatter("%(message)s"))
+    clear_line = "\r\033[K" if in_run() and sys.stderr.isatty() else ""  # the run's own line is there
+    terminal.setFormatter(logging.Formatter(f"{clear_line}%(message)s"))
+    if in_run() and log is not None:
+        terminal.setLevel(logging.WARNING)
     root.addHandler(terminal)
     if log is not None:
         log.parent.mkdir(parents=True, exist_ok=True)
@@ -82,7 +89,7 @@ def stage(
                     f"{name}: input {what} is missing: {path}", fix="run the stage that writes it"
                 )
         require_free_space(out.parent, MIN_FREE_MIB)
-        with output_lock(out):
+        with output_lock(out), share_told(log):
             yield
             write_provenance(
                 out,

@@ -1,5 +1,6 @@
 """Query and export a finished scene, and print the manual of the settings."""
 
+import gc
 from pathlib import Path
 from typing import Annotated
 
@@ -54,21 +55,25 @@ def query(
     answer's Gaussians (selection.ply).
     """
     start_logging(None)
-    from hilsplat.query.answer import answer
+    gc.disable()  # two seconds of work, of which searching for garbage would be a tenth
+    try:
+        from hilsplat.query.answer import answer
 
-    for found in answer(
-        scene_folder(scene, results),
-        text,
-        level=level,
-        variant=variant,
-        views=views,
-        answerer=answerer,
-        view=view,
-        out=out,
-        device=device,
-        threads=threads,
-    ):
-        typer.echo(found)
+        for found in answer(
+            scene_folder(scene, results),
+            text,
+            level=level,
+            variant=variant,
+            views=views,
+            answerer=answerer,
+            view=view,
+            out=out,
+            device=device,
+            threads=threads,
+        ):
+            typer.echo(found)
+    finally:
+        gc.enable()
 
 
 @app.command()

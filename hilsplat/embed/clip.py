@@ -1,6 +1,7 @@
 """CLIP by onnxruntime: crops of masks and texts as unit vectors of one space."""
 
 import logging
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from hilsplat.base.artifacts import read_full_index, read_json
 from hilsplat.base.crops import crop_to_square
 from hilsplat.base.errors import MisalignedArtifactError, ModelError
 from hilsplat.base.parallel import in_order
-from hilsplat.models.folder import ModelFolder, input_side_px, open_model_folder, require_one_space
+from hilsplat.models.folder import ModelFolder, Network, input_side_px, open_model_folder, require_one_space
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ClipSettings
 
@@ -43,13 +44,8 @@ class ClipModel:
         self.template = template
         self._known_texts: dict[str, np.ndarray] = {}
         self.digest = model.digest
-        self.vision = model.network("vision_model")
         self.text = model.network("text_model")
-        self.pixels, self.ids = next(iter(self.vision.spec.inputs)), next(iter(self.text.spec.inputs))
-        (self.vector,), (words,) = self.vision.spec.outputs, self.text.spec.outputs
-        require_one_space(
-            model.folder, self.vision.declared_axis(self.vector, 1), self.text.declared_axis(words, 1)
-        )
+        self.ids, (self.words,) = next(iter(self.text.spec.inputs)), self.text.spec.outputs
         self.side_px = input_side_px(model)
         # CLIP's own statistics if the folder names none, as in transformers
         preprocessing = model.preprocessing
@@ -73,6 +69,19 @@ class ClipModel:
             self.tokenizer.enable_padding(length=self.max_tokens, pad_id=self._pad_id(text_config))
         else:
             self.tokenizer.no_padding()
+
+    @cached_property
+    def vision(self) -> Network:
+        """The network of pictures, opened at its first use: it is large, and texts do not need it.
+
+        Raises:
+            ModelError: it cannot be read, or has another width than that of texts.
+        """
+        opened = self.model.network("vision_model")
+        (vector,) = opened.spec.outputs
+        numbers = opened.declared_axis(vector, 1), self.text.declared_axis(self.words, 1)
+        require_one_space(self.model.folder, *numbers)
+        return opened
 
     def _pad_id(self, text_config: dict[str, Any]) -> int:
         """Token that fills a text up: what the tokenizer names, else its configuration, else the model's."""
@@ -99,12 +108,14 @@ class ClipModel:
         Raises:
             ModelError: it is missing, incomplete or not a CLIP, or its networks do not belong together.
         """
-        return ClipModel(open_model_folder(folder, "clip", variant=variant), threads, template)
+        model = ClipModel(open_model_folder(folder, "clip", variant=variant), threads, template)
+        _ = model.vision  # opened and checked at once
+        return model
 
     @property
     def width(self) -> int:
         """Numbers in a vector."""
-        return self.vision.declared_axis(self.vector, 1) or self.embed_texts(["object"]).shape[1]
+        return self.text.declared_axis(self.words, 1) or self.embed_texts(["object"]).shape[1]
 
     def require_width(self, numbers: int, what: str) -> None:
         """Refuse something made for vectors of another width.
@@ -127,9 +138,10 @@ class ClipModel:
 
     def embed_crops(self, crops: UInt8[np.ndarray, "B side side 3"]) -> Float32[np.ndarray, "B C"]:
         """Unit vectors of square crops of `side_px`."""
-        step = self.vision.fixed_axis(self.pixels, 0) or len(crops)  # open_clip's exports take one picture
+        pixels = next(iter(self.vision.spec.inputs))
+        step = self.vision.fixed_axis(pixels, 0) or len(crops)  # open_clip's exports take one picture
         pieces = np.split(self.prepare(crops), range(step, len(crops), step))
-        return unit(np.concatenate([self.vision(**{self.pixels: piece})[0] for piece in pieces]))
+        return unit(np.concatenate([self.vision(**{pixels: piece})[0] for piece in pieces]))
 
     def embed_picture(self, picture: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, " C"]:
         """Unit vector of a whole picture, centred in a black square like the crops of masks."""
@@ -209,7 +221,7 @@ def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> C
 
     Its digest identifies it. The search covers the recorded path and every folder in `models/`, each relative
     to the working directory, to the folders above the artifact (such as the project that holds the results)
-    and to the project that this package runs from.
+    and to the project that this package runs from. The network of pictures is opened at its first use.
 
     Args:
         clip_folder: what the clip stage wrote.

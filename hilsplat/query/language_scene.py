@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 
 from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.device import ComputeDevice, compute_device
-from hilsplat.base.errors import ModelError, SettingsError
+from hilsplat.base.errors import ArtifactError, ModelError, SettingsError
 from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.compositing import normalised_weights
@@ -79,8 +79,8 @@ class LanguageScene:
         scene: cameras and views.
         gaussians: frozen geometry.
         tree: the nodes.
-        language: the field.
-        autoencoder: decodes the field.
+        language: the field; None: the run has not come to it yet, and only the tree answers.
+        autoencoder: decodes the field; None if there is no field.
         encode_texts: unit CLIP vectors of texts.
         pixel_weights: compositing weights of a view (pixels x Gaussians).
         settings: canonical phrases, scale of the relevancy, and how nodes are selected.
@@ -94,8 +94,8 @@ class LanguageScene:
     scene: Scene
     gaussians: Gaussians
     tree: SemanticTree
-    language: LanguageField
-    autoencoder: Code
+    language: LanguageField | None
+    autoencoder: Code | None
     encode_texts: TextEncoder
     pixel_weights: Callable[[str], sp.csr_matrix]
     settings: EvaluateSettings = field(default_factory=EvaluateSettings)
@@ -184,15 +184,18 @@ class LanguageScene:
         scene = opened.get(Scene.load, parts.scene)
         gaussians = opened.get(load_ply, parts.gaussians)
         tree = opened.get(SemanticTree.load, parts.semantic_tree)
-        language = opened.get(LanguageField.load, parts.field)
-        made_for = {"semantic tree": tree.gaussians_sha256, "language field": language.gaussians_sha256}
-        require_made_for(parts.gaussians, opened.get(sha256_of_file, parts.gaussians), scene.name, made_for)
-        code_file = autoencoder_file(parts.autoencoder)
-        made_for = {"language field": language.autoencoder_sha256}
-        require_made_for(code_file, opened.get(sha256_of_file, code_file), scene.name, made_for)
-        code = opened.get(load_code, parts.autoencoder)
+        made_for = {"semantic tree": tree.gaussians_sha256}
         clip = opened.get(open_clip_of, parts.clip, threads, settings.template)
-        clip.require_width(code.channels, f"autoencoder {parts.autoencoder}")
+        language = code = None
+        if parts.field is not None and parts.autoencoder is not None:
+            language = opened.get(LanguageField.load, parts.field)
+            made_for["language field"] = language.gaussians_sha256
+            code_file = autoencoder_file(parts.autoencoder)
+            own = {"language field": language.autoencoder_sha256}
+            require_made_for(code_file, opened.get(sha256_of_file, code_file), scene.name, own)
+            code = opened.get(load_code, parts.autoencoder)
+            clip.require_width(code.channels, f"autoencoder {parts.autoencoder}")
+        require_made_for(parts.gaussians, opened.get(sha256_of_file, parts.gaussians), scene.name, made_for)
         return LanguageScene(
             scene,
             gaussians,
@@ -212,6 +215,19 @@ class LanguageScene:
             names=names or NodeNames(),
             encode_picture=clip.embed_picture,
         )
+
+    def trained(self) -> tuple[LanguageField, Code]:
+        """The language field, and the code that it is written in.
+
+        Raises:
+            ArtifactError: the run has not come to them yet.
+        """
+        if self.language is None or self.autoencoder is None:
+            raise ArtifactError(
+                f"{self.scene.name} has no language field yet",
+                fix="let its tree answer, or wait for the run to end",
+            )
+        return self.language, self.autoencoder
 
     # -- answers ----------------------------------------------------------------------------------
 
@@ -481,10 +497,11 @@ class LanguageScene:
     def gaussian_relevancy(self, text: str, level: str = "auto") -> Float32[np.ndarray, " N"]:
         """The field's relevancy of every Gaussian at a level, or at its best; 0 without a latent."""
         named = [each for each in LEVELS if level in ("auto", each.label)]
+        features = self.trained()[0].features
         out = np.zeros(len(self.gaussians), np.float32)
         vector = self.text_vectors([text])
         for each in named:
-            latents = np.ascontiguousarray(self.language.features[:, each.index], np.float32)
+            latents = np.ascontiguousarray(features[:, each.index], np.float32)
             has = np.flatnonzero((latents != 0).any(axis=1))
             if len(has):
                 own = self._latent_relevancy.exact(latents[has], vector)[0]
@@ -494,7 +511,7 @@ class LanguageScene:
     def field_image(self, view: str, level: Level) -> UInt8[np.ndarray, "H W 3"]:
         """The field of a level as colours (see `field_colours`); uncovered pixels are black."""
         weights = self.view_weights(view)
-        colours = field_colours(self.language.features[:, level.index])
+        colours = field_colours(self.trained()[0].features[:, level.index])
         return to_uint8((weights @ colours).reshape(*self._camera(view).size_hw, 3))
 
     # -- what is kept of a view -------------------------------------------------------------------
@@ -518,10 +535,10 @@ class LanguageScene:
         """Per level, the pixels that show mostly Gaussians with a latent, and their rendered latents."""
 
         def render() -> list[tuple[np.ndarray, np.ndarray]]:
-            weights = self.view_weights(view)
+            weights, features = self.view_weights(view), self.trained()[0].features
             shown = []
             for index in range(len(LEVELS)):
-                own = np.ascontiguousarray(self.language.features[:, index], np.float32)
+                own = np.ascontiguousarray(features[:, index], np.float32)
                 has = (own != 0).any(axis=1).astype(np.float32)
                 share = weights @ has
                 pixels = np.flatnonzero(share > MIN_LATENT_SHARE)
@@ -545,7 +562,7 @@ class LanguageScene:
     @cached_property
     def _latent_relevancy(self) -> LatentRelevancy:
         return LatentRelevancy(
-            self.autoencoder,
+            self.trained()[1],
             self.text_vectors(self.settings.canonical),
             self.settings.relevancy_scale,
             self.threads,
@@ -555,8 +572,9 @@ class LanguageScene:
     @cached_property
     def _node_field_vectors(self) -> Float32[np.ndarray, "n C"]:
         """Decoded mean latent of each node's Gaussians at its level."""
-        means = node_means(self.tree.node_of_gaussian, self.tree.level, self.language.features)
-        return self.autoencoder.decode_array(means)
+        language, code = self.trained()
+        means = node_means(self.tree.node_of_gaussian, self.tree.level, language.features)
+        return code.decode_array(means)
 
 
 def path_of(text: str) -> tuple[str, ...]:

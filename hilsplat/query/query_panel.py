@@ -5,7 +5,10 @@ from pathlib import Path
 from textwrap import wrap
 
 import numpy as np
+from jaxtyping import UInt8
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.transforms import IdentityTransform
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.query.hits import counted, doubts_of
@@ -13,13 +16,20 @@ from hilsplat.query.language_scene import LanguageScene, path_of
 from hilsplat.query.node_search import NodeHits
 from hilsplat.query.pictures import (
     TITLE_LETTERS,
-    label_left,
     paint_answer,
     paint_relevancy,
     save_figure,
-    show,
     show_from_above,
 )
+
+DPI = 110
+COLUMNS = 5
+CELL_PX = 272
+GAP_PX = 8
+LEFT_PX = 24
+TITLE_PX = 20
+HEADING_PX = 26
+MAP_PX = 460
 
 
 def query_panel(
@@ -37,36 +47,73 @@ def query_panel(
     `note` ends the title; doubts follow below it. With the answerer "field", relevancy is that of the field.
     """
     last = path_of(text)[-1]
-    size_hw = scene.scene.cameras[views[0]].size_hw
-    width_in, columns = 13.0, 5
-    row_in = width_in / columns * size_hw[0] / size_hw[1] + 0.1
-    map_in = 4.2
-    figure = Figure(figsize=(width_in, len(views) * row_in + map_in + 0.6), layout="constrained")
     found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
     title = f"“{text}” in {scene.scene.name}: {found}{note}"
     doubts = [*wrap(scene.caution, TITLE_LETTERS), *map(str, doubts_of(scene, hits))]
-    figure.suptitle("\n".join([title, *doubts]), fontsize=12, fontweight="bold")
-    heights = [len(views) * row_in, map_in]
-    (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)
-    grid = upper.subplots(len(views), columns, squeeze=False)
-    for axes, view in zip(grid, views, strict=True):
+    height, width = scene.scene.cameras[views[0]].size_hw
+    row_px = TITLE_PX + round(CELL_PX * height / width) + GAP_PX
+    upper_px = HEADING_PX * (1 + len(doubts)) + GAP_PX + len(views) * row_px
+    page = _Page(LEFT_PX + COLUMNS * (CELL_PX + GAP_PX), upper_px + MAP_PX)
+    for number, line in enumerate([title, *doubts]):
+        page.write(line, page.width_px / 2, (number + 0.5) * HEADING_PX, size=12.0, bold=True)
+    for row, view in enumerate(views):
+        top = upper_px - (len(views) - row) * row_px
         image, mask = scene.image(view), scene.node_masks(view, hits.ids)
         if answerer == "tree":
             relevancy = scene.node_relevancy_map([last], view)[0]
         else:
             relevancy = scene.field_relevancy([last], view, exact=False)[0]
         low, high = float(relevancy.min()), float(relevancy.max())
-        show(axes[0], image, view)
-        label_left(axes[0], f"{scene.scene.split[view]} view")
-        show(axes[1], paint_answer(image, mask), f"answer: {mask.mean():.1%} of the view")
+        pictures = [(image, view), (paint_answer(image, mask), f"answer: {mask.mean():.1%} of the view")]
         for each in LEVELS:
-            top = float(relevancy[each.index].max())
-            picture = paint_relevancy(image, relevancy[each.index], low, high)
-            show(
-                axes[2 + each.index], picture, f"relevancy, {each.label}: {top:.2f}", bold=each is hits.level
-            )
+            own = relevancy[each.index]
+            name = f"relevancy, {each.label}: {float(own.max()):.2f}"
+            pictures.append((paint_relevancy(image, own, low, high), name))
+        page.write(f"{scene.scene.split[view]} view", LEFT_PX / 2, top + row_px / 2, rotation=90.0)
+        for column, (picture, name) in enumerate(pictures):
+            bold = column == 2 + hits.level.index
+            page.show(picture, name, LEFT_PX + column * (CELL_PX + GAP_PX), top, row_px, bold)
     selected = np.zeros(len(scene.gaussians), np.bool_)
     selected[scene.gaussians_of(hits.ids)] = True
     title = f"from above: {np.count_nonzero(selected)} of {len(selected)} Gaussians; triangles are cameras"
-    show_from_above(lower.subplots(), scene.gaussians, scene.scene.cameras, selected, title)
-    save_figure(figure, out_png)
+    below = (MAP_PX - TITLE_PX - GAP_PX) / page.height_px
+    axes = page.figure.add_axes((0.02, GAP_PX / page.height_px, 0.96, below))
+    show_from_above(axes, scene.gaussians, scene.scene.cameras, selected, title)
+    save_figure(page.figure, out_png, DPI)
+
+
+class _Page:
+    """A figure addressed in pixels from its upper left corner.
+
+    Pictures are scaled and placed as they are. An `Axes` for each, and a layout that is found by drawing
+    everything twice, took most of the time of a query.
+    """
+
+    def __init__(self, width_px: int, height_px: int) -> None:
+        self.width_px, self.height_px = width_px, height_px
+        self.figure = Figure(figsize=(width_px / DPI, height_px / DPI), dpi=DPI)
+
+    def write(
+        self, text: str, x: float, y: float, *, size: float = 8.0, bold: bool = False, rotation: float = 0.0
+    ) -> None:
+        """Write a text around a place."""
+        weight = "bold" if bold else "normal"
+        place = (x / self.width_px, 1 - y / self.height_px)
+        self.figure.text(*place, text, ha="center", va="center", size=size, weight=weight, rotation=rotation)
+
+    def show(
+        self, picture: UInt8[np.ndarray, "H W 3"], title: str, left: int, top: int, row_px: int, bold: bool
+    ) -> None:
+        """Show a picture below its title, as large as its cell allows."""
+        import cv2
+
+        height, width = picture.shape[:2]
+        scale = min(CELL_PX / width, (row_px - TITLE_PX - GAP_PX) / height)
+        size = (max(1, round(width * scale)), max(1, round(height * scale)))
+        scaled = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST)
+        x, y = left + (CELL_PX - size[0]) // 2, self.height_px - top - TITLE_PX - size[1]
+        self.figure.figimage(scaled, x, y)
+        line, colour = (2.0, "#ff7a00") if bold else (0.5, "#888888")
+        frame = Rectangle((x, y), *size, fill=False, lw=line, ec=colour, transform=IdentityTransform())
+        self.figure.add_artist(frame)
+        self.write(title, left + CELL_PX / 2, top + TITLE_PX / 2, bold=bold)

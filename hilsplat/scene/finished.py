@@ -21,8 +21,8 @@ class SceneParts:
         scene: cameras, photographs, split.
         gaussians: 3DGS PLY.
         semantic_tree: nodes.
-        field: language field.
-        autoencoder: decodes the field's features to CLIP vectors.
+        field: language field; None: it does not exist yet, and the tree answers without it.
+        autoencoder: decodes the field's features to CLIP vectors; None if there is no field.
         clip: CLIP vectors of the masks; its index names the model, which also embeds the queries.
         masks: masks of the train views.
     """
@@ -30,14 +30,15 @@ class SceneParts:
     scene: Path
     gaussians: Path
     semantic_tree: Path
-    field: Path
-    autoencoder: Path
+    field: Path | None
+    autoencoder: Path | None
     clip: Path
     masks: Path
 
     def as_inputs(self) -> dict[str, Path]:
-        """The parts by name, as provenance lists what a stage read."""
-        return {part.name: getattr(self, part.name) for part in fields(self)}
+        """The parts that there are, by name, as provenance lists what a stage read."""
+        named = {part.name: getattr(self, part.name) for part in fields(self)}
+        return {name: path for name, path in named.items() if path is not None}
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,7 @@ class FinishedScene:
 
         Provenance names what a stage read; without it, a part is expected beside the artifact made from it.
         A variant that has no field was scored with another variant's, named in the provenance of its scores.
+        While the run goes on, a tree of the variant's own is enough.
 
         Raises:
             ArtifactError: the folder, the variant or a part is missing.
@@ -72,7 +74,7 @@ class FinishedScene:
                 found=f"no such folder in {Path.cwd()}",
                 fix="correct the path, or name the results folder",
             )
-        if not (folder / variant).exists():
+        if variant != "default" and not (folder / variant).exists():
             raise ArtifactError(
                 f"{folder} has no variant {variant!r}",
                 expected=f"one of {', '.join(finished_variants(folder)) or 'none yet'}",
@@ -81,15 +83,19 @@ class FinishedScene:
         field = folder / variant / "field.safetensors"
         if not field.exists():
             field = _recorded_input(folder / variant / "scores.csv", "field", folder) or field
-        if not field.exists():
-            raise _unfinished(folder, field)
-        autoencoder = _input_of(field, "autoencoder", folder)
-        clip = _input_of(autoencoder, "clip", folder)
+        tree = folder / variant / "semantic_tree"
+        autoencoder = None
+        if field.exists():
+            autoencoder = _input_of(field, "autoencoder", folder)
+            tree = _input_of(autoencoder, "semantic_tree", folder)
+        elif not tree.exists():  # `default` has a tree of its own; others may share it
+            raise _unfinished(folder, tree if variant == "default" else field)
+        clip = _input_of(autoencoder or tree, "clip", folder)
         parts = SceneParts(
             scene=folder / "scene",
             gaussians=folder / "gaussians.ply",
-            semantic_tree=_input_of(autoencoder, "semantic_tree", folder),
-            field=field,
+            semantic_tree=tree,
+            field=field if autoencoder else None,
             autoencoder=autoencoder,
             clip=clip,
             masks=_input_of(clip, "masks", folder),
@@ -112,10 +118,8 @@ class FinishedScene:
         panel = place.parent.parent / "figures" / place.parent.name / place.name / "panel.png"
         if not provenance_path(panel).is_file():
             logger.warning(
-                "%s: neither %s nor %s records the settings of queries; using the default settings",
+                "%s: no scores and no panel record the settings of queries; using the default settings",
                 self.folder,
-                provenance_path(scores),
-                provenance_path(panel),
             )
         return _section(EvaluateSettings, _recorded_settings(panel).get("evaluate", {}))
 
@@ -141,8 +145,9 @@ def _section(section: type[Section], found: dict[str, Any]) -> Any:
 
 
 def finished_variants(folder: Path) -> list[str]:
-    """Variants of a scene that have a field of their own."""
-    return sorted(path.parent.name for path in folder.glob("*/field.safetensors"))
+    """Variants of a scene that answer: they have a field or a semantic tree of their own."""
+    made = [path for name in ("field.safetensors", "semantic_tree") for path in folder.glob(f"*/{name}")]
+    return sorted({path.parent.name for path in made})
 
 
 def _unfinished(folder: Path, missing: Path) -> ArtifactError:

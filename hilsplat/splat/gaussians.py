@@ -4,7 +4,6 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 from jaxtyping import Float32
-from scipy.special import expit
 
 
 @dataclass(frozen=True)
@@ -36,6 +35,8 @@ class Gaussians:
     @property
     def opacities(self) -> Float32[np.ndarray, " N"]:
         """Peak alphas in (0, 1)."""
+        from scipy.special import expit  # takes a while
+
         return expit(self.opacity_logits)
 
     @property

@@ -81,13 +81,14 @@ class ShownScene:
         return sorted(names, key=lambda name: (name != self.first, name != "default", name))
 
     def answering(self, variant: str) -> LanguageScene:
-        """The answers of a variant, opened at its first use.
+        """The answers of a variant, opened at its first use, and again when its field has been made.
 
         Raises:
             SettingsError: the variant does not exist, or not yet.
             HilsplatError: its parts cannot be opened.
         """
-        if variant not in self._variants:
+        before = self._variants.get(variant)
+        if before is None or (before.language is None and self._has_field(variant)):
             if variant not in self.variants:  # never a path: only what the folder lists
                 raise SettingsError(
                     f"variant {variant!r} cannot answer here",
@@ -100,6 +101,9 @@ class ShownScene:
             self._variants[variant] = replace(opened, _views=ViewStore(VIEWS_MIB))
             self._found[variant] = found
         return self._variants[variant]
+
+    def _has_field(self, variant: str) -> bool:
+        return (self.folder / variant / "field.safetensors").exists()
 
     def found(self, variant: str) -> FinishedScene:
         """Paths of the parts of a variant."""

@@ -14,7 +14,7 @@ import pytest
 
 MODELS = ("models/sam-tiny", "models/clip-tiny")
 """Of the checkout's models the tests see these alone, whatever was fetched."""
-PARTS = ("Snakefile", "rules", "workflow", "config", "hilsplat", *MODELS)
+PARTS = ("Snakefile", "rules", "workflow", "profiles", "config", "hilsplat", *MODELS)
 SCENE = Path("results/synthetic/tiny")
 UNFINISHED = shutil.ignore_patterns("*.pyc", "*.pyc.*", "*.tmp.*")
 """Files of Python and numba that other tests may be writing; they are renamed once complete."""

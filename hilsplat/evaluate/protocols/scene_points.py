@@ -82,11 +82,12 @@ class PointAnswers:
             of_node = carry.classify(self.scene.tree.clip.astype(np.float32), vectors)
             of_gaussian = np.append(of_node, 0)[node]  # -1 is none
             return self.carried.labels(of_gaussian)
-        latents = self.carried.features(np.ascontiguousarray(self.scene.language.features[:, LEVEL.index]))
+        language, code = self.scene.trained()
+        latents = self.carried.features(np.ascontiguousarray(language.features[:, LEVEL.index]))
         spoken = np.flatnonzero(latents.any(axis=1))
         labels = np.zeros(len(latents), dtype=np.int32)
         if len(spoken):
-            decoded = self.scene.autoencoder.decode_array(latents[spoken].astype(np.float32))
+            decoded = code.decode_array(latents[spoken].astype(np.float32))
             labels[spoken] = carry.classify(decoded, vectors)
         return labels
 

@@ -431,7 +431,7 @@ async function begin() {
   } else {
     fillVariants();
     $("about").textContent = `${scene.name}: ${counted(scene.gaussians, "Gaussian")}.`;
-    tell("The run goes on: you can look around; questions will be answered when the tree and the field are there.");
+    tell("The run goes on: you can look around; questions will be answered when the semantic tree is there.");
     setTimeout(answersLater, POLL_MS);
   }
 }

@@ -9,7 +9,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 from tokenizers import Tokenizer, models, pre_tokenizers
 
-from hilsplat.base.artifacts import read_index, read_npy, sha256_of_path
+from hilsplat.base.artifacts import read_index, read_npy, sha256_of_path, write_index
 from hilsplat.base.errors import MisalignedArtifactError, ModelError, SettingsError
 from hilsplat.base.images import write_png
 from hilsplat.configuration import parse_section
@@ -270,3 +270,14 @@ def test_the_clip_of_an_artifact_is_found_with_its_variant(red_scene, colour_cli
     settings = ClipSettings(model=str(colour_clip), variant="fp16")
     run_clip(scene, masks, tmp_path / "vectors", tmp_path / "cache", settings, threads=1)
     assert open_clip_of(tmp_path / "vectors").text.path.name == "text_model_fp16.onnx"
+
+
+def test_a_query_does_not_open_the_network_of_pictures(colour_clip, tmp_path):
+    model = ClipModel.load(colour_clip)
+    write_index(tmp_path / "vectors", {}, model=str(colour_clip), model_sha256=model.digest)
+    opened = open_clip_of(tmp_path / "vectors")
+    assert "vision" not in vars(opened)
+    assert opened.width == model.width == len(opened.embed_texts(["red"])[0])
+    assert "vision" not in vars(opened)
+    picture = np.zeros((6, 6, 3), np.uint8)
+    np.testing.assert_array_equal(opened.embed_picture(picture), model.embed_picture(picture))

@@ -259,6 +259,21 @@ def test_a_variant_answers_with_the_field_it_was_scored_with_and_never_with_anot
         FinishedScene.locate(folder, "x")
 
 
+def test_a_tree_answers_before_there_is_a_field_and_no_tree_before_its_own(tmp_path):
+    folder = tmp_path / "results" / "photos" / "bear"
+    for part in ("scene", "default/clip", "default/masks", "omega"):
+        (folder / part).mkdir(parents=True)
+    (folder / "gaussians.ply").touch()
+    with pytest.raises(ArtifactError, match=r"snakemake --cores 2 .*default/semantic_tree"):
+        FinishedScene.locate(folder)
+    (folder / "default/semantic_tree").mkdir()
+    parts = FinishedScene.locate(folder).parts
+    assert (parts.field, parts.autoencoder) == (None, None)
+    assert list(parts.as_inputs()) == ["scene", "gaussians", "semantic_tree", "clip", "masks"]
+    with pytest.raises(ArtifactError, match=r"omega/field\.safetensors is missing"):
+        FinishedScene.locate(folder, "omega")
+
+
 def test_a_scene_without_labels_opens_with_the_settings_of_its_panel(tmp_path):
     folder = tmp_path / "results" / "photos" / "bear"
     panel = tmp_path / "results" / "figures" / "photos" / "bear" / "panel.png"

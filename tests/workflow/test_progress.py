@@ -1,0 +1,40 @@
+"""What `snakemake --cores 2` prints: a line per stage, the commands of the first answer, errors in full."""
+
+import re
+import shutil
+
+from tests.workflow.conftest import SCENE, Project
+
+TREE = f"{SCENE}/default/semantic_tree"
+
+
+def test_a_stage_that_ended_is_one_line_and_the_first_answer_is_announced(copy_of_finished: Project) -> None:
+    project = copy_of_finished
+    shutil.rmtree(project.root / TREE)
+    printed = project.snakemake(TREE).stderr
+    assert re.search(r"^synthetic/tiny semantic tree: \d+ s \(1 of 1 done\)$", printed, re.MULTILINE), printed
+    assert printed.count("hilsplat view synthetic/tiny") == 1
+    assert "rule semantic_tree:" not in printed and "Select jobs" not in printed
+    assert not list(project.root.rglob("*.progress"))
+    record = max((project.root / ".snakemake/log").iterdir(), key=lambda file: file.stat().st_mtime)
+    assert "rule semantic_tree:" in record.read_text()  # Snakemake's own log has everything
+
+
+def test_a_failed_job_is_shown_in_full_with_the_log_of_its_stage(copy_of_finished: Project) -> None:
+    project = copy_of_finished
+    shutil.rmtree(project.root / TREE)
+    masks = project.root / SCENE / "default/masks"
+    (masks / "index.json").write_text("{}")
+    failed = project.snakemake(TREE, "--rerun-triggers", "input", check=False)
+    assert failed.returncode != 0
+    assert "Error in rule semantic_tree:" in failed.stderr
+    assert "shell:" in failed.stderr and "hilsplat semantic-tree" in failed.stderr
+    assert "Logfile" in failed.stderr  # profiles/default was found
+    assert "belong to other masks" in failed.stderr.partition("Logfile")[2]
+
+
+def test_verbose_leaves_snakemakes_own_output(copy_of_finished: Project) -> None:
+    project = copy_of_finished
+    shutil.rmtree(project.root / SCENE / "default/coverage_tree")
+    printed = project.snakemake(f"{SCENE}/default/coverage_tree", "--verbose").stderr
+    assert "rule coverage_tree:" in printed and "coverage tree: " not in printed
