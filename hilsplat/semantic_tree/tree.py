@@ -226,6 +226,7 @@ def run_semantic_tree(
 
     Raises:
         MisalignedArtifactError: contributions or CLIP vectors belong to other masks.
+        ArtifactError: the masks do not say what made them.
     """
     contributions = Contributions.load(contributions_folder)
     index = read_index(contributions_folder)
