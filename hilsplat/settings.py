@@ -346,6 +346,12 @@ class SemanticTreeSettings(Section):
     parent_coverage: float = knob(
         0.5, "a node becomes the child of a coarser one that holds more than this share of it", gt=0, lt=1
     )
+    whole_side: float = knob(
+        0.35,
+        "graph: regions that touch in 3D are joined to wholes up to about this size, as a share of a view's "
+        "side",
+        gt=0,
+    )
     device: Literal["cpu", "cuda"] = knob(
         "cpu", "device that compares masks; cuda: by torch, equal up to rounding"
     )

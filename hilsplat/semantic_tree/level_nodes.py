@@ -39,6 +39,18 @@ class LevelNodes:
     membership: Float32[np.ndarray, " N"]
     quality: Float64[np.ndarray, " t"]
 
+    def joined(self, into: Int64[np.ndarray, " t"]) -> "LevelNodes":
+        """The nodes that `into` numbers alike as one, of the mean quality of their masks."""
+        into_or_none = np.append(into, NONE)
+        masks = np.bincount(self.of_mask[self.of_mask != NONE], minlength=len(into))
+        total = np.bincount(into, masks * self.quality)
+        return LevelNodes(
+            into_or_none[self.of_mask],
+            into_or_none[self.of_gaussian].astype(np.int32),
+            self.membership,
+            total / np.maximum(np.bincount(into, masks), 1),
+        )
+
 
 def level_nodes(
     weights: sp.csr_matrix,

@@ -38,6 +38,7 @@ from hilsplat.semantic_tree.nodes import (
     node_parents,
     renumbered_without_empty,
 )
+from hilsplat.semantic_tree.wholes import joined_regions
 from hilsplat.settings import SemanticTreeSettings
 
 MIN_VISIBLE_PX = 0.3
@@ -132,6 +133,7 @@ def build_tree(
     means: Float[np.ndarray, "N 3"],
     settings: SemanticTreeSettings,
     threads: int = 1,
+    join_wholes: bool = False,
 ) -> SemanticTree:
     """Link masks into nodes, and give the nodes Gaussians, parents, vectors and boxes.
 
@@ -143,6 +145,7 @@ def build_tree(
         means: centres of the Gaussians, scene units.
         settings: thresholds.
         threads: number of threads for the evidence; results do not depend on it.
+        join_wholes: the masks know no things: wholes are joined from nodes that touch in 3D.
     """
     visible = mass > MIN_VISIBLE_PX
     num_visible = visible.sum(axis=0)
@@ -159,6 +162,9 @@ def build_tree(
         found = level_nodes(
             S[rows], contributions.view[rows], mass, visible, importance, total_mass, settings, threads
         )
+        if join_wholes and each is Level.WHOLE:
+            whole = joined_regions(found.of_gaussian, len(found.quality), means, mass, settings.whole_side)
+            found = found.joined(whole)
         renumber = np.append(len(level) + np.arange(len(found.quality)), NONE)
         node_of_gaussian[:, each.index] = renumber[found.of_gaussian]
         membership[:, each.index] = found.membership
@@ -185,6 +191,10 @@ def build_tree(
     np.add.at(vectors, cluster_of_mask[own], root_area[:, None] * clip[own])
     vectors /= np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
     centroid, box, oriented = node_boxes(node_of_gaussian, levels, means, total_mass)
+    fits = mask_fits(node_of_gaussian, num, S, mass, contributions.view, contributions.level, MIN_FIT)
+    if join_wholes:  # a mask of a piece fits no whole, but shows it
+        pieces = contributions.rows_of(Level.WHOLE)
+        fits[pieces] = cluster_of_mask[pieces]
     return SemanticTree(
         level=levels,
         parent=parent,
@@ -196,9 +206,7 @@ def build_tree(
         views=(view_area > 0).sum(axis=1).astype(np.int32),
         node_of_gaussian=node_of_gaussian,
         membership=membership,
-        node_of_mask=mask_fits(
-            node_of_gaussian, num, S, mass, contributions.view, contributions.level, MIN_FIT
-        ),
+        node_of_mask=fits,
         view_area_px=view_area.astype(np.float32),
         view_names=contributions.views,
         gaussians_sha256=contributions.gaussians_sha256,
@@ -218,6 +226,7 @@ def run_semantic_tree(
 
     Raises:
         MisalignedArtifactError: contributions or CLIP vectors belong to other masks.
+        ArtifactError: the masks do not say what made them.
     """
     contributions = Contributions.load(contributions_folder)
     index = read_index(contributions_folder)
@@ -239,6 +248,7 @@ def run_semantic_tree(
             contributions.means(),
             settings,
             threads,
+            join_wholes=read_full_index(masks_folder, "segmenter")["segmenter"] == "graph",
         )
         per_level = {level.label: len(tree.nodes_of(level)) for level in LEVELS}
         orphans = {

@@ -129,7 +129,7 @@ def build_two_boxes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TwoBoxes
         noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
         write_npy(world.clip / f"{view}.npy", noisy.astype(np.float16))
     for folder in (world.masks, world.coverage_tree, world.clip):
-        write_index(folder, {view: {} for view in world.views})
+        write_index(folder, {view: {} for view in world.views}, segmenter="sam")
     world.ply.write_bytes(b"two boxes")
 
     gaussian = np.arange(NUM_GAUSSIANS)
