@@ -18,6 +18,7 @@ from hilsplat.base.artifacts import read_into, read_npz, write_npz
 from hilsplat.base.compiled import compiled
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
+from hilsplat.contributions.channels import gram_product, padded
 
 PRODUCT_PARTS = 4
 """A product with G is summed in this many parts of equally many pairs. Fixed, so that the number of threads
@@ -52,13 +53,19 @@ class Gram:
 
     def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
         """G_l F_l for every level, in the precision of F; sums have one order on any number of threads."""
-        features = np.ascontiguousarray(features)
+        channels, is_single = features.shape[2], features.dtype == np.float32
+        features = padded(features) if is_single else np.ascontiguousarray(features)
         shares = np.linspace(0, self.nonzeros, PRODUCT_PARTS + 1)[1:-1]
         edges = [0, *np.searchsorted(self.indptr, shares).tolist(), self.num_gaussians]
 
         def part(begin: int, end: int) -> np.ndarray:
             out = np.zeros_like(features[begin:])
-            _gram_product(begin, end, self.indptr, self.indices, self.values, features, out)
+            rows = begin, end, self.indptr, self.indices, self.values
+            if is_single:
+                flat, width = features.reshape(-1), features.shape[2]
+                gram_product(*rows, flat, width, out.reshape(-1))
+            else:
+                _gram_product(*rows, features, out)
             return out
 
         with ThreadPoolExecutor(self.threads) as pool:
@@ -66,7 +73,7 @@ class Gram:
         total = parts[0]
         for begin, rest in zip(edges[1:-1], parts[1:], strict=True):
             total[begin:] += rest
-        return total
+        return np.ascontiguousarray(total[:, :, :channels])
 
     def save(self, path: Path) -> None:
         """Write `G.npz`."""

@@ -1,7 +1,7 @@
 """Rows of `scores.csv`: one number each, in long form."""
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -56,8 +56,7 @@ def write_scores(path: Path, scores: Iterable[Score]) -> None:
     for score in scores:
         assert score.metric in METRICS, score.metric
         assert score.metric in card_of(score.protocol).metrics, (score.metric, score.protocol)
-        row = asdict(score)
-        row["value"] = f"{score.value:.6f}"
+        row = {**vars(score), "value": f"{score.value:.6f}"}
         rows.append([str(row[name]) for name in COLUMNS])
     write_csv(path, COLUMNS, sorted(rows))
 

@@ -28,6 +28,7 @@ from hilsplat.models.store import is_embedded, meaningless
 from hilsplat.query.field_colours import field_colours
 from hilsplat.query.hits import Hit, hit_of, hits_of
 from hilsplat.query.latent_relevancy import LatentRelevancy
+from hilsplat.query.look_up_kernels import fill_maps
 from hilsplat.query.names import PATH_SEPARATOR, NodeNames, read_names
 from hilsplat.query.node_search import NodeHits, search
 from hilsplat.query.relevancy import margins, relevancy_of_margins
@@ -486,12 +487,7 @@ class LanguageScene:
             if not len(pixels):
                 continue
             found = answer.exact(latents, vectors) if placed is None else answer.fast(placed[index], vectors)
-            for row, level_map in zip(found, maps[:, index], strict=True):
-                if len(pixels) == len(level_map):
-                    level_map[:] = row
-                else:
-                    level_map[:] = row.min()
-                    level_map[pixels] = row
+            fill_maps(found, found.min(axis=1), pixels, index, maps)
         return maps.reshape(len(texts), len(LEVELS), height, width)
 
     def gaussian_relevancy(self, text: str, level: str = "auto") -> Float32[np.ndarray, " N"]:
@@ -536,15 +532,14 @@ class LanguageScene:
 
         def render() -> list[tuple[np.ndarray, np.ndarray]]:
             weights, features = self.view_weights(view), self.trained()[0].features
+            shares = weights @ (features != 0).any(axis=2).astype(np.float32)
+            rendered = (weights @ features.reshape(len(features), -1)).reshape(-1, *features.shape[1:])
             shown = []
             for index in range(len(LEVELS)):
-                own = np.ascontiguousarray(features[:, index], np.float32)
-                has = (own != 0).any(axis=1).astype(np.float32)
-                share = weights @ has
-                pixels = np.flatnonzero(share > MIN_LATENT_SHARE)
+                pixels = np.flatnonzero(shares[:, index] > MIN_LATENT_SHARE)
                 # Gaussians without a latent hold zeros, which a code would decode like any other: leave them
                 # out.
-                shown.append((pixels, ((weights[pixels] @ own) / share[pixels, None]).astype(np.float32)))
+                shown.append((pixels, rendered[pixels, index] / shares[pixels, index, None]))
             return shown
 
         return self._views.get(

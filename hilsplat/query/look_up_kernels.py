@@ -81,6 +81,15 @@ def projected_relevancy(coordinates, generic, first, weights, scale, out):
 
 
 @compiled
+def fill_maps(found, least, pixels, level, maps):
+    """Write the values of a level's pixels to its maps (T, 3, P), and each text's least value elsewhere."""
+    for text in range(len(found)):
+        maps[text, level, :] = least[text]
+        for place in range(len(pixels)):
+            maps[text, level, pixels[place]] = found[text, place]
+
+
+@compiled
 def _write_relevancy(cosines, generic, scale, out):
     """1 / (1 + exp(-scale (cosine - generic))) of at most `BLOCK` pixels.
 

@@ -41,7 +41,8 @@ class TrueMesh:
             ArtifactError: it is missing or not a mesh.
         """
         try:
-            record = PlyData.read(path)
+            # lists of a known length are mapped from the file, not parsed one by one
+            record = PlyData.read(path, known_list_len={"face": {"vertex_indices": 3}})
             vertices, faces = record["vertex"], record["face"]["vertex_indices"]
         except FileNotFoundError as error:
             raise ArtifactError(f"{path} is missing", fix="run the world stage") from error
@@ -50,7 +51,7 @@ class TrueMesh:
                 f"{path} cannot be read: {error}", fix="delete the truth folder and run the world stage again"
             ) from error
         corners = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
-        return TrueMesh(corners[np.stack(faces)])
+        return TrueMesh(corners[faces])
 
     @cached_property
     def embree(self) -> Any:

@@ -10,8 +10,9 @@ from hilsplat.base.artifacts import sha256_of_path
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.contributions import quadratic_builder, stage
+from hilsplat.contributions.channels import gram_product, padded
 from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.contributions.quadratic import level_mass, load_quadratic
+from hilsplat.contributions.quadratic import _gram_product, level_mass, load_quadratic
 from hilsplat.contributions.quadratic_builder import GramBuilder, QuadraticBuilder, stack_weights
 from hilsplat.contributions.rows import Contributions, mask_embeddings
 from hilsplat.contributions.stage import (
@@ -98,6 +99,23 @@ def test_gram_and_weights_give_the_quadratic_form_of_every_level():
     assert gram.product(columns).transpose(1, 0, 2) == pytest.approx(dense, abs=1e-6)
     # rows of W sum to 1, so G 1 is the mass in labelled pixels
     assert level_mass(gram) == pytest.approx(dense.sum(axis=2).T, abs=1e-5)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 16, 17, 32])
+def test_a_product_of_sixteen_channels_at_a_time_has_the_bytes_of_the_plain_loop(channels):
+    raw, masks = random_view(7)
+    gram = built_gram([labelled_rows(normalised_weights(raw), label_maps(masks))])
+    features = np.random.default_rng(channels).normal(size=(40, 3, channels)).astype(np.float32)
+    arrays = gram.indptr, gram.indices, gram.values
+    for begin, end in ((0, 40), (13, 31)):
+        plain = np.zeros((40 - begin, 3, channels), np.float32)
+        _gram_product(begin, end, *arrays, features, plain)
+        wide = padded(features)
+        fast = np.zeros_like(wide[begin:])
+        gram_product(begin, end, *arrays, wide.reshape(-1), wide.shape[2], fast.reshape(-1))
+        assert plain.any()
+        assert fast[:, :, :channels].tobytes() == plain.tobytes()
+        assert not fast[:, :, channels:].any()
 
 
 def built_gram(parts, threads=1):

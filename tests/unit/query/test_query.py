@@ -14,6 +14,7 @@ from hilsplat.field.code import load_code
 from hilsplat.field.field import run_field
 from hilsplat.field.language_field import LanguageField
 from hilsplat.query.language_scene import LanguageScene
+from hilsplat.query.look_up_kernels import fill_maps
 from hilsplat.query.node_search import ancestor_margins, automatic_level, best_nodes, search
 from hilsplat.query.view_nodes import ViewNodes
 from hilsplat.query.view_store import ViewStore
@@ -465,6 +466,23 @@ def test_gaussians_without_a_latent_do_not_dilute_a_pixel(scene):
     assert (share[pixels] < 0.99).any()
     expected = weights[pixels] @ features[:, 0] / share[pixels, None]
     assert latents == pytest.approx(expected, abs=1e-5)
+
+
+def test_latents_rendered_at_once_have_the_bytes_of_each_level_alone(scene):
+    weights = scene.view_weights("000.png")
+    for index, (pixels, latents) in enumerate(scene._view_latents("000.png")):
+        own = np.ascontiguousarray(scene.language.features[:, index])
+        share = weights @ (own != 0).any(axis=1).astype(np.float32)
+        assert len(pixels)
+        assert latents.tobytes() == ((weights[pixels] @ own) / share[pixels, None]).tobytes()
+
+
+def test_pixels_of_a_map_without_a_latent_get_the_least_value_of_its_text():
+    maps = np.full((2, 3, 4), 7, np.float32)
+    found = np.array([[0.5, 0.25], [0.125, 1]], np.float32)
+    fill_maps(found, found.min(axis=1), np.array([3, 1]), 1, maps)
+    assert maps[:, 1].tolist() == [[0.25, 0.25, 0.25, 0.5], [0.125, 1, 0.125, 0.125]]
+    assert (maps[:, [0, 2]] == 7).all()
 
 
 def test_field_image_has_one_colour_per_region(scene):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from plyfile import PlyData, PlyElement
 
 from hilsplat.base.errors import ArtifactError
 from hilsplat.scene.cameras import Cameras
@@ -20,6 +21,16 @@ def test_depth_from_the_truth_folder_is_the_renderers(tmp_path):
     scene = build_scene("tabletop", 100, 2)
     for name in cameras.names:
         np.testing.assert_allclose(mesh.depth(cameras[name]), depth_view(scene, cameras[name]), rtol=1e-4)
+
+
+def test_a_mesh_with_another_face_than_triangles_is_refused(tmp_path):
+    vertices = np.zeros(4, dtype=[(axis, "f4") for axis in "xyz"])
+    faces = np.empty(1, dtype=[("vertex_indices", object)])
+    faces[0] = (np.arange(4, dtype=np.int32),)
+    elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
+    PlyData(elements).write(str(tmp_path / "mesh.ply"))
+    with pytest.raises(ArtifactError, match=r"mesh\.ply cannot be read"):
+        TrueMesh.load(tmp_path / "mesh.ply")
 
 
 def test_a_missing_or_damaged_mesh_is_named(tmp_path):

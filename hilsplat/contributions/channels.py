@@ -1,0 +1,58 @@
+"""The product of G with a field of float32, sixteen channels at a time, with the bytes of the plain loop.
+
+numba turns a loop over the few channels of a row into vector code behind checks, made at every pass, that the
+arrays do not overlap, and keeps the sums in memory. Here rows have a multiple of sixteen channels, one value
+of `lanes` each, and the sums of a row of G stay in registers: 62 ms instead of 168 at d = 16 and 6.7 million
+pairs of Gaussians.
+"""
+
+import numpy as np
+from jaxtyping import Float32
+from numba.extending import intrinsic
+
+from hilsplat.base.compiled import compiled
+from hilsplat.splat.rasterise.lanes import LANES, WIDTH, lanes, load, store
+
+
+def padded(rows: Float32[np.ndarray, "*rows D"]) -> Float32[np.ndarray, "*rows E"]:
+    """Rows with channels of 0 up to a multiple of sixteen, contiguous."""
+    missing = -rows.shape[-1] % WIDTH
+    if missing:
+        rows = np.concatenate([rows, np.zeros((*rows.shape[:-1], missing), np.float32)], axis=-1)
+    return np.ascontiguousarray(rows)
+
+
+@intrinsic
+def plus(typingctx, total, scales, row):
+    """total + scales * row; each product is rounded before it is added, as in the plain loop."""
+
+    def codegen(context, builder, sig, args):
+        return builder.fadd(args[0], builder.fmul(args[1], args[2]))  # no flags: never fused
+
+    return LANES(LANES, LANES, LANES), codegen
+
+
+@compiled
+def gram_product(begin, end, indptr, indices, values, features, width, out):
+    """`quadratic._gram_product` for flat features and `out`, with `width` padded channels per row."""
+    row, origin = 3 * width, 3 * width * begin
+    for i in range(begin, end):
+        for c in range(0, width, WIDTH):
+            here = i * row + c
+            a, b, d = load(features, here), load(features, here + width), load(features, here + 2 * width)
+            own = here - origin
+            whole, part, subpart = load(out, own), load(out, own + width), load(out, own + 2 * width)
+            for k in range(indptr[i], indptr[i + 1]):
+                there = np.int64(indices[k]) * row + c
+                u, v, w = lanes(values[k, 0]), lanes(values[k, 1]), lanes(values[k, 2])
+                whole = plus(whole, u, load(features, there))
+                part = plus(part, v, load(features, there + width))
+                subpart = plus(subpart, w, load(features, there + 2 * width))
+                if there != here:
+                    other = there - origin
+                    store(out, other, plus(load(out, other), u, a))
+                    store(out, other + width, plus(load(out, other + width), v, b))
+                    store(out, other + 2 * width, plus(load(out, other + 2 * width), w, d))
+            store(out, own, whole)
+            store(out, own + width, part)
+            store(out, own + 2 * width, subpart)
