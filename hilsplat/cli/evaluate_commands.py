@@ -65,8 +65,16 @@ def evaluate(
     section = section_of("evaluate", settings)
     parts = _parts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
     inputs = {**parts.as_inputs(), **({"truth": truth} if truth else {})}
-    plugins = _readers(labels or ())
-    with stage("evaluate", out, log, settings=section, threads=threads, inputs=inputs, plugins=plugins):
+    with stage(
+        "evaluate",
+        out,
+        log,
+        settings=section,
+        threads=threads,
+        inputs=inputs,
+        plugins=_readers(labels or ()),
+        beside=(out.with_name("times.csv"),),
+    ):
         from hilsplat.evaluate.stage import run_evaluate
 
         run_evaluate(
@@ -116,7 +124,8 @@ def table(
 
     scores = scores or []
     inputs = {"published": published, **{f"scores {number}": path for number, path in enumerate(scores)}}
-    with stage("table", out, log, inputs=inputs):
+    beside = tuple(out.with_suffix(ending) for ending in (".md", ".tex", ".html"))
+    with stage("table", out, log, inputs=inputs, beside=beside):
         from hilsplat.evaluate.tables.build import run_table
 
         run_table(name, scores, published, json.loads(labels), out, absent or [])
@@ -149,8 +158,16 @@ def figures(
     parts = _parts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
     inputs = {**parts.as_inputs(), "fit": fit, **({"truth": truth} if truth else {})}
     recorded = {"figures": section, "evaluate": protocol}
-    plugins = _readers([labels])
-    with stage("figures", out, log, settings=recorded, threads=threads, inputs=inputs, plugins=plugins):
+    with stage(
+        "figures",
+        out,
+        log,
+        settings=recorded,
+        threads=threads,
+        inputs=inputs,
+        plugins=_readers([labels]),
+        beside=(out.with_name("registration.png"), out.with_name("fit.png")),
+    ):
         from hilsplat.evaluate.figures.panel import run_figures
 
         run_figures(
@@ -190,8 +207,16 @@ def comparison(
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
     recorded, compared = {"figures": section, "evaluate": protocol}, json.loads(variants)
     inputs = {f"scores of {variant}": folder / variant / "scores.csv" for variant in compared}
-    plugins = _readers([labels])
-    with stage("comparison", out, log, settings=recorded, threads=threads, inputs=inputs, plugins=plugins):
+    with stage(
+        "comparison",
+        out,
+        log,
+        settings=recorded,
+        threads=threads,
+        inputs=inputs,
+        plugins=_readers([labels]),
+        beside=(out.with_name("views.png"), out.with_name("features.png")),
+    ):
         from hilsplat.evaluate.figures.comparison import run_comparison
 
         run_comparison(

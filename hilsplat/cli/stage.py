@@ -65,11 +65,12 @@ def stage(
     threads: int = 1,
     inputs: dict[str, Path] | None = None,
     plugins: tuple[str, ...] = (),
+    beside: tuple[Path, ...] = (),
 ) -> Iterator[None]:
     """Everything around a stage's one function call: log, lock, disk space, provenance.
 
     `settings` is the section that the stage takes, or several by name; `plugins` are the places of the
-    readers or baselines that it uses (`base.plugins`).
+    readers or baselines that it uses (`base.plugins`); `beside` is what it writes besides `out`.
     """
     from hilsplat.base.provenance import write_provenance
 
@@ -92,6 +93,8 @@ def stage(
                 settings=_recorded(settings),
                 seed=seed,
                 inputs=inputs or {},
+                beside=beside,
+                plugins=plugins,
             )
     except HilsplatError:
         raise
@@ -112,3 +115,9 @@ def section_of(name: str, text: str) -> Any:
     from hilsplat.configuration import parse_section, with_models
 
     return with_models(parse_section(name, text))
+
+
+def model_input(section: Any) -> dict[str, Path]:
+    """The model folder of a section as an input; a missing one is for the stage to report."""
+    folder = Path(section.model)
+    return {"model": folder} if folder.is_dir() else {}

@@ -5,9 +5,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from hilsplat.base.artifacts import read_json, sha256_of_file
+from hilsplat.base.artifacts import provenance_path, read_json, sha256_of_file
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
-from hilsplat.base.provenance import provenance_path
 from hilsplat.settings import EvaluateSettings, Section
 
 logger = logging.getLogger(__name__)
