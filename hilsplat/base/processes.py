@@ -1,11 +1,60 @@
-"""Process many items in separate processes, with results in order."""
+"""Processes that end with their parent, and many items in separate processes with results in order."""
 
+import ctypes
+import os
+import signal
+import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
+from threading import Thread
 from typing import Any, TypeVar
 
+from hilsplat.base.litter import is_alive
+
 Result = TypeVar("Result")
+
+PARENT = "HILSPLAT_PARENT"
+"""Variable that names the process whose jobs must not outlive it; the workflow sets it (rules/common.smk)."""
+
+PR_SET_PDEATHSIG = 1
+"""From Linux's <sys/prctl.h>."""
+
+
+def end_with_parent(parent: int) -> None:
+    """Have this process killed as soon as the one that started it ends, however that ends.
+
+    Otherwise the jobs of a killed Snakemake go on, and write outputs of old settings beside the next run.
+    The system does it where it can (Linux, no shell in between); elsewhere a thread looks every second.
+
+    Args:
+        parent: number of the process that started this one, perhaps through a shell.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if not is_alive(parent):  # it ended before the line above
+        os._exit(1)
+    if sys.platform != "linux" or os.getppid() != parent:
+        Thread(target=_watch, args=(parent,), daemon=True).start()
+
+
+def _watch(parent: int) -> None:
+    while is_alive(parent):
+        time.sleep(1)
+    os._exit(1)
+
+
+def jobs_end_with_this_process() -> None:
+    """Have the commands that this process starts from now on end with it."""
+    os.environ[PARENT] = str(os.getpid())
+
+
+def end_with_workflow() -> None:
+    """End with the Snakemake that started this job; a command that a person starts is left alone."""
+    parent = os.environ.pop(PARENT, "")  # popped: what this process starts has another parent
+    if parent.isdecimal():
+        end_with_parent(int(parent))
 
 
 def in_processes(
@@ -26,5 +75,10 @@ def in_processes(
         for item in items:
             yield work(*item)
         return
-    with ProcessPoolExecutor(min(workers, len(items)), mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(
+        min(workers, len(items)),
+        mp_context=get_context("spawn"),
+        initializer=end_with_parent,
+        initargs=(os.getpid(),),
+    ) as pool:
         yield from pool.map(work, *zip(*items, strict=True), chunksize=chunk)

@@ -17,6 +17,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 import typer  # noqa: E402
 
 from hilsplat.base.errors import HilsplatError  # noqa: E402
+from hilsplat.base.processes import end_with_workflow  # noqa: E402
 from hilsplat.cli.apps import app  # noqa: E402
 
 # `hilsplat --help` lists the commands in this order.
@@ -30,6 +31,7 @@ from hilsplat.cli import world_commands, model_commands, dataset_commands  # noq
 
 def main() -> None:
     """Run the command; an error that a user can fix ends in a message, without a traceback."""
+    end_with_workflow()
     try:
         app()
     except HilsplatError as error:
