@@ -7,12 +7,13 @@ from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.names import NAME_RULE, name_problem
 from hilsplat.models.store import AUTO, EMBEDDED, read_model, real_model
 from hilsplat.settings import (
+    LARGEST,
     AutoencoderSettings,
     ClipSettings,
     ContributionsSettings,
@@ -159,8 +160,6 @@ SEEDED = re.compile(r"(.+)\.seed([0-9]+)")
 
 class RunSettings(StageSettings):
     """The whole configuration: what to run, and with which settings."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     seed: int = knob(0, "seed for everything random", ge=0)
     scenes: str = knob("config/scenes.tsv", "scene sheet, relative to the project")
@@ -329,7 +328,7 @@ def knob_table() -> str:
                 f"{symbol} {getattr(limit, attribute)}"
                 for limit in [*field.metadata, *_limits_inside(field.annotation)]
                 for attribute, symbol in (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
-                if hasattr(limit, attribute)
+                if hasattr(limit, attribute) and getattr(limit, attribute) != LARGEST
             )
             choices = "|".join(_choices(field.annotation))
             facts = [choices, limits, extra["unit"], f"origin: {extra['origin']}"]

@@ -9,7 +9,8 @@ import functools
 import json
 import re
 import shlex
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Protocol, runtime_checkable
@@ -30,10 +31,13 @@ from hilsplat.evaluate.tables.build import TABLES
 from hilsplat.methods.registry import METHODS, OURS, require_method
 from hilsplat.scene.sheet import SceneRow, choose_scenes, read_sheet
 from hilsplat.workflow.answering import doubt_about_photographs, models_of
+from hilsplat.workflow.feasible import require_feasible
 from hilsplat.workflow.model_digests import model_digest
+from hilsplat.workflow.soundness import Wanted
 from hilsplat.workflow.stages import stage_code
 
-CACHE = Path("results/.cache")
+RESULTS = Path("results")
+CACHE = RESULTS / ".cache"
 
 LEAST_MB = 4000
 """Memory that the stages with a model declare at least."""
@@ -81,6 +85,7 @@ class Plan:
             require_method(run.stages(name).method.name)
         sheet = Path(run.scenes)
         self.rows = tuple(read_sheet(sheet, run.groups, run.data_root))
+        self._row_of = {(row.dataset, row.scene): row for row in self.rows}
         chosen = choose_scenes(self.rows, run.groups, run.only)
         if more := {row.group for row in chosen} - set(run.groups):  # check their sources too
             read_sheet(sheet, {*run.groups, *more}, run.data_root)
@@ -100,6 +105,22 @@ class Plan:
                 fix="name other groups or scenes, or set data_root",
             )
         self._stages = functools.cache(lambda *which: run.stages(*which).with_models())
+
+    def require_feasible(self) -> None:
+        """Refuse devices that this machine does not have, and model folders that cannot be used.
+
+        A stage would find out too, but hours later.
+
+        Raises:
+            HilsplatError: the message names the setting, and a scene and variant that have it.
+        """
+        seen: set[Any] = set()
+        for row in self.scenes:
+            for variant in self.run.variant_names():
+                stages = self._stages(variant, self._scopes(row))
+                if stages not in seen:
+                    seen.add(stages)
+                    require_feasible(stages, f"{row.name}, variant {variant}")
 
     # ---- wildcards and threads ----------------------------------------------------------------------
 
@@ -131,11 +152,11 @@ class Plan:
 
     def row(self, job: Job) -> SceneRow:
         """Row of the scene sheet."""
-        return next(row for row in self.rows if (row.dataset, row.scene) == (job.dataset, job.scene))
+        return self._row_of[job.dataset, job.scene]
 
     def stages(self, job: Job) -> StageSettings:
         """All settings of a scene and, if the job has one, a variant."""
-        return self._stages(getattr(job, "variant", "default"), scopes_of(self.row(job)))
+        return self._stages(getattr(job, "variant", "default"), self._scopes(self.row(job)))
 
     def settings(self, section: str) -> Callable[[Job], str]:
         """Parameter: a section's settings, as JSON."""
@@ -168,7 +189,7 @@ class Plan:
         """Which models make the masks and the words of which scenes, one line each, doubts included."""
         scenes: dict[tuple[str, str], list[str]] = {}
         for row in self.scenes:
-            stages = self._stages("default", scopes_of(row))
+            stages = self._stages("default", self._scopes(row))
             key = (models_of(stages), "" if row.world else doubt_about_photographs(stages))
             scenes.setdefault(key, []).append(row.name)
         lines = []
@@ -217,15 +238,72 @@ class Plan:
 
     def shared_variant(self, stage: str, job: VariantJob) -> str:
         """First variant whose settings up to a stage equal those of the job's variant."""
-        scopes = scopes_of(self.row(job))
-        wanted = self._stages(job.variant, scopes)
-        seed = self.run.seed_of(job.variant) if wanted.depends_on_seed(stage) else None
+        return self._first_alike(stage, job.variant, self._scopes(self.row(job)))
+
+    @functools.cache  # noqa: B019  a process has one plan
+    def _first_alike(self, stage: str, variant: str, scopes: tuple[str, ...]) -> str:
+        wanted = self._stages(variant, scopes)
+        seed = self.run.seed_of(variant) if wanted.depends_on_seed(stage) else None
         for name in self.run.variant_names():
             other = self._stages(name, scopes)
             same = all(getattr(other, part) == getattr(wanted, part) for part in UPSTREAM[stage])
             if same and seed in (None, self.run.seed_of(name)):
                 return name
-        return str(job.variant)
+        return variant
+
+    def _scopes(self, row: SceneRow) -> tuple[str, ...]:
+        """Keys of `overrides` that apply to a scene and exist: scenes without any share their settings."""
+        return tuple(scope for scope in scopes_of(row) if scope in self.run.overrides)
+
+    def wanted(self) -> list[Wanted]:
+        """Every artifact that the run may write, and how it is to be made."""
+        found = [each for row in self.scenes for each in self._wanted_of(row)]
+        return [*found, *(Wanted(Path(table), table, "table") for table in self.tables())]
+
+    def _wanted_of(self, row: SceneRow) -> Iterator[Wanted]:
+        """The artifacts of one scene; what variants share is listed once."""
+        scene = SimpleNamespace(dataset=row.dataset, scene=row.scene)
+        if row.world:
+            world = self._want(scene, "world", "world")
+            yield replace(world, output=self.output(scene, "world/images"))
+        if is_exported(row.source):
+            yield self._want(scene, "source", "source", plugins=self.source_reader(scene))
+        yield self._want(scene, "poses", "scene", seed=self.run.seed)
+        yield self._want(scene, "gaussians", "gaussians.ply", seed=self.run.seed)
+        for variant in self.run.variant_names():
+            job = SimpleNamespace(**vars(scene), variant=variant)
+            stages, seed = self.stages(job), self.run.seed_of(variant)
+            for stage in ("coverage_tree", "clip", "contributions", "semantic_tree"):
+                if self.shared_variant(stage, job) == variant:
+                    yield self._want(job, stage, stage)
+            if self.shared_variant("masks", job) == variant:
+                stage = self.masks_stage(job)
+                yield self._want(job, stage, "masks", stages.perturb.seed if stage == "truth_masks" else None)
+            if self.shared_variant("autoencoder", job) == variant:
+                yield self._want(job, "autoencoder", "autoencoder", seed)
+            if self.shared_variant("field", job) == variant:
+                if stages.method.name == OURS:
+                    yield self._want(job, "field", "field.safetensors")
+                else:
+                    yield self._want(job, "method", "field.safetensors", seed, self.baseline(job))
+            yield self._want(job, "evaluate", "scores.csv", plugins=self.label_readers(job))
+        figures = {
+            name: getattr(self.stages(scene), name).model_dump(mode="json")
+            for name in ("figures", "evaluate")
+        }
+        for stage, picture in (("figures", "panel"), ("comparison", "comparison")):
+            path = f"results/figures/{row.name}/{picture}.png"
+            yield Wanted(Path(path), path, stage, figures, None, self.label_readers(scene))
+        path = f"results/figures/{row.name}/masks.png"
+        yield Wanted(Path(path), path, "mask_truth")
+
+    def _want(
+        self, job: Job, stage: str, name: str, seed: int | None = None, plugins: tuple[str, ...] = ()
+    ) -> Wanted:
+        path = self.output(job, *([job.variant] if isinstance(job, VariantJob) else []), name)
+        section = getattr(self.stages(job), "perturb" if stage == "truth_masks" else stage, None)
+        settings = section.model_dump(mode="json") if section is not None else {}
+        return Wanted(Path(path), path, stage, settings, seed, plugins)
 
     # ---- photographs and poses ----------------------------------------------------------------------
 
