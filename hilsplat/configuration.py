@@ -168,7 +168,11 @@ class RunSettings(StageSettings):
         (),
         "the only scenes to run, of whatever group: table-1, or synthetic/table-1; empty: all of the groups",
     )
-    data_root: str = knob("", "folder of the published data sets; empty: their scenes are skipped")
+    data_root: str = knob(
+        "",
+        "folder of the published data sets; empty: their scenes are skipped",
+        pattern="^[^<>]*$",  # it stands in the report's parameters
+    )
     main_variants: tuple[str, ...] = knob(("default",), "variants in the main tables")
     ablation_variants: tuple[str, ...] = knob((), "variants in the ablation table")
     theta_variants: tuple[str, ...] = knob((), "variants in the sweep over theta")

@@ -3,7 +3,6 @@
 # All outputs are `update(...)`: Snakemake deletes others before their job begins. A stage replaces its output when the
 # new one is whole, so a job that fails, or is killed, leaves the former one.
 import functools
-import json
 from pathlib import Path
 
 from snakemake.exceptions import WorkflowError

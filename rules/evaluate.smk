@@ -58,7 +58,7 @@ rule table:
     resources:
         mem_mb=1000,
     params:
-        labels=json.dumps(dict(PLAN.run.labels)),
+        labels=PLAN.names(),
         absent=lambda wildcards: PLAN.absent_options(wildcards.table),
         code=PLAN.code("table"),
     shell:

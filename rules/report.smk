@@ -130,7 +130,7 @@ rule comparison:
     params:
         folder=lambda wildcards, input: str(Path(input.gaussians).parent),
         variants=json.dumps(PLAN.run.main_variants),
-        names=json.dumps(dict(PLAN.run.labels)),
+        names=PLAN.names(),
         settings=PLAN.settings("figures"),
         evaluate=PLAN.settings("evaluate"),
         queries=PLAN.queries,

@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from hilsplat.base.errors import ArtifactError, DiskSpaceError
+from hilsplat.base.json_text import parse_json
 from hilsplat.base.litter import temporary_prefix
 
 Made = TypeVar("Made")
@@ -162,10 +163,10 @@ def read_json(path: Path) -> Any:
         ArtifactError: the file is missing or is not valid JSON.
     """
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
+        return parse_json(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise ArtifactError(f"{path} is missing", fix=remake(path)) from error
-    except (ValueError, RecursionError, OSError) as error:
+    except (ValueError, OSError) as error:
         raise ArtifactError(f"{path} is not valid JSON: {error}", fix=remake(path)) from error
 
 

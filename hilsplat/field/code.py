@@ -1,6 +1,5 @@
 """The scene's code: CLIP vectors to a few numbers and back, by a network or linearly; reading it."""
 
-import json
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -10,6 +9,7 @@ from safetensors import SafetensorError, safe_open
 
 from hilsplat.base.artifacts import read_index, read_npz
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.base.json_text import parse_json
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.linear_code import METADATA_KEY, LinearCode
 
@@ -49,7 +49,7 @@ def load_code(folder: Path) -> Code:
     path = autoencoder_file(folder)
     try:
         with safe_open(path, framework="np") as file:
-            about = json.loads(file.metadata()[METADATA_KEY])
+            about = parse_json(file.metadata()[METADATA_KEY])
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         if about.get("code") == "pca":
             return LinearCode(state["mean"], state["basis"])

@@ -11,6 +11,7 @@ from safetensors import SafetensorError, safe_open
 
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.errors import ArtifactError
+from hilsplat.base.json_text import parse_json
 from hilsplat.field.linear_code import METADATA_KEY
 
 
@@ -45,7 +46,7 @@ class LanguageField:
         """
         try:
             with safe_open(path, framework="np") as file:
-                about = json.loads(file.metadata()[METADATA_KEY])
+                about = parse_json(file.metadata()[METADATA_KEY])
                 return LanguageField(file.get_tensor("features"), **about)
         except (FileNotFoundError, SafetensorError, KeyError, TypeError) as error:
             raise ArtifactError(f"{path} cannot be read: {error}", fix="rerun the field stage") from error

@@ -1,6 +1,5 @@
 """Read posed views: COLMAP models, transforms.json (nerfstudio, Blender), LLFF, Polycam, Record3D."""
 
-import json
 import math
 import os
 from collections.abc import Mapping
@@ -12,6 +11,7 @@ import numpy as np
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, list_images
 from hilsplat.base.images import open_image
+from hilsplat.base.json_text import parse_json
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.known_poses import KnownPoses, KnownView
@@ -119,7 +119,7 @@ def read_transforms(
     points = None
     for file in known.files:
         try:
-            content = json.loads(file.read_text(encoding="utf-8"))
+            content = parse_json(file.read_text(encoding="utf-8"))
         except ValueError as error:
             raise SceneError(f"{file} is not valid JSON: {error}", fix="export it again") from error
         if not isinstance(content, dict) or not isinstance(content.get("frames"), list):

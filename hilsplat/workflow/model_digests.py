@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 from hilsplat.base.artifacts import sha256_of_path, write_json
+from hilsplat.base.json_text import parse_json
 
 
 @functools.cache
@@ -21,7 +22,7 @@ def model_digest(folder: Path, cache: Path) -> str:
     stamp = json.dumps([[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files])
     memo = cache / "digests.json"
     try:
-        known = json.loads(memo.read_text())
+        known = parse_json(memo.read_text())
     except (OSError, ValueError):
         known = {}
     if stamp not in known:

@@ -6,7 +6,6 @@ wildcards of a rule.
 """
 
 import functools
-import json
 import re
 import shlex
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -16,6 +15,7 @@ from types import SimpleNamespace
 from typing import Any, Protocol, runtime_checkable
 
 from hilsplat.base.errors import ModelError, SettingsError
+from hilsplat.base.json_text import inert, inert_json
 from hilsplat.configuration import UPSTREAM, StageSettings, parse_run
 from hilsplat.datasets.registry import readers_of
 from hilsplat.datasets.sources import (
@@ -160,7 +160,7 @@ class Plan:
 
     def settings(self, section: str) -> Callable[[Job], str]:
         """Parameter: a section's settings, as JSON."""
-        return lambda job: getattr(self.stages(job), section).model_dump_json()
+        return lambda job: inert(getattr(self.stages(job), section).model_dump_json())
 
     def seed(self, job: VariantJob) -> int:
         """Parameter: the seed of a variant's networks."""
@@ -439,10 +439,14 @@ class Plan:
     def _data_root_option(self) -> str:
         return f"--data-root {shlex.quote(str(Path(self.run.data_root)))}"
 
+    def names(self) -> str:
+        """Parameter: variant -> its name in tables and figures, as JSON."""
+        return inert_json(dict(self.run.labels))
+
     def queries(self, job: Job) -> str:
         """Parameter: texts for the panel of a scene without labels on images, as JSON."""
         of_dataset = self.run.queries.get(job.dataset, ())
-        return json.dumps(self.run.queries.get(f"{job.dataset}/{job.scene}", of_dataset))
+        return inert_json(self.run.queries.get(f"{job.dataset}/{job.scene}", of_dataset))
 
     # ---- tables ---------------------------------------------------------------------------------------
 

@@ -5,7 +5,6 @@ also read a list of polygons), `bbox` [x1, y1, x2, y2]. `group` does not identif
 restart and repeat. Unknown keys are ignored.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from hilsplat.base.errors import SceneError
+from hilsplat.base.json_text import parse_json
 from hilsplat.datasets.images.polygons import fill_polygon, outside_px
 
 SLACK_PX = 1.0
@@ -69,7 +69,7 @@ def read_isat(path: Path) -> IsatFile:
     """
     path = Path(path)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(path.read_text(encoding="utf-8"))
     except (ValueError, OSError) as error:
         raise SceneError(
             f"label file {path} cannot be read: {error}",
