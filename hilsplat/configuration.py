@@ -3,10 +3,12 @@
 import difflib
 import json
 import re
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
+import yaml
 from pydantic import BaseModel, ValidationError
 
 from hilsplat.base.errors import SettingsError
@@ -291,7 +293,48 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
         run.stages(variant)
     for scope in run.overrides:
         run.stages(scopes=(scope,))
+    require_known("labels", run.labels, ["default", *run.variants])
     return run
+
+
+def require_known(where: str, keys: Iterable[str], known: Collection[str]) -> None:
+    """Refuse keys that stand for nothing, which would change nothing.
+
+    Raises:
+        SettingsError: the first unknown key, with the one that may have been meant.
+    """
+    for key in keys:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1)
+            raise SettingsError(
+                f"{where}.{key}: there is nothing of this name",
+                expected=f"did you mean {near[0]!r}?" if near else f"one of {', '.join(known)}",
+                fix=f"correct the key, or take it out of {where}",
+            )
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """Read a configuration file.
+
+    Raises:
+        SettingsError: it is missing, or is not YAML that holds keys; the message names line and column.
+    """
+    try:
+        found = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        raise SettingsError(
+            f"{path}{place} is not YAML: {error.problem or error.context}",
+            fix="indent with spaces, close what is open, and quote texts with a colon or braces",
+        ) from error
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, OSError) as error:
+        raise SettingsError(f"{path} cannot be read: {error}", fix="save it as YAML in UTF-8") from error
+    if found is not None and not isinstance(found, dict):
+        raise SettingsError(
+            f"{path} does not hold settings", expected="lines of key: value", found=type(found).__name__
+        )
+    return found or {}
 
 
 def config_schema() -> dict[str, Any]:

@@ -129,7 +129,7 @@ rule comparison:
         mem_mb=6000,
     params:
         folder=lambda wildcards, input: str(Path(input.gaussians).parent),
-        variants=json.dumps(PLAN.run.main_variants),
+        variants=PLAN.main_variants(),
         names=PLAN.names(),
         settings=PLAN.settings("figures"),
         evaluate=PLAN.settings("evaluate"),

@@ -19,8 +19,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from hilsplat.base.errors import ArtifactError, DiskSpaceError
-from hilsplat.base.json_text import parse_json
-from hilsplat.base.litter import temporary_prefix
+from hilsplat.base.processes import temporary_prefix
 
 Made = TypeVar("Made")
 
@@ -103,9 +102,14 @@ def work_folder(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         folder = Path(tempfile.mkdtemp(prefix=temporary_prefix(), dir=path.parent))
     try:
-        yield folder
+        with full_disk_told(path):
+            yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+FULL_DISK = ("No space left on device", "disk is full", "Disk quota exceeded")
+"""What libraries in C++ and Rust say, whose errors are not the system's: safetensors, SQLite, COLMAP."""
 
 
 @contextmanager
@@ -117,8 +121,9 @@ def full_disk_told(path: Path) -> Iterator[None]:
     """
     try:
         yield
-    except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+    except Exception as error:
+        full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
+        if full or any(words in str(error) for words in FULL_DISK):
             raise DiskSpaceError(
                 f"no space left while writing {path}",
                 fix=f"free space on the disk of {path.parent}, then run again; finished work is kept",
@@ -170,6 +175,18 @@ def read_json(path: Path) -> Any:
         raise ArtifactError(f"{path} is not valid JSON: {error}", fix=remake(path)) from error
 
 
+def parse_json(text: str | bytes) -> Any:
+    """Parse JSON that somebody else wrote.
+
+    Raises:
+        ValueError: it is not JSON, or is nested too deeply to be anything that we read.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
 def write_npz(path: Path, **arrays: np.ndarray) -> None:
     """Write a compressed .npz atomically, with fixed time stamps: same arrays, same bytes."""
     with (
@@ -184,19 +201,30 @@ def write_npz(path: Path, **arrays: np.ndarray) -> None:
                 np.lib.format.write_array(stream, np.ascontiguousarray(array), allow_pickle=False)
 
 
-def read_npz(path: Path) -> dict[str, np.ndarray]:
+def read_npz(path: Path, *needed: str) -> dict[str, np.ndarray]:
     """Read an .npz into a dict, without unpickling anything.
 
+    Args:
+        path: the file.
+        needed: names of arrays that it must have.
+
     Raises:
-        ArtifactError: the file is missing, damaged or holds objects.
+        ArtifactError: the file is missing or damaged, holds objects, or lacks an array.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
+            arrays = {name: archive[name] for name in archive.files}
     except FileNotFoundError as error:
         raise ArtifactError(f"{path} is missing", fix=remake(path)) from error
-    except DAMAGE as error:
+    except (*DAMAGE, AttributeError) as error:  # AttributeError: it is an .npy
         raise ArtifactError(f"{path} cannot be read: {error}", fix=remake(path)) from error
+    if lacking := [name for name in needed if name not in arrays]:
+        raise ArtifactError(
+            f"{path} lacks {', '.join(lacking)}",
+            found=", ".join(sorted(arrays)) or "no array",
+            fix=remake(path),
+        )
+    return arrays
 
 
 def read_into(maker: type[Made], path: Path, **more: Any) -> Made:
@@ -234,13 +262,16 @@ def write_npy(path: Path, array: np.ndarray) -> None:
 
 
 def read_npy(path: Path) -> np.ndarray:
-    """Read one .npy array, without unpickling anything.
+    """Read one .npy array of numbers, without unpickling anything.
 
     Raises:
-        ArtifactError: the file is missing or damaged.
+        ArtifactError: the file is missing or damaged, or holds something else.
     """
     try:
-        return np.load(path, allow_pickle=False)
+        array = np.load(path, allow_pickle=False)
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+            raise ValueError(f"it holds {getattr(array, 'dtype', 'an archive')}, not numbers")
+        return array
     except FileNotFoundError as error:
         raise ArtifactError(f"{path} is missing", fix=remake(path)) from error
     except DAMAGE as error:

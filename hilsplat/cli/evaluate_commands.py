@@ -15,6 +15,7 @@ from hilsplat.cli.stage import (
     Results,
     Settings,
     Threads,
+    json_option,
     section_of,
     stage,
     start_logging,
@@ -120,15 +121,13 @@ def table(
     log: Log = None,
 ) -> None:
     """Build one table of the paper, with reported, measured and stand-in rows."""
-    import json
-
     scores = scores or []
     inputs = {"published": published, **{f"scores {number}": path for number, path in enumerate(scores)}}
     beside = tuple(out.with_suffix(ending) for ending in (".md", ".tex", ".html"))
     with stage("table", out, log, inputs=inputs, beside=beside):
         from hilsplat.evaluate.tables.build import run_table
 
-        run_table(name, scores, published, json.loads(labels), out, absent or [])
+        run_table(name, scores, published, json_option("--labels", labels, dict), out, absent or [])
 
 
 @app.command()
@@ -152,8 +151,6 @@ def figures(
     log: Log = None,
 ) -> None:
     """Draw the panel of a scene: photograph, masks, field, relevancy, answers, truth."""
-    import json
-
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
     parts = _parts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
     inputs = {**parts.as_inputs(), "fit": fit, **({"truth": truth} if truth else {})}
@@ -179,7 +176,7 @@ def figures(
             truth=truth,
             labels=labels,
             data_root=data_root,
-            queries=json.loads(queries),
+            queries=json_option("--queries", queries, list),
             threads=threads,
         )
 
@@ -202,10 +199,8 @@ def comparison(
     log: Log = None,
 ) -> None:
     """Compare variants: queries by method, one query in four views, features at three levels."""
-    import json
-
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
-    recorded, compared = {"figures": section, "evaluate": protocol}, json.loads(variants)
+    recorded, compared = {"figures": section, "evaluate": protocol}, json_option("--variants", variants, list)
     inputs = {f"scores of {variant}": folder / variant / "scores.csv" for variant in compared}
     with stage(
         "comparison",
@@ -222,14 +217,14 @@ def comparison(
         run_comparison(
             folder,
             compared,
-            json.loads(names),
+            json_option("--names", names, dict),
             out,
             section,
             protocol,
             truth=truth,
             labels=labels,
             data_root=data_root,
-            queries=json.loads(queries),
+            queries=json_option("--queries", queries, list),
             threads=threads,
         )
 

@@ -16,7 +16,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import typer  # noqa: E402
 
-from hilsplat.base.errors import HilsplatError  # noqa: E402
+from hilsplat.base.errors import HilsplatError, place_error  # noqa: E402
 from hilsplat.base.processes import end_with_workflow  # noqa: E402
 from hilsplat.cli.apps import app  # noqa: E402
 
@@ -36,6 +36,11 @@ def main() -> None:
         app()
     except HilsplatError as error:
         logging.getLogger("hilsplat").error("%s", error)
+        sys.exit(1)
+    except OSError as error:
+        if (told := place_error(error)) is None:
+            raise
+        logging.getLogger("hilsplat").error("%s", told)
         sys.exit(1)
 
 

@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Float32
 from safetensors import SafetensorError, safe_open
 
-from hilsplat.base.artifacts import read_index, read_npz
+from hilsplat.base.artifacts import parse_json, read_index, read_npz, remake
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
-from hilsplat.base.json_text import parse_json
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.linear_code import METADATA_KEY, LinearCode
 
@@ -56,10 +55,8 @@ def load_code(folder: Path) -> Code:
         from hilsplat.field.network_code import Autoencoder
 
         return Autoencoder.from_arrays(about["channels"], about["latent"], state)
-    except (FileNotFoundError, SafetensorError, KeyError, TypeError) as error:
-        raise ArtifactError(
-            f"{path} cannot be read: {error}", fix="run the autoencoder stage again"
-        ) from error
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ArtifactError(f"{path} cannot be read: {error}", fix=remake(path)) from error
 
 
 def autoencoder_file(folder: Path) -> Path:
@@ -74,7 +71,7 @@ def load_latents(folder: Path, contributions: Contributions) -> Float32[np.ndarr
         MisalignedArtifactError: the numbers of rows differ.
     """
     read_index(folder)
-    latents = read_npz(Path(folder) / "latents.npz")["latents"]
+    latents = read_npz(Path(folder) / "latents.npz", "latents")["latents"]
     if len(latents) != len(contributions):
         raise MisalignedArtifactError(
             f"latents of {folder} do not belong to these contributions",

@@ -8,8 +8,8 @@ import huggingface_hub
 import requests
 from huggingface_hub.errors import CacheNotFound, OfflineModeIsEnabled
 
+from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import DownloadError
-from hilsplat.base.json_text import parse_json
 from hilsplat.models.clip_split import WHOLE
 from hilsplat.models.layouts import LAYOUTS, SUPPORTED, layout_of
 

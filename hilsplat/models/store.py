@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hilsplat.base.json_text import parse_json
+from hilsplat.base.artifacts import parse_json
 from hilsplat.models.layouts import LAYOUTS, layout_of
 
 MODELS = Path("models")

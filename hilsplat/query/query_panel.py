@@ -45,7 +45,7 @@ def query_panel(
     found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
     title = f"“{text}” in {scene.scene.name}: {found}{note}"
     doubts = [*wrap(scene.caution, TITLE_LETTERS), *map(str, doubts_of(scene, hits))]
-    figure.suptitle("\n".join([title, *doubts]), fontsize=12, fontweight="bold")
+    figure.suptitle("\n".join([title, *doubts]), fontsize=12, fontweight="bold", parse_math=False)
     heights = [len(views) * row_in, map_in]
     (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)
     grid = upper.subplots(len(views), columns, squeeze=False)

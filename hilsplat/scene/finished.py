@@ -72,9 +72,12 @@ class FinishedScene:
                 fix="correct the path, or name the results folder",
             )
         if not (folder / variant).exists():
+            finished = finished_variants(folder)
+            if not finished:
+                raise _unfinished(folder, folder / variant / "field.safetensors")
             raise ArtifactError(
                 f"{folder} has no variant {variant!r}",
-                expected=f"one of {', '.join(finished_variants(folder)) or 'none yet'}",
+                expected=f"one of {', '.join(finished)}",
                 fix="name it under ablation_variants and run the workflow",
             )
         field = folder / variant / "field.safetensors"

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, list_images
 from hilsplat.base.images import open_image
-from hilsplat.base.json_text import parse_json
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.known_poses import KnownPoses, KnownView
@@ -125,6 +125,8 @@ def read_transforms(
         if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
             raise SceneError(f"{file} has no list `frames`", fix="export it again")
         for number, frame in enumerate(content["frames"]):
+            if not isinstance(frame, dict):
+                raise SceneError(f"{file}, frame {number} is not an object", fix="export it again")
             views.append(_read_frame(known, file, number, {**content, **frame}))
         if points is None and isinstance(content.get("ply_file_path"), str):
             _check_inside(known.root, content["ply_file_path"])

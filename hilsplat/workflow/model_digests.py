@@ -4,8 +4,7 @@ import functools
 import json
 from pathlib import Path
 
-from hilsplat.base.artifacts import sha256_of_path, write_json
-from hilsplat.base.json_text import parse_json
+from hilsplat.base.artifacts import parse_json, sha256_of_path, write_json
 
 
 @functools.cache

@@ -5,7 +5,9 @@ attributes `dataset` and `scene`, and `variant` for the stages that variants sha
 wildcards of a rule.
 """
 
+import difflib
 import functools
+import json
 import re
 import shlex
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -15,8 +17,7 @@ from types import SimpleNamespace
 from typing import Any, Protocol, runtime_checkable
 
 from hilsplat.base.errors import ModelError, SettingsError
-from hilsplat.base.json_text import inert, inert_json
-from hilsplat.configuration import UPSTREAM, StageSettings, parse_run
+from hilsplat.configuration import UPSTREAM, StageSettings, parse_run, require_known
 from hilsplat.datasets.registry import readers_of
 from hilsplat.datasets.sources import (
     DATA_PREFIX,
@@ -29,7 +30,7 @@ from hilsplat.datasets.sources import (
 )
 from hilsplat.evaluate.tables.build import TABLES
 from hilsplat.methods.registry import METHODS, OURS, require_method
-from hilsplat.scene.sheet import SceneRow, choose_scenes, read_sheet
+from hilsplat.scene.sheet import GROUPS, PHOTOS, SceneRow, choose_scenes, read_sheet
 from hilsplat.workflow.answering import doubt_about_photographs, models_of
 from hilsplat.workflow.feasible import require_feasible
 from hilsplat.workflow.model_digests import model_digest
@@ -85,6 +86,20 @@ class Plan:
             require_method(run.stages(name).method.name)
         sheet = Path(run.scenes)
         self.rows = tuple(read_sheet(sheet, run.groups, run.data_root))
+        datasets = {row.dataset for row in self.rows} | {PHOTOS}
+        scenes = [row.name for row in self.rows]
+        # a scene of the sheet may be taken out of it, and its settings stay
+        named = [key for key in (*run.overrides, *run.queries) if "/" in key]
+        gone = [key for key in named if key.partition("/")[0] in datasets]
+        require_known("overrides", run.overrides, [*GROUPS, *scenes, *gone])
+        require_known("queries", run.queries, [*sorted(datasets), *scenes, *gone])
+        for key in sorted({*gone} - {*scenes}):
+            if near := difflib.get_close_matches(key, scenes, n=1, cutoff=0.85):
+                raise SettingsError(
+                    f"overrides or queries name the scene {key!r}, which {sheet} does not have",
+                    expected=f"did you mean {near[0]!r}?",
+                    fix="correct the key, or take it out",
+                )
         self._row_of = {(row.dataset, row.scene): row for row in self.rows}
         chosen = choose_scenes(self.rows, run.groups, run.only)
         if more := {row.group for row in chosen} - set(run.groups):  # check their sources too
@@ -104,6 +119,8 @@ class Plan:
                 ),
                 fix="name other groups or scenes, or set data_root",
             )
+        for row in self.scenes:
+            self._require_no_braces(row)
         self._stages = functools.cache(lambda *which: run.stages(*which).with_models())
 
     def require_feasible(self) -> None:
@@ -331,6 +348,17 @@ class Plan:
         """Option of poses: whether the images are renders."""
         return "--render" if self.row(job).world else "--no-render"
 
+    def _require_no_braces(self, row: SceneRow) -> None:
+        """Refuse files in whose names Snakemake would see wildcards; it knows no way to quote them."""
+        job = SimpleNamespace(dataset=row.dataset, scene=row.scene)
+        files = self.image_files(job) if row.folder is not None else []
+        for path in [*([files] if isinstance(files, str) else files), *self.brought(job)]:
+            if "{" in path or "}" in path:
+                raise SettingsError(
+                    f"{path} of {row.name} cannot be read by the workflow: its name has braces",
+                    fix="rename it, or its folder",
+                )
+
     def source_files(self, job: Job) -> list[str]:
         """Input of source: files of a data set with the images and poses."""
         return [str(path) for path in image_files(self.row(job).source, self.run.data_root)]
@@ -439,14 +467,18 @@ class Plan:
     def _data_root_option(self) -> str:
         return f"--data-root {shlex.quote(str(Path(self.run.data_root)))}"
 
+    def main_variants(self) -> str:
+        """Parameter: the variants of the main tables, as JSON."""
+        return json.dumps(self.run.main_variants)
+
     def names(self) -> str:
         """Parameter: variant -> its name in tables and figures, as JSON."""
-        return inert_json(dict(self.run.labels))
+        return inert(json.dumps(dict(self.run.labels)))
 
     def queries(self, job: Job) -> str:
         """Parameter: texts for the panel of a scene without labels on images, as JSON."""
         of_dataset = self.run.queries.get(job.dataset, ())
-        return inert_json(self.run.queries.get(f"{job.dataset}/{job.scene}", of_dataset))
+        return inert(json.dumps(self.run.queries.get(f"{job.dataset}/{job.scene}", of_dataset)))
 
     # ---- tables ---------------------------------------------------------------------------------------
 
@@ -531,6 +563,11 @@ def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int)
     needs = needs_of(model, prompts)
     views = needs.views_at_once(threads, SHARE_OF_MACHINE * machine_mib())
     return round(needs.total_mib(views) * MIB / 1e6)
+
+
+def inert(text: str) -> str:
+    """The same JSON without `<`: Snakemake writes the parameters of jobs raw into a script of its report."""
+    return text.replace("<", "\\u003c")
 
 
 def scopes_of(row: SceneRow) -> tuple[str, str]:

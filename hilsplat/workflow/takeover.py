@@ -5,7 +5,7 @@ import logging
 import os
 from pathlib import Path
 
-from hilsplat.base.litter import machine, remove_litter
+from hilsplat.base.processes import machine, remove_litter
 
 logger = logging.getLogger(__name__)
 

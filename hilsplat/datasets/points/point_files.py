@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyParseError
 
+from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SceneError
-from hilsplat.base.json_text import parse_json
 
 UNPACK_AGAIN = "unpack or download it again; the copy is incomplete"
 

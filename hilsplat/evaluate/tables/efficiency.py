@@ -7,9 +7,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from hilsplat.base.artifacts import write_text
+from hilsplat.base.artifacts import parse_json, write_text
 from hilsplat.base.errors import ArtifactError
-from hilsplat.base.json_text import parse_json
 from hilsplat.base.tables import write_csv
 from hilsplat.configuration import SECTIONS
 
@@ -86,7 +85,9 @@ def read_benchmark(path: Path, results: Path) -> list[Job]:
             record = parse_json(line)
             elapsed_s = float(record["s"])
         except (ValueError, KeyError, TypeError) as error:
-            raise ArtifactError(f"{path} is not a valid benchmark file: {error}", fix="delete it") from error
+            raise ArtifactError(
+                f"{path} is not a valid benchmark file: {error}", fix="run its stage again"
+            ) from error
         jobs.append(
             Job(
                 path.stem,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hilsplat.base.artifacts import atomic_folder, atomic_path, work_folder, write_text
-from hilsplat.base.litter import machine, remove_litter
+from hilsplat.base.processes import machine, remove_litter
 
 
 def dead_pid() -> int:

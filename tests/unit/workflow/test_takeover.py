@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from hilsplat.base.litter import machine
+from hilsplat.base.processes import machine
 from hilsplat.workflow import takeover
 from hilsplat.workflow.takeover import take_over
 
