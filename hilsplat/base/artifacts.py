@@ -44,7 +44,8 @@ def remake(path: Path) -> str:
     places = [place for place in (Path(path), *Path(path).parents) if provenance_path(place).is_file()]
     if not places:
         return "run the stage that writes it again"
-    parts = places[0].parts  # Snakemake knows its files by their paths from the project
+    place = places[0] / "images" if places[0].name == "world" else places[0]  # its rule declares two folders
+    parts = place.parts  # Snakemake knows its files by their paths from the project
     start = len(parts) - 1 - parts[::-1].index("results") if "results" in parts else 0
     return f"snakemake --cores 2 --forcerun {shlex.quote(str(Path(*parts[start:])))}"
 
