@@ -33,7 +33,7 @@ lint: $(STAMP)
 	snakemake --lint --configfile config/ci.yaml
 
 test: lint
-	python -m pytest --numprocesses $(CORES) --dist loadfile --no-loadscope-reorder tests/workflow tests/browser tests/unit
+	python -m pytest --numprocesses $(CORES) --dist loadfile --no-loadscope-reorder tests/workflow tests/browser tests/bad_inputs tests/unit
 
 bench: $(STAMP)
 	OMP_NUM_THREADS=1 python -m pytest -c benchmarks/pytest.ini benchmarks

@@ -6,6 +6,16 @@
 #   snakemake --report results/report.html                          the report of a finished run
 
 
+from pathlib import Path
+
+from hilsplat.configuration import read_config
+
+if Path("config/config.yaml").is_file():
+    read_config(
+        Path("config/config.yaml")
+    )  # its message has the line, which Snakemake's has not
+
+
 configfile: "config/config.yaml"
 
 

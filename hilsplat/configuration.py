@@ -3,16 +3,19 @@
 import difflib
 import json
 import re
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+import yaml
+from pydantic import BaseModel, ValidationError
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.names import NAME_RULE, name_problem
 from hilsplat.models.store import AUTO, EMBEDDED, read_model, real_model
 from hilsplat.settings import (
+    LARGEST,
     AutoencoderSettings,
     ClipSettings,
     ContributionsSettings,
@@ -160,8 +163,6 @@ SEEDED = re.compile(r"(.+)\.seed([0-9]+)")
 class RunSettings(StageSettings):
     """The whole configuration: what to run, and with which settings."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     seed: int = knob(0, "seed for everything random", ge=0)
     scenes: str = knob("config/scenes.tsv", "scene sheet, relative to the project")
     groups: tuple[str, ...] = knob(("benchmark",), "groups of the scene sheet to run")
@@ -169,7 +170,11 @@ class RunSettings(StageSettings):
         (),
         "the only scenes to run, of whatever group: table-1, or synthetic/table-1; empty: all of the groups",
     )
-    data_root: str = knob("", "folder of the published data sets; empty: their scenes are skipped")
+    data_root: str = knob(
+        "",
+        "folder of the published data sets; empty: their scenes are skipped",
+        pattern="^[^<>]*$",  # it stands in the report's parameters
+    )
     main_variants: tuple[str, ...] = knob(("default",), "variants in the main tables")
     ablation_variants: tuple[str, ...] = knob((), "variants in the ablation table")
     theta_variants: tuple[str, ...] = knob((), "variants in the sweep over theta")
@@ -288,7 +293,48 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
         run.stages(variant)
     for scope in run.overrides:
         run.stages(scopes=(scope,))
+    require_known("labels", run.labels, ["default", *run.variants])
     return run
+
+
+def require_known(where: str, keys: Iterable[str], known: Collection[str]) -> None:
+    """Refuse keys that stand for nothing, which would change nothing.
+
+    Raises:
+        SettingsError: the first unknown key, with the one that may have been meant.
+    """
+    for key in keys:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1)
+            raise SettingsError(
+                f"{where}.{key}: there is nothing of this name",
+                expected=f"did you mean {near[0]!r}?" if near else f"one of {', '.join(known)}",
+                fix=f"correct the key, or take it out of {where}",
+            )
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """Read a configuration file.
+
+    Raises:
+        SettingsError: it is missing, or is not YAML that holds keys; the message names line and column.
+    """
+    try:
+        found = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        raise SettingsError(
+            f"{path}{place} is not YAML: {error.problem or error.context}",
+            fix="indent with spaces, close what is open, and quote texts with a colon or braces",
+        ) from error
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, OSError) as error:
+        raise SettingsError(f"{path} cannot be read: {error}", fix="save it as YAML in UTF-8") from error
+    if found is not None and not isinstance(found, dict):
+        raise SettingsError(
+            f"{path} does not hold settings", expected="lines of key: value", found=type(found).__name__
+        )
+    return found or {}
 
 
 def config_schema() -> dict[str, Any]:
@@ -329,7 +375,7 @@ def knob_table() -> str:
                 f"{symbol} {getattr(limit, attribute)}"
                 for limit in [*field.metadata, *_limits_inside(field.annotation)]
                 for attribute, symbol in (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
-                if hasattr(limit, attribute)
+                if hasattr(limit, attribute) and getattr(limit, attribute) != LARGEST
             )
             choices = "|".join(_choices(field.annotation))
             facts = [choices, limits, extra["unit"], f"origin: {extra['origin']}"]

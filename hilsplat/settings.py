@@ -9,16 +9,21 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+LARGEST = 2_000_000_000
+"""Largest whole number of any knob: the libraries take 32 bits, and a run adds up to 10 to its seed."""
+
 
 def knob(default: Any, what: str, *, unit: str = "", origin: str = "ours", **limits: Any) -> Any:
     """A field with its description, unit, range (ge, gt, le, lt) and the origin of its default."""
+    if type(default) is int and not {"le", "lt"} & limits.keys():
+        limits["le"] = LARGEST
     return Field(default, description=what, json_schema_extra={"unit": unit, "origin": origin}, **limits)
 
 
 class Section(BaseModel):
-    """Settings of one stage; frozen. Unknown keys are refused."""
+    """Settings of one stage; frozen. Unknown keys and numbers that are not finite are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     @property
     def is_random(self) -> bool:

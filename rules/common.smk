@@ -2,15 +2,21 @@
 #
 # Priorities lead to a scene's first answer: of the jobs that could start, the nearest to its semantic tree is
 # first, and fields, scores and pictures come after all trees. Gaussians are before masks: they can be looked at.
-import json
+#
+# All outputs are `update(...)`: Snakemake deletes others before their job begins. A stage replaces its output when the
+# new one is whole, so a job that fails, or is killed, leaves the former one.
+import functools
 from pathlib import Path
 
 from snakemake.exceptions import WorkflowError
 from snakemake.logging import logger
 
 from hilsplat.base.errors import HilsplatError
+from hilsplat.base.processes import jobs_end_with_this_process
 from hilsplat.evaluate.tables.build import TABLES
-from hilsplat.workflow.plan import Plan, any_of
+from hilsplat.workflow.plan import CACHE, RESULTS, Plan, any_of
+from hilsplat.workflow.soundness import unsound
+from hilsplat.workflow.takeover import take_over
 
 try:
     PLAN = Plan(config)
@@ -18,6 +24,51 @@ except HilsplatError as error:  # a mistake that a user can fix: no traceback
     raise WorkflowError(str(error)) from None
 for name, reason in PLAN.absent.items():
     logger.warning(f"{name} is skipped: {reason}")
+
+if workflow.is_main_process and workflow.resource_settings.nodes is None:
+    try:  # jobs run on this machine: refuse what cannot work before anything is touched
+        PLAN.require_feasible()
+    except HilsplatError as error:
+        raise WorkflowError(str(error)) from None
+jobs_end_with_this_process()
+
+
+def checked(inputs):
+    """An input function that first settles, once the DAG exists, which artifacts cannot stay as they are.
+
+    Every job of a scene depends on a rule that takes its inputs through this function.
+    """
+
+    def settled(wildcards):
+        settle_artifacts()
+        return inputs(wildcards)
+
+    return settled
+
+
+@functools.cache
+def settle_artifacts():
+    # Snakemake would copy each output aside, and back with a new time: our writers need neither.
+    workflow.persistence.backup_output = lambda path: None
+    workflow.persistence.restore_output = lambda path: Path(path).exists()
+    if not workflow.is_main_process:
+        return
+    if (
+        workflow.executor_plugin is not None and not workflow.dryrun
+    ):  # not for a report, a plan or a graph
+        if notice := take_over(Path(workflow.persistence.path), RESULTS):
+            logger.warning(notice)
+    triggers = {str(trigger) for trigger in workflow.rerun_triggers}
+    wrong = unsound(
+        PLAN.wanted(),
+        CACHE,
+        compare_settings="params" in triggers,
+        compare_inputs="input" in triggers,
+    )
+    for output, reason in wrong.items():
+        logger.warning(f"{output} is made again: {reason}")
+    workflow.dag.forcefiles.update(wrong)  # as --forcerun, for jobs of this run alone
+
 
 ENVIRONMENT = "../workflow/envs/hilsplat.yaml"
 

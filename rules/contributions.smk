@@ -5,7 +5,9 @@ rule contributions:
         gaussians="results/{dataset}/{scene}/gaussians.ply",
         masks=PLAN.shared("masks", "masks"),
     output:
-        contributions=directory("results/{dataset}/{scene}/{variant}/contributions"),
+        contributions=directory(
+            update("results/{dataset}/{scene}/{variant}/contributions")
+        ),
     log:
         "results/{dataset}/{scene}/{variant}/logs/contributions.log",
     benchmark:

@@ -4,7 +4,7 @@ rule clip:
         scene="results/{dataset}/{scene}/scene",
         masks=PLAN.shared("masks", "masks"),
     output:
-        clip=directory("results/{dataset}/{scene}/{variant}/clip"),
+        clip=directory(update("results/{dataset}/{scene}/{variant}/clip")),
     log:
         "results/{dataset}/{scene}/{variant}/logs/clip.log",
     benchmark:

@@ -10,8 +10,8 @@ rule evaluate:
         clip=PLAN.shared("clip", "clip"),
         masks=PLAN.shared("masks", "masks"),
     output:
-        scores="results/{dataset}/{scene}/{variant}/scores.csv",
-        times="results/{dataset}/{scene}/{variant}/times.csv",
+        scores=update("results/{dataset}/{scene}/{variant}/scores.csv"),
+        times=update("results/{dataset}/{scene}/{variant}/times.csv"),
     log:
         "results/{dataset}/{scene}/{variant}/logs/evaluate.log",
     benchmark:
@@ -38,11 +38,11 @@ rule table:
         scores=lambda wildcards: PLAN.scores(wildcards.table),
         published="config/published/{table}.csv",
     output:
-        csv="results/tables/{table}.csv",
-        md="results/tables/{table}.md",
-        tex="results/tables/{table}.tex",
+        csv=update("results/tables/{table}.csv"),
+        md=update("results/tables/{table}.md"),
+        tex=update("results/tables/{table}.tex"),
         html=report(
-            "results/tables/{table}.html",
+            update("results/tables/{table}.html"),
             caption="../workflow/report/table.rst",
             category="Tables",
             labels={"table": "{table}"},
@@ -58,7 +58,7 @@ rule table:
     resources:
         mem_mb=1000,
     params:
-        labels=json.dumps(dict(PLAN.run.labels)),
+        labels=PLAN.names(),
         absent=lambda wildcards: PLAN.absent_options(wildcards.table),
         code=PLAN.code("table"),
     shell:

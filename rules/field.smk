@@ -5,7 +5,7 @@ rule autoencoder:
         semantic_tree=PLAN.shared("semantic_tree", "semantic_tree"),
         contributions=PLAN.shared("contributions", "contributions"),
     output:
-        autoencoder=directory("results/{dataset}/{scene}/{variant}/autoencoder"),
+        autoencoder=directory(update("results/{dataset}/{scene}/{variant}/autoencoder")),
     log:
         "results/{dataset}/{scene}/{variant}/logs/autoencoder.log",
     benchmark:
@@ -31,7 +31,7 @@ rule field:
         coverage_tree=PLAN.shared("coverage_tree", "coverage_tree"),
         autoencoder=PLAN.shared("autoencoder", "autoencoder"),
     output:
-        field="results/{dataset}/{scene}/{variant}/field.safetensors",
+        field=update("results/{dataset}/{scene}/{variant}/field.safetensors"),
     log:
         "results/{dataset}/{scene}/{variant}/logs/field.log",
     benchmark:

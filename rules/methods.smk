@@ -7,7 +7,7 @@ rule method:
         contributions=PLAN.shared("contributions", "contributions"),
         autoencoder=PLAN.shared("autoencoder", "autoencoder"),
     output:
-        field="results/{dataset}/{scene}/{variant}/field.safetensors",
+        field=update("results/{dataset}/{scene}/{variant}/field.safetensors"),
     log:
         "results/{dataset}/{scene}/{variant}/logs/field.log",
     benchmark:

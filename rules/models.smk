@@ -1,8 +1,8 @@
 # The small models of the synthetic world. A default run does not train them: trained ones are committed.
 rule train_models:
     output:
-        directory("results/models/sam-tiny"),
-        directory("results/models/clip-tiny"),
+        directory(update("results/models/sam-tiny")),
+        directory(update("results/models/clip-tiny")),
     log:
         "results/models/train.log",
     conda:

@@ -12,21 +12,21 @@ rule figures:
         autoencoder="results/{dataset}/{scene}/default/autoencoder",
     output:
         panel=report(
-            "results/figures/{dataset}/{scene}/panel.png",
+            update("results/figures/{dataset}/{scene}/panel.png"),
             caption="../workflow/report/panel.rst",
             category="Scenes",
             subcategory="{dataset}/{scene}",
             labels={"figure": "queries"},
         ),
         registration=report(
-            "results/figures/{dataset}/{scene}/registration.png",
+            update("results/figures/{dataset}/{scene}/registration.png"),
             caption="../workflow/report/registration.rst",
             category="Scenes",
             subcategory="{dataset}/{scene}",
             labels={"figure": "camera poses"},
         ),
         fit=report(
-            "results/figures/{dataset}/{scene}/fit.png",
+            update("results/figures/{dataset}/{scene}/fit.png"),
             caption="../workflow/report/fit.rst",
             category="Scenes",
             subcategory="{dataset}/{scene}",
@@ -63,13 +63,13 @@ rule mask_truth:
         masks="results/{dataset}/{scene}/default/masks",
     output:
         picture=report(
-            "results/figures/{dataset}/{scene}/masks.png",
+            update("results/figures/{dataset}/{scene}/masks.png"),
             caption="../workflow/report/masks.rst",
             category="Scenes",
             subcategory="{dataset}/{scene}",
             labels={"figure": "masks against the truth"},
         ),
-        table="results/figures/{dataset}/{scene}/masks.csv",
+        table=update("results/figures/{dataset}/{scene}/masks.csv"),
     log:
         "results/figures/{dataset}/{scene}/masks.log",
     benchmark:
@@ -98,21 +98,21 @@ rule comparison:
         scores=PLAN.compared_scores,  # their provenance holds the settings of the answers
     output:
         methods=report(
-            "results/figures/{dataset}/{scene}/comparison.png",
+            update("results/figures/{dataset}/{scene}/comparison.png"),
             caption="../workflow/report/comparison.rst",
             category="Scenes",
             subcategory="{dataset}/{scene}",
             labels={"figure": "queries by method"},
         ),
         views=report(
-            "results/figures/{dataset}/{scene}/views.png",
+            update("results/figures/{dataset}/{scene}/views.png"),
             caption="../workflow/report/views.rst",
             category="Scenes",
             subcategory="{dataset}/{scene}",
             labels={"figure": "one query over views"},
         ),
         features=report(
-            "results/figures/{dataset}/{scene}/features.png",
+            update("results/figures/{dataset}/{scene}/features.png"),
             caption="../workflow/report/features.rst",
             category="Scenes",
             subcategory="{dataset}/{scene}",
@@ -129,8 +129,8 @@ rule comparison:
         mem_mb=6000,
     params:
         folder=lambda wildcards, input: str(Path(input.gaussians).parent),
-        variants=json.dumps(PLAN.run.main_variants),
-        names=json.dumps(dict(PLAN.run.labels)),
+        variants=PLAN.main_variants(),
+        names=PLAN.names(),
         settings=PLAN.settings("figures"),
         evaluate=PLAN.settings("evaluate"),
         queries=PLAN.queries,
@@ -148,7 +148,7 @@ rule sweep_plot:
         table="results/tables/{sweep}.csv",
     output:
         plot=report(
-            "results/figures/sweep-{sweep}.png",
+            update("results/figures/sweep-{sweep}.png"),
             caption="../workflow/report/sweep.rst",
             category="Sweeps",
             labels={"figure": "{sweep}"},

@@ -1,9 +1,9 @@
 # Camera poses: structure from motion, or import.
 rule source:
     input:
-        PLAN.source_files,
+        checked(PLAN.source_files),
     output:
-        directory("results/{dataset}/{scene}/source"),
+        directory(update("results/{dataset}/{scene}/source")),
     log:
         "results/{dataset}/{scene}/logs/source.log",
     benchmark:
@@ -24,9 +24,9 @@ rule source:
 
 rule poses:
     input:
-        PLAN.image_files,
+        checked(PLAN.image_files),
     output:
-        scene=directory("results/{dataset}/{scene}/scene"),
+        scene=directory(update("results/{dataset}/{scene}/scene")),
     log:
         "results/{dataset}/{scene}/logs/poses.log",
     benchmark:

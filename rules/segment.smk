@@ -4,7 +4,7 @@ rule masks:
         scene="results/{dataset}/{scene}/scene",
         truth=PLAN.masks_truth,  # empty, except for the diagnostic segmenter
     output:
-        masks=directory("results/{dataset}/{scene}/{variant}/masks"),
+        masks=directory(update("results/{dataset}/{scene}/{variant}/masks")),
     log:
         "results/{dataset}/{scene}/{variant}/logs/masks.log",
     benchmark:
@@ -30,7 +30,9 @@ rule coverage_tree:
     input:
         masks=PLAN.shared("masks", "masks"),
     output:
-        coverage_tree=directory("results/{dataset}/{scene}/{variant}/coverage_tree"),
+        coverage_tree=directory(
+            update("results/{dataset}/{scene}/{variant}/coverage_tree")
+        ),
     log:
         "results/{dataset}/{scene}/{variant}/logs/coverage_tree.log",
     benchmark:

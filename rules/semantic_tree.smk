@@ -5,7 +5,9 @@ rule semantic_tree:
         masks=PLAN.shared("masks", "masks"),
         clip=PLAN.shared("clip", "clip"),
     output:
-        semantic_tree=directory("results/{dataset}/{scene}/{variant}/semantic_tree"),
+        semantic_tree=directory(
+            update("results/{dataset}/{scene}/{variant}/semantic_tree")
+        ),
     log:
         "results/{dataset}/{scene}/{variant}/logs/semantic_tree.log",
     benchmark:

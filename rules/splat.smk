@@ -4,9 +4,9 @@ rule gaussians:
         scene="results/{dataset}/{scene}/scene",
         brought=PLAN.brought,
     output:
-        ply="results/{dataset}/{scene}/gaussians.ply",
-        coordinates="results/{dataset}/{scene}/gaussians.json",
-        report=directory("results/{dataset}/{scene}/gaussians"),
+        ply=update("results/{dataset}/{scene}/gaussians.ply"),
+        coordinates=update("results/{dataset}/{scene}/gaussians.json"),
+        report=directory(update("results/{dataset}/{scene}/gaussians")),
     log:
         "results/{dataset}/{scene}/logs/gaussians.log",
     benchmark:

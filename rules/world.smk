@@ -1,8 +1,10 @@
 # Synthetic scenes: images for the stages, truth for evaluation, figures and the diagnostic segmenter.
 rule world:
+    input:
+        checked(lambda wildcards: []),
     output:
-        images=directory("results/{dataset}/{scene}/world/images"),
-        truth=directory("results/{dataset}/{scene}/world/truth"),
+        images=directory(update("results/{dataset}/{scene}/world/images")),
+        truth=directory(update("results/{dataset}/{scene}/world/truth")),
     log:
         "results/{dataset}/{scene}/logs/world.log",
     benchmark:

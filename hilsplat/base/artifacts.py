@@ -5,9 +5,11 @@ import fcntl
 import hashlib
 import json
 import os
+import shlex
 import shutil
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
@@ -17,6 +19,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from hilsplat.base.errors import ArtifactError, DiskSpaceError
+from hilsplat.base.processes import temporary_prefix
 
 Made = TypeVar("Made")
 
@@ -25,6 +28,26 @@ ZIP64_BYTES = 2**30
 
 INDEX = "index.json"
 """Written last into a folder artifact: its presence means that the folder is complete."""
+
+DAMAGE = (ValueError, zipfile.BadZipFile, zlib.error, NotImplementedError, EOFError, OSError, MemoryError)
+"""What numpy and zipfile raise on files whose bytes are not what was written."""
+
+
+def provenance_path(artifact: Path) -> Path:
+    """Path of the provenance of a file or folder artifact: beside it, with its name."""
+    artifact = Path(artifact)
+    return artifact.parent / f"{artifact.name}.provenance.json"
+
+
+def remake(path: Path) -> str:
+    """How to have an artifact, or the one that a file belongs to, written again."""
+    places = [place for place in (Path(path), *Path(path).parents) if provenance_path(place).is_file()]
+    if not places:
+        return "run the stage that writes it again"
+    place = places[0] / "images" if places[0].name == "world" else places[0]  # its rule declares two folders
+    parts = place.parts  # Snakemake knows its files by their paths from the project
+    start = len(parts) - 1 - parts[::-1].index("results") if "results" in parts else 0
+    return f"snakemake --cores 2 --forcerun {shlex.quote(str(Path(*parts[start:])))}"
 
 
 @contextmanager
@@ -36,7 +59,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    with full_disk_told(path):
+        handle, name = tempfile.mkstemp(prefix=temporary_prefix(), suffix=path.suffix[-16:], dir=path.parent)
     os.close(handle)
     temporary = Path(name)
     try:
@@ -56,17 +80,37 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         DiskSpaceError: the disk is full.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
-    try:
+    with work_folder(path) as both:
+        temporary = both / "new"
         with full_disk_told(path):
+            temporary.mkdir()
             yield temporary
             temporary.chmod(0o755)
-            if path.exists():
-                shutil.rmtree(path)
+            if path.exists():  # moved, not deleted: there is no moment in which neither is whole
+                path.replace(both / "old")
             temporary.replace(path)
+
+
+@contextmanager
+def work_folder(path: Path) -> Iterator[Path]:
+    """A temporary folder beside `path`, removed at the end.
+
+    Raises:
+        DiskSpaceError: the disk is full.
+    """
+    path = Path(path)
+    with full_disk_told(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(prefix=temporary_prefix(), dir=path.parent))
+    try:
+        with full_disk_told(path):
+            yield folder
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+FULL_DISK = ("No space left on device", "disk is full", "Disk quota exceeded")
+"""What libraries in C++ and Rust say, whose errors are not the system's: safetensors, SQLite, COLMAP."""
 
 
 @contextmanager
@@ -78,8 +122,9 @@ def full_disk_told(path: Path) -> Iterator[None]:
     """
     try:
         yield
-    except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+    except Exception as error:
+        full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
+        if full or any(words in str(error) for words in FULL_DISK):
             raise DiskSpaceError(
                 f"no space left while writing {path}",
                 fix=f"free space on the disk of {path.parent}, then run again; finished work is kept",
@@ -124,13 +169,23 @@ def read_json(path: Path) -> Any:
         ArtifactError: the file is missing or is not valid JSON.
     """
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
+        return parse_json(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise ArtifactError(f"{path} is missing", fix="run the stage that writes it") from error
-    except ValueError as error:
-        raise ArtifactError(
-            f"{path} is not valid JSON: {error}", fix="delete it and run its stage again"
-        ) from error
+        raise ArtifactError(f"{path} is missing", fix=remake(path)) from error
+    except (ValueError, OSError) as error:
+        raise ArtifactError(f"{path} is not valid JSON: {error}", fix=remake(path)) from error
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Parse JSON that somebody else wrote.
+
+    Raises:
+        ValueError: it is not JSON, or is nested too deeply to be anything that we read.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
 
 
 def write_npz(path: Path, **arrays: np.ndarray) -> None:
@@ -147,21 +202,30 @@ def write_npz(path: Path, **arrays: np.ndarray) -> None:
                 np.lib.format.write_array(stream, np.ascontiguousarray(array), allow_pickle=False)
 
 
-def read_npz(path: Path) -> dict[str, np.ndarray]:
+def read_npz(path: Path, *needed: str) -> dict[str, np.ndarray]:
     """Read an .npz into a dict, without unpickling anything.
 
+    Args:
+        path: the file.
+        needed: names of arrays that it must have.
+
     Raises:
-        ArtifactError: the file is missing, damaged or holds objects.
+        ArtifactError: the file is missing or damaged, holds objects, or lacks an array.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
+            arrays = {name: archive[name] for name in archive.files}
     except FileNotFoundError as error:
-        raise ArtifactError(f"{path} is missing", fix="run the stage that writes it") from error
-    except (ValueError, zipfile.BadZipFile, EOFError, OSError) as error:
+        raise ArtifactError(f"{path} is missing", fix=remake(path)) from error
+    except (*DAMAGE, AttributeError) as error:  # AttributeError: it is an .npy
+        raise ArtifactError(f"{path} cannot be read: {error}", fix=remake(path)) from error
+    if lacking := [name for name in needed if name not in arrays]:
         raise ArtifactError(
-            f"{path} cannot be read: {error}", fix="delete it and run its stage again"
-        ) from error
+            f"{path} lacks {', '.join(lacking)}",
+            found=", ".join(sorted(arrays)) or "no array",
+            fix=remake(path),
+        )
+    return arrays
 
 
 def read_into(maker: type[Made], path: Path, **more: Any) -> Made:
@@ -181,8 +245,8 @@ def read_into(maker: type[Made], path: Path, **more: Any) -> Made:
         raise ArtifactError(
             f"{path} is of another version",
             expected=", ".join(sorted(expected)),
-            found=", ".join(sorted(arrays)),
-            fix="run its stage again",
+            found=", ".join(sorted(arrays)) or "no array",
+            fix=remake(path),
         )
     return maker(**arrays, **more)
 
@@ -199,19 +263,20 @@ def write_npy(path: Path, array: np.ndarray) -> None:
 
 
 def read_npy(path: Path) -> np.ndarray:
-    """Read one .npy array, without unpickling anything.
+    """Read one .npy array of numbers, without unpickling anything.
 
     Raises:
-        ArtifactError: the file is missing or damaged.
+        ArtifactError: the file is missing or damaged, or holds something else.
     """
     try:
-        return np.load(path, allow_pickle=False)
+        array = np.load(path, allow_pickle=False)
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+            raise ValueError(f"it holds {getattr(array, 'dtype', 'an archive')}, not numbers")
+        return array
     except FileNotFoundError as error:
-        raise ArtifactError(f"{path} is missing", fix="run the stage that writes it") from error
-    except (ValueError, EOFError, OSError) as error:
-        raise ArtifactError(
-            f"{path} cannot be read: {error}", fix="delete it and run its stage again"
-        ) from error
+        raise ArtifactError(f"{path} is missing", fix=remake(path)) from error
+    except DAMAGE as error:
+        raise ArtifactError(f"{path} cannot be read: {error}", fix=remake(path)) from error
 
 
 def sha256_of_bytes(*parts: bytes) -> str:
@@ -241,7 +306,7 @@ def sha256_of_path(path: Path) -> str:
         return sha256_of_file(path)
     files = sorted(file for file in path.rglob("*") if file.is_file() and not file.name.startswith("."))
     if not files:
-        raise ArtifactError(f"{path} is missing or empty", fix="run the stage that writes it")
+        raise ArtifactError(f"{path} is missing or empty", fix=remake(path))
     return sha256_of_json([(file.relative_to(path).as_posix(), sha256_of_file(file)) for file in files])
 
 
@@ -258,10 +323,11 @@ def read_index(folder: Path) -> dict[str, Any]:
     """
     path = Path(folder) / INDEX
     if not path.is_file():
-        raise ArtifactError(
-            f"{folder} is missing or incomplete: it has no {INDEX}", fix="run its stage again"
-        )
-    return read_json(path)
+        raise ArtifactError(f"{folder} is missing or incomplete: it has no {INDEX}", fix=remake(Path(folder)))
+    index = read_json(path)
+    if not isinstance(index, dict) or not isinstance(index.get("views", {}), dict):
+        raise ArtifactError(f"{path} is not the index of an artifact", fix=remake(path))
+    return index
 
 
 def read_full_index(folder: Path, *entries: str) -> dict[str, Any]:
@@ -275,7 +341,7 @@ def read_full_index(folder: Path, *entries: str) -> dict[str, Any]:
         raise ArtifactError(
             f"{folder} is of another version",
             expected=f"{', '.join(missing)} in {INDEX}",
-            fix="run its stage again",
+            fix=remake(Path(folder)),
         )
     return index
 
@@ -321,18 +387,29 @@ class ViewCache:
 def output_lock(output: Path) -> Iterator[None]:
     """Lock an output for writing; a second writer of the same output is refused.
 
+    A writer that does not reach the end leaves a mark in the lock: the output may then be neither what its
+    provenance says nor what the writer was about to write.
+
     Raises:
         ArtifactError: another process is writing it.
     """
     output = Path(output)
     output.parent.mkdir(parents=True, exist_ok=True)
-    lock = output.parent / f".{output.name}.lock"
-    with lock.open("w") as stream:
+    with lock_path(output).open("a") as stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise ArtifactError(
                 f"another process is writing {output}",
-                fix="wait for it, or end it (a killed Snakemake leaves its jobs running), then run again",
+                fix="wait for it, or end it, then run again",
             ) from error
+        stream.truncate(0)
+        stream.write("unfinished\n")
+        stream.flush()
         yield
+        stream.truncate(0)
+
+
+def lock_path(output: Path) -> Path:
+    """The lock of an output; not empty if its last writer was killed or failed."""
+    return output.parent / f".{output.name}.lock"

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hilsplat.base.errors import HilsplatError
+from hilsplat.base.processes import remove_litter
 
 VIEW_CACHES = ("masks", "clip", "contributions")
 """Caches that can be pruned: a missing entry costs time, never a result."""
@@ -51,19 +52,19 @@ def size_table(folder: Path) -> str:
 def prune_cache(
     folder: Path, stages: list[str], *, days: float | None = None, max_mib: float | None = None
 ) -> tuple[int, float]:
-    """Delete entries of view caches, the least recently used first.
+    """Delete what killed jobs left unfinished, and entries of view caches, the least recently used first.
 
     Args:
         folder: cache folder.
         stages: which of `VIEW_CACHES`; empty: all of them.
         days: delete entries not used for this many days.
-        max_mib: then delete entries until at most this much is left.
+        max_mib: then delete entries until at most this much is left. Without either limit no entry goes.
 
     Returns:
         files deleted, and their size in MiB.
 
     Raises:
-        HilsplatError: a stage has no view cache, or neither limit is given.
+        HilsplatError: a stage has no view cache.
     """
     strangers = sorted(set(stages) - set(VIEW_CACHES))
     if strangers:
@@ -71,10 +72,8 @@ def prune_cache(
             f"there is no cache of finished views for {', '.join(strangers)}",
             expected=f"one of {', '.join(VIEW_CACHES)}",
         )
-    if days is None and max_mib is None:
-        raise HilsplatError(
-            "neither --days nor --max-mib is given", fix="give one or both; --days 0 deletes everything"
-        )
+    # the caches lie in the results folder, whose stages leave theirs beside their outputs
+    remove_litter(folder.parent if Path(folder).name == ".cache" else folder)
     chosen = set(stages or VIEW_CACHES)
     files = [path for cache in caches(folder) if cache.name in chosen for path in cache.files]
     used = {path: path.stat() for path in files}

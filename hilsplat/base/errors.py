@@ -1,5 +1,7 @@
 """Errors that a user can fix: where, expected, found, and the way out."""
 
+import errno
+
 
 class HilsplatError(Exception):
     """Base of every error that a file, a setting or a user causes.
@@ -30,6 +32,35 @@ class HilsplatError(Exception):
     def add_line(self, name: str, value: object) -> None:
         """Add a line such as `found`, known only to a caller, at the end of the message."""
         self.args = (f"{self}\n  {name:<9} {value}",)
+
+
+def place_error(error: OSError) -> HilsplatError | None:
+    """An error of the system that a user can fix, in words; None for another one.
+
+    Missing files are not among them: every reader says which stage writes its file.
+    """
+    problem = PLACES.get(error.errno or 0)
+    if problem is None or error.filename is None:
+        return None
+    return HilsplatError(
+        f"{error.filename} {problem}",
+        found=error.strerror,
+        fix="choose another place, or free this one",
+    )
+
+
+PLACES = {
+    errno.EACCES: "may not be read or written",
+    errno.EPERM: "may not be read or written",
+    errno.EROFS: "is on a disk that can only be read",
+    errno.ENOTDIR: "cannot be: a part of the path is a file",
+    errno.EISDIR: "is a folder, where a file is needed",
+    errno.EEXIST: "is in the way",
+    errno.ENAMETOOLONG: "is longer than this disk takes",
+    errno.ENOSPC: "does not fit on the disk, which is full",
+    errno.EDQUOT: "does not fit into your share of the disk",
+}
+"""What is wrong with a place, by the system's number."""
 
 
 class SettingsError(HilsplatError):

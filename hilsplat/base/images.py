@@ -1,6 +1,7 @@
 """Reading and writing images: upright, RGB, channel-last."""
 
 import functools
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -32,9 +33,21 @@ def open_image(path: Path) -> Image.Image:
 
     Size and EXIF are known at once, pixels are decoded on demand. A HEIF image comes upright: its rotation is
     part of the format, and its EXIF orientation is reset.
+
+    Raises:
+        ImageError: it states more pixels than a photograph has.
     """
     _register_heif()
-    return Image.open(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            return Image.open(path)
+    except Image.DecompressionBombError as error:
+        raise ImageError(
+            f"image {path} is too large: {str(error).partition(',')[0]}",
+            expected=f"at most {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} megapixels",
+            fix="shrink it, or leave it out",
+        ) from error
 
 
 @functools.cache
@@ -70,7 +83,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
             return np.asarray(upright.convert("RGB"))
     except FileNotFoundError as error:
         raise ImageError(f"image {path} is missing") from error
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, MemoryError) as error:
         size = path.stat().st_size if path.exists() else 0
         raise ImageError(
             f"image {path} cannot be read: {error}",

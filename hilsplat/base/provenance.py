@@ -1,6 +1,7 @@
 """Provenance of artifacts, written beside them."""
 
 import functools
+import os
 import platform
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -8,7 +9,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from hilsplat.base.artifacts import sha256_of_path, write_json
+from hilsplat.base.artifacts import provenance_path, sha256_of_path, write_json
 
 LIBRARIES = (
     "hilsplat",
@@ -24,12 +25,6 @@ LIBRARIES = (
 )
 
 
-def provenance_path(artifact: Path) -> Path:
-    """Path of the provenance of a file or folder artifact: beside it, with its name."""
-    artifact = Path(artifact)
-    return artifact.with_name(f"{artifact.name}.provenance.json")
-
-
 def write_provenance(
     artifact: Path,
     *,
@@ -39,8 +34,14 @@ def write_provenance(
     settings: Mapping[str, Any],
     seed: int | None,
     inputs: Mapping[str, Path],
+    beside: Sequence[Path] = (),
+    plugins: Sequence[str] = (),
 ) -> None:
-    """Write stage, code digest, command, settings, seed, digests of inputs, versions, git commit."""
+    """Write stage, code digest, command, settings, seed, digests of inputs and outputs, versions, git commit.
+
+    `beside` are further files and folders that the stage wrote, `plugins` the readers or baselines it used.
+    """
+    folder = Path(artifact).parent
     write_json(
         provenance_path(artifact),
         {
@@ -48,6 +49,7 @@ def write_provenance(
             "artifact": Path(artifact).name,
             "command": list(command),
             "code": code,
+            "plugins": list(plugins),
             "settings": dict(settings),
             "seed": seed,
             "inputs": {
@@ -55,11 +57,27 @@ def write_provenance(
                 for name, path in inputs.items()
                 if Path(path).exists()
             },
+            "outputs": {
+                os.path.relpath(path, folder): {"sha256": sha256_of_path(path), "bytes": sizes_of(path)}
+                for path in (artifact, *beside)
+            },
             "python": platform.python_version(),
             "libraries": library_versions(),
             "git": git_commit(),
         },
     )
+
+
+def sizes_of(path: Path) -> dict[str, int]:
+    """Bytes of each file of an artifact by its path inside, without hidden ones; a file has the path ".".
+
+    Reading them takes no time, and tells which file is gone or cut.
+    """
+    path = Path(path)
+    if path.is_file():
+        return {".": path.stat().st_size}
+    files = sorted(file for file in path.rglob("*") if file.is_file() and not file.name.startswith("."))
+    return {file.relative_to(path).as_posix(): file.stat().st_size for file in files}
 
 
 @functools.cache

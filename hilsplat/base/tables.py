@@ -43,6 +43,13 @@ def read_csv(path: Path, columns: Sequence[str], fix: str) -> list[dict[str, str
     return rows
 
 
+def plain_markdown(text: str) -> str:
+    """Text of a cell that Markdown shows as it is: no column, emphasis, link or HTML comes from it."""
+    for mark in ("|", "*", "]("):
+        text = text.replace(mark, f"\\{mark}" if len(mark) == 1 else "]\\(")
+    return " ".join(text.replace("<", "&lt;").splitlines())
+
+
 def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[object]], words: int) -> str:
     """A table as Markdown; the first `words` columns are words, the others numbers."""
     numbers = len(columns) - words

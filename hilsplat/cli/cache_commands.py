@@ -40,7 +40,7 @@ def cache_prune(
         list[str] | None, typer.Option(help="cache to prune: masks, clip or contributions; default: all")
     ] = None,
 ) -> None:
-    """Delete cached views; a stage that needs one computes it again."""
+    """Delete what killed jobs left unfinished and, with a limit, cached views: they are computed again."""
     from hilsplat.base.cache import prune_cache, size_table
 
     number, freed_mib = prune_cache(context.obj, stage or [], days=days, max_mib=max_mib)

@@ -15,6 +15,7 @@ from hilsplat.cli.stage import (
     PathOut,
     Settings,
     Threads,
+    model_input,
     section_of,
     stage,
 )
@@ -33,7 +34,7 @@ def clip(
 ) -> None:
     """Embed each mask with CLIP."""
     section = section_of("clip", settings)
-    inputs = {"scene": scene, "masks": masks}
+    inputs = {"scene": scene, "masks": masks, **model_input(section)}
     with stage("clip", out, log, settings=section, threads=threads, inputs=inputs):
         from hilsplat.embed.stage import run_clip
 

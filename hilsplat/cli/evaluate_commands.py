@@ -15,6 +15,7 @@ from hilsplat.cli.stage import (
     Results,
     Settings,
     Threads,
+    json_option,
     section_of,
     stage,
     start_logging,
@@ -65,8 +66,16 @@ def evaluate(
     section = section_of("evaluate", settings)
     parts = _parts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
     inputs = {**parts.as_inputs(), **({"truth": truth} if truth else {})}
-    plugins = _readers(labels or ())
-    with stage("evaluate", out, log, settings=section, threads=threads, inputs=inputs, plugins=plugins):
+    with stage(
+        "evaluate",
+        out,
+        log,
+        settings=section,
+        threads=threads,
+        inputs=inputs,
+        plugins=_readers(labels or ()),
+        beside=(out.with_name("times.csv"),),
+    ):
         from hilsplat.evaluate.stage import run_evaluate
 
         run_evaluate(
@@ -112,14 +121,13 @@ def table(
     log: Log = None,
 ) -> None:
     """Build one table of the paper, with reported, measured and stand-in rows."""
-    import json
-
     scores = scores or []
     inputs = {"published": published, **{f"scores {number}": path for number, path in enumerate(scores)}}
-    with stage("table", out, log, inputs=inputs):
+    beside = tuple(out.with_suffix(ending) for ending in (".md", ".tex", ".html"))
+    with stage("table", out, log, inputs=inputs, beside=beside):
         from hilsplat.evaluate.tables.build import run_table
 
-        run_table(name, scores, published, json.loads(labels), out, absent or [])
+        run_table(name, scores, published, json_option("--labels", labels, dict), out, absent or [])
 
 
 @app.command()
@@ -143,14 +151,20 @@ def figures(
     log: Log = None,
 ) -> None:
     """Draw the panel of a scene: photograph, masks, field, relevancy, answers, truth."""
-    import json
-
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
     parts = _parts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
     inputs = {**parts.as_inputs(), "fit": fit, **({"truth": truth} if truth else {})}
     recorded = {"figures": section, "evaluate": protocol}
-    plugins = _readers([labels])
-    with stage("figures", out, log, settings=recorded, threads=threads, inputs=inputs, plugins=plugins):
+    with stage(
+        "figures",
+        out,
+        log,
+        settings=recorded,
+        threads=threads,
+        inputs=inputs,
+        plugins=_readers([labels]),
+        beside=(out.with_name("registration.png"), out.with_name("fit.png")),
+    ):
         from hilsplat.evaluate.figures.panel import run_figures
 
         run_figures(
@@ -162,7 +176,7 @@ def figures(
             truth=truth,
             labels=labels,
             data_root=data_root,
-            queries=json.loads(queries),
+            queries=json_option("--queries", queries, list),
             threads=threads,
         )
 
@@ -185,26 +199,32 @@ def comparison(
     log: Log = None,
 ) -> None:
     """Compare variants: queries by method, one query in four views, features at three levels."""
-    import json
-
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
-    recorded, compared = {"figures": section, "evaluate": protocol}, json.loads(variants)
+    recorded, compared = {"figures": section, "evaluate": protocol}, json_option("--variants", variants, list)
     inputs = {f"scores of {variant}": folder / variant / "scores.csv" for variant in compared}
-    plugins = _readers([labels])
-    with stage("comparison", out, log, settings=recorded, threads=threads, inputs=inputs, plugins=plugins):
+    with stage(
+        "comparison",
+        out,
+        log,
+        settings=recorded,
+        threads=threads,
+        inputs=inputs,
+        plugins=_readers([labels]),
+        beside=(out.with_name("views.png"), out.with_name("features.png")),
+    ):
         from hilsplat.evaluate.figures.comparison import run_comparison
 
         run_comparison(
             folder,
             compared,
-            json.loads(names),
+            json_option("--names", names, dict),
             out,
             section,
             protocol,
             truth=truth,
             labels=labels,
             data_root=data_root,
-            queries=json.loads(queries),
+            queries=json_option("--queries", queries, list),
             threads=threads,
         )
 

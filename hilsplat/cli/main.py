@@ -17,7 +17,8 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import typer  # noqa: E402
 
-from hilsplat.base.errors import HilsplatError  # noqa: E402
+from hilsplat.base.errors import HilsplatError, place_error  # noqa: E402
+from hilsplat.base.processes import end_with_workflow  # noqa: E402
 from hilsplat.cli.apps import app  # noqa: E402
 
 # `hilsplat --help` lists the commands in this order.
@@ -31,10 +32,16 @@ from hilsplat.cli import world_commands, model_commands, dataset_commands  # noq
 
 def main() -> None:
     """Run the command; an error that a user can fix ends in a message, without a traceback."""
+    end_with_workflow()
     try:
         app()
     except HilsplatError as error:
         logging.getLogger("hilsplat").error("%s", error)
+        sys.exit(1)
+    except OSError as error:
+        if (told := place_error(error)) is None:
+            raise
+        logging.getLogger("hilsplat").error("%s", told)
         sys.exit(1)
     finally:  # else Python's end searches all that numba and matplotlib made for garbage, for 0.4 s
         gc.freeze()

@@ -84,7 +84,10 @@ def gaussians(
     """Fit 3D Gaussians to the training views, or take your own; a JSON beside them gives the coordinates."""
     section = section_of("gaussians", settings)
     inputs = {"scene": scene, **({"brought": brought} if brought else {})}
-    with stage("gaussians", out, log, settings=section, seed=seed, threads=threads, inputs=inputs):
+    beside = (out.with_suffix(".json"), report)
+    with stage(
+        "gaussians", out, log, settings=section, seed=seed, threads=threads, inputs=inputs, beside=beside
+    ):
         from hilsplat.splat.fit import run_gaussians
 
         run_gaussians(scene, out, report, cache, section, seed, threads, brought)

@@ -16,6 +16,7 @@ from hilsplat.cli.stage import (
     PathOut,
     Settings,
     Threads,
+    model_input,
     section_of,
     stage,
     start_logging,
@@ -47,7 +48,8 @@ def masks(
             found=f"--truth {truth}",
             fix="leave out --truth, or set masks.segmenter: truth-perturbed, a diagnostic",
         )
-    with stage("masks", out, log, settings=section, threads=threads, inputs={"scene": scene}):
+    inputs = {"scene": scene, **(model_input(section) if section.segmenter == "sam" else {})}
+    with stage("masks", out, log, settings=section, threads=threads, inputs=inputs):
         from hilsplat.segment.stage import run_masks
 
         run_masks(scene, out, cache, section, threads, memory)

@@ -10,8 +10,8 @@ from typing import Annotated, Any
 
 import typer
 
-from hilsplat.base.artifacts import output_lock, require_free_space
-from hilsplat.base.errors import HilsplatError
+from hilsplat.base.artifacts import output_lock, parse_json, require_free_space
+from hilsplat.base.errors import HilsplatError, SettingsError, place_error
 from hilsplat.base.progress import in_run, share_told
 from hilsplat.workflow.stages import stage_code
 
@@ -27,7 +27,7 @@ Memory = Annotated[
         min=1, help="memory for views at once, MiB; default: what is free; results do not depend on it"
     ),
 ]
-Seed = Annotated[int, typer.Option(min=0, help="seed for everything random")]
+Seed = Annotated[int, typer.Option(min=0, max=2_000_000_000, help="seed for everything random")]
 Log = Annotated[Path | None, typer.Option(help="also write the log to this file")]
 Cache = Annotated[Path, typer.Option(help="folder of the caches of finished views, for resuming")]
 Results = Annotated[Path, typer.Option(help="results folder")]
@@ -53,7 +53,11 @@ def start_logging(log: Path | None) -> None:
         terminal.setLevel(logging.WARNING)
     root.addHandler(terminal)
     if log is not None:
-        log.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            log.parent.mkdir(parents=True, exist_ok=True)
+            log.touch()
+        except OSError as error:
+            raise place_error(error) or error from None
         file = logging.FileHandler(log, mode="w", encoding="utf-8")
         file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
         root.addHandler(file)
@@ -72,11 +76,12 @@ def stage(
     threads: int = 1,
     inputs: dict[str, Path] | None = None,
     plugins: tuple[str, ...] = (),
+    beside: tuple[Path, ...] = (),
 ) -> Iterator[None]:
     """Everything around a stage's one function call: log, lock, disk space, provenance.
 
     `settings` is the section that the stage takes, or several by name; `plugins` are the places of the
-    readers or baselines that it uses (`base.plugins`).
+    readers or baselines that it uses (`base.plugins`); `beside` is what it writes besides `out`.
     """
     from hilsplat.base.provenance import write_provenance
 
@@ -99,10 +104,14 @@ def stage(
                 settings=_recorded(settings),
                 seed=seed,
                 inputs=inputs or {},
+                beside=beside,
+                plugins=plugins,
             )
     except HilsplatError:
         raise
-    except Exception:  # a bug of ours: the traceback belongs in the log
+    except Exception as error:  # a bug of ours: the traceback belongs in the log
+        if isinstance(error, OSError) and (told := place_error(error)) is not None:
+            raise told from error
         logging.getLogger("hilsplat").exception("%s failed on %s", name, out)
         sys.exit(1)
 
@@ -119,3 +128,25 @@ def section_of(name: str, text: str) -> Any:
     from hilsplat.configuration import parse_section, with_models
 
     return with_models(parse_section(name, text))
+
+
+def model_input(section: Any) -> dict[str, Path]:
+    """The model folder of a section as an input; a missing one is for the stage to report."""
+    folder = Path(section.model)
+    return {"model": folder} if folder.is_dir() else {}
+
+
+def json_option(option: str, text: str, kind: type) -> Any:
+    """An option that holds JSON: a list of texts, or texts by name.
+
+    Raises:
+        SettingsError: it is not JSON, or holds something else.
+    """
+    try:
+        value = parse_json(text)
+    except ValueError as error:
+        raise SettingsError(f"{option} is not JSON: {error}", found=text[:80]) from error
+    texts = value.values() if isinstance(value, dict) else value
+    if not isinstance(value, kind) or not all(isinstance(each, str) for each in texts):
+        raise SettingsError(f"{option} is not a {kind.__name__} of texts, as JSON", found=text[:80])
+    return value

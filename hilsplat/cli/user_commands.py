@@ -100,6 +100,20 @@ def scene_folder(scene: str, results: Path) -> Path:
 
 
 @app.command()
+def verify(
+    results: Annotated[Path, typer.Argument(help="results folder, or a copy of it")] = Path("results"),
+) -> None:
+    """Check every digest of a results folder: what is whole, stale or damaged."""
+    start_logging(None)
+    from hilsplat.workflow.verify import verify
+
+    report, is_whole = verify(results)
+    typer.echo(report)
+    if not is_whole:
+        raise typer.Exit(1)
+
+
+@app.command()
 def settings(
     schema: Annotated[
         bool, typer.Option(help="print the JSON schema of the configuration, for editors")

@@ -28,7 +28,8 @@ def world_make(
 ) -> None:
     """Make a synthetic scene: images, and the truth that only evaluate reads."""
     section = section_of("world", settings)
-    with stage("world", out, log, settings=section, threads=threads):
+    beside = (out / "images", out / "truth")
+    with stage("world", out, log, settings=section, threads=threads, beside=beside):
         from hilsplat.world.stage import run_world
 
         run_world(source, section, out, threads)
@@ -112,7 +113,7 @@ def world_masks(
     truth, masks_folder = folder / "world" / "truth", folder / variant / "masks"
     target = out or masks_folder.with_name("masks_truth.png")
     inputs = {"scene": folder / "scene", "truth": truth, "masks": masks_folder}
-    with stage("mask_truth", target, log, inputs=inputs):
+    with stage("mask_truth", target, log, inputs=inputs, beside=(target.with_suffix(".csv"),)):
         from hilsplat.evaluate.diagnostics.mask_truth import run_mask_truth
 
         table = run_mask_truth(folder / "scene", truth, masks_folder, target)

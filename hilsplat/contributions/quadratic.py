@@ -157,7 +157,7 @@ def load_quadratic(folder: Path, threads: int = 1) -> Quadratic:
     if (folder / "G.npz").is_file():
         return read_into(Gram, folder / "G.npz", threads=threads)
     if (folder / "W.npz").is_file():
-        arrays = read_npz(folder / "W.npz")
+        arrays = read_npz(folder / "W.npz", "indptr", "indices", "data", "columns", "valid")
         shape = (len(arrays["indptr"]) - 1, int(arrays["columns"][0]))
         matrix = sp.csr_matrix((arrays["data"], arrays["indices"], arrays["indptr"]), shape=shape)
         return StackedWeights(matrix, arrays["valid"])

@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Int
-from PIL import Image, UnidentifiedImageError
+from PIL import UnidentifiedImageError
 
 from hilsplat.base.errors import ImageError, SceneError
 from hilsplat.base.files import list_images
+from hilsplat.base.images import open_image
 from hilsplat.base.levels import Level
 from hilsplat.datasets.dataset import SceneReport
 from hilsplat.scene.features import view_name
@@ -183,7 +184,7 @@ def image_size_hw(path: Path) -> tuple[int, int]:
         ImageError: it is missing or not an image.
     """
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             return image.height, image.width
     except FileNotFoundError as error:
         raise ImageError(f"image {path} is missing") from error
@@ -200,7 +201,7 @@ def read_mask_file(path: Path, least: int) -> Bool[np.ndarray, "H W"]:
         ImageError: it is missing, truncated or not an image.
     """
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             return np.asarray(image.convert("L")) >= least
     except FileNotFoundError as error:
         raise ImageError(f"mask {path} is missing") from error

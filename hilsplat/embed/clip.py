@@ -57,6 +57,8 @@ class ClipModel:
             self.tokenizer = Tokenizer.from_file(str(path))
         except Exception as error:  # the tokenizers package raises bare Exception
             raise ModelError(f"{path} cannot be read: {error}", fix="fetch a whole copy") from error
+        if not self.tokenizer.get_vocab_size(with_added_tokens=False):
+            raise ModelError(f"{path} has no word", fix="fetch a whole copy")
         fixed = self.text.fixed_axis(self.ids, 1)
         text_config = model.config.get("text_config", {})
         self.siglip = model.layout == "siglip"

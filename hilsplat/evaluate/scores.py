@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hilsplat.base.artifacts import remake
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.tables import write_csv
 from hilsplat.evaluate.metrics.registry import METRICS
@@ -74,17 +75,15 @@ def read_scores(paths: Iterable[Path]) -> "pd.DataFrame":
         try:
             frame = pd.read_csv(path, dtype=str, keep_default_na=False)
         except FileNotFoundError as error:
-            raise ArtifactError(f"{path} is missing", fix="run the evaluate stage") from error
-        except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-            raise ArtifactError(
-                f"{path} cannot be read: {error}", fix="delete it and run evaluate again"
-            ) from error
+            raise ArtifactError(f"{path} is missing", fix=remake(path)) from error
+        except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError, OSError) as error:
+            raise ArtifactError(f"{path} cannot be read: {error}", fix=remake(path)) from error
         if tuple(frame.columns) != COLUMNS:
             raise ArtifactError(
                 f"{path} does not have the columns of a score file",
                 expected=", ".join(COLUMNS),
                 found=", ".join(map(str, frame.columns)),
-                fix="delete it and run evaluate again",
+                fix=remake(path),
             )
         frames.append(frame)
     if not frames:

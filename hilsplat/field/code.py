@@ -1,6 +1,5 @@
 """The scene's code: CLIP vectors to a few numbers and back, by a network or linearly; reading it."""
 
-import json
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -8,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32
 from safetensors import SafetensorError, safe_open
 
-from hilsplat.base.artifacts import read_index, read_npz
+from hilsplat.base.artifacts import parse_json, read_index, read_npz, remake
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.linear_code import METADATA_KEY, LinearCode
@@ -49,17 +48,15 @@ def load_code(folder: Path) -> Code:
     path = autoencoder_file(folder)
     try:
         with safe_open(path, framework="np") as file:
-            about = json.loads(file.metadata()[METADATA_KEY])
+            about = parse_json(file.metadata()[METADATA_KEY])
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         if about.get("code") == "pca":
             return LinearCode(state["mean"], state["basis"])
         from hilsplat.field.network_code import Autoencoder
 
         return Autoencoder.from_arrays(about["channels"], about["latent"], state)
-    except (FileNotFoundError, SafetensorError, KeyError, TypeError) as error:
-        raise ArtifactError(
-            f"{path} cannot be read: {error}", fix="run the autoencoder stage again"
-        ) from error
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ArtifactError(f"{path} cannot be read: {error}", fix=remake(path)) from error
 
 
 def autoencoder_file(folder: Path) -> Path:
@@ -74,7 +71,7 @@ def load_latents(folder: Path, contributions: Contributions) -> Float32[np.ndarr
         MisalignedArtifactError: the numbers of rows differ.
     """
     read_index(folder)
-    latents = read_npz(Path(folder) / "latents.npz")["latents"]
+    latents = read_npz(Path(folder) / "latents.npz", "latents")["latents"]
     if len(latents) != len(contributions):
         raise MisalignedArtifactError(
             f"latents of {folder} do not belong to these contributions",

@@ -102,7 +102,7 @@ def read_parents(tree_folder: Path, contributions: Contributions) -> dict[str, n
     counts = np.bincount(contributions.view, minlength=len(contributions.views))
     parents = {}
     for view, count in zip(contributions.views, counts, strict=True):
-        parent = read_npz(Path(tree_folder) / f"{view}.npz")["parent"]
+        parent = read_npz(Path(tree_folder) / f"{view}.npz", "parent")["parent"]
         if len(parent) != count:
             raise MisalignedArtifactError(
                 f"the coverage tree of view {view} belongs to other masks",

@@ -9,7 +9,7 @@ import safetensors.numpy
 from jaxtyping import Float32
 from safetensors import SafetensorError, safe_open
 
-from hilsplat.base.artifacts import atomic_path
+from hilsplat.base.artifacts import atomic_path, parse_json, remake
 from hilsplat.base.errors import ArtifactError
 from hilsplat.field.linear_code import METADATA_KEY
 
@@ -45,10 +45,10 @@ class LanguageField:
         """
         try:
             with safe_open(path, framework="np") as file:
-                about = json.loads(file.metadata()[METADATA_KEY])
+                about = parse_json(file.metadata()[METADATA_KEY])
                 return LanguageField(file.get_tensor("features"), **about)
-        except (FileNotFoundError, SafetensorError, KeyError, TypeError) as error:
-            raise ArtifactError(f"{path} cannot be read: {error}", fix="rerun the field stage") from error
+        except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+            raise ArtifactError(f"{path} cannot be read: {error}", fix=remake(path)) from error
 
 
 def report_path(field: Path) -> Path:

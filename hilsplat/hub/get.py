@@ -2,13 +2,12 @@
 
 import logging
 import shutil
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hilsplat.base.artifacts import full_disk_told, output_lock, read_json, write_json
+from hilsplat.base.artifacts import full_disk_told, output_lock, read_json, work_folder, write_json
 from hilsplat.base.errors import DiskSpaceError, DownloadError
 from hilsplat.base.progress import transfer_bar
 from hilsplat.embed.model_check import check_model
@@ -218,8 +217,8 @@ def _install(found: Prepared) -> str:
         if choice.split:
             split_whole(found.staging)
         return _place(found, found.staging)
-    with tempfile.TemporaryDirectory(prefix=f".{found.target.name}-", dir=found.target.parent) as temporary:
-        made = Path(temporary) / found.target.name
+    with work_folder(found.target) as temporary:
+        made = temporary / found.target.name
         with full_disk_told(made):
             versions = export_networks(found.staging, made)
         text = _place(found, made, exported=versions)

@@ -1,6 +1,5 @@
 """What a repository of the hub holds, and which of its files a model needs here."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +8,7 @@ import huggingface_hub
 import requests
 from huggingface_hub.errors import CacheNotFound, OfflineModeIsEnabled
 
+from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import DownloadError
 from hilsplat.models.clip_split import WHOLE
 from hilsplat.models.layouts import LAYOUTS, SUPPORTED, layout_of
@@ -181,7 +181,7 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
         DownloadError: the model is of no kind that is read here, or it has neither networks nor weights.
     """
     try:
-        described = json.loads(config)
+        described = parse_json(config)
     except ValueError:
         described = None
     kind = layout_of(described)

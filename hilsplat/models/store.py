@@ -3,12 +3,12 @@
 Light enough to import when a run is planned: it opens no network.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hilsplat.base.artifacts import parse_json
 from hilsplat.models.layouts import LAYOUTS, layout_of
 
 MODELS = Path("models")
@@ -108,7 +108,7 @@ def is_embedded(config: Mapping[str, Any]) -> bool:
 def read_model(folder: Path) -> PresentModel | None:
     """What a folder holds, by its config.json; None if it has no network or is not a model that we read."""
     try:
-        config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+        config = parse_json((folder / "config.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
     layout = layout_of(config)

@@ -14,7 +14,7 @@ from hilsplat.base.names import NAME_RULE, name_problem
 from hilsplat.base.progress import track
 from hilsplat.photos.check import CHECK_SIDE_PX, CheckedPhoto, photo_doubts
 from hilsplat.photos.intake import brought_photographs
-from hilsplat.scene.features import EXIF_ORIENTATION, exif_focal_px
+from hilsplat.scene.features import EXIF_ORIENTATION, exif_focal_px, require_usable_name
 from hilsplat.scene.layouts import has_known_poses, photo_folder
 from hilsplat.scene.sheet import (
     COLUMNS,
@@ -102,13 +102,14 @@ def inspect_photos(folder: Path) -> PhotoReport:
     num_rotated = 0
     checked: list[CheckedPhoto] = []
     for path in track(list_images(where), "photographs checked"):
+        require_usable_name(path)
         if path.stat().st_size == 0:
             unreadable.append((path.name, "the file is empty"))
             continue
         try:
             pixels = read_image(path)
         except ImageError as error:
-            reason = str(error.__cause__).replace(str(path), path.name)
+            reason = str(error.__cause__ or error).replace(str(path), path.name)
             unreadable.append((path.name, f"{reason} ({path.stat().st_size} bytes)"))
             continue
         size_hw = (pixels.shape[0], pixels.shape[1])

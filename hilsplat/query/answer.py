@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from hilsplat.base.artifacts import sha256_of_bytes
 from hilsplat.base.levels import LEVELS
 from hilsplat.query.hits import Hit, counted, doubts_of, hits_of
 from hilsplat.query.language_scene import LanguageScene, path_of
@@ -15,6 +16,9 @@ from hilsplat.semantic_tree.export import write_selection_ply
 
 LISTED = 10
 """Most answers to list."""
+
+LONGEST_NAME = 80
+"""Most bytes of a folder's name that are the text's own."""
 
 
 def answer(
@@ -113,6 +117,14 @@ def report(scene: LanguageScene, text: str, found: NodeHits, view: str | None = 
 
 
 def file_name(text: str) -> str:
-    """Folder name for a query that is safe on every system, such as `bear--nose`."""
-    words = [re.sub(r"[^\w.-]+", "-", part).strip("-.") for part in text.split(PATH_SEPARATOR)]
-    return "--".join(word for word in words if word) or "query"
+    """Folder name for a query that is safe on every system, such as `bear--nose`.
+
+    A text that is long, or holds more than words, gets some digits of its digest too: no two share a folder.
+    """
+    parts = [part.split() for part in text.split(PATH_SEPARATOR)]
+    if all(parts) and all(re.fullmatch(r"[\w.]*\w", word) for part in parts for word in part):
+        name = "--".join("-".join(part) for part in parts)
+        if len(name.encode()) <= LONGEST_NAME:
+            return name
+    words = re.sub(r"[^a-zA-Z0-9]+", "-", text)[:LONGEST_NAME].strip("-")
+    return f"{words or 'query'}-{sha256_of_bytes(text.encode())[:8]}"

@@ -576,8 +576,12 @@ def path_of(text: str) -> tuple[str, ...]:
     """The texts of a query, coarse to fine: one, or those of a path such as "bear > head > nose".
 
     Raises:
-        SettingsError: one of them is empty.
+        SettingsError: one of them is empty, or not UTF-8.
     """
+    if not text.isascii() and text != text.encode(errors="replace").decode():
+        raise SettingsError(
+            f"the query {text!r} is not UTF-8 text", fix="set the terminal to UTF-8, or write it in ASCII"
+        )
     path = tuple(part.strip() for part in text.split(PATH_SEPARATOR))
     if not all(path):
         raise SettingsError(

@@ -81,12 +81,13 @@ def show(axes: Axes, picture: UInt8[np.ndarray, "H W 3"], title: str = "", bold:
     for spine in axes.spines.values():
         spine.set_linewidth(2.0 if bold else 0.5)
         spine.set_color("#ff7a00" if bold else "#888888")
-    axes.set_title(title, fontsize=8, pad=3, fontweight="bold" if bold else "normal")
+    # titles hold texts and names of people: a dollar sign in them is no mathematics
+    axes.set_title(title, fontsize=8, pad=3, fontweight="bold" if bold else "normal", parse_math=False)
 
 
 def label_left(axes: Axes, text: str, level: Level | None = None) -> None:
     """Write the name of a row of pictures along its left side."""
-    axes.set_ylabel(f"{text}\n{level.label}" if level else text, fontsize=8)
+    axes.set_ylabel(f"{text}\n{level.label}" if level else text, fontsize=8, parse_math=False)
 
 
 def show_from_above(
@@ -113,7 +114,7 @@ def show_from_above(
     axes.set_aspect("equal")
     axes.set_xticks([])
     axes.set_yticks([])
-    axes.set_title(title, fontsize=8, pad=3)
+    axes.set_title(title, fontsize=8, pad=3, parse_math=False)
 
 
 def _from_above(cameras: Cameras) -> Float[np.ndarray, "3 3"]:

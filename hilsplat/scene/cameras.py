@@ -81,7 +81,7 @@ class Cameras:
     @staticmethod
     def load(path: Path) -> "Cameras":
         """Read `cameras.npz`."""
-        arrays = read_npz(path)
+        arrays = read_npz(path, "names", "cam_from_world", "K", "size_hw")
         return Cameras(
             tuple(str(name) for name in arrays["names"]),
             arrays["cam_from_world"],

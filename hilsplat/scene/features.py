@@ -1,6 +1,7 @@
 """From photographs to verified matches: upright work images, cameras to estimate, SIFT, pairs."""
 
 import logging
+import os
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -64,6 +65,30 @@ def view_name(stem: str) -> str:
     return f"{stem}.png"
 
 
+LONGEST_NAME = 200
+"""Most bytes of a photograph's name: names of further files are made from it, and a disk takes 255."""
+
+
+def require_usable_name(photo: Path) -> None:
+    """Refuse a photograph after which files of later stages could not be named.
+
+    Raises:
+        SceneError: its name is too long, has braces, which are wildcards to Snakemake, or cannot be shown.
+    """
+    if "{" in photo.name or "}" in photo.name or not photo.name.isprintable():
+        raise SceneError(
+            f"the name of photograph {str(photo)!r} has a brace or a sign that cannot be shown",
+            fix="rename it",
+        )
+    if (num_bytes := len(os.fsencode(photo.name))) > LONGEST_NAME:
+        raise SceneError(
+            f"the name of photograph {photo} is too long",
+            expected=f"at most {LONGEST_NAME} bytes",
+            found=f"{num_bytes}",
+            fix="rename it",
+        )
+
+
 def view_names(sources: Sequence[Path]) -> list[str]:
     """View names of image files: the file name with the suffix .png ("DSC_1.jpg" -> "DSC_1.png").
 
@@ -73,6 +98,8 @@ def view_names(sources: Sequence[Path]) -> list[str]:
     Raises:
         SceneError: two files would get the same view name.
     """
+    for source in sources:
+        require_usable_name(source)
     stems = Counter(source.stem for source in sources)
     by_folder = {stem for stem, count in stems.items() if count > 1}
     same_folder = Counter((source.parent, source.stem) for source in sources)

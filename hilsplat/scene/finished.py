@@ -5,9 +5,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from hilsplat.base.artifacts import read_json, sha256_of_file
+from hilsplat.base.artifacts import provenance_path, read_json, sha256_of_file
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
-from hilsplat.base.provenance import provenance_path
 from hilsplat.settings import EvaluateSettings, Section
 
 logger = logging.getLogger(__name__)
@@ -74,10 +73,11 @@ class FinishedScene:
                 found=f"no such folder in {Path.cwd()}",
                 fix="correct the path, or name the results folder",
             )
-        if variant != "default" and not (folder / variant).exists():
+        finished = finished_variants(folder)
+        if finished and not (folder / variant).exists():
             raise ArtifactError(
                 f"{folder} has no variant {variant!r}",
-                expected=f"one of {', '.join(finished_variants(folder)) or 'none yet'}",
+                expected=f"one of {', '.join(finished)}",
                 fix="name it under ablation_variants and run the workflow",
             )
         field = folder / variant / "field.safetensors"

@@ -1,6 +1,5 @@
 """Read posed views: COLMAP models, transforms.json (nerfstudio, Blender), LLFF, Polycam, Record3D."""
 
-import json
 import math
 import os
 from collections.abc import Mapping
@@ -9,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, list_images
 from hilsplat.base.images import open_image
@@ -119,12 +119,14 @@ def read_transforms(
     points = None
     for file in known.files:
         try:
-            content = json.loads(file.read_text(encoding="utf-8"))
+            content = parse_json(file.read_text(encoding="utf-8"))
         except ValueError as error:
             raise SceneError(f"{file} is not valid JSON: {error}", fix="export it again") from error
         if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
             raise SceneError(f"{file} has no list `frames`", fix="export it again")
         for number, frame in enumerate(content["frames"]):
+            if not isinstance(frame, dict):
+                raise SceneError(f"{file}, frame {number} is not an object", fix="export it again")
             views.append(_read_frame(known, file, number, {**content, **frame}))
         if points is None and isinstance(content.get("ply_file_path"), str):
             _check_inside(known.root, content["ply_file_path"])

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from hilsplat.base.errors import SceneError
+from hilsplat.base.artifacts import read_npy
+from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.base.images import open_image
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.colmap import pycolmap
@@ -30,9 +31,9 @@ def read_poses_bounds(
         SceneError: the file does not hold such an array, or a matrix is not a rotation.
     """
     try:
-        rows = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise SceneError(f"{path} cannot be read: {error}", fix="unpack it again") from error
+        rows = read_npy(path)
+    except ArtifactError as error:
+        raise SceneError(str(error).splitlines()[0], fix="unpack it again") from error
     if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows).all():
         raise SceneError(
             f"{path} does not hold LLFF poses",

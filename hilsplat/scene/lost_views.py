@@ -69,7 +69,7 @@ def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> bool:
     FigureCanvasAgg(figure)
     rest = f" (the first {MAX_ROWS})" if len(lost) > MAX_ROWS else ""
     title = f"{len(lost)} of {report['images']} photographs are not registered{rest}"
-    figure.suptitle(f"{title}\n{ADVICE}", fontsize=10)
+    figure.suptitle(f"{title}\n{ADVICE}", fontsize=10, parse_math=False)
     cells = figure.subplots(len(shown), 1 + NEIGHBOURS, squeeze=False)
     for row, (view, entry) in zip(cells, shown, strict=True):
         near = entry["belongs_near"]
@@ -77,7 +77,7 @@ def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> bool:
         titles += [f"{each['view']}: {each['matches']} shared matches" for each in near]
         for axes, name, title in zip(row, [view, *(each["view"] for each in near)], titles, strict=False):
             axes.imshow(resize_to_fit(read_image(images / name), THUMBNAIL_PX))
-            axes.set_title(title, fontsize=7)
+            axes.set_title(title, fontsize=7, parse_math=False)
         for axes in row:
             axes.set_axis_off()
         if not near:

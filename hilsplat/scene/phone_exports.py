@@ -3,13 +3,13 @@
 Layouts and axes as nerfstudio's `polycam_utils.py`, `record3d_utils.py` and `process_data.py` read them.
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
+from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import list_images
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
@@ -113,7 +113,7 @@ def _spread(items: list[Any]) -> list[Any]:
 
 def _json(file: Path) -> dict[str, Any]:
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = parse_json(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise SceneError(f"{file} is not valid JSON: {error}", fix="export it again") from error
     if not isinstance(content, dict):

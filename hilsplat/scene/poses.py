@@ -2,14 +2,13 @@
 
 import logging
 import shutil
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hilsplat.base.artifacts import work_folder
 from hilsplat.base.errors import RegistrationError, SceneError
 from hilsplat.base.files import list_images
 from hilsplat.base.progress import stage_log
@@ -85,7 +84,7 @@ def run_poses(
     """
     images, out = Path(images), Path(out)
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)  # COLMAP narrates each step on stderr
-    with stage_log("poses", name) as counts, _work_folder(out) as work:
+    with stage_log("poses", name) as counts, work_folder(out) as work:
         known = find_known_poses(images) if images.is_dir() else None
         if known is None:
             report = _reconstruct(images, out, work, name, is_render, settings, seed, threads)
@@ -95,17 +94,6 @@ def run_poses(
         counts["points"] = report["points"]
         if report["mean_reprojection_error_px"] is not None:
             counts["reprojection error"] = f"{report['mean_reprojection_error_px']:.2f} px"
-
-
-@contextmanager
-def _work_folder(out: Path) -> Iterator[Path]:
-    """A temporary folder beside `out`, removed at the end."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    folder = Path(tempfile.mkdtemp(prefix=f".{out.name}-work-", dir=out.parent))
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _reconstruct(

@@ -1,7 +1,7 @@
 """Overlapping masks of one view at three levels, run-length coded."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -262,4 +262,5 @@ class HierarchicalMasks:
     @staticmethod
     def load(path: Path) -> "HierarchicalMasks":
         """Read `<view>.npz`."""
-        return HierarchicalMasks.from_arrays(read_npz(path))
+        arrays = read_npz(path, *(field.name for field in fields(HierarchicalMasks)))
+        return HierarchicalMasks.from_arrays(arrays)

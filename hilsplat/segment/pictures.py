@@ -166,6 +166,6 @@ def masks_overview(
     image = Scene.load(scene_folder).image(chosen)
     write_png(out_png, masks_picture(image, masks))
     if tree_folder is not None:
-        parent = read_npz(Path(tree_folder) / f"{chosen}.npz")["parent"]
+        parent = read_npz(Path(tree_folder) / f"{chosen}.npz", "parent")["parent"]
         write_png(out_png.with_name(f"{out_png.stem}_tree.png"), tree_picture(image, masks, parent))
     return chosen

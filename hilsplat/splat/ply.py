@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
-from hilsplat.base.artifacts import atomic_path
+from hilsplat.base.artifacts import atomic_path, remake
 from hilsplat.base.errors import ArtifactError
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 
@@ -45,24 +45,25 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
         PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(temporary)
 
 
-def load_ply(path: Path, fix: str = "delete it and run the gaussians stage again") -> Gaussians:
+def load_ply(path: Path, fix: str = "") -> Gaussians:
     """Read a 3DGS PLY, of this package or another; the number of f_rest columns gives the degree.
 
     Binary or ASCII, properties in any order and of any number type; normals and properties unknown to
     3DGS (colours, labels) are ignored.
 
     Args:
-        fix: advice for a file that cannot be used.
+        fix: advice for a file that cannot be used; "": how to have its stage write it again.
 
     Raises:
         ArtifactError: the file is missing, damaged or not a 3DGS PLY, or holds numbers that are not finite.
     """
     path = Path(path)
+    fix = fix or remake(path)
     try:
         vertex = PlyData.read(path)["vertex"]
     except FileNotFoundError as error:
-        raise ArtifactError(f"{path} is missing", fix="run the gaussians stage") from error
-    except (PlyParseError, KeyError, ValueError, EOFError) as error:
+        raise ArtifactError(f"{path} is missing", fix=fix) from error
+    except (PlyParseError, KeyError, ValueError, EOFError, OSError, MemoryError) as error:
         raise ArtifactError(f"{path} is not a readable PLY: {error}", fix=fix) from error
     found = {prop.name for prop in vertex.properties}
     if "packed_position" in found:

@@ -2,9 +2,7 @@
 
 from pathlib import Path
 
-import yaml
-
-from hilsplat.configuration import StageSettings, parse_run
+from hilsplat.configuration import StageSettings, parse_run, read_config
 from hilsplat.models.store import meaningless, read_model
 from hilsplat.scene.sheet import PHOTOS
 
@@ -37,6 +35,6 @@ def models_of_photographs(config: Path, scene: str) -> list[str]:
     """
     if not config.is_file():
         return []
-    run = parse_run(yaml.safe_load(config.read_text(encoding="utf-8")) or {})
+    run = parse_run(read_config(config))
     stages = run.stages("default", (PHOTOS, f"{PHOTOS}/{scene}")).with_models()
     return [line for line in (models_of(stages), doubt_about_photographs(stages)) if line]

@@ -4,7 +4,7 @@ import functools
 import json
 from pathlib import Path
 
-from hilsplat.base.artifacts import sha256_of_path, write_json
+from hilsplat.base.artifacts import parse_json, sha256_of_path, write_json
 
 
 @functools.cache
@@ -21,7 +21,7 @@ def model_digest(folder: Path, cache: Path) -> str:
     stamp = json.dumps([[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files])
     memo = cache / "digests.json"
     try:
-        known = json.loads(memo.read_text())
+        known = parse_json(memo.read_text())
     except (OSError, ValueError):
         known = {}
     if stamp not in known:

@@ -5,17 +5,19 @@ attributes `dataset` and `scene`, and `variant` for the stages that variants sha
 wildcards of a rule.
 """
 
+import difflib
 import functools
 import json
 import re
 import shlex
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Protocol, runtime_checkable
 
 from hilsplat.base.errors import ModelError, SettingsError
-from hilsplat.configuration import UPSTREAM, StageSettings, parse_run
+from hilsplat.configuration import UPSTREAM, StageSettings, parse_run, require_known
 from hilsplat.datasets.registry import readers_of
 from hilsplat.datasets.sources import (
     DATA_PREFIX,
@@ -28,12 +30,15 @@ from hilsplat.datasets.sources import (
 )
 from hilsplat.evaluate.tables.build import TABLES
 from hilsplat.methods.registry import METHODS, OURS, require_method
-from hilsplat.scene.sheet import SceneRow, choose_scenes, read_sheet
+from hilsplat.scene.sheet import GROUPS, PHOTOS, SceneRow, choose_scenes, read_sheet
 from hilsplat.workflow.answering import doubt_about_photographs, models_of
+from hilsplat.workflow.feasible import require_feasible
 from hilsplat.workflow.model_digests import model_digest
+from hilsplat.workflow.soundness import Wanted
 from hilsplat.workflow.stages import stage_code
 
-CACHE = Path("results/.cache")
+RESULTS = Path("results")
+CACHE = RESULTS / ".cache"
 
 LEAST_MB = 4000
 """Memory that the stages with a model declare at least."""
@@ -81,6 +86,21 @@ class Plan:
             require_method(run.stages(name).method.name)
         sheet = Path(run.scenes)
         self.rows = tuple(read_sheet(sheet, run.groups, run.data_root))
+        datasets = {row.dataset for row in self.rows} | {PHOTOS}
+        scenes = [row.name for row in self.rows]
+        # a scene of the sheet may be taken out of it, and its settings stay
+        named = [key for key in (*run.overrides, *run.queries) if "/" in key]
+        gone = [key for key in named if key.partition("/")[0] in datasets]
+        require_known("overrides", run.overrides, [*GROUPS, *scenes, *gone])
+        require_known("queries", run.queries, [*sorted(datasets), *scenes, *gone])
+        for key in sorted({*gone} - {*scenes}):
+            if near := difflib.get_close_matches(key, scenes, n=1, cutoff=0.85):
+                raise SettingsError(
+                    f"overrides or queries name the scene {key!r}, which {sheet} does not have",
+                    expected=f"did you mean {near[0]!r}?",
+                    fix="correct the key, or take it out",
+                )
+        self._row_of = {(row.dataset, row.scene): row for row in self.rows}
         chosen = choose_scenes(self.rows, run.groups, run.only)
         if more := {row.group for row in chosen} - set(run.groups):  # check their sources too
             read_sheet(sheet, {*run.groups, *more}, run.data_root)
@@ -99,7 +119,25 @@ class Plan:
                 ),
                 fix="name other groups or scenes, or set data_root",
             )
+        for row in self.scenes:
+            self._require_no_braces(row)
         self._stages = functools.cache(lambda *which: run.stages(*which).with_models())
+
+    def require_feasible(self) -> None:
+        """Refuse devices that this machine does not have, and model folders that cannot be used.
+
+        A stage would find out too, but hours later.
+
+        Raises:
+            HilsplatError: the message names the setting, and a scene and variant that have it.
+        """
+        seen: set[Any] = set()
+        for row in self.scenes:
+            for variant in self.run.variant_names():
+                stages = self._stages(variant, self._scopes(row))
+                if stages not in seen:
+                    seen.add(stages)
+                    require_feasible(stages, f"{row.name}, variant {variant}")
 
     # ---- wildcards and threads ----------------------------------------------------------------------
 
@@ -131,15 +169,15 @@ class Plan:
 
     def row(self, job: Job) -> SceneRow:
         """Row of the scene sheet."""
-        return next(row for row in self.rows if (row.dataset, row.scene) == (job.dataset, job.scene))
+        return self._row_of[job.dataset, job.scene]
 
     def stages(self, job: Job) -> StageSettings:
         """All settings of a scene and, if the job has one, a variant."""
-        return self._stages(getattr(job, "variant", "default"), scopes_of(self.row(job)))
+        return self._stages(getattr(job, "variant", "default"), self._scopes(self.row(job)))
 
     def settings(self, section: str) -> Callable[[Job], str]:
         """Parameter: a section's settings, as JSON."""
-        return lambda job: getattr(self.stages(job), section).model_dump_json()
+        return lambda job: inert(getattr(self.stages(job), section).model_dump_json())
 
     def seed(self, job: VariantJob) -> int:
         """Parameter: the seed of a variant's networks."""
@@ -168,7 +206,7 @@ class Plan:
         """Which models make the masks and the words of which scenes, one line each, doubts included."""
         scenes: dict[tuple[str, str], list[str]] = {}
         for row in self.scenes:
-            stages = self._stages("default", scopes_of(row))
+            stages = self._stages("default", self._scopes(row))
             key = (models_of(stages), "" if row.world else doubt_about_photographs(stages))
             scenes.setdefault(key, []).append(row.name)
         lines = []
@@ -217,15 +255,72 @@ class Plan:
 
     def shared_variant(self, stage: str, job: VariantJob) -> str:
         """First variant whose settings up to a stage equal those of the job's variant."""
-        scopes = scopes_of(self.row(job))
-        wanted = self._stages(job.variant, scopes)
-        seed = self.run.seed_of(job.variant) if wanted.depends_on_seed(stage) else None
+        return self._first_alike(stage, job.variant, self._scopes(self.row(job)))
+
+    @functools.cache  # noqa: B019  a process has one plan
+    def _first_alike(self, stage: str, variant: str, scopes: tuple[str, ...]) -> str:
+        wanted = self._stages(variant, scopes)
+        seed = self.run.seed_of(variant) if wanted.depends_on_seed(stage) else None
         for name in self.run.variant_names():
             other = self._stages(name, scopes)
             same = all(getattr(other, part) == getattr(wanted, part) for part in UPSTREAM[stage])
             if same and seed in (None, self.run.seed_of(name)):
                 return name
-        return str(job.variant)
+        return variant
+
+    def _scopes(self, row: SceneRow) -> tuple[str, ...]:
+        """Keys of `overrides` that apply to a scene and exist: scenes without any share their settings."""
+        return tuple(scope for scope in scopes_of(row) if scope in self.run.overrides)
+
+    def wanted(self) -> list[Wanted]:
+        """Every artifact that the run may write, and how it is to be made."""
+        found = [each for row in self.scenes for each in self._wanted_of(row)]
+        return [*found, *(Wanted(Path(table), table, "table") for table in self.tables())]
+
+    def _wanted_of(self, row: SceneRow) -> Iterator[Wanted]:
+        """The artifacts of one scene; what variants share is listed once."""
+        scene = SimpleNamespace(dataset=row.dataset, scene=row.scene)
+        if row.world:
+            world = self._want(scene, "world", "world")
+            yield replace(world, output=self.output(scene, "world/images"))
+        if is_exported(row.source):
+            yield self._want(scene, "source", "source", plugins=self.source_reader(scene))
+        yield self._want(scene, "poses", "scene", seed=self.run.seed)
+        yield self._want(scene, "gaussians", "gaussians.ply", seed=self.run.seed)
+        for variant in self.run.variant_names():
+            job = SimpleNamespace(**vars(scene), variant=variant)
+            stages, seed = self.stages(job), self.run.seed_of(variant)
+            for stage in ("coverage_tree", "clip", "contributions", "semantic_tree"):
+                if self.shared_variant(stage, job) == variant:
+                    yield self._want(job, stage, stage)
+            if self.shared_variant("masks", job) == variant:
+                stage = self.masks_stage(job)
+                yield self._want(job, stage, "masks", stages.perturb.seed if stage == "truth_masks" else None)
+            if self.shared_variant("autoencoder", job) == variant:
+                yield self._want(job, "autoencoder", "autoencoder", seed)
+            if self.shared_variant("field", job) == variant:
+                if stages.method.name == OURS:
+                    yield self._want(job, "field", "field.safetensors")
+                else:
+                    yield self._want(job, "method", "field.safetensors", seed, self.baseline(job))
+            yield self._want(job, "evaluate", "scores.csv", plugins=self.label_readers(job))
+        figures = {
+            name: getattr(self.stages(scene), name).model_dump(mode="json")
+            for name in ("figures", "evaluate")
+        }
+        for stage, picture in (("figures", "panel"), ("comparison", "comparison")):
+            path = f"results/figures/{row.name}/{picture}.png"
+            yield Wanted(Path(path), path, stage, figures, None, self.label_readers(scene))
+        path = f"results/figures/{row.name}/masks.png"
+        yield Wanted(Path(path), path, "mask_truth")
+
+    def _want(
+        self, job: Job, stage: str, name: str, seed: int | None = None, plugins: tuple[str, ...] = ()
+    ) -> Wanted:
+        path = self.output(job, *([job.variant] if isinstance(job, VariantJob) else []), name)
+        section = getattr(self.stages(job), "perturb" if stage == "truth_masks" else stage, None)
+        settings = section.model_dump(mode="json") if section is not None else {}
+        return Wanted(Path(path), path, stage, settings, seed, plugins)
 
     # ---- photographs and poses ----------------------------------------------------------------------
 
@@ -252,6 +347,17 @@ class Plan:
     def lens(self, job: Job) -> str:
         """Option of poses: whether the images are renders."""
         return "--render" if self.row(job).world else "--no-render"
+
+    def _require_no_braces(self, row: SceneRow) -> None:
+        """Refuse files in whose names Snakemake would see wildcards; it knows no way to quote them."""
+        job = SimpleNamespace(dataset=row.dataset, scene=row.scene)
+        files = self.image_files(job) if row.folder is not None else []
+        for path in [*([files] if isinstance(files, str) else files), *self.brought(job)]:
+            if "{" in path or "}" in path:
+                raise SettingsError(
+                    f"{path} of {row.name} cannot be read by the workflow: its name has braces",
+                    fix="rename it, or its folder",
+                )
 
     def source_files(self, job: Job) -> list[str]:
         """Input of source: files of a data set with the images and poses."""
@@ -361,10 +467,18 @@ class Plan:
     def _data_root_option(self) -> str:
         return f"--data-root {shlex.quote(str(Path(self.run.data_root)))}"
 
+    def main_variants(self) -> str:
+        """Parameter: the variants of the main tables, as JSON."""
+        return json.dumps(self.run.main_variants)
+
+    def names(self) -> str:
+        """Parameter: variant -> its name in tables and figures, as JSON."""
+        return inert(json.dumps(dict(self.run.labels)))
+
     def queries(self, job: Job) -> str:
         """Parameter: texts for the panel of a scene without labels on images, as JSON."""
         of_dataset = self.run.queries.get(job.dataset, ())
-        return json.dumps(self.run.queries.get(f"{job.dataset}/{job.scene}", of_dataset))
+        return inert(json.dumps(self.run.queries.get(f"{job.dataset}/{job.scene}", of_dataset)))
 
     # ---- tables ---------------------------------------------------------------------------------------
 
@@ -449,6 +563,11 @@ def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int)
     needs = needs_of(model, prompts)
     views = needs.views_at_once(threads, SHARE_OF_MACHINE * machine_mib())
     return round(needs.total_mib(views) * MIB / 1e6)
+
+
+def inert(text: str) -> str:
+    """The same JSON without `<`: Snakemake writes the parameters of jobs raw into a script of its report."""
+    return text.replace("<", "\\u003c")
 
 
 def scopes_of(row: SceneRow) -> tuple[str, str]:

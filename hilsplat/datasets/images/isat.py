@@ -5,7 +5,6 @@ also read a list of polygons), `bbox` [x1, y1, x2, y2]. `group` does not identif
 restart and repeat. Unknown keys are ignored.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,8 +13,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.images.polygons import fill_polygon, outside_px
+
+LARGEST_SIDE_PX = 20_000
+"""Regions are drawn at the size that a label file states: a wrong number must not take all memory."""
 
 SLACK_PX = 1.0
 """Without a warning, vertices may be this far outside the image and boxes may differ this much from their
@@ -69,7 +72,7 @@ def read_isat(path: Path) -> IsatFile:
     """
     path = Path(path)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(path.read_text(encoding="utf-8"))
     except (ValueError, OSError) as error:
         raise SceneError(
             f"label file {path} cannot be read: {error}",
@@ -87,14 +90,15 @@ def read_isat(path: Path) -> IsatFile:
     if not isinstance(info, dict):
         info = {}
     height, width = info.get("height"), info.get("width")
-    if not (isinstance(height, int) and isinstance(width, int) and height > 0 and width > 0):
+    sides = [side for side in (height, width) if isinstance(side, int) and 0 < side <= LARGEST_SIDE_PX]
+    if len(sides) != 2:
         raise SceneError(
             f"label file {path} does not give the size of its image",
-            expected="info.width and info.height, px",
+            expected=f"info.width and info.height, px, at most {LARGEST_SIDE_PX}",
             found=f"height {height!r}, width {width!r}",
             fix="export the labels again",
         )
-    size_hw = (height, width)
+    size_hw = (sides[0], sides[1])
     warnings: list[str] = []
     name = info.get("name")
     if isinstance(name, str) and name and Path(name).stem != path.stem:

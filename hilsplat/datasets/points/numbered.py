@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from PIL import Image
-
 from hilsplat.base.errors import ImageError, SceneError
+from hilsplat.base.images import open_image
 from hilsplat.datasets.points.point_files import UNPACK_AGAIN
 
 
@@ -35,7 +34,7 @@ def size_of_image(image: Path) -> tuple[int, int]:
         ImageError: it is not an image.
     """
     try:
-        with Image.open(image) as opened:
+        with open_image(image) as opened:
             return opened.height, opened.width
     except OSError as error:
         raise ImageError(f"image {image} cannot be read: {error}", fix=UNPACK_AGAIN) from error

@@ -1,11 +1,11 @@
 """Readers for the file formats of labelled points, with messages that say what to do."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 from plyfile import PlyData, PlyParseError
 
+from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SceneError
 
 UNPACK_AGAIN = "unpack or download it again; the copy is incomplete"
@@ -39,7 +39,7 @@ def read_json_object(path: Path, keys: tuple[str, ...]) -> dict:
     """
     require_file(path)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(path.read_text(encoding="utf-8"))
     except ValueError as error:  # UnicodeDecodeError is one
         raise SceneError(f"{path} is not valid JSON: {error}", fix=UNPACK_AGAIN) from error
     lacking = [key for key in keys if key not in content] if isinstance(content, dict) else list(keys)

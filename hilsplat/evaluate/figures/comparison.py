@@ -225,7 +225,7 @@ def _grid(scene: Scene, rows: int, columns: int, title: str) -> tuple[Figure, np
     height, width = scene.cameras[scene.cameras.names[0]].size_hw
     row_in = WIDTH_IN / columns * height / width + 0.18
     figure = Figure(figsize=(WIDTH_IN, rows * row_in + 0.4), layout="constrained")
-    figure.suptitle(title, fontsize=12, fontweight="bold")
+    figure.suptitle(title, fontsize=12, fontweight="bold", parse_math=False)
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.ravel():
         axes.set_xticks([])

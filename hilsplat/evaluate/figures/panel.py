@@ -181,7 +181,7 @@ def draw_panel(
     label = label_of_index(index)
     warning = ": a diagnostic, masks made from the true labels" if made_from_truth(label) else ""
     title = [scene.name + warning, *textwrap.wrap(answers.caution, TITLE_LETTERS)]
-    figure.suptitle("\n".join(title), fontsize=12, fontweight="bold")
+    figure.suptitle("\n".join(title), fontsize=12, fontweight="bold", parse_math=False)
     parts: list[FigureBase] = [figure]
     if rows:
         parts = list(figure.subfigures(2, 1, squeeze=False, height_ratios=[overview_in, queries_in]).flat)

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hilsplat.base.artifacts import read_json
-from hilsplat.base.provenance import provenance_path
+from hilsplat.base.artifacts import provenance_path, read_json
 from hilsplat.base.tables import read_csv, write_csv
 from hilsplat.evaluate.tables.efficiency import Job, read_benchmark
 

@@ -3,12 +3,11 @@
 Times differ from run to run, so this table is kept apart from those that must not change.
 """
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from hilsplat.base.artifacts import write_text
+from hilsplat.base.artifacts import parse_json, write_text
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.tables import write_csv
 from hilsplat.configuration import SECTIONS
@@ -83,10 +82,12 @@ def read_benchmark(path: Path, results: Path) -> list[Job]:
     jobs = []
     for line in path.read_text(encoding="utf-8").splitlines():
         try:
-            record = json.loads(line)
+            record = parse_json(line)
             elapsed_s = float(record["s"])
         except (ValueError, KeyError, TypeError) as error:
-            raise ArtifactError(f"{path} is not a valid benchmark file: {error}", fix="delete it") from error
+            raise ArtifactError(
+                f"{path} is not a valid benchmark file: {error}", fix="run its stage again"
+            ) from error
         jobs.append(
             Job(
                 path.stem,

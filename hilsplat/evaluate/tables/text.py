@@ -3,6 +3,7 @@
 import csv
 import io
 
+from hilsplat.base.tables import plain_markdown
 from hilsplat.evaluate.tables.rows import Cell, Table, shown_columns
 
 
@@ -42,7 +43,7 @@ def as_markdown(table: Table) -> str:
         lines += [f"## {block.title}", "", "| " + " | ".join([*names, *values]) + " |"]
         lines.append("|" + "---|" * len(names) + "---:|" * len(values))
         for number, row in enumerate(block.rows):
-            cells = [row.names.get(name, "").replace("|", "\\|").replace("*", "\\*") for name in names]
+            cells = [plain_markdown(row.names.get(name, "")) for name in names]
             for column in values:
                 cell = row.cells.get(column, Cell())
                 note = f"<sup>{notes[cell.note]}</sup>" if cell.note else ""
@@ -50,6 +51,11 @@ def as_markdown(table: Table) -> str:
             lines.append("| " + " | ".join(cells) + " |")
         lines.append("")
     lines += ["Best three in a block and protocol: **best**, <u>second</u>, *third*.", ""]
-    lines += [f"- {note}".replace("*:", "\\*:") for note in table.footnotes]
-    lines += [f"- <sup>{number}</sup> {note}" for note, number in notes.items()]
+    lines += [f"- {_plain(note)}".replace("*:", "\\*:") for note in table.footnotes]
+    lines += [f"- <sup>{number}</sup> {_plain(note)}" for note, number in notes.items()]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _plain(note: str) -> str:
+    """A note without HTML or links; it may hold emphasis of ours."""
+    return " ".join(note.replace("<", "&lt;").replace("](", "]\\(").splitlines())

@@ -191,7 +191,7 @@ class Training:
                 if not self.constant.is_file():
                     raise ArtifactError(
                         f"{self.now} cannot be trained for longer: {self.constant.name} is missing",
-                        fix="ask for the budget it was trained with, or delete it to begin again",
+                        fix="ask for the budget it was trained with, or name another --cache to begin again",
                     )
                 rows = self.progress.rows
                 self._load(self.constant)

@@ -156,7 +156,7 @@ def render_training_views(cache: Path, seeds: Sequence[int], views: int, workers
     for row, path in enumerate(paths):
         arrays = read_npz(path)
         if arrays["images"].shape[0] != views:
-            raise ArtifactError(f"{path} is damaged", fix="delete it and run again")
+            raise ArtifactError(f"{path} is damaged", fix="run with another --cache folder")
         at = slice(row * views, (row + 1) * views)
         images[at], labels[at] = arrays["images"], arrays["labels"]
         rows = json.loads(arrays["nodes"].tobytes())

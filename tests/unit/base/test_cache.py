@@ -1,6 +1,9 @@
 """The caches of finished views: their size, and what is deleted first."""
 
 import os
+import shutil
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -8,6 +11,7 @@ import pytest
 
 from hilsplat.base.cache import prune_cache, size_table
 from hilsplat.base.errors import HilsplatError
+from hilsplat.base.processes import machine
 
 MIB = 2**20
 
@@ -56,9 +60,19 @@ def test_the_longest_unused_go_until_the_rest_is_small_enough(cache):
     assert "clip/9/9.npz" in left(cache)
 
 
-def test_a_stage_without_view_cache_and_no_limit_are_refused(cache):
+def test_a_stage_without_view_cache_is_refused(cache):
     with pytest.raises(HilsplatError, match="there is no cache of finished views for models"):
         prune_cache(cache, ["models"], days=0.0)
-    with pytest.raises(HilsplatError, match="neither --days nor --max-mib"):
-        prune_cache(cache, [])
     assert len(left(cache)) == 7
+
+
+def test_without_a_limit_only_what_dead_jobs_left_goes(tmp_path_factory, cache):
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    results = tmp_path_factory.mktemp("project") / "results"
+    litter = results / f"photos/desk/.writing-{machine()}-{process.pid}-x"
+    litter.mkdir(parents=True)
+    shutil.copytree(cache, results / ".cache")
+    assert prune_cache(results / ".cache", []) == (0, 0)
+    assert not litter.exists()
+    assert left(results / ".cache") == left(cache)

@@ -1,7 +1,14 @@
 """Work in processes: order, and no process where one would do."""
 
 import os
+import select
+import shlex
+import signal
+import subprocess
+import sys
+import time
 from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -26,3 +33,78 @@ def test_a_failure_reaches_the_caller():
 
 def test_nothing_to_do_starts_nothing():
     assert list(in_processes(square, [], workers=4)) == []
+
+
+JOB = """
+import sys, time
+from hilsplat.base.processes import end_with_workflow
+end_with_workflow()
+print("started", flush=True)
+time.sleep(60)
+"""
+WORKFLOW = """
+import os, subprocess, sys
+os.environ["HILSPLAT_PARENT"] = str(os.getpid())
+job = subprocess.Popen(sys.argv[1], shell=True, stdout=sys.stdout)
+print(job.pid, flush=True)
+job.wait()
+"""
+
+
+def ended(stream) -> bool:
+    """Whether every process that holds the other end of a pipe ended within ten seconds."""
+    readable, _, _ = select.select([stream], [], [], 10)
+    return bool(readable) and stream.read() == b""
+
+
+@pytest.mark.parametrize("between", ["exec ", "true; ", "(", "sh -c '(\"$@\"); true' sh "])
+def test_a_job_ends_with_the_workflow_that_started_it(between):
+    """Also if a shell stands between the two, as with an activated environment."""
+    command = f"{between}{shlex.join([sys.executable, '-c', JOB])}{')' if between == '(' else ''}"
+    workflow = subprocess.Popen([sys.executable, "-c", WORKFLOW, command], stdout=subprocess.PIPE)
+    assert workflow.stdout.readline() and workflow.stdout.readline() == b"started\n"
+    workflow.kill()
+    workflow.wait()
+    assert ended(workflow.stdout)
+
+
+def test_a_job_does_not_start_once_its_workflow_has_ended():
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    environment = {**os.environ, "HILSPLAT_PARENT": str(gone.pid)}
+    job = subprocess.run([sys.executable, "-c", JOB], env=environment, capture_output=True, check=False)
+    assert job.returncode == 1 and job.stdout == b""
+
+
+def test_a_command_of_a_person_outlives_the_shell():
+    script = f"{shlex.join([sys.executable, '-c', JOB])} & echo $!"
+    shell = subprocess.Popen(["sh", "-c", script], stdout=subprocess.PIPE)
+    lines = {shell.stdout.readline(), shell.stdout.readline()}
+    shell.wait()
+    (job,) = (int(line) for line in lines - {b"started\n"})
+    os.kill(job, signal.SIGTERM)  # fails if it is gone
+    assert ended(shell.stdout)
+
+
+POOL = """
+import time
+from hilsplat.base.processes import in_processes
+if __name__ == "__main__":
+    print("started", flush=True)
+    for _ in in_processes(time.sleep, [(60,), (60,)], 2):
+        pass
+"""
+
+
+def test_the_processes_of_a_pool_end_with_it(tmp_path):
+    (tmp_path / "pool.py").write_text(POOL)
+    pool = subprocess.Popen([sys.executable, tmp_path / "pool.py"], stdout=subprocess.PIPE)
+    assert pool.stdout.readline() == b"started\n"
+    children = Path(f"/proc/{pool.pid}/task/{pool.pid}/children")
+    deadline = time.monotonic() + 30
+    while len(children.read_text().split()) < 3 and time.monotonic() < deadline:  # workers, and a tracker
+        time.sleep(0.05)
+    time.sleep(1)  # the workers import what they need
+    pool.kill()
+    pool.wait()
+    assert ended(pool.stdout)

@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilsplat.base.artifacts import write_json
+from hilsplat.base.artifacts import provenance_path, write_json
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError
 from hilsplat.base.levels import Level
-from hilsplat.base.provenance import provenance_path
 from hilsplat.field.autoencoder import run_autoencoder
 from hilsplat.field.code import load_code
 from hilsplat.field.field import run_field

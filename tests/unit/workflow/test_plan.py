@@ -299,3 +299,23 @@ def test_every_rule_quotes_what_it_puts_into_a_command(project):
     assert len(commands) > 15
     placed = [place for command in commands for place in re.findall(r"{([^}]*)}", command)]
     assert {place for place in placed if not place.endswith(":q")} <= READY
+
+
+def test_no_text_of_a_configuration_can_end_a_script_of_the_report(tmp_path):
+    """Snakemake writes the parameters of figures and tables raw into a script of `report.html`."""
+    hostile = "</script><script>alert(1)</script><!--"
+    found = plan(
+        tmp_path,
+        groups=["photos"],
+        queries={"photos/desk": [hostile]},
+        labels={"default": hostile},
+        evaluate={"template": f"{hostile} {{}}", "canonical": [hostile]},
+    )
+    job = Job("photos", "desk")
+    texts = [found.queries(job), found.names(), found.settings("evaluate")(job)]
+    assert not any("<" in text for text in texts)
+    queries, names, evaluate = map(json.loads, texts)
+    assert (queries, names) == ([hostile], {"default": hostile})
+    assert evaluate["canonical"] == [hostile]
+    with pytest.raises(SettingsError, match="data_root"):
+        plan(tmp_path, data_root=hostile)

@@ -3,11 +3,17 @@
 import numpy as np
 import pytest
 
-from hilsplat.base.artifacts import read_index, read_json, sha256_of_path, write_index, write_json
+from hilsplat.base.artifacts import (
+    provenance_path,
+    read_index,
+    read_json,
+    sha256_of_path,
+    write_index,
+    write_json,
+)
 from hilsplat.base.errors import ArtifactError, HilsplatError, MisalignedArtifactError, SettingsError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.base.provenance import provenance_path
 from hilsplat.cli import segment_commands
 from hilsplat.cli import stage as around
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, write_hierarchy

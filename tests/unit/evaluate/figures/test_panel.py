@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilsplat.base.artifacts import write_json
+from hilsplat.base.artifacts import provenance_path, write_json
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
-from hilsplat.base.provenance import provenance_path
 from hilsplat.evaluate.figures.panel import annotated_rows, draw_panel, free_rows, truths_of
 from hilsplat.models.store import meaningless
 from hilsplat.query.answer import file_name, report, views_of

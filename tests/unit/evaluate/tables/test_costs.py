@@ -6,9 +6,8 @@ import math
 
 import pytest
 
-from hilsplat.base.artifacts import write_json
+from hilsplat.base.artifacts import provenance_path, write_json
 from hilsplat.base.errors import ArtifactError
-from hilsplat.base.provenance import provenance_path
 from hilsplat.evaluate.scores import Score, write_scores
 from hilsplat.evaluate.tables.build import run_table
 from hilsplat.evaluate.tables.costs import read_costs, time_queries, write_times

@@ -6,6 +6,7 @@ import pytest
 from hilsplat.configuration import RunSettings
 from hilsplat.evaluate.instance_files import write_instances
 from hilsplat.evaluate.metrics.instances import InstanceScan, match_instances
+from hilsplat.evaluate.scores import write_scores
 from hilsplat.evaluate.tables.build import TABLES, run_table
 from tests.unit.evaluate.tables.test_tables import PUBLISHED, built, measured, score
 
@@ -137,3 +138,16 @@ def test_lerf_mask_means_go_over_texts_and_not_over_pairs(tmp_path):
     ]
     rows, _ = built(tmp_path, "lerf", scores)
     assert measured(rows, protocol=protocol)["Average mIoU"] == "50.00"  # pairs would give 56.67
+
+
+def test_names_from_a_configuration_are_text_in_every_format(tmp_path):
+    hostile = "<script>alert(1)</script> [x](javascript:alert(1)) a|b\nc"
+    scores = tmp_path / "scores.csv"
+    write_scores(scores, [score("iou", 0.5)])
+    out = tmp_path / "hierarchy.csv"
+    run_table("hierarchy", [scores], PUBLISHED / "hierarchy.csv", {"default": hostile}, out, [hostile])
+    for suffix in (".md", ".html"):
+        text = out.with_suffix(suffix).read_text()
+        assert "alert(1)" in text
+        assert "<script" not in text
+    assert "](java" not in out.with_suffix(".md").read_text()

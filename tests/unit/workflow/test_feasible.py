@@ -1,0 +1,68 @@
+"""What this machine cannot do is refused before a job begins."""
+
+import pytest
+
+from hilsplat.base.errors import HilsplatError, SettingsError
+from hilsplat.configuration import StageSettings, parse_run
+from hilsplat.workflow.feasible import require_feasible
+
+
+def stages(**sections: dict) -> StageSettings:
+    return StageSettings.model_validate(sections)
+
+
+def test_the_default_settings_can_be_met():
+    require_feasible(stages(), "d/s")
+
+
+@pytest.mark.parametrize("section", ["gaussians", "contributions", "semantic_tree", "field"])
+def test_a_device_that_is_not_here_is_refused(section):
+    from hilsplat.base.device import cuda_missing
+
+    if cuda_missing() is None:
+        pytest.skip("this machine has CUDA")
+    with pytest.raises(HilsplatError, match=rf"^{section}\.device of d/s, variant v: (.|\n)*device: cuda"):
+        require_feasible(stages(**{section: {"device": "cuda"}}), "d/s, variant v")
+
+
+@pytest.mark.parametrize(
+    ("section", "model", "words"),
+    [
+        ("masks", "models/nope", "model folder models/nope is missing"),
+        ("clip", "models/nope", "model folder models/nope is missing"),
+        ("masks", "models/clip-tiny", "holds another kind of model"),
+        ("clip", "models/sam-tiny", "holds another kind of model"),
+        ("clip", "hilsplat", "no readable config.json"),
+    ],
+)
+def test_a_model_folder_that_cannot_be_used_is_refused(section, model, words):
+    with pytest.raises(HilsplatError, match=rf"^{section}\.model of d/s: (.|\n)*{words}"):
+        require_feasible(stages(**{section: {"model": model}}), "d/s")
+
+
+def test_a_model_that_nothing_runs_is_not_looked_at():
+    require_feasible(stages(masks={"segmenter": "graph", "model": "models/nope"}), "d/s")
+
+
+@pytest.mark.parametrize("value", [float("inf"), float("-inf"), float("nan")])
+@pytest.mark.parametrize(
+    ("section", "knob"),
+    [
+        ("field", "weight_part"),
+        ("gaussians", "means_rate"),
+        ("masks", "predicted_iou_min"),
+        ("masks", "graph_scales"),
+    ],
+)
+def test_numbers_that_are_not_finite_are_refused(section, knob, value):
+    given = [value] * 3 if knob == "graph_scales" else value
+    with pytest.raises(SettingsError, match=rf"{section}\.{knob}"):
+        parse_run({section: {knob: given}})
+
+
+@pytest.mark.parametrize(
+    "config", [{"seed": 2**31}, {"gaussians": {"iterations": 10**30}}, {"perturb": {"seed": 2**64}}]
+)
+def test_numbers_beyond_what_the_libraries_take_are_refused(config):
+    with pytest.raises(SettingsError, match="less than or equal to 2000000000"):
+        parse_run(config)
