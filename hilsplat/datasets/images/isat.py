@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.images.polygons import fill_polygon, outside_px
+from hilsplat.datasets.images.polygons import fill_polygons, outside_px
 
 SLACK_PX = 1.0
 """Without a warning, vertices may be this far outside the image and boxes may differ this much from their
@@ -40,7 +40,7 @@ class IsatObject:
 
     def mask(self, size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
         """Rasterise (see `polygons.fill_polygon`)."""
-        return np.any([fill_polygon(polygon, size_hw) for polygon in self.polygons], axis=0)
+        return fill_polygons(self.polygons, size_hw)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +76,15 @@ def read_isat(path: Path) -> IsatFile:
             expected="JSON with info and objects",
             fix="unpack the labels again",
         ) from error
+    return parse_isat(path, content)
+
+
+def parse_isat(path: Path, content: Any) -> IsatFile:
+    """Check the content of a label file; `path` names it in messages.
+
+    Raises:
+        SceneError: as `read_isat`.
+    """
     if not isinstance(content, dict) or not isinstance(content.get("objects"), list):
         raise SceneError(
             f"label file {path} has no list `objects`",
