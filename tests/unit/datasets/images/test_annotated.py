@@ -12,6 +12,7 @@ from hilsplat.datasets.images.annotated import DATASET
 from hilsplat.datasets.images.polygons import fill_polygons, trace_polygons
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.datasets.sources import label_files, label_sets
+from tests.conftest import PROJECT
 
 MUG = {
     "id": 4,
@@ -82,3 +83,35 @@ def test_traced_polygons_fill_the_same_pixels(seed):
     areas = [np.count_nonzero(fill_polygons([polygon], mask.shape)) for polygon in polygons]
     assert sum(areas) == np.count_nonzero(mask)  # without common pixels
     assert all(len(polygon) >= 3 for polygon in polygons)
+
+
+# -- the annotation that the project keeps: photographs of a bedroom, which are not part of it -----------
+
+
+@pytest.fixture(scope="module")
+def bedroom():
+    """Ten objects with parts and subparts in four photographs, drawn with `hilsplat annotate`."""
+    return open_labelled("annotated/photos/plush_bedroom", PROJECT / "tests")
+
+
+def test_the_kept_annotation_has_ten_objects_whose_children_are_inside_them(bedroom):
+    assert bedroom.warnings == ()
+    regions = [region for regions in bedroom.views.values() for region in regions]
+    counts = [sum(region.level == level for region in regions) for level in Level]
+    assert (len(bedroom.views), counts) == (4, [23, 38, 31])
+    wholes = {region.text for region in regions if region.level is Level.WHOLE}
+    assert len(wholes) == 10 and {"plush doll", "black piano", "fox plush toy"} < wholes
+    for labelled in bedroom.views.values():
+        masks = {region.path: np.zeros(region.size_hw, bool) for region in labelled}
+        for region in labelled:  # two eyes have one path
+            masks[region.path] |= region.mask()
+        for path, mask in masks.items():
+            assert mask.any() and not (len(path) > 1 and (mask & ~masks[path[:-1]]).any()), path
+
+
+def test_the_kept_annotation_names_photographs_that_exist(bedroom):
+    folder = PROJECT / "photos/plush_bedroom"
+    if not folder.is_dir():
+        pytest.skip(f"the photographs are not part of the project: {folder} is missing (docs/annotate.md)")
+    stems = {path.stem for path in folder.rglob("*.jpg")}
+    assert {view.removesuffix(".png") for view in bedroom.views} <= stems
