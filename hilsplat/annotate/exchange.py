@@ -43,7 +43,15 @@ def exported(kind: Kind, known: Mapping[str, Sequence[Label]], cameras: Cameras)
 
 def _isat(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
     """ISAT has one polygon per object; pieces of a thing share their group."""
-    info = {"description": "ISAT", "folder": "", "name": view, "width": size_hw[1], "height": size_hw[0]}
+    size = {"width": size_hw[1], "height": size_hw[0]}
+    info: dict[str, object] = {
+        "description": "ISAT",
+        "folder": "",
+        "name": view,
+        **size,
+        "depth": 3,
+        "note": "",
+    }
     objects = []
     for label in labels:
         for ring in label.polygons:
@@ -63,7 +71,7 @@ def _isat(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
                     **_ours(label),
                 }
             )
-    return _json({"info": {**info, "depth": 3, "note": ""}, "objects": objects})
+    return _json({"info": info, "objects": objects})
 
 
 def _labelme(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
