@@ -10,6 +10,8 @@ from hilsplat.cli.stage import (
     DataRoot,
     Log,
     PathOut,
+    Results,
+    Threads,
     stage,
     start_logging,
 )
@@ -57,3 +59,35 @@ def datasets_export(
         from hilsplat.datasets.sources import export_images
 
         export_images(name, data_root, out)
+
+
+@datasets_app.command("fits")
+def datasets_fits(
+    scene: Annotated[str, typer.Argument(help="dataset/scene in the results folder that has a tree")],
+    labels: Annotated[
+        str | None,
+        typer.Option(help="labels with levels, such as hi_lerf/figurines; default: your own of this scene"),
+    ] = None,
+    variant: Annotated[str, typer.Option(help="variant whose masks and tree to measure")] = "default",
+    results: Results = Path("results"),
+    data_root: DataRoot = Path(),
+    out: Annotated[Path | None, typer.Option(help="CSV to write; default: beside the tree")] = None,
+    threads: Threads = 2,
+) -> None:
+    """Measure how well masks and nodes fit annotated regions, by level and without any text."""
+    folder = results / scene
+    name, semantic_tree = labels or f"annotated/{scene}", folder / variant / "semantic_tree"
+    target = out or semantic_tree.with_name("label_fits.csv")
+    inputs = {
+        "scene": folder / "scene",
+        "gaussians": folder / "gaussians.ply",
+        "masks": folder / variant / "masks",
+        "semantic_tree": semantic_tree,
+    }
+    from hilsplat.datasets.registry import readers_of
+
+    with stage("label_fits", target, None, inputs=inputs, plugins=readers_of([name])):
+        from hilsplat.evaluate.diagnostics.label_fits import run_label_fits
+
+        table = run_label_fits(folder, variant, name, data_root, target, threads)
+    typer.echo(table)

@@ -1,4 +1,4 @@
-"""Look at a scene and ask it in a browser."""
+"""Look at a scene and ask it in a browser, or annotate its photographs there."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,8 +6,11 @@ from typing import Annotated
 import typer
 
 from hilsplat.cli.apps import app
-from hilsplat.cli.stage import Results, Threads, start_logging
+from hilsplat.cli.stage import DataRoot, Results, Threads, start_logging
 from hilsplat.cli.user_commands import SceneName, scene_folder
+
+Port = Annotated[int, typer.Option(min=0, max=65535, help="port of the page; 0: any that is free")]
+Browser = Annotated[bool, typer.Option(help="open the page in a browser")]
 
 
 @app.command()
@@ -15,8 +18,8 @@ def view(
     scene: SceneName,
     variant: Annotated[str, typer.Option(help="variant that answers first")] = "default",
     results: Results = Path("results"),
-    port: Annotated[int, typer.Option(min=0, max=65535, help="port of the page; 0: any that is free")] = 0,
-    browser: Annotated[bool, typer.Option(help="open the page in a browser")] = True,
+    port: Port = 0,
+    browser: Browser = True,
     threads: Threads = 2,
 ) -> None:
     """Fly through a scene in a browser on this machine, and ask it.
@@ -28,3 +31,28 @@ def view(
 
     folder = scene_folder(scene, results)
     run_view(folder, variant=variant, port=port, browser=browser, threads=threads, told=typer.echo)
+
+
+@app.command()
+def annotate(
+    scene: SceneName,
+    variant: Annotated[str, typer.Option(help="variant whose masks or nodes are proposed")] = "default",
+    results: Results = Path("results"),
+    data_root: DataRoot = Path(),
+    port: Port = 0,
+    browser: Browser = True,
+    threads: Threads = 2,
+) -> None:
+    """Draw what the photographs of a scene show, with levels and parents, in a browser on this machine.
+
+    Writes annotated/DATASET/SCENE below the data root after each change; evaluate reads it like any data set.
+    """
+    start_logging(None)
+    from hilsplat.annotate.app import run_annotate
+    from hilsplat.scene.scene import Scene
+
+    folder = scene_folder(scene, results)
+    labels = data_root / "annotated" / Scene.load(folder / "scene").name
+    run_annotate(
+        folder, labels, variant=variant, port=port, browser=browser, threads=threads, told=typer.echo
+    )

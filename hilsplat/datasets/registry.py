@@ -19,6 +19,7 @@ DATASETS: Plugins[Dataset] = Plugins(
         "3d_ovs": "hilsplat.datasets.images.ovs3d:DATASET",
         "hi_lerf": "hilsplat.datasets.images.hi:HI_LERF",
         "hi_3dovs": "hilsplat.datasets.images.hi:HI_3DOVS",
+        "annotated": "hilsplat.datasets.images.annotated:DATASET",
         "scannet": "hilsplat.datasets.points.scannet:DATASET",
         "scannet200": "hilsplat.datasets.points.scannet:SCANNET200_DATASET",
         "replica": "hilsplat.datasets.points.replica:DATASET",

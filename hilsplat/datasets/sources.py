@@ -48,16 +48,23 @@ def absence(source: str, data_root: str) -> str | None:
     return None
 
 
-def label_sets(source: str, data_root: str) -> tuple[str, ...]:
+def label_sets(source: str, data_root: str, row: str) -> tuple[str, ...]:
     """Labels that a scene can be scored against, as `data set/scene`, its own first; none if the data is
-    missing."""
+    missing.
+
+    Args:
+        source: of a row of the scene sheet.
+        data_root: folder of the data sets; empty: the working folder, which may hold your own annotations.
+        row: name of the row, `dataset/scene`.
+    """
+    own = (f"annotated/{row}",) if any((_root(data_root) / "annotated" / row).glob("*.json")) else ()
     place = published(source)
     if place is None or absence(source, data_root) is not None:
-        return ()
+        return own
     from hilsplat.datasets.registry import dataset_of
 
     name, scene = place
-    found = [f"{name}/{scene}"]
+    found = [f"{name}/{scene}", *own]
     for other in LABELS_ON.get(name, ()):
         dataset = dataset_of(other)
         folder = Path(data_root).expanduser() / dataset.folder
@@ -66,13 +73,17 @@ def label_sets(source: str, data_root: str) -> tuple[str, ...]:
     return tuple(found)
 
 
+def _root(data_root: str) -> Path:
+    return Path(data_root).expanduser()
+
+
 def label_files(labels: str, data_root: str) -> tuple[Path, ...]:
     """Files of `data set/scene` that only evaluation reads, sorted: editing one reruns nothing else."""
     from hilsplat.datasets.registry import dataset_of
 
     name, _, scene = labels.partition("/")
     dataset = dataset_of(name)
-    root = Path(data_root).expanduser() / dataset.folder
+    root = _root(data_root) / dataset.folder
     files: list[Path] = []
     for pattern in dataset.label_places(scene):
         files += [path for path in root.glob(pattern) if path.is_file()]

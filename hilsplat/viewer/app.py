@@ -7,43 +7,41 @@ take long and read only arrays, so they have a thread of their own.
 
 import asyncio
 import base64
-import logging
-import secrets
-import socket
-import webbrowser
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from pydantic import ValidationError
-from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from hilsplat.base.errors import HilsplatError, SettingsError
+from hilsplat.base.errors import SettingsError
 from hilsplat.query.names import StaleNamesError, write_names
 from hilsplat.viewer import answers, exports, wire
 from hilsplat.viewer.guard import Guard
 from hilsplat.viewer.html_page import html_page
 from hilsplat.viewer.payload import packed_gaussians, packed_nodes
 from hilsplat.viewer.picking import pick
-from hilsplat.viewer.shown import ShownScene, as_json
+from hilsplat.viewer.server import (
+    BYTES,
+    TYPES,
+    Pages,
+    answer_json,
+    encoded,
+    guarded,
+    photograph,
+    plain,
+    read,
+    serve,
+    static_files,
+    thumbnail,
+    view_name,
+)
+from hilsplat.viewer.shown import ShownScene
 
-TYPES = {"html": "text/html; charset=utf-8", "js": "text/javascript", "css": "text/css"}
 Made = TypeVar("Made")
-Sent = TypeVar("Sent", bound=wire.Asked)
-
-logger = logging.getLogger(__name__)
-
-
-def static_files() -> dict[str, bytes]:
-    """Files of the page by name: nothing else can be asked for."""
-    folder = files("hilsplat.viewer") / "static"
-    return {each.name: each.read_bytes() for each in folder.iterdir() if each.name.endswith(tuple(TYPES))}
 
 
 class Viewer:
@@ -51,15 +49,14 @@ class Viewer:
 
     def __init__(self, shown: ShownScene) -> None:
         self.shown = shown
-        self.static = static_files()
+        self.pages = Pages("index.html", static_files())
         self.worker = ThreadPoolExecutor(1, thread_name_prefix="scene")
         self.films = ThreadPoolExecutor(1, thread_name_prefix="film")
 
     def app(self, token: str) -> Guard:
         """The application, guarded."""
         routes = [
-            Route("/", self.page),
-            Route("/static/{name}", self.static_file),
+            *self.pages.routes(),
             Route("/api/scene", self.scene),
             Route("/api/variant/{variant}", self.variant),
             Route("/api/splats", self.splats),
@@ -79,39 +76,21 @@ class Viewer:
             Route("/api/export/film", self.export_film, methods=["POST"]),
             Route("/api/export/page", self.export_page, methods=["POST"]),
         ]
-        handlers: dict[Any, Any] = {
-            StaleNamesError: _told(412),
-            HilsplatError: _told(422),
-            ValidationError: _told(400),
-        }
-        return Guard(Starlette(routes=routes, exception_handlers=handlers), token)
+        return guarded(routes, token, StaleNamesError)
 
     async def _do(self, work: Callable[..., Made], *arguments: Any) -> Made:
         """Run on the thread of the scene."""
         return await asyncio.get_running_loop().run_in_executor(self.worker, work, *arguments)
 
-    # -- files ------------------------------------------------------------------------------------
-
-    async def page(self, request: Request) -> Response:
-        """The page."""
-        return _plain(self.static["index.html"], TYPES["html"])
-
-    async def static_file(self, request: Request) -> Response:
-        """A script or style of the page, by a fixed list of names."""
-        name = request.path_params["name"]
-        if name not in self.static:
-            return _plain(b"no such file", "text/plain", 404)
-        return _plain(self.static[name], TYPES[name.rpartition(".")[2]])
-
     # -- the scene --------------------------------------------------------------------------------
 
     async def scene(self, request: Request) -> Response:
         """Views, counts, and the variants that answer by now."""
-        return _json(await self._do(self.shown.described))
+        return answer_json(await self._do(self.shown.described))
 
     async def variant(self, request: Request) -> Response:
         """The outline of a variant."""
-        return _json(await self._do(self.shown.described_variant, request.path_params["variant"]))
+        return answer_json(await self._do(self.shown.described_variant, request.path_params["variant"]))
 
     async def splats(self, request: Request) -> Response:
         """The Gaussians, packed."""
@@ -124,28 +103,15 @@ class Viewer:
     async def nodes(self, request: Request) -> Response:
         """Nodes of the Gaussians, packed."""
         variant = request.path_params["variant"]
-        return _plain(await self._do(lambda: packed_nodes(self.shown.answering(variant).tree)), _BYTES)
+        return plain(await self._do(lambda: packed_nodes(self.shown.answering(variant).tree)), BYTES)
 
     async def photo(self, request: Request) -> Response:
         """An undistorted photograph."""
-
-        def read() -> tuple[bytes, str]:
-            path = self.shown.scene.image_path(self.shown.view_name(request.path_params["number"]))
-            return path.read_bytes(), path.suffix.lower()
-
-        data, suffix = await self._do(read)
-        return _plain(data, "image/png" if suffix == ".png" else "image/jpeg", cached=True)
+        return await self._do(photograph, self.shown.scene, request.path_params["number"])
 
     async def thumb(self, request: Request) -> Response:
         """A small photograph."""
-
-        def read() -> bytes:
-            from hilsplat.base.images import resize_to_fit
-
-            image = self.shown.scene.image(self.shown.view_name(request.path_params["number"]))
-            return exports.encoded(resize_to_fit(image, 160))
-
-        return _plain(await self._do(read), "image/jpeg", cached=True)
+        return await self._do(thumbnail, self.shown.scene, request.path_params["number"])
 
     async def crop(self, request: Request) -> Response:
         """A node as its best photograph shows it."""
@@ -153,26 +119,26 @@ class Viewer:
         def draw() -> bytes:
             scene = self.shown.answering(request.path_params["variant"])
             node = _node(scene, request.path_params["node"])
-            return exports.encoded(exports.crop(scene, node, self.shown.threads))
+            return encoded(exports.crop(scene, node, self.shown.threads))
 
-        return _plain(await self._do(draw), "image/jpeg", cached=True)
+        return plain(await self._do(draw), "image/jpeg", cached=True)
 
     # -- answers ----------------------------------------------------------------------------------
 
     async def query(self, request: Request) -> Response:
         """A text or a path."""
-        asked = await _read(request, wire.Query)
+        asked = await read(request, wire.Query)
 
         def answer() -> dict[str, Any]:
-            view = None if asked.view is None else self.shown.view_name(asked.view)
+            view = None if asked.view is None else view_name(self.shown.scene, asked.view)
             scene = self.shown.answering(asked.variant)
             return answers.answer(scene, asked.text, asked.level, asked.answerer, view, asked.threshold)
 
-        return _json(await self._do(answer))
+        return answer_json(await self._do(answer))
 
     async def like(self, request: Request) -> Response:
         """What looks like a node or a picture."""
-        asked = await _read(request, wire.Like)
+        asked = await read(request, wire.Like)
 
         def answer() -> dict[str, Any]:
             scene = self.shown.answering(asked.variant)
@@ -183,17 +149,17 @@ class Viewer:
             hits = scene.like_picture(_picture(asked.picture), limit=answers.LISTED)
             return answers.alike(scene, hits, "like the picture")
 
-        return _json(await self._do(answer))
+        return answer_json(await self._do(answer))
 
     async def field(self, request: Request) -> Response:
         """The field's relevancy of every Gaussian, a byte each."""
-        asked = await _read(request, wire.FieldRelevancy)
+        asked = await read(request, wire.FieldRelevancy)
         found = await self._do(self.shown.field_relevancy, asked.variant, asked.text, asked.level)
-        return _plain(found.tobytes(), _BYTES)
+        return plain(found.tobytes(), BYTES)
 
     async def pick(self, request: Request) -> Response:
         """What a pixel shows."""
-        asked = await _read(request, wire.Pick)
+        asked = await read(request, wire.Pick)
 
         def find() -> dict[str, Any]:
             has = asked.variant in self.shown.variants
@@ -205,24 +171,24 @@ class Viewer:
                 return {"nodes": [], "alpha": 0}
             return {"nodes": found.nodes, "alpha": found.alpha, "point": found.point}
 
-        return _json(await self._do(find))
+        return answer_json(await self._do(find))
 
     async def frame(self, request: Request) -> Response:
         """A picture of the scene."""
-        asked = await _read(request, wire.Frame)
+        asked = await read(request, wire.Frame)
 
         def draw() -> bytes:
             from hilsplat.viewer.frames import painted
 
             paint = self.shown.paint(asked.variant, asked.style)
             pixels = painted(self.shown.gaussians, asked.camera.camera(), paint, self.shown.threads)
-            return exports.encoded(pixels, asked.image, asked.quality)
+            return encoded(pixels, asked.image, asked.quality)
 
-        return _plain(await self._do(draw), f"image/{asked.image}")
+        return plain(await self._do(draw), f"image/{asked.image}")
 
     async def names(self, request: Request) -> Response:
         """Replace the names of a tree's nodes; `If-Match` is the version that was read."""
-        asked = await _read(request, wire.Names)
+        asked = await read(request, wire.Names)
         version = request.headers.get("if-match", "").strip('"')
 
         def write() -> dict[str, Any]:
@@ -232,44 +198,44 @@ class Viewer:
             self.shown.renamed(asked.variant, names)
             return {"version": names.version, "names": dict(names.of_node)}
 
-        return _json(await self._do(write))
+        return answer_json(await self._do(write))
 
     # -- files to keep ----------------------------------------------------------------------------
 
     async def export_ply(self, request: Request) -> Response:
         """Gaussians of nodes."""
-        asked = await _read(request, wire.Selection)
+        asked = await read(request, wire.Selection)
 
         def make() -> bytes:
             scene = self.shown.answering(asked.variant)
             rows = scene.gaussians_of(_nodes(scene, asked.nodes))
             return exports.selection_ply(self.shown.folder / "gaussians.ply", rows)
 
-        return _plain(await self._do(make), _BYTES)
+        return plain(await self._do(make), BYTES)
 
     async def export_boxes(self, request: Request) -> Response:
         """Boxes of nodes."""
-        asked = await _read(request, wire.Selection)
+        asked = await read(request, wire.Selection)
 
         def make() -> dict[str, Any]:
             scene = self.shown.answering(asked.variant)
             return answers.boxes(scene, _nodes(scene, asked.nodes))
 
-        return _json(await self._do(make))
+        return answer_json(await self._do(make))
 
     async def export_masks(self, request: Request) -> Response:
         """Masks of nodes in all views."""
-        asked = await _read(request, wire.Selection)
+        asked = await read(request, wire.Selection)
 
         def make() -> bytes:
             scene = self.shown.answering(asked.variant)
             return exports.masks_zip(scene, _nodes(scene, asked.nodes))
 
-        return _plain(await self._do(make), "application/zip")
+        return plain(await self._do(make), "application/zip")
 
     async def export_film(self, request: Request) -> Response:
         """A fly-around in the colours of the page."""
-        asked = await _read(request, wire.Film)
+        asked = await read(request, wire.Film)
         paint = await self._do(self.shown.paint, asked.variant, asked.style)
 
         def make() -> bytes:
@@ -284,42 +250,12 @@ class Viewer:
             )
 
         data = await asyncio.get_running_loop().run_in_executor(self.films, make)
-        return _plain(data, "video/mp4" if asked.format == "mp4" else "image/gif")
+        return plain(data, "video/mp4" if asked.format == "mp4" else "image/gif")
 
     async def export_page(self, request: Request) -> Response:
         """The scene as one HTML file, with its answers to some texts."""
-        asked = await _read(request, wire.Page)
-        return _plain(await self._do(html_page, self.shown, asked, self.static), TYPES["html"])
-
-
-_BYTES = "application/octet-stream"
-
-
-async def _read(request: Request, kind: type[Sent]) -> Sent:
-    return kind.model_validate_json(await request.body())
-
-
-def _json(value: Any) -> Response:
-    return _plain(as_json(value), "application/json")
-
-
-def _plain(data: bytes, kind: str, status: int = 200, *, cached: bool = False) -> Response:
-    lasting = "private, max-age=3600" if cached else "no-store"
-    return Response(data, status, headers={"content-type": kind, "cache-control": lasting})
-
-
-def _told(status: int) -> Callable[[Request, Exception], Awaitable[Response]]:
-    """A handler that sends the error to the page, as text."""
-
-    async def tell(request: Request, error: Exception) -> Response:
-        if isinstance(error, ValidationError):
-            first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-            text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-        else:
-            text = str(error)
-        return _plain(as_json({"error": text}), "application/json", status)
-
-    return tell
+        asked = await read(request, wire.Page)
+        return plain(await self._do(html_page, self.shown, asked, self.pages.static), TYPES["html"])
 
 
 def _node(scene: Any, node: int) -> int:
@@ -345,26 +281,6 @@ def _picture(text: str) -> np.ndarray:
     return np.ascontiguousarray(pixels[..., ::-1])
 
 
-def listening_at(port: int) -> socket.socket:
-    """A socket that listens on this machine alone; 0: at any free port.
-
-    Raises:
-        SettingsError: the port is taken.
-    """
-    # Named as TCP, or asyncio leaves Nagle's algorithm on, and answers wait 40 ms for an acknowledgement.
-    made = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        made.bind(("127.0.0.1", port))
-    except OSError as error:
-        made.close()
-        raise SettingsError(
-            f"port {port} cannot be used: {error}", fix="choose another, or leave it out"
-        ) from error
-    made.listen()  # before the address is printed: whoever connects at once waits instead of being refused
-    return made
-
-
 def run_view(
     folder: Path, *, variant: str, port: int, browser: bool, threads: int, told: Callable[[str], None]
 ) -> None:
@@ -382,15 +298,8 @@ def run_view(
         ArtifactError: the scene has no Gaussians yet.
         SettingsError: the port is taken.
     """
-    import uvicorn
-
     shown = ShownScene(folder, variant, threads)
-    viewer, token = Viewer(shown), secrets.token_urlsafe(24)
+    viewer = Viewer(shown)
     viewer.worker.submit(shown.warm_up).result()
-    listening = listening_at(port)
-    address = f"http://127.0.0.1:{listening.getsockname()[1]}/?token={token}"
-    config = uvicorn.Config(viewer.app(token), log_level="warning", access_log=False, server_header=False)
-    told(f"{shown.scene.name}: {len(shown.gaussians)} Gaussians at {address}\nCtrl-C ends it")
-    if browser:
-        webbrowser.open(address)
-    uvicorn.Server(config).run(sockets=[listening])
+    about = f"{shown.scene.name}: {len(shown.gaussians)} Gaussians"
+    serve(viewer.app, about, port=port, browser=browser, told=told)

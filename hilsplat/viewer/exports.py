@@ -33,14 +33,6 @@ DIMMED = 0.3
 """Brightness of a crop outside the node."""
 
 
-def encoded(pixels: UInt8[np.ndarray, "H W 3"], kind: str = "jpeg", quality: int = 80) -> bytes:
-    """An image as the bytes of a JPEG or PNG."""
-    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if kind == "jpeg" else []
-    made, data = cv2.imencode(".jpg" if kind == "jpeg" else ".png", pixels[..., ::-1], options)
-    assert made
-    return data.tobytes()
-
-
 def selection_ply(gaussians_ply: Path, rows: np.ndarray) -> bytes:
     """Some Gaussians as a 3DGS PLY."""
     with TemporaryDirectory() as folder:

@@ -33,10 +33,11 @@ class Guard:
     Args:
         app: what is guarded.
         token: secret of the printed address.
+        max_body: most bytes that the page may send at once.
     """
 
-    def __init__(self, app: ASGIApp, token: str) -> None:
-        self.app = app
+    def __init__(self, app: ASGIApp, token: str, max_body: int = MAX_BODY_BYTES) -> None:
+        self.app, self.max_body = app, max_body
         self.token = token
         self.cookie = f"hilsplat-{secrets.token_hex(4)}"  # ports share cookies: a name for each server
 
@@ -51,7 +52,7 @@ class Guard:
         if refused := self._refusal(scope["method"], scope["path"], headers, is_opening):
             await PlainTextResponse(refused, 403, HEADERS)(scope, receive, send)
             return
-        if int(headers.get("content-length") or 0) > MAX_BODY_BYTES or "transfer-encoding" in headers:
+        if int(headers.get("content-length") or 0) > self.max_body or "transfer-encoding" in headers:
             await PlainTextResponse("too much was sent", 413, HEADERS)(scope, receive, send)
             return
 
@@ -77,7 +78,7 @@ class Guard:
         if headers.get("sec-fetch-site") == "cross-site" and not is_opening:
             return "another site sent this"
         if not is_opening and not self._has_cookie(headers.get("cookie", "")):
-            return "open the address that hilsplat view printed, with its token"
+            return "open the printed address, with its token"
         if method in ("GET", "HEAD"):
             return ""
         if headers.get("origin") not in (f"http://{host}",):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from hilsplat.base.images import resize_to_fit
 from hilsplat.viewer import answers, exports
 from hilsplat.viewer.payload import packed_gaussians, packed_nodes
+from hilsplat.viewer.server import as_json, encoded
 
 if TYPE_CHECKING:
     from hilsplat.viewer.shown import ShownScene
@@ -38,23 +39,20 @@ def html_page(shown: "ShownScene", asked: "Page", static: dict[str, bytes]) -> b
     Raises:
         SettingsError: a text is empty, or the variant cannot answer.
     """
-    from hilsplat.viewer.shown import as_json
-
     scene = shown.answering(asked.variant)
     described: dict[str, Any] = {
         "scene": {**shown.described(), "variants": [asked.variant]},
         "variant": shown.described_variant(asked.variant),
         "answers": [answers.answer(scene, text) for text in asked.texts],
         "photos": [
-            _text(exports.encoded(resize_to_fit(scene.image(view), PHOTO_PX), quality=75))
-            for view in scene.views
+            _text(encoded(resize_to_fit(scene.image(view), PHOTO_PX), quality=75)) for view in scene.views
         ],
     }
     nodes = list(range(len(scene.tree)))
     if len(nodes) > MAX_CROPS:
         wholes = {int(node) for node in nodes if scene.tree.level[node] == 1}
         nodes = sorted(wholes | {hit["node"] for answer in described["answers"] for hit in answer["hits"]})
-    crops = {node: _text(exports.encoded(exports.crop(scene, node, shown.threads))) for node in nodes}
+    crops = {node: _text(encoded(exports.crop(scene, node, shown.threads))) for node in nodes}
     described["crops"] = crops
     scripts = {name: text.decode() for name, text in static.items() if name.endswith(".js")}
     scripts["api.js"] = scripts.pop("offline.js")

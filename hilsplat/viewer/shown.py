@@ -1,6 +1,5 @@
 """A scene's folder as the page shows it: Gaussians at once, each variant's answers when they exist."""
 
-import json
 import logging
 from dataclasses import replace
 from functools import cached_property
@@ -144,17 +143,6 @@ class ShownScene:
         """Digest of the Gaussians, for the browser's cache."""
         return self.opened.get(sha256_of_file, self.folder / "gaussians.ply")[:32]
 
-    def view_name(self, number: int) -> str:
-        """The view with this number.
-
-        Raises:
-            SettingsError: there is none.
-        """
-        names = self.scene.cameras.names
-        if not 0 <= number < len(names):
-            raise SettingsError(f"view {number} does not exist", expected=f"0 to {len(names) - 1}")
-        return names[number]
-
     # -- painting ---------------------------------------------------------------------------------
 
     def field_relevancy(self, variant: str, text: str, level: str) -> np.ndarray:
@@ -201,8 +189,3 @@ class ShownScene:
                 self.answering(self.first)
             except HilsplatError as error:  # the Gaussians can still be looked at; the page shows why
                 logger.warning("no answers: %s", error)
-
-
-def as_json(value: Any) -> bytes:
-    """JSON as the page reads it."""
-    return json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()

@@ -423,8 +423,8 @@ class Plan:
     # ---- annotations: for evaluation and figures alone ------------------------------------------------
 
     def labels(self, row: SceneRow) -> tuple[str, ...]:
-        """Labels of a scene of a published data set, as `data set/scene`; several may share its images."""
-        return label_sets(row.source, self.run.data_root)
+        """Labels of a scene, as `data set/scene`: published ones and your own annotations."""
+        return () if row.world else label_sets(row.source, self.run.data_root, row.name)
 
     def label_readers(self, job: Job) -> tuple[str, ...]:
         """The readers of a scene's labels."""

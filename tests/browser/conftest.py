@@ -43,10 +43,10 @@ def browser():
 
 
 @contextmanager
-def serving(folder: Path) -> Iterator[str]:
-    """Address of the page of a scene, served by the command."""
+def serving(folder: Path, *words: str) -> Iterator[str]:
+    """Address of the page of a scene, served by `hilsplat view` or the command of the words."""
     code = "from hilsplat.cli.main import main; main()"
-    command = [sys.executable, "-u", "-c", code, "view", str(folder), "--no-browser"]
+    command = [sys.executable, "-u", "-c", code, *(words or ("view",)), str(folder), "--no-browser"]
     environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as server:
         try:
@@ -110,7 +110,8 @@ def cloud_address(browser, cloud) -> Iterator[str]:
 def opened(browser) -> Iterator[Callable]:
     """Opens an address, waits for the first picture, and checks at the end that nothing went wrong.
 
-    A console error, an uncaught exception or a request to another address fails the test.
+    A console error, an uncaught exception or a request to another address fails the test, except for what
+    the test has put into `opened.expected`.
     """
     contexts = []
     wrong: list[str] = []
@@ -132,9 +133,11 @@ def opened(browser) -> Iterator[Callable]:
         page.locator("body[data-ready=yes]").wait_for()
         return page
 
+    open_page.expected = []
     yield open_page
     for context in contexts:
         context.close()
+    wrong = [said for said in wrong if not any(each in said for each in open_page.expected)]
     assert not wrong, wrong
 
 

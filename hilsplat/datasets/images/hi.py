@@ -2,14 +2,16 @@
 
 The paper publishes frames and levels but no labels and no format. Our format is the label file of LERF-OVS
 with three more keys per object: `id`, unique in the file; `level`, 1 whole, 2 part, 3 subpart; `parent`, the
-id of an object one level up, or null. `segmentation` may be a list of polygons. The images are those of the
-other data set, whose folder is beside this one.
+id of an object one level up, or null. `segmentation` may be a list of polygons. `hilsplat annotate` adds
+`origin`: drawn, edited, accepted or proposed. The images are those of the other data set, whose folder is
+beside this one; `annotated.py` has the same format without a published data set.
 
 A frame without an image or a label, an invalid parent, or a child outside its parent is reported, never
 fatal.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -32,6 +34,9 @@ from hilsplat.datasets.published import FRAMES
 
 IMAGES_OF = {"hi_lerf": "lerf_ovs", "hi_3dovs": "3d_ovs"}
 """Folder with the images of each data set, beside its own."""
+
+PROPOSED = "proposed"
+"""`origin` of an object that a program proposed and nobody has accepted: it is no annotation yet."""
 
 OUTSIDE_SHARE = 0.01
 """This share of a child may be outside its parent, because borders are rasterised."""
@@ -64,20 +69,7 @@ def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
         size = check_label_size(f"label file {path}", labels.size_hw, image_size_hw(images[view]))
         if size:
             warnings.append(size)
-        objects = by_id(labels)
-        parents = parents_of(labels, objects, warnings)
-        warnings.extend(nesting_violations(labels, objects, parents))
-        views[view] = tuple(
-            LabelledRegion(
-                thing.category,
-                labels.size_hw,
-                partial(thing.mask, labels.size_hw),
-                thing.box_xyxy[None],
-                Level(thing.keys["level"]),
-                path_of(number, objects, parents),
-            )
-            for number, thing in objects.items()
-        )
+        views[view] = regions_of(labels, warnings)
     listed = FRAMES[dataset].get(scene, ())
     for what, present in (("image", images), ("label", files)):
         sentence = missing_frames(what, listed, present)
@@ -85,6 +77,37 @@ def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
             warnings.append(sentence)
     prompts = tuple(sorted({region.text for regions in views.values() for region in regions}))
     return LabelledScene(dataset, scene, images, source, views, prompts, tuple(warnings))
+
+
+def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, ...]:
+    """One region per object of a file, except for proposals that nobody has accepted.
+
+    Args:
+        labels: a file in our format.
+        warnings: gets a sentence for each thing that was reinterpreted.
+
+    Raises:
+        SceneError: an id or a level cannot be used.
+    """
+    waiting = [thing for thing in labels.objects if thing.keys.get("origin") == PROPOSED]
+    if waiting:
+        warnings.append(f"{labels.path.name}: proposals not accepted, left out: {len(waiting)}")
+        accepted = tuple(thing for thing in labels.objects if thing not in waiting)
+        labels = replace(labels, objects=accepted)
+    objects = by_id(labels)
+    parents = parents_of(labels, objects, warnings)
+    warnings.extend(nesting_violations(labels, objects, parents))
+    return tuple(
+        LabelledRegion(
+            thing.category,
+            labels.size_hw,
+            partial(thing.mask, labels.size_hw),
+            thing.box_xyxy[None],
+            Level(thing.keys["level"]),
+            path_of(number, objects, parents),
+        )
+        for number, thing in objects.items()
+    )
 
 
 def by_id(labels: IsatFile) -> dict[int, IsatObject]:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int64
 
 from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.images.polygons import fill_polygon, outside_px
+from hilsplat.datasets.images.polygons import fill_polygons, outside_px
 
 LARGEST_SIDE_PX = 20_000
 """Regions are drawn at the size that a label file states: a wrong number must not take all memory."""
@@ -43,7 +43,7 @@ class IsatObject:
 
     def mask(self, size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
         """Rasterise (see `polygons.fill_polygon`)."""
-        return np.any([fill_polygon(polygon, size_hw) for polygon in self.polygons], axis=0)
+        return fill_polygons(self.polygons, size_hw)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +79,15 @@ def read_isat(path: Path) -> IsatFile:
             expected="JSON with info and objects",
             fix="unpack the labels again",
         ) from error
+    return parse_isat(path, content)
+
+
+def parse_isat(path: Path, content: Any) -> IsatFile:
+    """Check the content of a label file; `path` names it in messages.
+
+    Raises:
+        SceneError: as `read_isat`.
+    """
     if not isinstance(content, dict) or not isinstance(content.get("objects"), list):
         raise SceneError(
             f"label file {path} has no list `objects`",

@@ -1,12 +1,15 @@
-"""Regions as polygons, rasterised as in the published evaluations."""
+"""Regions as polygons, rasterised as in the published evaluations, and traced back from pixels."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 
-def fill_polygon(points_xy: Float[np.ndarray, "P 2"], size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+def fill_polygon(
+    points_xy: Float[np.ndarray, "P 2"] | Int[np.ndarray, "P 2"], size_hw: tuple[int, int]
+) -> Bool[np.ndarray, "H W"]:
     """Pixels of one polygon: vertices truncated to whole numbers, even-odd fill, border pixels included.
 
     This is OpenCV's `fillPoly` on int32 vertices, which LangSplat's evaluation uses. Pixel (x, y) is the
@@ -18,6 +21,41 @@ def fill_polygon(points_xy: Float[np.ndarray, "P 2"], size_hw: tuple[int, int]) 
     canvas = np.zeros(size_hw, dtype=np.uint8)
     cv2.fillPoly(canvas, [np.asarray(points_xy).astype(np.int32)], 1)
     return canvas.astype(bool)
+
+
+def fill_polygons(
+    polygons: Sequence[Float[np.ndarray, "_ 2"] | Int[np.ndarray, "_ 2"]], size_hw: tuple[int, int]
+) -> Bool[np.ndarray, "H W"]:
+    """Union of polygons; nothing for none."""
+    union = np.zeros(size_hw, bool)
+    for polygon in polygons:
+        union |= fill_polygon(polygon, size_hw)
+    return union
+
+
+def trace_polygons(mask: Bool[np.ndarray, "H W"]) -> list[Int[np.ndarray, "_ 2"]]:
+    """Polygons without common pixels whose union, filled by `fill_polygon`, is the mask, pixel by pixel.
+
+    A polygon cannot have a hole, so the mask is cut in two through the middle of each.
+    """
+    import cv2
+
+    mode, every = cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE
+    contours, ranks = cv2.findContours(mask.astype(np.uint8), mode, every)
+    holes = (
+        [contour for contour, rank in zip(contours, ranks[0], strict=True) if rank[3] >= 0]
+        if contours
+        else []
+    )
+    middles = {int(contour[..., 0].min() + contour[..., 0].max() + 1) // 2 for contour in holes}
+    edges = [0, *sorted(middles), mask.shape[1]]
+    polygons: list[np.ndarray] = []
+    for left, right in pairwise(edges):
+        strip = np.ascontiguousarray(mask[:, left:right], np.uint8)
+        for contour in cv2.findContours(strip, mode, every)[0]:
+            points = contour.reshape(-1, 2).astype(np.int64) + np.array([left, 0])
+            polygons.append(np.concatenate([points, points[-1:].repeat(max(0, 3 - len(points)), axis=0)]))
+    return polygons
 
 
 def outside_px(polygons: Sequence[Float[np.ndarray, "_ 2"]], size_hw: tuple[int, int]) -> float:

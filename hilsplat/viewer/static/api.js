@@ -1,23 +1,9 @@
 // The server's answers. The exported page has offline.js in this file's place, with the same names.
 
+import { get, send } from "./http.js";
+
 export const offline = false;
 export const texts = [];   // what an exported page can answer
-
-export class Refused extends Error {
-  constructor(message, status) { super(message); this.status = status; }
-}
-
-async function checked(response) {
-  if (response.ok) return response;
-  let message = `${response.status} ${response.statusText}`;
-  try { message = (await response.clone().json()).error; } catch { message = await response.text() || message; }
-  throw new Refused(message, response.status);
-}
-
-const get = async (path) => checked(await fetch(path));
-const send = async (path, value, { method = "POST", headers = {}, signal } = {}) => checked(await fetch(path, {
-  method, signal, headers: { "content-type": "application/json", ...headers }, body: JSON.stringify(value),
-}));
 
 export const scene = async () => (await get("/api/scene")).json();
 export const variant = async (name) => (await get(`/api/variant/${encodeURIComponent(name)}`)).json();

@@ -23,7 +23,7 @@ def test_every_data_set_says_what_a_user_must_know(dataset):
     for text in (dataset.title, dataset.licence, dataset.terms, dataset.citation, dataset.layout):
         assert text.strip()
     assert dataset.folder and all(map(dataset.required, dataset.scenes))
-    assert dataset.scenes or dataset.name == "waymo"  # the paper names no segment: all that are there
+    assert dataset.scenes or dataset.name in ("waymo", "annotated")  # all that are there
 
 
 def test_an_unknown_name_lists_the_known_ones():

@@ -82,9 +82,12 @@ def test_a_data_root_that_is_one_folder_too_high_says_so(root, tmp_path):
 
 
 def test_a_scene_is_scored_against_all_labels_on_its_images(root):
-    assert label_sets("data:lerf_ovs/figurines", str(root)) == ("lerf_ovs/figurines", "hi_lerf/figurines")
-    assert label_sets("data:3d_ovs/bed", str(root)) == ("3d_ovs/bed",)
-    assert label_sets("data:lerf_ovs/ramen", str(root)) == ()
+    assert label_sets("data:lerf_ovs/figurines", str(root), "lerf/figurines") == (
+        "lerf_ovs/figurines",
+        "hi_lerf/figurines",
+    )
+    assert label_sets("data:3d_ovs/bed", str(root), "3d_ovs/bed") == ("3d_ovs/bed",)
+    assert label_sets("data:lerf_ovs/ramen", str(root), "lerf/ramen") == ()
 
 
 def test_label_files_are_those_that_only_evaluation_reads(root):

@@ -3,7 +3,8 @@
 import pytest
 from starlette.testclient import TestClient
 
-from hilsplat.viewer.app import Viewer, static_files
+from hilsplat.viewer.app import Viewer
+from hilsplat.viewer.server import static_files
 from tests.unit.viewer.conftest import ADDRESS, TOKEN
 
 QUERY = {"text": "mug"}

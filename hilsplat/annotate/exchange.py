@@ -1,0 +1,326 @@
+"""Annotations from and for other programs: ISAT (the labels of LERF-OVS), labelme, COCO.
+
+Only our own format has levels and parents; the others carry them in keys of ours, which their programs ignore
+or keep. Without those keys a thing comes in as a whole.
+"""
+
+import io
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool
+from pydantic import ValidationError
+
+from hilsplat.annotate.labels import Label, as_file, labels_of, whole_pixels
+from hilsplat.base.errors import SceneError
+from hilsplat.datasets.images.isat import parse_isat
+from hilsplat.datasets.images.polygons import trace_polygons
+from hilsplat.scene.cameras import Cameras
+from hilsplat.viewer.exports import coco_counts
+
+Kind = Literal["hilsplat", "isat", "labelme", "coco"]
+OURS = ("level", "parent", "origin")
+
+
+# -- out ------------------------------------------------------------------------------------------
+
+
+def exported(kind: Kind, known: Mapping[str, Sequence[Label]], cameras: Cameras) -> bytes:
+    """All annotations as a ZIP of a file per view, or, for COCO, as one JSON file."""
+    if kind == "coco":
+        return _json(_coco(known, cameras)).encode()
+    write = {"hilsplat": as_file, "isat": _isat, "labelme": _labelme}[kind]
+    held = io.BytesIO()
+    with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
+        for view, labels in known.items():
+            archive.writestr(f"{Path(view).stem}.json", write(view, cameras[view].size_hw, labels))
+    return held.getvalue()
+
+
+def _isat(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
+    """ISAT has one polygon per object; pieces of a thing share their group."""
+    size = {"width": size_hw[1], "height": size_hw[0]}
+    info: dict[str, object] = {
+        "description": "ISAT",
+        "folder": "",
+        "name": view,
+        **size,
+        "depth": 3,
+        "note": "",
+    }
+    objects = []
+    for label in labels:
+        for ring in label.polygons:
+            points = np.array(ring)
+            box = [*points.min(axis=0).tolist(), *points.max(axis=0).tolist()]
+            area = int(label.model_copy(update={"polygons": [ring]}).mask(size_hw).sum())
+            objects.append(
+                {
+                    "category": label.text,
+                    "group": label.id,
+                    "segmentation": ring,
+                    "area": area,
+                    "layer": float(label.level),
+                    "bbox": box,
+                    "iscrowd": 0,
+                    "note": "",
+                    **_ours(label),
+                }
+            )
+    return _json({"info": info, "objects": objects})
+
+
+def _labelme(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
+    shapes = [
+        {
+            "label": label.text,
+            "points": ring,
+            "group_id": label.id,
+            "shape_type": "polygon",
+            "flags": {},
+            **_ours(label),
+        }
+        for label in labels
+        for ring in label.polygons
+    ]
+    size = {"imageHeight": size_hw[0], "imageWidth": size_hw[1]}
+    return _json(
+        {"version": "5.5.0", "flags": {}, "shapes": shapes, "imagePath": view, "imageData": None, **size}
+    )
+
+
+def _coco(known: Mapping[str, Sequence[Label]], cameras: Cameras) -> dict[str, Any]:
+    """Regions as run lengths, because COCO fills polygons otherwise than we do."""
+    texts = sorted({label.text for labels in known.values() for label in labels})
+    content: dict[str, Any] = {
+        "info": {"description": "annotations by hilsplat"},
+        "images": [],
+        "categories": [{"id": 1 + number, "name": text} for number, text in enumerate(texts)],
+        "annotations": [],
+    }
+    for number, (view, labels) in enumerate(known.items()):
+        height, width = cameras[view].size_hw
+        content["images"].append({"id": number, "file_name": view, "height": height, "width": width})
+        for label in labels:
+            mask = label.mask((height, width))
+            rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+            box = (columns[0], rows[0], np.ptp(columns) + 1, np.ptp(rows) + 1)
+            content["annotations"].append(
+                {
+                    "id": len(content["annotations"]) + 1,
+                    "image_id": number,
+                    "category_id": 1 + texts.index(label.text),
+                    "iscrowd": 0,
+                    "area": int(mask.sum()),
+                    "bbox": [int(side) for side in box],
+                    "segmentation": {"size": [height, width], "counts": coco_counts(mask)},
+                    "thing": label.id,
+                    **_ours(label),
+                }
+            )
+    return content
+
+
+def _ours(label: Label) -> dict[str, object]:
+    return {name: getattr(label, name) for name in OURS}
+
+
+def _json(value: object) -> str:
+    return json.dumps(value, ensure_ascii=False)
+
+
+# -- in -------------------------------------------------------------------------------------------
+
+
+def imported(name: str, text: str, cameras: Cameras) -> dict[str, list[Label]]:
+    """Annotations of a file of any of the four formats, by view.
+
+    Ids count from 1 unless the file has its own.
+
+    Args:
+        name: of the file; it finds the photograph where the content names none.
+        text: content.
+        cameras: views of the scene.
+
+    Raises:
+        SceneError: the format is none of these, or the file does not fit the scene.
+    """
+    try:
+        content = json.loads(text)
+    except ValueError as error:
+        raise SceneError(f"{name} cannot be read: {error}", expected="a JSON file") from error
+    found: dict[str, list[Label]] = {}
+    if isinstance(content, dict) and isinstance(content.get("shapes"), list):
+        image = str(content.get("imagePath") or name)
+        view = _view(name, image, cameras, content.get("imageHeight"), content.get("imageWidth"))
+        pieces = [
+            _labelme_piece(f"{name}, shape {row}", shape) for row, shape in enumerate(content["shapes"])
+        ]
+        found[view] = _joined(name, pieces)
+    elif isinstance(content, dict) and isinstance(content.get("annotations"), list):
+        found = _from_coco(name, content, cameras)
+    elif isinstance(content, dict) and isinstance(content.get("objects"), list):
+        labels = parse_isat(Path(name), content)
+        view = _view(name, str(content["info"].get("name") or name), cameras, *labels.size_hw)
+        if labels.objects and all("id" in thing.keys for thing in labels.objects):
+            found[view] = labels_of(labels)
+        else:
+            pieces = [
+                (
+                    thing.category,
+                    thing.keys.get("group") if "level" in thing.keys else None,
+                    polygon,
+                    thing.keys,
+                )
+                for thing in labels.objects
+                for polygon in thing.polygons
+            ]  # groups of LERF's own files repeat and identify nothing
+            found[view] = _joined(name, pieces)
+    else:
+        raise SceneError(
+            f"{name} is of no known format",
+            expected="objects (ISAT, LERF-OVS, hilsplat), shapes (labelme) or annotations (COCO)",
+            found=f"keys {', '.join(content)}" if isinstance(content, dict) else type(content).__name__,
+        )
+    return found
+
+
+Piece = tuple[str, Any, np.ndarray, Mapping[str, Any]]
+"""Text, what identifies its thing or None, vertices, and the keys of the file."""
+
+
+def _joined(name: str, pieces: Sequence[Piece]) -> list[Label]:
+    """One label per thing; pieces without an identity are things of their own."""
+    things: dict[Any, list[Piece]] = {}
+    for row, piece in enumerate(pieces):
+        things.setdefault((piece[0], piece[1]) if piece[1] is not None else row, []).append(piece)
+    own = [same[0][1] for same in things.values()]
+    is_id = all(type(number) is int and number > 0 for number in own) and len(set(own)) == len(own)
+    return [
+        _label(name, own[row] if is_id else 1 + row, same, is_id) for row, same in enumerate(things.values())
+    ]
+
+
+def _label(name: str, number: int, pieces: Sequence[Piece], has_ids: bool) -> Label:
+    text, _, _, keys = pieces[0]
+    try:
+        return Label(
+            id=number,
+            level=keys.get("level") or 1,
+            parent=keys.get("parent") if has_ids else None,
+            text=text,
+            polygons=[whole_pixels(piece[2]) for piece in pieces],
+            origin=keys.get("origin") or "drawn",
+        )
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise SceneError(f"{name}: {text!r} cannot be used: {first['loc'][0]}: {first['msg']}") from error
+
+
+def _labelme_piece(where: str, shape: Any) -> Piece:
+    try:
+        points, kind = (
+            np.array(shape["points"], np.float64).reshape(-1, 2),
+            shape.get("shape_type", "polygon"),
+        )
+        if kind == "rectangle" and len(points) == 2:
+            (x0, y0), (x1, y1) = points
+            points, kind = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]), "polygon"
+        text = str(shape["label"])
+    except (TypeError, KeyError, ValueError) as error:
+        raise SceneError(f"{where} cannot be read: {error!r}", expected="label and points") from error
+    if kind != "polygon":
+        raise SceneError(f"{where} ({text}) is a {kind}", expected="polygon or rectangle", fix="redraw it")
+    return text, shape.get("group_id"), points, shape
+
+
+def _from_coco(name: str, content: Mapping[str, Any], cameras: Cameras) -> dict[str, list[Label]]:
+    try:
+        texts = {each["id"]: str(each["name"]) for each in content["categories"]}
+        images = {each["id"]: each for each in content["images"]}
+        views = {
+            number: _view(name, str(each["file_name"]), cameras, each.get("height"), each.get("width"))
+            for number, each in images.items()
+        }
+        found: dict[str, list[Label]] = {view: [] for view in views.values()}
+        for row, each in enumerate(content["annotations"]):
+            view = views[each["image_id"]]
+            polygons = _coco_polygons(
+                f"{name}, annotation {row}", each["segmentation"], cameras[view].size_hw
+            )
+            number, has_ids = each.get("thing", 1 + len(found[view])), "thing" in each
+            pieces = [(texts[each["category_id"]], None, polygon, each) for polygon in polygons]
+            if pieces:
+                found[view].append(_label(name, number, pieces, has_ids))
+    except (TypeError, KeyError) as error:
+        raise SceneError(f"{name} is not a COCO file: {error!r} is missing or of another type") from error
+    return {view: labels for view, labels in found.items() if labels}
+
+
+def _coco_polygons(where: str, value: Any, size_hw: tuple[int, int]) -> list[np.ndarray]:
+    """Flat lists x1, y1, x2, ..., or run lengths, plain or compressed."""
+    if isinstance(value, list):
+        return [np.array(flat, np.float64).reshape(-1, 2) for flat in value]
+    counts = value["counts"]
+    if tuple(value["size"]) != tuple(size_hw):
+        raise SceneError(
+            f"{where} does not fit its photograph", expected=f"size {list(size_hw)}", found=value["size"]
+        )
+    runs = unpacked_counts(counts) if isinstance(counts, str) else [int(count) for count in counts]
+    if sum(runs) != size_hw[0] * size_hw[1] or min(runs, default=0) < 0:
+        raise SceneError(f"{where}: its run lengths do not fill the photograph", found=f"{sum(runs)} px")
+    return trace_polygons(_from_counts(runs, size_hw))
+
+
+def _from_counts(runs: Sequence[int], size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    """Inverse of `viewer.exports.coco_counts`."""
+    values = np.arange(len(runs)) % 2 == 1
+    return np.ascontiguousarray(np.repeat(values, runs).reshape(size_hw[::-1]).T)
+
+
+def unpacked_counts(text: str) -> list[int]:
+    """COCO's compressed run lengths.
+
+    Five bits a character, low bits first; from the fourth run on, differences from the last but one.
+    """
+    runs: list[int] = []
+    value = shift = 0
+    for character in text:
+        bits = ord(character) - 48
+        value |= (bits & 31) << shift
+        shift += 5
+        if bits & 32:
+            continue
+        if bits & 16:
+            value -= 1 << shift
+        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+        value = shift = 0
+    return runs
+
+
+def _view(name: str, image: str, cameras: Cameras, height: Any, width: Any) -> str:
+    """View of a file, by the name of its photograph without folder and suffix.
+
+    Raises:
+        SceneError: the scene has no such view, or the file was made for another size.
+    """
+    stem = Path(image.replace("\\", "/")).stem
+    view = next((each for each in cameras.names if Path(each).stem == stem), None)
+    if view is None:
+        raise SceneError(
+            f"{name} belongs to no photograph of this scene",
+            expected=f"such as {cameras.names[0]}",
+            found=image,
+        )
+    size_hw = cameras[view].size_hw
+    if (height, width) != (None, None) and (height, width) != tuple(size_hw):
+        raise SceneError(
+            f"{name} does not fit its photograph",
+            expected=f"{size_hw[1]} x {size_hw[0]} px (width x height), undistorted",
+            found=f"{width} x {height} px",
+        )
+    return view

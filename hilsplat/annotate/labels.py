@@ -1,0 +1,223 @@
+"""Annotations of one view: what a thing is called, its level and parent, and which pixels it has.
+
+A file per view in the format of `datasets.images.hi`; the same thing has the same id in all views. Polygons
+have whole pixels as vertices, so that what is drawn is what evaluation fills.
+"""
+
+import json
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import Bool
+from pydantic import Field
+
+from hilsplat.base.artifacts import output_lock, sha256_of_bytes, write_text
+from hilsplat.base.errors import ArtifactError, SceneError, SettingsError
+from hilsplat.base.levels import Level
+from hilsplat.datasets.images.hi import by_id, parents_of
+from hilsplat.datasets.images.isat import IsatFile, read_isat
+from hilsplat.datasets.images.polygons import fill_polygons, trace_polygons
+from hilsplat.viewer.wire import MAX_SIDE_PX, Message, Text
+
+NO_FILE = "none"
+"""Version of a view without a file."""
+
+Origin = Literal["drawn", "edited", "accepted", "proposed"]
+Place = Annotated[int, Field(ge=-MAX_SIDE_PX, le=2 * MAX_SIDE_PX)]
+Ring = Annotated[list[tuple[Place, Place]], Field(min_length=1, max_length=20_000)]
+Rings = Annotated[list[Ring], Field(max_length=2000)]
+
+
+class Label(Message):
+    """One thing in one view.
+
+    Attributes:
+        id: the same in all views that show the thing.
+        level: 1 whole, 2 part, 3 subpart.
+        parent: id of a thing one level up in the same view; None if it has none.
+        text: what one would ask for.
+        polygons: vertices in whole pixels; the region is the union of the filled polygons.
+        origin: drawn by hand; proposed by a node, a mask or another view; accepted as proposed; or a proposal
+            that was edited by hand. What is only proposed is not scored.
+    """
+
+    id: Annotated[int, Field(ge=1, le=1_000_000)]
+    level: Annotated[int, Field(ge=1, le=3)]
+    parent: int | None = None
+    text: Text
+    polygons: Annotated[Rings, Field(min_length=1)]
+    origin: Origin = "drawn"
+
+    def mask(self, size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+        """The region."""
+        return fill_rings(self.polygons, size_hw)
+
+    def with_mask(self, mask: Bool[np.ndarray, "H W"]) -> "Label":
+        """The same thing with other pixels."""
+        return self.model_copy(update={"polygons": traced(mask)})
+
+
+class StaleLabelsError(ArtifactError):
+    """The annotations of a view were changed by someone else since they were read."""
+
+
+def fill_rings(
+    rings: Sequence[Sequence[tuple[int, int]]], size_hw: tuple[int, int]
+) -> Bool[np.ndarray, "H W"]:
+    """Union of polygons."""
+    return fill_polygons([np.array(ring, np.float64).reshape(-1, 2) for ring in rings], size_hw)
+
+
+def traced(mask: Bool[np.ndarray, "H W"]) -> list[list[tuple[int, int]]]:
+    """Polygons of exactly these pixels."""
+    return [[(int(x), int(y)) for x, y in polygon] for polygon in trace_polygons(mask)]
+
+
+def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[Label]:
+    """Cut every child to its parent, wholes first, so that a subpart also stays inside the whole.
+
+    Raises:
+        SettingsError: an id is there twice, a parent is missing or not one level up, or nothing of a thing is
+            inside the image and its parent.
+    """
+    twice = [number for number, count in Counter(label.id for label in labels).items() if count > 1]
+    if twice:
+        raise SettingsError(f"id {twice[0]} is there twice", fix="reload the page")
+    own = {label.id: label for label in labels}
+    masks: dict[int, np.ndarray] = {}
+    cut: dict[int, Label] = {}
+    for label in sorted(labels, key=lambda label: label.level):
+        masks[label.id] = mask = label.mask(size_hw)
+        if not mask.any():
+            raise SettingsError(f"{label.text!r} has no pixel inside the photograph", fix="draw it again")
+        cut[label.id] = label
+        if label.parent is None:
+            continue
+        parent = own.get(label.parent)
+        if parent is None or parent.level != label.level - 1:
+            found = (
+                f"{parent.text!r}, a {Level(parent.level).label}" if parent else "nothing of this photograph"
+            )
+            raise SettingsError(
+                f"the parent of {label.text!r} cannot be its parent",
+                expected=f"a {Level(label.level - 1).label}" if label.level > 1 else "none: it is a whole",
+                found=found,
+                fix="choose another parent or level",
+            )
+        inside = mask & masks[parent.id]
+        if not inside.any():
+            raise SettingsError(
+                f"{label.text!r} lies wholly outside {parent.text!r}",
+                fix="draw it inside, or choose another parent",
+            )
+        if not np.array_equal(inside, mask):
+            masks[label.id], cut[label.id] = inside, label.with_mask(inside)
+    return [cut[label.id] for label in labels]
+
+
+# -- files ----------------------------------------------------------------------------------------
+
+
+def label_path(folder: Path, view: str) -> Path:
+    """File of a view's annotations."""
+    return Path(folder) / f"{Path(view).stem}.json"
+
+
+def version_of(path: Path) -> str:
+    """What a change must name: digest of the file as it was read."""
+    return sha256_of_bytes(path.read_bytes())[:16] if path.is_file() else NO_FILE
+
+
+def read_labels(path: Path, size_hw: tuple[int, int]) -> list[Label]:
+    """Annotations of a view; none if there is no file.
+
+    Raises:
+        SceneError: the file cannot be used, or was drawn on a photograph of another size.
+    """
+    if not path.is_file():
+        return []
+    found = read_isat(path)
+    if found.size_hw != tuple(size_hw):
+        raise SceneError(
+            f"label file {path} does not fit its photograph",
+            expected=f"{size_hw[1]} x {size_hw[0]} px (width x height)",
+            found=f"{found.size_hw[1]} x {found.size_hw[0]} px",
+            fix="annotate the scene that it was drawn on, or move the file away",
+        )
+    return labels_of(found)
+
+
+def labels_of(found: IsatFile) -> list[Label]:
+    """Objects of a file in our format.
+
+    Raises:
+        SceneError: an id or a level cannot be used.
+    """
+    objects = by_id(found)
+    parents = parents_of(found, objects, [])
+    return [
+        Label(
+            id=number,
+            level=thing.keys["level"],
+            parent=parents[number],
+            text=thing.category,
+            polygons=[whole_pixels(polygon) for polygon in thing.polygons],
+            origin=thing.keys.get("origin", "drawn"),
+        )
+        for number, thing in objects.items()
+    ]
+
+
+def whole_pixels(points: np.ndarray) -> list[tuple[int, int]]:
+    """Vertices as the filling truncates them."""
+    return [(int(x), int(y)) for x, y in points]
+
+
+def write_labels(
+    path: Path, view: str, size_hw: tuple[int, int], labels: Sequence[Label], version: str
+) -> str:
+    """Replace the annotations of a view, unless the file has changed since `version` was read.
+
+    A view without annotations has no file.
+
+    Returns:
+        the new version.
+
+    Raises:
+        StaleLabelsError: someone else changed them.
+    """
+    with output_lock(path):
+        if version_of(path) != version:
+            raise StaleLabelsError(
+                f"the annotations of {view} have changed meanwhile", fix="reload the page, then change them"
+            )
+        if labels:
+            write_text(path, as_file(view, size_hw, labels))
+        else:
+            path.unlink(missing_ok=True)
+        return version_of(path)
+
+
+def as_file(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
+    """A view's annotations in our format, one object a line: short files, readable differences."""
+    info = {"name": view, "width": size_hw[1], "height": size_hw[0]}
+    lines = [_compact(_as_object(label)) for label in sorted(labels, key=lambda label: label.id)]
+    return f'{{"info":{_compact(info)},\n"objects":[\n' + ",\n".join(lines) + "\n]}\n"
+
+
+def _as_object(label: Label) -> dict[str, object]:
+    return {
+        "id": label.id,
+        "level": label.level,
+        "parent": label.parent,
+        "category": label.text,
+        "origin": label.origin,
+        "segmentation": label.polygons,
+    }
+
+
+def _compact(value: object) -> str:
+    return json.dumps(value, ensure_ascii=False, separators=(",", ":"))

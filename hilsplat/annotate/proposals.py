@@ -1,0 +1,235 @@
+"""Outlines that a person may accept or correct: nodes, masks of the segmenter, and what other views say.
+
+None of them is an annotation until a person says so: a truth that is the prediction in disguise measures
+nothing.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Bool
+
+from hilsplat.annotate.labels import Label, traced
+from hilsplat.base.errors import SettingsError
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.contributions.compositing import normalised_weights
+from hilsplat.query.names import read_names
+from hilsplat.query.view_store import ViewStore
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.semantic_tree.tree import SemanticTree
+from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.ply import load_ply
+from hilsplat.splat.rasterise.api import pixel_weights
+
+LEAST_PX = 20
+"""Smaller proposals are noise."""
+LEAST_SHARE = 0.05
+"""Pieces and holes of a proposal below this share of it are noise too."""
+SMOOTH_PX = 1.0
+"""A proposal's outline may leave its pixels by this much: fewer vertices to correct."""
+MOST_MASKS = 6
+LEAST_SEEN = 0.25
+"""Share of a pixel that an annotated view must have seen for the pixel to be judged by it."""
+VIEWS_MIB = 512.0
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """An outline and where it comes from.
+
+    Attributes:
+        what: such as "node 12" or "mask 3".
+        text: the node's name, if somebody gave it one.
+        level: of the node or mask.
+        polygons: as in `Label`.
+    """
+
+    what: str
+    text: str
+    level: int
+    polygons: list[list[tuple[int, int]]]
+
+
+class Proposals:
+    """What can be proposed in the views of a scene, as far as its run has come. Not made for threads.
+
+    Args:
+        scene: cameras and photographs.
+        folder: of the scene; Gaussians and a variant's masks and tree are looked for in it.
+        variant: whose masks and tree.
+        threads: number of threads for drawing.
+    """
+
+    def __init__(self, scene: Scene, folder: Path, variant: str, threads: int) -> None:
+        self.scene, self.threads = scene, threads
+        self.masks = Path(folder) / variant / "masks"
+        semantic_tree = Path(folder) / variant / "semantic_tree"
+        ply = Path(folder) / "gaussians.ply"
+        self.gaussians: Gaussians | None = load_ply(ply) if ply.is_file() else None
+        has_tree = self.gaussians is not None and (semantic_tree / "index.json").is_file()
+        self.tree: SemanticTree | None = SemanticTree.load(semantic_tree) if has_tree else None
+        self.names: Mapping[int, str] = read_names(folder, semantic_tree).of_node if has_tree else {}
+        self._kept = ViewStore(VIEWS_MIB)
+
+    @property
+    def of(self) -> str:
+        """What is proposed at a pixel: nodes, masks or nothing."""
+        return "nodes" if self.tree is not None else "masks" if (self.masks / "index.json").is_file() else ""
+
+    def at(self, view: str, x: int, y: int) -> list[Proposal]:
+        """Outlines of what a pixel shows, large ones first.
+
+        Raises:
+            SettingsError: the pixel is outside the photograph.
+        """
+        height, width = self.scene.cameras[view].size_hw
+        if not (0 <= x < width and 0 <= y < height):
+            raise SettingsError(f"({x}, {y}) is outside the photograph", expected=f"below {width} x {height}")
+        if self.tree is not None:
+            return self._nodes_at(view, y * width + x)
+        return self._masks_at(view, x, y)
+
+    def _nodes_at(self, view: str, pixel: int) -> list[Proposal]:
+        assert self.tree is not None
+        weights, size_hw = self._weights(view), self.scene.cameras[view].size_hw
+        row = weights[pixel]
+        found = []
+        for level in LEVELS:
+            nodes = self.tree.node_of_gaussian[:, level.index]
+            share = np.bincount(nodes[row.indices] + 1, row.data, minlength=1)  # entry 0: without a node
+            share[0] = 0
+            node = int(share.argmax()) - 1
+            if node < 0:
+                continue
+            mask = weights @ (nodes == node).astype(np.float32) > 0.5
+            found.append((f"node {node}", self.names.get(node, ""), level, mask.reshape(size_hw)))
+        return _proposals(found)
+
+    def _masks_at(self, view: str, x: int, y: int) -> list[Proposal]:
+        path = self.masks / f"{view}.npz"  # views that were held out have none
+        if not path.is_file():
+            return []
+        masks = HierarchicalMasks.load(path)
+        dense = masks.dense()
+        rows = [int(row) for row in np.argsort(-masks.area_px, kind="stable") if dense[row, y, x]][
+            -MOST_MASKS:
+        ]
+        return _proposals([(f"mask {row}", "", Level(int(masks.level[row])), dense[row]) for row in rows])
+
+    # -- from other views -------------------------------------------------------------------------
+
+    def carried(
+        self, known: Mapping[str, Sequence[Label]], ids: Sequence[int], view: str
+    ) -> list[tuple[Label, list[list[tuple[int, int]]]]]:
+        """Things that other views have, carried into a view by their Gaussians, parents before children.
+
+        A Gaussian belongs to a thing if more than half of what the annotated views see of it lies inside the
+        thing's regions there. Gaussians that none of those views sees say nothing. Children are cut to their
+        parents here.
+
+        Args:
+            known: annotations by view; proposals that nobody accepted are no evidence.
+            ids: things to carry; those that the view has already are left as they are.
+            view: where to.
+
+        Returns:
+            a label of each thing in another view, and its polygons here.
+
+        Raises:
+            SettingsError: the scene has no Gaussians yet.
+        """
+        if self.gaussians is None:
+            raise SettingsError(
+                "the scene has no Gaussians yet to carry annotations by", fix="wait for the run"
+            )
+        size_hw = self.scene.cameras[view].size_hw
+        masks = {label.id: label.mask(size_hw) for label in known.get(view, ())}
+        evidence = {
+            number: shown
+            for number in ids
+            if (
+                shown := [
+                    (other, label)
+                    for other, labels in known.items()
+                    for label in labels
+                    if other != view and label.id == number and label.origin != "proposed"
+                ]
+            )
+        }
+        weights, found = self._weights(view), []
+        for number, shown in sorted(evidence.items(), key=lambda item: item[1][0][1].level):
+            label = shown[0][1]
+            if number in masks or (label.parent is not None and label.parent not in masks):
+                continue
+            belongs, seen = self._members(shown)
+            part, all_seen = weights @ belongs, weights @ seen
+            mask = ((part > 0.5 * all_seen) & (all_seen > LEAST_SEEN)).reshape(size_hw)
+            if label.parent is not None:
+                mask &= masks[label.parent]
+            if (mask := cleaned(mask)).any():
+                if label.parent is not None:
+                    mask &= masks[label.parent]
+                masks[number] = mask
+                found.append((label, traced(mask)))
+        return found
+
+    def _members(self, shown: Sequence[tuple[str, Label]]) -> tuple[np.ndarray, np.ndarray]:
+        """Which Gaussians belong to a thing, and which any of its views sees, as 0 and 1."""
+        assert self.gaussians is not None
+        inside = np.zeros(len(self.gaussians), np.float64)
+        total = np.zeros(len(self.gaussians), np.float64)
+        for view, label in shown:
+            weights = self._weights(view)
+            inside += weights.T @ label.mask(self.scene.cameras[view].size_hw).ravel().astype(np.float32)
+            total += self._seen(view)
+        seen = total > 0
+        return (inside > 0.5 * total).astype(np.float32), seen.astype(np.float32)
+
+    def _seen(self, view: str) -> np.ndarray:
+        """How much of each Gaussian a view shows, px."""
+        weights = self._weights(view)
+        return self._kept.get(
+            ("seen", view), lambda: np.asarray(weights.sum(axis=0)).ravel(), lambda sums: sums.nbytes
+        )
+
+    def _weights(self, view: str) -> sp.csr_matrix:
+        assert self.gaussians is not None
+        gaussians, camera = self.gaussians, self.scene.cameras[view]
+        least = self.tree.min_weight if self.tree is not None else 0.0
+        return self._kept.get(
+            ("weights", view),
+            lambda: normalised_weights(
+                pixel_weights(gaussians, camera, min_weight=least, threads=self.threads)
+            ),
+            lambda kept: kept.data.nbytes + kept.indices.nbytes + kept.indptr.nbytes,
+        )
+
+
+def _proposals(found: Sequence[tuple[str, str, Level, np.ndarray]]) -> list[Proposal]:
+    """Proposals with some pixels; of equal ones only the first."""
+    kept: list[Proposal] = []
+    for what, text, level, mask in found:
+        if (mask := cleaned(mask)).any():
+            polygons = traced(mask)
+            if not any(polygons == other.polygons for other in kept):
+                kept.append(Proposal(what, text, int(level), polygons))
+    return kept
+
+
+def cleaned(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """A mask without specks and pinholes, and with a smoother outline; empty if nothing of size is left."""
+    least = max(LEAST_PX, LEAST_SHARE * np.count_nonzero(mask))
+    contours, ranks = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    canvas = np.zeros(mask.shape, np.uint8)
+    if not contours:
+        return canvas.astype(bool)
+    by_area = sorted(zip(contours, ranks[0], strict=True), key=lambda pair: -cv2.contourArea(pair[0]))
+    for contour, rank in by_area:  # from outside to inside: a hole erases what is around a smaller piece
+        if cv2.contourArea(contour) >= least:
+            cv2.fillPoly(canvas, [cv2.approxPolyDP(contour, SMOOTH_PX, True)], int(rank[3] < 0))
+    return canvas.astype(bool)

@@ -1,0 +1,289 @@
+// The annotation page: which photograph, tool and thing; the server computes every region.
+
+import { $, make } from "./elements.js";
+import { attachHands } from "./hands.js";
+import { get, send } from "./http.js";
+import { Sheet } from "./sheet.js";
+import { Store } from "./store.js";
+import { attachThings, fillForm, level, LEVEL, makeStrip, markStrip, setLevel, showTexts, showThings, under } from "./things.js";
+
+const UNNAMED = "unnamed", NEAR_PX = 8;
+const sheet = new Sheet(), start = new URLSearchParams(location.hash.slice(1));
+let scene, number = 0, chosen = 0, next = { text: "", level: 1, parent: null };
+let draft = [], stroke = null, cross = null, offer = null, working = Promise.resolve();
+
+function tell(text, error = false) { $("status").textContent = text; $("status").classList.toggle("error", error); }
+const store = new Store({ told: tell, changed: refresh });
+const labels = () => store.labels(number);
+const own = () => labels().find((label) => label.id === chosen) ?? null;
+const tool = () => document.querySelector("[name=tool]:checked").value;
+const radius = () => Number($("radius").value);
+const ask = async (path, value) => (await send(path, value)).json();
+// One after the other: a region is made from the one before.
+const soon = (work) => { working = working.then(work).catch((error) => tell(error.message, true)); return working; };
+
+// -- showing ---------------------------------------------------------------------------------------
+
+function draw() {
+  const brushes = tool() === "brush" || tool() === "erase";
+  sheet.hand({ offer, draft, stroke, cross: tool() === "choose" ? null : cross, brush: brushes ? radius() : 0 });
+}
+
+function refresh() {
+  if (!scene || !store.views) return;
+  if (!own()) chosen = 0;
+  fillForm(labels(), own(), next);
+  showThings(labels(), chosen, choose);
+  showTexts(store.things);
+  markStrip(scene.views, store, number);
+  $("undo").disabled = !store.past.length;
+  $("redo").disabled = !store.future.length;
+  $("carry").disabled = !scene.carries;
+  $("saved").textContent = store.unsaved ? "Saving…" : `Saved in ${scene.folder}.`;
+  document.body.dataset.saved = String(!store.unsaved);
+  sheet.things(labels(), chosen);
+  draw();
+}
+
+function choose(id) {
+  chosen = id;
+  drop();
+  refresh();
+}
+
+function drop() {
+  draft = [];
+  stroke = offer = null;
+  $("offers-section").hidden = true;
+}
+
+function stand(to) {
+  number = (to + scene.views.length) % scene.views.length;
+  drop();
+  sheet.show(number, scene.views[number].size_hw);
+  $("picture").alt = scene.views[number].name;
+  history.replaceState(null, "", `${location.pathname}#view=${number}`);
+  refresh();
+  $("views").children[number].scrollIntoView({ block: "nearest", inline: "nearest" });
+  tell(`${scene.views[number].name}${scene.views[number].split === "test" ? ", held out" : ""}`);
+}
+
+function setTool(name) {
+  document.querySelector(`[name=tool][value=${name}]`).checked = true;
+  $("view").dataset.tool = name;
+  drop();
+  draw();
+}
+
+// -- regions ---------------------------------------------------------------------------------------
+
+const edited = (label) => label.origin === "drawn" ? "drawn" : "edited";
+const ringsOf = (id) => labels().find((label) => label.id === id)?.polygons ?? null;
+
+// The same thing as in another photograph keeps its id.
+function idFor(thing) {
+  const same = (label) => label.text.toLowerCase() === thing.text.toLowerCase() && label.level === thing.level && label.parent === thing.parent;
+  for (const [id, label] of store.things) if (thing.text !== UNNAMED && same(label) && !store.has(number, id)) return id;
+  return Math.max(0, ...store.things.keys()) + 1;
+}
+
+function add(thing) {
+  const label = { ...thing, id: idFor(thing) };
+  chosen = label.id;
+  store.change([[number, [...labels(), label]]]);
+  if (label.text === UNNAMED) { $("text").focus(); $("text").select(); }
+}
+
+async function region(ring, brush) {
+  const label = own(), view = number, parent = label ? label.parent : next.parent;
+  if (!label && brush?.erase) { tell("Choose what to erase from.", true); return; }
+  const made = await ask("/api/shape", { view, add: [...(label?.polygons ?? []), ...(ring ? [ring] : [])], stroke: brush, inside: parent ? ringsOf(parent) : null });
+  if (view !== number) return;
+  if (!made.polygons.length) {
+    if (label) remove(); else tell("Nothing of it is inside the photograph and its parent.", true);
+  } else if (label) store.change([[view, labels().map((each) => each.id === label.id ? { ...each, polygons: made.polygons, origin: edited(each) } : each)]]);
+  else add({ ...next, text: next.text || UNNAMED, polygons: made.polygons, origin: "drawn" });
+}
+
+function closePolygon() {
+  const ring = draft.filter(([x, y], k) => !k || x !== draft[k - 1][0] || y !== draft[k - 1][1]);
+  draft = [];
+  if (ring.length > 2) soon(() => region(ring, null));
+  draw();
+}
+
+async function propose([x, y]) {
+  tell("Looking for outlines…");
+  const found = await ask("/api/at", { view: number, x, y });
+  $("offers-section").hidden = !found.length;
+  const preview = (each) => { offer = each?.polygons ?? null; draw(); };
+  $("offers").replaceChildren(...found.map((each) => make("li", {}, make("button", { type: "button", onclick: () => take(each), onpointerenter: () => preview(each), onpointerleave: () => preview(null), onfocus: () => preview(each), onblur: () => preview(null) },
+    each.text ? `${each.text}, ${LEVEL(each)} (${each.what})` : `${LEVEL(each)} (${each.what})`))));
+  tell(found.length ? "Choose an outline; it stays a proposal until you accept or correct it." : `No ${scene.proposes.slice(0, -1)} shows there.`);
+  $("offers").querySelector("button")?.focus();
+}
+
+function take(each) {
+  const above = own(), parent = above?.level === each.level - 1 ? above.id : null;
+  drop();
+  add({ text: each.text || next.text || UNNAMED, level: each.level, parent, polygons: each.polygons, origin: "proposed" });
+}
+
+async function carry() {
+  tell("Looking at the other photographs…");
+  await store.saving;
+  const view = number, ids = [...store.things.keys()].filter((id) => !store.has(view, id));
+  if (!ids.length) { tell("Everything that other photographs have is here already.", true); return; }
+  const found = await ask("/api/carry", { ids, view });
+  if (found.length) store.change([[view, [...store.labels(view), ...found]]]);
+  tell(found.length ? `${found.length} proposed: accept (A), correct or delete each.` : "The other photographs' things do not show here, or have not been accepted there.");
+}
+
+// -- things ----------------------------------------------------------------------------------------
+
+// A thing is one in all photographs: its text, level and parent change everywhere.
+function edit(patch) {
+  if (!own()) { Object.assign(next, patch); refresh(); return; }
+  const id = chosen, after = [];
+  store.views.forEach((view, k) => {
+    if (!store.has(k, id)) return;
+    const mine = { ...patch };
+    if (mine.parent && !store.has(k, mine.parent)) mine.parent = null;
+    after.push([k, view.labels.map((label) => label.id === id ? { ...label, ...mine } : label)]);
+  });
+  store.change(after);
+}
+
+function setText() {
+  const text = $("text").value.trim();
+  if (own() && !text) { refresh(); return; }
+  edit({ text });
+}
+
+function accept() {
+  const right = new Set();
+  for (let label = own(); label; label = labels().find((each) => each.id === label.parent)) right.add(label.id);
+  store.change([[number, labels().map((label) => right.has(label.id) && label.origin === "proposed" ? { ...label, origin: "accepted" } : label)]]);
+}
+
+function remove() {
+  const gone = new Set([chosen, ...under(labels(), chosen)]);
+  store.change([[number, labels().filter((label) => !gone.has(label.id))]]);
+}
+
+function fresh(child = false) {
+  const above = own();
+  if (child && above && above.level < 3) next = { text: "", level: above.level + 1, parent: above.id };
+  else next = { ...next, text: "" };
+  if (!labels().some((label) => label.id === next.parent)) next.parent = null;
+  choose(0);
+  $("text").focus();
+}
+
+async function take_in(files) {
+  const after = new Map();
+  for (const file of files) {
+    for (const [key, found] of Object.entries(await ask("/api/import", { name: file.name, text: await file.text() }))) {
+      const view = Number(key), shown = after.get(view) ?? store.labels(view), taken = new Set(shown.map((label) => label.id));
+      const free = Math.max(0, ...store.things.keys(), ...taken, ...found.map((label) => label.id)), clash = found.some((label) => taken.has(label.id)) ? free : 0;
+      after.set(view, [...shown, ...found.map((label) => ({ ...label, id: label.id + clash, parent: label.parent && label.parent + clash }))]);
+    }
+  }
+  store.change([...after]);
+  tell(`Imported into ${after.size} photograph${after.size === 1 ? "" : "s"}.`);
+}
+
+// -- hands -----------------------------------------------------------------------------------------
+
+function down(at, event) {
+  $("view").focus({ preventScroll: true });
+  cross = at;
+  if (tool() === "choose") {
+    const hit = event && document.elementFromPoint(event.clientX, event.clientY)?.closest("[data-id]");
+    choose(hit ? Number(hit.dataset.id) : 0);
+  } else if (tool() === "polygon") {
+    const near = draft.length > 2 && Math.hypot(at[0] - draft[0][0], at[1] - draft[0][1]) * sheet.scale < NEAR_PX;
+    if (near) closePolygon(); else draft = [...draft, at];
+  } else if (tool() === "propose") soon(() => propose(at));
+  else stroke = { points: [at], radius: radius(), erase: tool() === "erase" };
+  draw();
+}
+
+function drag(at) {
+  cross = at;
+  const last = stroke?.points.at(-1);
+  if (stroke && (at[0] !== last[0] || at[1] !== last[1])) stroke.points.push(at);
+  draw();
+}
+
+function up() {
+  const done = stroke;
+  if (done) soon(async () => { await region(null, done); if (stroke === done) stroke = null; draw(); });
+}
+
+attachHands(sheet, { drawing: () => tool() !== "choose", down, drag, up, close: closePolygon, hover: (at) => { cross = at; draw(); } });
+attachThings(choose);
+
+function escape() {
+  if (draft.length || stroke || !$("offers-section").hidden) drop();
+  else if (chosen) choose(0);
+  draw();
+}
+
+document.addEventListener("keydown", (event) => {
+  if (document.querySelector("dialog[open]")) return;
+  if (event.key === "Escape") { escape(); $("view").focus(); return; }
+  const typing = event.target.closest("input:not([type=radio]):not([type=range]), select");
+  if (typing) { if (event.key === "Enter" && event.target.id === "text") { event.target.blur(); $("view").focus(); event.preventDefault(); } return; }
+  const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+  if ((event.ctrlKey || event.metaKey) && key === "z") { if (event.shiftKey) store.redo(); else store.undo(); event.preventDefault(); return; }
+  if (event.ctrlKey || event.metaKey || event.altKey) return;
+  const arrow = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[key], onView = event.target === $("view") || event.target === document.body;
+  const by = event.shiftKey ? 10 : 1;
+  const keys = {
+    v: () => setTool("choose"), p: () => setTool("polygon"), b: () => setTool("brush"), e: () => setTool("erase"), x: () => scene.proposes && setTool("propose"),
+    n: () => fresh(), j: () => fresh(true), t: () => { $("text").focus(); $("text").select(); }, a: () => own()?.origin === "proposed" && accept(), c: () => scene.carries && soon(carry),
+    Delete: () => own() && remove(), Backspace: () => { draft = draft.slice(0, -1); draw(); }, "[": () => stand(number - 1), "]": () => stand(number + 1),
+    ",": () => resize(-1), ".": () => resize(1), "+": () => sheet.zoom(1.25), "=": () => sheet.zoom(1.25), "-": () => sheet.zoom(0.8), 0: () => sheet.fit(), "?": () => $("help").showModal(),
+    1: () => pickLevel(1), 2: () => pickLevel(2), 3: () => pickLevel(3),
+  };
+  if (onView && arrow) { cross = sheet.inside((cross ?? sheet.size.map((side) => side / 2)).map((value, k) => value + by * arrow[k])); drag(cross); }
+  else if (onView && key === " ") { down(cross ?? sheet.inside(sheet.size.map((side) => side / 2)), null); if (stroke) up(); }
+  else if (onView && key === "Enter") closePolygon();
+  else if (keys[key] && !(event.target.closest("button, [role=treeitem]") && key === "Enter")) keys[key]();
+  else return;
+  event.preventDefault();
+});
+
+const resize = (by) => { $("radius").value = radius() + by; draw(); };
+const pickLevel = (value) => { setLevel(value); levelChanged(); };
+// A level keeps its parent only where one of that level can be it.
+const levelChanged = () => edit({ level: level(), parent: null });
+
+$("thing").addEventListener("submit", (event) => event.preventDefault());
+$("text").addEventListener("change", setText);
+for (const radio of document.querySelectorAll("[name=level]")) radio.addEventListener("change", levelChanged);
+$("parent").addEventListener("change", () => edit({ parent: Number($("parent").value) || null }));
+for (const radio of document.querySelectorAll("[name=tool]")) radio.addEventListener("change", () => setTool(tool()));
+for (const [id, work] of Object.entries({ new: () => fresh(), child: () => fresh(true), accept, delete: remove, undo: () => store.undo(), redo: () => store.redo(),
+  carry: () => soon(carry), import: () => $("file").click(), "help-button": () => $("help").showModal() })) $(id).addEventListener("click", work);
+$("file").addEventListener("change", () => { const files = [...$("file").files]; $("file").value = ""; $("save").open = false; soon(() => take_in(files)); });
+$("radius").addEventListener("input", draw);
+window.addEventListener("beforeunload", (event) => { if (store.unsaved) event.preventDefault(); });
+
+async function begin() {
+  scene = await (await get("/api/scene")).json();
+  const name = scene.name.split("/").at(-1);
+  document.title = `Annotate ${name} · hilsplat`;
+  $("propose-label").hidden = !scene.proposes;
+  $("about").textContent = `${scene.name}${scene.proposes ? `. Proposals: ${scene.proposes}` : ""}${scene.carries ? ", and what other photographs have" : ""}.`;
+  makeStrip(scene.views, stand);
+  await store.load();
+  const first = store.views.findIndex((view) => view.labels.length);
+  stand(Number(start.get("view") ?? Math.max(0, first)) || 0);
+  setTool("choose");
+  document.body.dataset.ready = "yes";
+}
+
+globalThis.hilsplat = { store, sheet };   // what tests read
+begin().catch((error) => { tell(error.message, true); document.body.dataset.ready = "failed"; });

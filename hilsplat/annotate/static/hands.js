@@ -1,0 +1,48 @@
+// Mouse, pen and touch on the photograph. One pointer draws with the tool; the right button or two move, wheel and pinch zoom.
+
+export function attachHands(sheet, { drawing, down, drag, up, hover, close }) {
+  const host = sheet.host, pointers = new Map();
+  let acting = false, apart = 0;
+
+  host.addEventListener("pointerdown", (event) => {
+    host.setPointerCapture(event.pointerId);
+    pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, moved: 0 });
+    if (pointers.size === 2) { if (acting) up(null); acting = false; apart = 0; return; }
+    acting = event.button === 0 && drawing();
+    if (acting) down(sheet.pixel(event), event);
+  });
+
+  host.addEventListener("pointermove", (event) => {
+    const last = pointers.get(event.pointerId);
+    if (!last) { hover(sheet.pixel(event)); return; }
+    const dx = event.clientX - last.x, dy = event.clientY - last.y;
+    Object.assign(last, { x: event.clientX, y: event.clientY, moved: last.moved + Math.abs(dx) + Math.abs(dy) });
+    if (acting) { for (const each of event.getCoalescedEvents?.() ?? [event]) drag(sheet.pixel(each)); return; }
+    host.classList.add("moving");
+    if (pointers.size === 2) {
+      const [a, b] = [...pointers.values()], now = Math.hypot(a.x - b.x, a.y - b.y), box = host.getBoundingClientRect();
+      if (apart) sheet.zoom(now / apart, (a.x + b.x) / 2 - box.left, (a.y + b.y) / 2 - box.top);
+      apart = now;
+      sheet.move(dx / 2, dy / 2);
+    } else sheet.move(dx, dy);
+  });
+
+  const ended = (event) => {
+    const last = pointers.get(event.pointerId);
+    pointers.delete(event.pointerId);
+    host.classList.remove("moving");
+    if (acting) up(event.type === "pointerup" ? sheet.pixel(event) : null);
+    else if (event.type === "pointerup" && last?.moved < 4 && event.button === 0) down(sheet.pixel(event), event);
+    acting = false;
+  };
+  host.addEventListener("pointerup", ended);
+  host.addEventListener("pointercancel", ended);
+  host.addEventListener("pointerleave", () => hover(null));
+  host.addEventListener("dblclick", close);
+  host.addEventListener("contextmenu", (event) => event.preventDefault());
+  host.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    const box = host.getBoundingClientRect();
+    sheet.zoom(Math.exp(-0.0015 * event.deltaY * (event.deltaMode ? 30 : 1)), event.clientX - box.left, event.clientY - box.top);
+  }, { passive: false });
+}

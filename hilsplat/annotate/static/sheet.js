@@ -1,0 +1,87 @@
+// The photograph and what is drawn on it: zoom, places in its pixels, outlines.
+
+import { $ } from "./elements.js";
+import { colourOf } from "./styles.js";
+
+const NS = "http://www.w3.org/2000/svg";
+export const colour = (id) => `rgb(${colourOf(id).join(" ")})`;
+
+export function element(name, attributes) {
+  const made = document.createElementNS(NS, name);
+  for (const [key, value] of Object.entries(attributes)) if (value !== null) made.setAttribute(key, value);
+  return made;
+}
+
+// Vertices are whole pixels; their centres are at .5.
+export const outline = (polygons) => polygons.map((ring) => `M${ring.map(([x, y]) => `${x + 0.5} ${y + 0.5}`).join("L")}Z`).join("");
+
+export class Sheet {
+  constructor() {
+    this.host = $("view");
+    this.scale = 1;
+    this.x = this.y = 0;
+    new ResizeObserver(() => this.fit()).observe(this.host);
+  }
+
+  show(number, [height, width]) {
+    this.size = [width, height];
+    $("picture").src = `/api/photo/${number}`;
+    for (const each of [$("picture"), $("drawing")]) { each.setAttribute("width", width); each.setAttribute("height", height); }
+    $("drawing").setAttribute("viewBox", `0 0 ${width} ${height}`);
+    this.fit();
+  }
+
+  fit() {
+    if (!this.size) return;
+    const { clientWidth: w, clientHeight: h } = this.host;
+    this.scale = Math.min(w / this.size[0], h / this.size[1]);
+    this.x = (w - this.scale * this.size[0]) / 2;
+    this.y = (h - this.scale * this.size[1]) / 2;
+    this.place();
+  }
+
+  place() {
+    $("sheet").style.transform = `translate(${this.x}px, ${this.y}px) scale(${this.scale})`;
+    $("sheet").classList.toggle("near", this.scale > 2);
+  }
+
+  move(dx, dy) { this.x += dx; this.y += dy; this.place(); }
+
+  zoom(factor, x = this.host.clientWidth / 2, y = this.host.clientHeight / 2) {
+    const scale = Math.min(40, Math.max(0.1, this.scale * factor)), by = scale / this.scale;
+    this.x = x - by * (x - this.x);
+    this.y = y - by * (y - this.y);
+    this.scale = scale;
+    this.place();
+  }
+
+  // Pixel of the photograph under a place of the page, kept inside.
+  pixel(event) {
+    const box = this.host.getBoundingClientRect();
+    return this.inside([(event.clientX - box.left - this.x) / this.scale, (event.clientY - box.top - this.y) / this.scale]);
+  }
+
+  inside(at) { return at.map((value, k) => Math.max(0, Math.min(this.size[k] - 1, Math.floor(value)))); }
+
+  // The things, which change rarely.
+  things(labels, chosen) {
+    $("outlines").replaceChildren(...[...labels].sort((a, b) => a.level - b.level).map((label) => element("path", { d: outline(label.polygons), "data-id": label.id,
+      class: `thing ${label.origin === "proposed" ? "proposed" : ""} ${label.id === chosen ? "chosen" : ""}`, fill: colour(label.id), stroke: colour(label.id) })));
+  }
+
+  // What a hand is doing, at most once a frame.
+  hand(state) {
+    if (!this.waiting) requestAnimationFrame(() => { const last = this.waiting; this.waiting = null; this.drawHand(last); });
+    this.waiting = state;
+  }
+
+  drawHand({ offer, draft, stroke, cross, brush }) {
+    const made = [], middle = ([x, y]) => `${x + 0.5} ${y + 0.5}`, arm = 9 / this.scale;
+    if (offer) made.push(element("path", { d: outline(offer), class: "offer" }));
+    if (draft.length) made.push(element("path", { d: `M${draft.map(middle).join("L")}${draft.length > 2 ? "Z" : ""}`, class: "draft" }), element("circle", { cx: draft[0][0] + 0.5, cy: draft[0][1] + 0.5, r: 4 / this.scale, class: "draft" }));
+    if (stroke) made.push(element("path", { d: `M${[...stroke.points, stroke.points.at(-1)].map(middle).join("L")}`, class: `stroke ${stroke.erase ? "erase" : ""}`, "stroke-width": 2 * stroke.radius + 1 }));
+    if (cross && brush) made.push(element("circle", { cx: cross[0] + 0.5, cy: cross[1] + 0.5, r: brush, class: "cross" }));
+    else if (cross) made.push(element("path", { d: `M${cross[0] + 0.5 - arm} ${cross[1] + 0.5}h${2 * arm}M${cross[0] + 0.5} ${cross[1] + 0.5 - arm}v${2 * arm}`, class: "cross" }));
+    $("hand").replaceChildren(...made);
+  }
+}

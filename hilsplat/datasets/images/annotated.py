@@ -1,0 +1,67 @@
+"""Annotations of your own scenes, in the format of `hi.py`, as `hilsplat annotate` writes them.
+
+The photographs are the undistorted ones of the scene itself (`results/<dataset>/<scene>/scene/images`), so
+there is nothing beside the label files; evaluation compares their size with the scene's cameras.
+"""
+
+from pathlib import Path
+
+from hilsplat.datasets.dataset import Dataset
+from hilsplat.datasets.images.hi import regions_of
+from hilsplat.datasets.images.isat import read_isat
+from hilsplat.datasets.images.lerf_ovs import label_files
+from hilsplat.datasets.labelled import LabelledRegion, LabelledScene
+
+LAYOUT = """\
+annotated/
+  <dataset>/<scene>/DSC_0001.json ...   our format (docs/datasets.md), a file per annotated photograph
+"""
+
+
+def open_scene(root: Path, scene: str) -> LabelledScene:
+    """Read the annotations of a scene: one region per object that was drawn or accepted.
+
+    Args:
+        root: the folder `annotated`.
+        scene: such as "photos/desk".
+
+    Raises:
+        SceneError: there are none, or a label file cannot be used.
+    """
+    DATASET.require(root, scene)
+    warnings: list[str] = []
+    views: dict[str, tuple[LabelledRegion, ...]] = {}
+    for view, path in label_files(Path(root) / scene).items():
+        labels = read_isat(path)
+        warnings.extend(labels.warnings)
+        views[view] = regions_of(labels, warnings)
+    prompts = tuple(sorted({region.text for regions in views.values() for region in regions}))
+    return LabelledScene("annotated", scene, {}, None, views, prompts, tuple(warnings))
+
+
+class Annotated(Dataset):
+    """A data set without published scenes: its scenes are those that somebody has annotated."""
+
+    def found(self, root: Path) -> tuple[str, ...]:
+        """Scenes with a label file below the folder."""
+        files = Path(root).glob("*/*/*.json")
+        return tuple(sorted({f"{path.parent.parent.name}/{path.parent.name}" for path in files}))
+
+    def _has_begun(self, root: Path) -> bool:
+        return bool(self.found(root))
+
+
+DATASET = Annotated(
+    name="annotated",
+    title="Own annotations",
+    labels="images",
+    folder="annotated",
+    scenes=(),
+    licence="yours; the photographs keep theirs",
+    terms="Draw them with: hilsplat annotate SCENE",
+    citation="none",
+    layout=LAYOUT,
+    required=lambda scene: (scene,),
+    open=open_scene,
+    label_places=lambda scene: (f"{scene}/*.json",),
+)

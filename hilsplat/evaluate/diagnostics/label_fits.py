@@ -1,0 +1,181 @@
+"""How well masks and nodes fit annotated regions, by level and whatever they are called.
+
+The best IoU of any mask or node with a region needs no text and so no CLIP: it says what a perfect query
+could still get from them.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Bool, Float32, Float64
+
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.progress import stage_log, track
+from hilsplat.base.tables import markdown_table, write_csv
+from hilsplat.contributions.compositing import normalised_weights
+from hilsplat.datasets.labelled import LabelledRegion
+from hilsplat.datasets.registry import open_labelled
+from hilsplat.evaluate.truths import labelled_truths
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.origin import masks_label
+from hilsplat.semantic_tree.tree import SemanticTree
+from hilsplat.splat.ply import load_ply
+from hilsplat.splat.rasterise.api import pixel_weights
+
+FIT_IOU = 0.5
+COLUMNS = (
+    "scene",
+    "what",
+    "views",
+    "level",
+    "regions",
+    "best_iou",
+    "recall",
+    "any_level_iou",
+    "any_level_recall",
+    "containment",
+)
+
+
+@dataclass
+class Fits:
+    """Regions of one level, over some views.
+
+    Attributes:
+        best: IoU of the best mask or node of the same level, a region each; 0 if there is none.
+        anywhere: the same over all levels.
+        containment: of each region with an annotated parent, the share of its best mask inside the parent's.
+    """
+
+    best: list[float] = field(default_factory=list)
+    anywhere: list[float] = field(default_factory=list)
+    containment: list[float] = field(default_factory=list)
+
+    def row(self) -> list[str]:
+        """Number of regions, means, and shares that fit."""
+        best, anywhere = np.array(self.best), np.array(self.anywhere)
+        shares = [best.mean(), (best >= FIT_IOU).mean(), anywhere.mean(), (anywhere >= FIT_IOU).mean()]
+        nested = f"{np.mean(self.containment):.3f}" if self.containment else ""
+        return [str(len(best)), *(f"{share:.3f}" for share in shares), nested]
+
+
+def add_view(
+    fits: Mapping[Level, Fits],
+    regions: list[tuple[LabelledRegion, Bool[np.ndarray, "H W"]]],
+    found: Mapping[Level, Bool[np.ndarray, "M P"]],
+) -> None:
+    """Compare the regions of a view with what was found there at each level."""
+    ious = {
+        level: region_ious(np.stack([mask.ravel() for _, mask in regions]), found[level]) for level in LEVELS
+    }
+    bests: dict[tuple[str, ...], np.ndarray] = {}
+    for row, (region, _) in enumerate(regions):
+        level = region.level
+        if level is None:
+            continue
+        own = ious[level][row]
+        fits[level].best.append(float(own.max(initial=0)))
+        fits[level].anywhere.append(max(float(ious[each][row].max(initial=0)) for each in LEVELS))
+        if own.max(initial=0) > 0:
+            bests[region.path] = found[level][int(own.argmax())]
+    for region, _ in regions:  # a path that two things share stands for the last of them
+        parent, child = bests.get(region.path[:-1]), bests.get(region.path)
+        if region.level is not None and len(region.path) > 1:
+            inside = 0.0 if parent is None or child is None else float((parent & child).sum() / child.sum())
+            fits[region.level].containment.append(inside)
+
+
+def region_ious(
+    regions: Bool[np.ndarray, "R P"], masks: Bool[np.ndarray, "M P"]
+) -> Float64[np.ndarray, "R M"]:
+    """IoU of every region with every mask; both may overlap among themselves."""
+    shared = regions.astype(np.float32) @ masks.T.astype(np.float32)
+    union = regions.sum(axis=1)[:, None] + masks.sum(axis=1)[None] - shared
+    return np.divide(shared, union, out=np.zeros(shared.shape), where=union > 0)
+
+
+def masks_of_view(folder: Path, view: str) -> dict[Level, np.ndarray]:
+    """The segmenter's masks by level."""
+    masks = HierarchicalMasks.load(folder / f"{view}.npz")
+    dense = {level: masks.dense(masks.rows_of(level)) for level in LEVELS}
+    return {level: each.reshape(len(each), -1) for level, each in dense.items()}
+
+
+def nodes_of_view(tree: SemanticTree, weights: sp.csr_matrix) -> dict[Level, np.ndarray]:
+    """Pixels of which each node makes up more than half, by level; nodes that the view does not show are left
+    out."""
+    found = {}
+    for level in LEVELS:
+        nodes = tree.node_of_gaussian[:, level.index]
+        rows = np.flatnonzero(nodes >= 0)
+        member = sp.csr_matrix(
+            (np.ones(len(rows), np.float32), (rows, nodes[rows])), shape=(len(nodes), len(tree))
+        )
+        shares = (weights @ member).tocsc()
+        chosen = [node for node in range(len(tree)) if (share_of(shares, node) > 0.5).any()]
+        masks = np.zeros((len(chosen), weights.shape[0]), bool)
+        for row, node in enumerate(chosen):
+            begin, end = shares.indptr[node : node + 2]
+            masks[row, shares.indices[begin:end][shares.data[begin:end] > 0.5]] = True
+        found[level] = masks
+    return found
+
+
+def share_of(shares: sp.csc_matrix, node: int) -> Float32[np.ndarray, " e"]:
+    """Shares of a node in the pixels that show any of it."""
+    begin, end = shares.indptr[node : node + 2]
+    return shares.data[begin:end]
+
+
+def run_label_fits(
+    folder: Path, variant: str, labels: str, data_root: Path, out: Path, threads: int = 1
+) -> str:
+    """Write and return a table: masks where the segmenter made some, nodes in all annotated views.
+
+    Args:
+        folder: of the scene, with `scene`, `gaussians.ply` and the variant's `masks` and `semantic_tree`.
+        variant: whose masks and tree.
+        labels: labels with levels, such as "annotated/photos/desk".
+        data_root: folder of the data sets.
+        out: CSV.
+        threads: for rendering.
+
+    Raises:
+        SceneError: the labels cannot be read, or do not fit the scene.
+        ArtifactError: a part of the scene is missing.
+    """
+    folder, scene = Path(folder), Scene.load(folder / "scene")
+    labelled, masks = open_labelled(labels, data_root), folder / variant / "masks"
+    labelled_truths(labelled, scene)  # checks that they fit
+    tree, gaussians = (
+        SemanticTree.load(folder / variant / "semantic_tree"),
+        load_ply(folder / "gaussians.ply"),
+    )
+    fits: dict[tuple[str, str], dict[Level, Fits]] = {}
+    with stage_log("label_fits", scene.name) as counts:
+        for view in track(list(labelled.views), "views compared"):
+            camera = scene.cameras[view]
+            regions = [(region, region.mask(camera.size_hw)) for region in labelled.views[view]]
+            split = "held out" if scene.split[view] == "test" else "training"
+            for what, found in _found(masks, view, tree, gaussians, camera, threads):
+                add_view(fits.setdefault((what, split), {level: Fits() for level in LEVELS}), regions, found)
+        counts["views"] = len(labelled.views)
+    rows = [
+        [scene.name, what, split, level.label, *each[level].row()]
+        for (what, split), each in sorted(fits.items())
+        for level in LEVELS
+        if each[level].best
+    ]
+    write_csv(out, COLUMNS, rows)
+    return markdown_table(COLUMNS, rows, 4)
+
+
+def _found(masks, view, tree, gaussians, camera, threads) -> Iterator[tuple[str, dict[Level, np.ndarray]]]:
+    if (masks / f"{view}.npz").is_file():
+        yield f"masks, {masks_label(masks)}", masks_of_view(masks, view)
+    weights = pixel_weights(gaussians, camera, min_weight=tree.min_weight, threads=threads)
+    yield "nodes", nodes_of_view(tree, normalised_weights(weights))

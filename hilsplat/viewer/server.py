@@ -1,0 +1,189 @@
+"""What the pages' servers share: static files, answers, errors, photographs, a socket on this machine."""
+
+import json
+import secrets
+import socket
+import webbrowser
+from collections.abc import Awaitable, Callable
+from importlib.resources import files
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from pydantic import BaseModel, ValidationError
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
+
+from hilsplat.base.errors import HilsplatError, SettingsError
+from hilsplat.base.images import resize_to_fit
+from hilsplat.scene.scene import Scene
+from hilsplat.viewer.guard import MAX_BODY_BYTES, Guard
+
+TYPES = {"html": "text/html; charset=utf-8", "js": "text/javascript", "css": "text/css"}
+BYTES = "application/octet-stream"
+THUMB_PX = 160
+Sent = TypeVar("Sent", bound=BaseModel)
+
+
+def static_files(package: str = "hilsplat.viewer") -> dict[str, bytes]:
+    """Files of a page by name: nothing else can be asked for."""
+    folder = files(package) / "static"
+    return {each.name: each.read_bytes() for each in folder.iterdir() if each.name.endswith(tuple(TYPES))}
+
+
+class Pages:
+    """A page and its static files, by a fixed list of names."""
+
+    def __init__(self, page: str, static: dict[str, bytes]) -> None:
+        self.first, self.static = page, static
+
+    def routes(self) -> list[Route]:
+        """Where they are."""
+        return [Route("/", self.page), Route("/static/{name}", self.static_file)]
+
+    async def page(self, request: Request) -> Response:
+        """The page."""
+        return plain(self.static[self.first], TYPES["html"])
+
+    async def static_file(self, request: Request) -> Response:
+        """A script or style of the page."""
+        name = request.path_params["name"]
+        if name not in self.static:
+            return plain(b"no such file", "text/plain", 404)
+        return plain(self.static[name], TYPES[name.rpartition(".")[2]])
+
+
+def guarded(routes: list[Route], token: str, stale: type[Exception], max_body: int = MAX_BODY_BYTES) -> Guard:
+    """The application: errors become text for the page; `stale` says that a version is no longer the last."""
+    handlers: dict[Any, Any] = {
+        stale: _told(412),
+        HilsplatError: _told(422),
+        ValidationError: _told(400),
+    }
+    return Guard(Starlette(routes=routes, exception_handlers=handlers), token, max_body)
+
+
+# -- answers --------------------------------------------------------------------------------------
+
+
+def as_json(value: Any) -> bytes:
+    """JSON as the page reads it."""
+    return json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
+
+
+async def read(request: Request, kind: type[Sent]) -> Sent:
+    """What the page sent, checked."""
+    return kind.model_validate_json(await request.body())
+
+
+def answer_json(value: Any) -> Response:
+    """A value for the page."""
+    return plain(as_json(value), "application/json")
+
+
+def plain(data: bytes, kind: str, status: int = 200, *, cached: bool = False) -> Response:
+    """Bytes for the page."""
+    lasting = "private, max-age=3600" if cached else "no-store"
+    return Response(data, status, headers={"content-type": kind, "cache-control": lasting})
+
+
+def _told(status: int) -> Callable[[Request, Exception], Awaitable[Response]]:
+    """A handler that sends the error to the page, as text."""
+
+    async def tell(request: Request, error: Exception) -> Response:
+        if isinstance(error, ValidationError):
+            first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+            text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        else:
+            text = str(error)
+        return plain(as_json({"error": text}), "application/json", status)
+
+    return tell
+
+
+# -- photographs ----------------------------------------------------------------------------------
+
+
+def view_name(scene: Scene, number: int) -> str:
+    """The view with this number: no name comes from the page.
+
+    Raises:
+        SettingsError: there is none.
+    """
+    names = scene.cameras.names
+    if not 0 <= number < len(names):
+        raise SettingsError(f"view {number} does not exist", expected=f"0 to {len(names) - 1}")
+    return names[number]
+
+
+def photograph(scene: Scene, number: int) -> Response:
+    """An undistorted photograph."""
+    path = scene.image_path(view_name(scene, number))
+    kind = "image/png" if path.suffix.lower() == ".png" else "image/jpeg"
+    return plain(path.read_bytes(), kind, cached=True)
+
+
+def thumbnail(scene: Scene, number: int) -> Response:
+    """A small photograph."""
+    small = resize_to_fit(scene.image(view_name(scene, number)), THUMB_PX)
+    return plain(encoded(small), "image/jpeg", cached=True)
+
+
+def encoded(pixels: UInt8[np.ndarray, "H W 3"], kind: str = "jpeg", quality: int = 80) -> bytes:
+    """An image as the bytes of a JPEG or PNG."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if kind == "jpeg" else []
+    made, data = cv2.imencode(".jpg" if kind == "jpeg" else ".png", pixels[..., ::-1], options)
+    assert made
+    return data.tobytes()
+
+
+# -- the socket -----------------------------------------------------------------------------------
+
+
+def listening_at(port: int) -> socket.socket:
+    """A socket that listens on this machine alone; 0: at any free port.
+
+    Raises:
+        SettingsError: the port is taken.
+    """
+    # Named as TCP, or asyncio leaves Nagle's algorithm on, and answers wait 40 ms for an acknowledgement.
+    made = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        made.bind(("127.0.0.1", port))
+    except OSError as error:
+        made.close()
+        raise SettingsError(
+            f"port {port} cannot be used: {error}", fix="choose another, or leave it out"
+        ) from error
+    made.listen()  # before the address is printed: whoever connects at once waits instead of being refused
+    return made
+
+
+def serve(
+    app: Callable[[str], Guard], about: str, *, port: int, browser: bool, told: Callable[[str], None]
+) -> None:
+    """Serve an application on this machine until Ctrl-C.
+
+    Args:
+        app: makes it, given the token that opens it.
+        about: what the page shows, for the printed line.
+        port: 0: any that is free.
+        browser: whether to open the page in a browser.
+        told: gets the address, once the page can be opened.
+
+    Raises:
+        SettingsError: the port is taken.
+    """
+    import uvicorn
+
+    token, listening = secrets.token_urlsafe(24), listening_at(port)
+    address = f"http://127.0.0.1:{listening.getsockname()[1]}/?token={token}"
+    config = uvicorn.Config(app(token), log_level="warning", access_log=False, server_header=False)
+    told(f"{about} at {address}\nCtrl-C ends it")
+    if browser:
+        webbrowser.open(address)
+    uvicorn.Server(config).run(sockets=[listening])

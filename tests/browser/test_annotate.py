@@ -1,0 +1,217 @@
+"""Annotating by hand in a real browser, by role and label as people find things."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilsplat.annotate.labels import Label, label_path, read_labels, version_of, write_labels
+from hilsplat.datasets.registry import open_labelled
+from tests.browser.conftest import serving
+from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, WIDTH, region_mask
+
+SIZE = (HEIGHT, WIDTH + NUM_VIEWS)
+
+
+@pytest.fixture
+def root(tmp_path) -> Path:
+    """Where annotations are written."""
+    return tmp_path
+
+
+@pytest.fixture
+def page(opened, browser, desk, root) -> Iterator:
+    with serving(desk, "annotate", "--data-root", str(root)) as address:
+        yield opened(address)
+
+
+def saved(page) -> None:
+    """Wait until every change has been saved."""
+    page.wait_for_timeout(150)
+    page.locator("body[data-saved=true]").wait_for()
+
+
+def kept(root: Path, view: str = "000.png") -> list[Label]:
+    return read_labels(label_path(root / "annotated/photos/desk", view), SIZE)
+
+
+def place(page, x: float, y: float) -> tuple[float, float]:
+    """Where a pixel of the photograph is on the page."""
+    box = page.locator("#view").bounding_box()
+    sheet = page.evaluate("({s: hilsplat.sheet.scale, x: hilsplat.sheet.x, y: hilsplat.sheet.y})")
+    return box["x"] + sheet["x"] + (x + 0.5) * sheet["s"], box["y"] + sheet["y"] + (y + 0.5) * sheet["s"]
+
+
+def polygon(page, *corners: tuple[int, int]) -> None:
+    page.locator("#view").press("p")
+    for corner in corners:
+        page.mouse.click(*place(page, *corner))
+    page.keyboard.press("Enter")
+    saved(page)
+
+
+def name(page, text: str) -> None:
+    page.get_by_role("textbox", name="Text").or_(page.get_by_role("combobox", name="Text")).fill(text)
+    page.keyboard.press("Enter")
+
+
+def draw_mug(page) -> None:
+    name(page, "mug")
+    polygon(page, (1, 1), (15, 1), (15, 20), (1, 20))
+
+
+def items(page):
+    return page.get_by_role("tree", name="In this photograph").get_by_role("treeitem")
+
+
+def test_a_whole_and_its_part_are_drawn_cut_saved_and_scored(page, root):
+    draw_mug(page)
+    page.locator("#view").press("j")  # a part of it
+    name(page, "handle")
+    polygon(page, (10, 4), (30, 4), (30, 10), (10, 10))
+    assert [item.get_attribute("aria-label") for item in items(page).all()] == ["mug, whole", "handle, part"]
+    mug, handle = kept(root)
+    assert (handle.parent, handle.level, handle.origin) == (mug.id, 2, "drawn")
+    expected = np.zeros(SIZE, bool)
+    expected[4:11, 10:16] = True  # cut at the mug's side
+    np.testing.assert_array_equal(handle.mask(SIZE), expected)
+    scene = open_labelled("annotated/photos/desk", root)
+    assert [region.path for region in scene.views["000.png"]] == [("mug",), ("mug", "handle")]
+
+
+def test_a_brush_adds_and_an_eraser_takes_away(page, root):
+    draw_mug(page)
+    before = kept(root)[0].mask(SIZE)
+    page.get_by_role("slider", name="Radius of the brush, pixels").fill("2")
+    for key, changes in (("b", (1, 0)), ("e", (0, 1))):
+        page.locator("#view").press(key)
+        page.mouse.move(*place(page, 10, 22 if key == "b" else 10))
+        page.mouse.down()
+        page.mouse.move(*place(page, 18, 22 if key == "b" else 10), steps=3)
+        page.mouse.up()
+        saved(page)
+        after = kept(root)[0].mask(SIZE)
+        more, less = (after & ~before).any(), (before & ~after).any()
+        assert (more, less) == changes
+        before = after
+
+
+def test_changes_are_undone_and_redone_and_each_is_saved(page, root):
+    draw_mug(page)
+    first = (root / "annotated/photos/desk/000.json").read_bytes()
+    page.locator("#view").press("Escape")
+    page.locator("#view").press("n")
+    name(page, "book")
+    polygon(page, (22, 2), (36, 2), (36, 20))
+    both = (root / "annotated/photos/desk/000.json").read_bytes()
+    page.locator("#view").press("Control+z")
+    saved(page)
+    assert (root / "annotated/photos/desk/000.json").read_bytes() == first and items(page).count() == 1
+    page.get_by_role("button", name="Undo").click()
+    saved(page)
+    assert not (root / "annotated/photos/desk/000.json").exists()
+    for _ in range(2):
+        page.locator("#view").press("Control+Shift+z")
+        saved(page)
+    assert (root / "annotated/photos/desk/000.json").read_bytes() == both
+
+
+def test_everything_can_be_drawn_by_keys(page, root):
+    name(page, "mug")
+    page.locator("#view").press("p")
+    for keys in (["Shift+ArrowLeft", "Space"], ["Shift+ArrowRight", "Space"], ["Shift+ArrowDown", "Space"]):
+        for key in keys:
+            page.keyboard.press(key)
+    page.keyboard.press("Enter")
+    saved(page)
+    (mug,) = kept(root)
+    (ring,) = mug.polygons  # traced, so it may begin at any corner
+    x, y = min(ring)
+    assert set(ring) == {(x, y), (x + 10, y), (x + 10, y + 10)}
+
+
+def test_a_node_is_proposed_stays_a_proposal_and_is_accepted(page, root):
+    page.locator("#view").press("x")
+    page.mouse.click(*place(page, 6, 6))
+    offers = page.get_by_role("region", name="Proposals at this pixel").get_by_role("button")
+    offers.first.wait_for()
+    assert offers.count() == 3
+    offers.nth(0).click()
+    saved(page)
+    page.get_by_role("combobox", name="Text").or_(page.get_by_role("textbox", name="Text")).fill("mug")
+    page.keyboard.press("Enter")
+    saved(page)
+    (mug,) = kept(root)
+    assert mug.origin == "proposed" and mug.text == "mug"
+    assert open_labelled("annotated/photos/desk", root).views["000.png"] == ()
+    assert items(page).first.get_attribute("aria-label") == "mug, whole, proposed"
+    page.locator("#view").press("a")
+    saved(page)
+    assert kept(root)[0].origin == "accepted"
+    polygon(page, (1, 1), (4, 1), (4, 4))  # adds to the chosen thing
+    assert kept(root)[0].origin == "edited"
+
+
+def test_things_are_carried_into_the_next_photograph(page, root):
+    mug = region_mask("mug") | region_mask("handle")
+    label = Label(id=4, level=1, text="mug", polygons=[[(0, 0), (1, 0), (1, 1)]]).with_mask(mug)
+    page.evaluate(f"hilsplat.store.change([[0, [{label.model_dump_json()}]]])")
+    saved(page)
+    page.locator("#view").press("]")
+    page.get_by_role("button", name="From others").click()
+    page.get_by_text("1 proposed").first.wait_for()
+    saved(page)
+    (carried,) = kept(root, "001.png")
+    expected = region_mask("mug", 1) | region_mask("handle", 1)
+    found = carried.mask(SIZE)
+    assert (carried.id, carried.origin) == (4, "proposed")
+    assert (found & expected).sum() / (found | expected).sum() > 0.75
+
+
+def test_what_somebody_else_saved_meanwhile_is_not_overwritten(page, opened, root):
+    opened.expected.append("412 (Precondition Failed)")
+    draw_mug(page)
+    path = label_path(root / "annotated/photos/desk", "000.png")
+    theirs = [kept(root)[0].model_copy(update={"text": "cup"})]
+    write_labels(path, "000.png", SIZE, theirs, version_of(path))
+    page.locator("#view").press("Escape")
+    page.locator("#view").press("n")
+    name(page, "book")
+    polygon(page, (22, 2), (36, 2), (36, 20))
+    page.get_by_text("have changed meanwhile").wait_for()
+    items(page).first.wait_for()
+    assert kept(root) == theirs
+    assert [item.get_attribute("aria-label") for item in items(page).all()] == ["cup, whole"]
+
+
+def test_files_are_exported_and_imported_again(page, root, tmp_path):
+    draw_mug(page)
+    page.locator("#save summary").click()
+    with page.expect_download() as started:
+        page.get_by_role("link", name="COCO").click()
+    file = tmp_path / "coco.json"
+    started.value.save_as(file)
+    assert json.loads(file.read_text())["categories"] == [{"id": 1, "name": "mug"}]
+    before = kept(root)[0].mask(SIZE)
+    page.locator("#view").press("Control+z")
+    saved(page)
+    assert kept(root) == []
+    page.get_by_label("Files to import").set_input_files(file)
+    page.get_by_text("Imported into 1 photograph.").wait_for()
+    saved(page)
+    np.testing.assert_array_equal(kept(root)[0].mask(SIZE), before)
+
+
+def test_a_telephone_has_everything_within_its_width(page):
+    page.set_viewport_size({"width": 390, "height": 780})
+    view, panel = page.locator("#view").bounding_box(), page.locator("#panel").bounding_box()
+    assert view["width"] == 390 and view["height"] > 150 and panel["y"] >= view["y"] + view["height"]
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def test_every_control_has_a_name(page):
+    controls = "[...document.querySelectorAll('button, input:not([hidden]), select, a, [role=option]')]"
+    named = "each.getAttribute('aria-label') || each.textContent.trim() || each.labels?.length"
+    assert page.evaluate(f"{controls}.filter((each) => !({named})).map((each) => each.outerHTML)") == []

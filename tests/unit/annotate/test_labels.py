@@ -1,0 +1,110 @@
+"""Annotations of a view: children are cut to their parents, files are replaced only by who has read them."""
+
+import numpy as np
+import pytest
+
+from hilsplat.annotate.labels import (
+    NO_FILE,
+    Label,
+    StaleLabelsError,
+    cut_to_parents,
+    read_labels,
+    traced,
+    version_of,
+    write_labels,
+)
+from hilsplat.base.errors import SceneError, SettingsError
+from hilsplat.datasets.images.hi import regions_of
+from hilsplat.datasets.images.isat import read_isat
+
+SIZE = (30, 40)
+
+
+def box(x0: int, y0: int, x1: int, y1: int) -> list[list[tuple[int, int]]]:
+    """Polygon of the pixels from (x0, y0) to (x1, y1), both included."""
+    return [[(x0, y0), (x1, y0), (x1, y1), (x0, y1)]]
+
+
+def label(number: int, level: int, parent: int | None, polygons, text: str = "", **more) -> Label:
+    return Label(
+        id=number, level=level, parent=parent, text=text or f"thing {number}", polygons=polygons, **more
+    )
+
+
+def test_children_are_cut_to_their_parents_down_to_subparts():
+    whole, part = label(1, 1, None, box(5, 5, 20, 20)), label(2, 2, 1, box(0, 10, 12, 29))
+    subpart = label(3, 3, 2, box(8, 18, 39, 25))
+    cut = cut_to_parents([subpart, part, whole], SIZE)
+    assert [each.id for each in cut] == [3, 2, 1]
+    subpart_mask, part_mask, whole_mask = (each.mask(SIZE) for each in cut)
+    np.testing.assert_array_equal(part_mask, part.mask(SIZE) & whole.mask(SIZE))
+    np.testing.assert_array_equal(subpart_mask, subpart.mask(SIZE) & part_mask)
+    np.testing.assert_array_equal(whole_mask, whole.mask(SIZE))
+
+
+def test_what_fits_keeps_its_vertices():
+    given = [label(1, 1, None, [[(3, 3), (20, 4), (9, 22)]]), label(2, 2, 1, [[(8, 6), (10, 6), (9, 9)]])]
+    assert cut_to_parents(given, SIZE) == given
+    once = cut_to_parents([label(1, 1, None, box(5, 5, 9, 9)), label(2, 2, 1, box(0, 0, 7, 7))], SIZE)
+    assert cut_to_parents(once, SIZE) == once
+
+
+def test_a_child_around_a_hole_of_its_parent_is_cut_exactly():
+    ring = np.zeros(SIZE, bool)
+    ring[4:26, 4:36] = True
+    ring[10:20, 12:28] = False
+    cut = cut_to_parents([label(1, 1, None, traced(ring)), label(2, 2, 1, box(0, 8, 39, 22))], SIZE)
+    np.testing.assert_array_equal(cut[1].mask(SIZE), ring & label(2, 2, 1, box(0, 8, 39, 22)).mask(SIZE))
+
+
+@pytest.mark.parametrize(
+    ("labels", "message"),
+    [
+        ([label(1, 1, None, box(0, 0, 4, 4)), label(2, 2, 1, box(6, 6, 9, 9))], "wholly outside 'thing 1'"),
+        ([label(1, 1, None, box(0, 0, 4, 4)), label(2, 3, 1, box(0, 0, 4, 4))], "expected  a part"),
+        ([label(1, 1, None, box(0, 0, 4, 4)), label(2, 1, 1, box(0, 0, 4, 4))], "none: it is a whole"),
+        ([label(2, 2, 7, box(0, 0, 4, 4))], "nothing of this photograph"),
+        ([label(1, 1, None, box(0, 0, 4, 4)), label(1, 1, None, box(0, 0, 4, 4))], "id 1 is there twice"),
+        ([label(1, 1, None, box(50, 50, 60, 60))], "no pixel inside the photograph"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(labels, message):
+    with pytest.raises(SettingsError, match=message):
+        cut_to_parents(labels, SIZE)
+
+
+def test_a_written_file_is_read_back_and_scored_without_proposals(tmp_path):
+    path = tmp_path / "desk/DSC_1.json"
+    given = [
+        label(1, 1, None, box(5, 5, 20, 20), "mug"),
+        label(2, 2, 1, box(6, 6, 9, 9), "Henkel „links“", origin="edited"),
+        label(5, 2, 1, box(10, 6, 12, 9), "rim", origin="proposed"),
+    ]
+    version = write_labels(path, "DSC_1.png", SIZE, given, NO_FILE)
+    assert version == version_of(path) and read_labels(path, SIZE) == given
+    warnings: list[str] = []
+    regions = regions_of(read_isat(path), warnings)
+    assert [region.path for region in regions] == [("mug",), ("mug", "Henkel „links“")]
+    assert warnings == ["DSC_1.json: proposals not accepted, left out: 1"]
+    first = path.read_bytes()
+    write_labels(path, "DSC_1.png", SIZE, given[::-1], version)
+    assert path.read_bytes() == first  # whatever the order of drawing
+
+
+def test_a_file_that_somebody_else_changed_is_not_replaced(tmp_path):
+    path = tmp_path / "DSC_1.json"
+    mine = write_labels(path, "DSC_1.png", SIZE, [label(1, 1, None, box(0, 0, 4, 4))], NO_FILE)
+    theirs = write_labels(path, "DSC_1.png", SIZE, [label(1, 1, None, box(0, 0, 5, 5))], mine)
+    kept = path.read_bytes()
+    for old in (mine, NO_FILE, ""):
+        with pytest.raises(StaleLabelsError, match="reload"):
+            write_labels(path, "DSC_1.png", SIZE, [], old)
+    assert path.read_bytes() == kept
+    assert write_labels(path, "DSC_1.png", SIZE, [], theirs) == NO_FILE and not path.exists()
+
+
+def test_a_file_of_another_size_is_refused(tmp_path):
+    path = tmp_path / "DSC_1.json"
+    write_labels(path, "DSC_1.png", SIZE, [label(1, 1, None, box(0, 0, 4, 4))], NO_FILE)
+    with pytest.raises(SceneError, match=r"expected  60 x 50 px.*\n.*40 x 30"):
+        read_labels(path, (50, 60))

@@ -1,0 +1,234 @@
+"""The annotation page's server: who may talk to it, saving under a version, shapes, proposals, carrying."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from hilsplat.annotate.app import Annotator
+from hilsplat.annotate.labels import Label
+from hilsplat.base.errors import ArtifactError
+from hilsplat.datasets.registry import open_labelled
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.viewer.server import static_files
+from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, build_finished_desk, region_mask
+
+TOKEN, ADDRESS = "secret-of-the-test", "http://127.0.0.1:4000"
+SIZE = (HEIGHT, WIDTH + NUM_VIEWS)
+MUG = {"id": 1, "level": 1, "text": "mug", "polygons": [[[1, 1], [12, 1], [12, 20], [1, 20]]]}
+HANDLE = {
+    "id": 2,
+    "level": 2,
+    "parent": 1,
+    "text": "handle",
+    "polygons": [[[8, 4], [30, 4], [30, 9], [8, 9]]],
+}
+
+
+@pytest.fixture(scope="session")
+def desk(tmp_path_factory) -> Path:
+    """The folder of a finished scene."""
+    return build_finished_desk(tmp_path_factory.mktemp("project")) / SCENE
+
+
+@pytest.fixture
+def labels(tmp_path) -> Path:
+    return tmp_path / "annotated/photos/desk"
+
+
+def opened(desk: Path, labels: Path) -> TestClient:
+    headers = {"origin": ADDRESS, "sec-fetch-site": "same-origin"}
+    client = TestClient(Annotator(desk, labels, "default", 1).app(TOKEN), base_url=ADDRESS, headers=headers)
+    assert client.get(f"/?token={TOKEN}").status_code == 200
+    return client
+
+
+@pytest.fixture
+def client(desk, labels) -> TestClient:
+    return opened(desk, labels)
+
+
+def put(client, number, labels, version):
+    return client.put(f"/api/labels/{number}", json={"labels": labels}, headers={"if-match": f'"{version}"'})
+
+
+def mask_of(polygons) -> np.ndarray:
+    return Label(id=1, level=1, text="x", polygons=polygons).mask(SIZE)
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> float:
+    return np.count_nonzero(a & b) / np.count_nonzero(a | b)
+
+
+# -- who --------------------------------------------------------------------------------------------
+
+
+def test_strangers_foreign_hosts_and_other_sites_are_refused(desk, labels, client):
+    stranger = TestClient(Annotator(desk, labels, "default", 1).app(TOKEN), base_url=ADDRESS)
+    for path in ("/", "/api/labels", "/static/annotate.js", f"/api/labels?token={TOKEN}"):
+        assert stranger.get(path).status_code == 403, path
+    for headers in (
+        {"host": "evil.example"},
+        {"origin": "http://evil.example"},
+        {"origin": ""},
+        {"sec-fetch-site": "cross-site"},
+        {"content-type": "text/plain"},
+    ):
+        sent = client.put("/api/labels/0", json={"labels": [MUG]}, headers={"if-match": '"none"', **headers})
+        assert sent.status_code == 403, headers
+    assert not labels.exists()
+
+
+@pytest.mark.parametrize("path", ["/api/labels/99", "/api/labels/-1", "/api/labels/..%2f..%2fx"])
+def test_no_name_from_the_page_becomes_a_path(client, labels, path):
+    sent = client.put(path, json={"labels": [MUG]}, headers={"if-match": '"none"'})
+    assert sent.status_code in (404, 405, 422) and not labels.exists()
+
+
+def test_the_page_is_small_and_asks_no_other_address(client):
+    files = {**static_files(), **static_files("hilsplat.annotate")}
+    scripts = {name: data.decode() for name, data in files.items() if name.endswith(".js")}
+    assert sum(map(len, scripts.values())) < 200_000
+    for name, text in {**scripts, "annotate.html": files["annotate.html"].decode()}.items():
+        found = text.replace("http://www.w3.org/2000/svg", "")
+        assert "http://" not in found and "https://" not in found and "innerHTML" not in found, name
+    for name in (
+        "annotate.js",
+        "store.js",
+        "style.css",
+        "elements.js",
+        "http.js",
+        "styles.js",
+        "annotate.css",
+    ):
+        assert client.get(f"/static/{name}").status_code == 200
+    assert client.get("/static/main.js").status_code == 404  # of the other page
+
+
+# -- saving -----------------------------------------------------------------------------------------
+
+
+def test_what_is_saved_is_cut_to_its_parent_and_a_data_set(client, labels, tmp_path):
+    saved = put(client, 2, [MUG, HANDLE], "none").json()
+    parent, child = (mask_of(each["polygons"]) for each in saved["labels"])
+    np.testing.assert_array_equal(child, mask_of(HANDLE["polygons"]) & parent)
+    assert client.get("/api/labels").json()[2] == saved
+    scene = open_labelled("annotated/photos/desk", tmp_path)
+    assert [region.path for region in scene.views["002.png"]] == [("mug",), ("mug", "handle")]
+    np.testing.assert_array_equal(scene.views["002.png"][1].mask(), child)
+
+
+def test_a_version_that_is_not_the_last_is_refused(client):
+    first = put(client, 0, [MUG], "none").json()["version"]
+    second = put(client, 0, [{**MUG, "text": "cup"}], first)
+    assert second.status_code == 200
+    for old in ("none", first, ""):
+        stale = put(client, 0, [], old)
+        assert stale.status_code == 412 and "reload" in stale.json()["error"]
+    assert client.put("/api/labels/0", json={"labels": []}).status_code == 412
+    assert client.get("/api/labels").json()[0]["labels"][0]["text"] == "cup"
+
+
+@pytest.mark.parametrize(
+    ("change", "status"),
+    [
+        ({"level": 4}, 400),
+        ({"text": ""}, 400),
+        ({"text": "x" * 201}, 400),
+        ({"polygons": []}, 400),
+        ({"polygons": [[[0.5, 1], [2, 2], [3, 1]]]}, 400),
+        ({"origin": "guessed"}, 400),
+        ({"path": "/etc/passwd"}, 400),
+        ({"parent": 7}, 422),
+        ({"polygons": [[[900, 900], [910, 900], [910, 910]]]}, 422),
+    ],
+)
+def test_what_cannot_be_is_refused_with_a_reason(client, labels, change, status):
+    sent = put(client, 0, [{**MUG, **change}], "none")
+    assert sent.status_code == status and sent.json()["error"] and not labels.exists()
+
+
+# -- shapes -----------------------------------------------------------------------------------------
+
+
+def test_a_brush_adds_discs_erases_and_stays_inside_the_parent(client):
+    square, stroke = [[[2, 2], [12, 2], [12, 12], [2, 12]]], {"points": [[12, 7], [24, 7]], "radius": 3}
+
+    def region(**more) -> np.ndarray:
+        shape = client.post("/api/shape", json={"view": 0, "add": square, "stroke": stroke, **more}).json()
+        found = mask_of(shape["polygons"]) if shape["polygons"] else np.zeros(SIZE, bool)
+        assert shape["area_px"] == found.sum()
+        return found
+
+    painted, drawn = region(add=[]), mask_of(square)
+    rows, columns = np.indices(SIZE)
+    assert painted[(abs(rows - 7) <= 2) & (columns >= 10) & (columns <= 26)].all()
+    assert not painted[(abs(rows - 7) > 4) | (columns < 8) | (columns > 28)].any()
+    np.testing.assert_array_equal(region(), drawn | painted)
+    np.testing.assert_array_equal(region(stroke={**stroke, "erase": True}), drawn & ~painted)
+    np.testing.assert_array_equal(region(inside=square), drawn)
+    assert not region(inside=[[[30, 15], [33, 15], [33, 18]]]).any()
+
+
+# -- proposals --------------------------------------------------------------------------------------
+
+
+def test_nodes_are_proposed_at_a_pixel_from_whole_to_subpart(client):
+    view, shift = 3, 3
+    offers = client.post(
+        "/api/at", json={"view": view, "x": 6 + shift, "y": 6}
+    ).json()  # the rim of the handle
+    assert [offer["level"] for offer in offers] == [1, 2, 3]
+    assert all(offer["what"].startswith("node ") for offer in offers)
+    for offer, name in zip(offers, ("mug", "handle", "rim"), strict=True):
+        expected = region_mask(name, shift)
+        if name == "mug":
+            expected = expected | region_mask("handle", shift)
+        assert iou(mask_of(offer["polygons"]), expected) > 0.7, name
+    assert client.post("/api/at", json={"view": view, "x": 999, "y": 0}).status_code == 422
+
+
+def test_masks_are_proposed_while_there_is_no_tree(desk, labels, tmp_path):
+    young = tmp_path / "results/photos/desk"
+    shutil.copytree(desk / "scene", young / "scene")
+    client = opened(young, labels)
+    assert client.get("/api/scene").json()["proposes"] == ""
+    shutil.copytree(desk / "default/masks", young / "default/masks")
+    client = opened(young, labels)
+    described = client.get("/api/scene").json()
+    assert described["proposes"] == "masks" and not described["carries"]
+    offers = client.post("/api/at", json={"view": 1, "x": 25, "y": 8}).json()
+    masks = HierarchicalMasks.load(young / "default/masks/001.png.npz")
+    for offer in offers:
+        dense = masks.dense(np.array([int(offer["what"].removeprefix("mask "))]))[0]
+        assert dense[8, 25] and iou(mask_of(offer["polygons"]), dense) > 0.8
+    assert offers
+    assert client.post("/api/carry", json={"ids": [1], "view": 0}).status_code == 422
+
+
+def test_things_are_carried_by_their_gaussians_with_their_parts_inside(client):
+    view, shift = 1, 1
+    mug = region_mask("mug", shift) | region_mask("handle", shift)
+    things = [
+        Label(id=5, level=1, text="mug", polygons=[[(0, 0), (1, 0), (1, 1)]]).with_mask(mug),
+        Label(id=6, level=2, parent=5, text="handle", polygons=[[(0, 0), (1, 0), (1, 1)]]).with_mask(
+            region_mask("handle", shift)
+        ),
+        Label(id=7, level=1, text="guess", polygons=[[(20, 5), (30, 5), (30, 9)]], origin="proposed"),
+    ]
+    put(client, view, [thing.model_dump() for thing in things], "none")
+    carried = client.post("/api/carry", json={"ids": [5, 6, 7], "view": 4}).json()
+    assert [(thing["id"], thing["origin"]) for thing in carried] == [(5, "proposed"), (6, "proposed")]
+    found, part = (mask_of(thing["polygons"]) for thing in carried)
+    assert iou(found, region_mask("mug", 4) | region_mask("handle", 4)) > 0.75
+    assert iou(part, region_mask("handle", 4)) > 0.75 and not (part & ~found).any()
+    saved = put(client, 4, carried, "none")
+    assert saved.status_code == 200
+    assert client.post("/api/carry", json={"ids": [5, 6], "view": 4}).json() == []  # they are there now
+
+
+def test_a_scene_without_poses_says_what_to_run(tmp_path):
+    with pytest.raises(ArtifactError, match="has no photographs to annotate yet"):
+        Annotator(tmp_path, tmp_path / "labels", "default", 1)
