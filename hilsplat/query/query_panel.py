@@ -99,8 +99,9 @@ class _Page:
         """Write a text around a place."""
         weight = "bold" if bold else "normal"
         place = (x / self.width_px, 1 - y / self.height_px)
-        look = {"ha": "center", "va": "center", "size": size, "weight": weight, "rotation": rotation}
-        self.figure.text(*place, text, **look, parse_math=False)
+        written = self.figure.text(*place, text, ha="center", va="center", size=size, rotation=rotation)
+        written.set_parse_math(False)
+        written.set_fontweight(weight)
 
     def show(
         self, picture: UInt8[np.ndarray, "H W 3"], title: str, left: int, top: int, row_px: int, bold: bool

@@ -39,8 +39,8 @@ CORE_S_PER_MP = {
 }
 """Rule -> seconds of one core per megapixel of all views. Rules that are missing take `START_S`."""
 
-FIT_S_PER_MP = 0.4
-"""Seconds of one core for a step of the fit, per megapixel of a view."""
+FIT_S_PER_MP = 0.18
+"""Seconds of one core for a step of the fit, per megapixel of a view: the mean of coarse and fine steps."""
 
 GRAPH_S_PER_MP = 4.0
 TINY_S_PER_VIEW = {"masks": 2.5, "clip": 0.2}
@@ -115,7 +115,8 @@ def first_guess(rule: str, stages: StageSettings, size: Size, threads: int) -> f
     total_mp = size.views * size.view_mp
     if rule == "gaussians":
         fit = stages.gaussians
-        core_s = FIT_S_PER_MP * fit.iterations * size.view_mp * fit.image_scale**2
+        steps = min(fit.iterations, fit.steps_per_view * size.views)
+        core_s = FIT_S_PER_MP * steps * size.view_mp * fit.image_scale**2
     elif rule == "masks" and stages.masks.segmenter == "graph":
         core_s = GRAPH_S_PER_MP * total_mp
     elif rule in TINY_S_PER_VIEW:
