@@ -530,12 +530,16 @@ class Plan:
         return [f"results/tables/{name}.csv" for name in TABLES]
 
     def targets(self) -> list[str]:
-        """Pictures of every scene, and tables and plots if the run has a scene to measure.
+        """Pictures of every scene, scores of those that you annotated, and tables and plots if the run has a
+        scene of theirs.
 
         A run of photographs would otherwise replace a benchmark's tables by ones of reported rows alone.
         """
         plots = [f"results/figures/sweep-{name}.png" for name in ("theta", "omega")]
-        return [*self.figures(), *(self.tables() + plots if self._labelled() else [])]
+        own = [row for row in self._labelled() if not self._data_of(row)]
+        scores = [f"results/{row.dataset}/{row.scene}/default/scores.csv" for row in own]
+        has_tables = len(self._labelled()) > len(own)
+        return [*self.figures(), *scores, *(self.tables() + plots if has_tables else [])]
 
     def figures(self) -> list[str]:
         """The panel of every scene, masks against the truth if it is known, and a comparison of methods for

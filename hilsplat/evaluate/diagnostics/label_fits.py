@@ -48,7 +48,8 @@ class Fits:
     Attributes:
         best: IoU of the best mask or node of the same level, a region each; 0 if there is none.
         anywhere: the same over all levels.
-        containment: of each region with an annotated parent, the share of its best mask inside the parent's.
+        containment: of each region with an annotated parent, the share of its best mask inside the parent's;
+            0 if either has none.
     """
 
     best: list[float] = field(default_factory=list)

@@ -67,6 +67,23 @@ def test_an_unknown_method_stops_at_once(tmp_path):
         plan(tmp_path, variants={**VARIANTS, "lifted": {"method": {"name": "magic"}}})
 
 
+def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(tmp_path):
+    alone = plan(tmp_path, groups=["photos"], data_root=str(tmp_path)).targets()
+    file = tmp_path / "annotated/photos/desk/1.json"
+    file.parent.mkdir(parents=True)
+    file.write_text("{}")
+    found = plan(tmp_path, groups=["photos"], data_root=str(tmp_path))
+    job = Job("photos", "desk")
+    assert found.targets() == [*alone, "results/photos/desk/default/scores.csv"]
+    assert found.truth_or_labels(job) == [str(file)] and str(file) not in found.image_files(job)
+    assert f"--labels annotated/photos/desk --data-root {tmp_path}" in found.truth_option(job)
+    assert found.label_readers(job) == ("hilsplat.datasets.images.annotated:DATASET",)
+    both = plan(tmp_path, groups=["photos", "benchmark"], data_root=str(tmp_path))
+    assert "results/tables/lerf.csv" in both.targets() and not any(
+        "desk" in path for path in both.scores("lerf")
+    )
+
+
 @pytest.mark.parametrize(
     ("stage", "variant", "owner"),
     [
