@@ -1,6 +1,8 @@
 """Shared fixtures and the rules that hold for all tests."""
 
+import logging
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -34,3 +36,11 @@ settings.load_profile("hilsplat")
 def project() -> Path:
     """Root of the checkout."""
     return PROJECT
+
+
+@pytest.fixture(autouse=True)
+def own_log() -> Iterator[None]:
+    """Handlers that a command adds write to the terminal of its test, which is gone after it."""
+    before = list(logging.getLogger().handlers)
+    yield
+    logging.getLogger().handlers[:] = before

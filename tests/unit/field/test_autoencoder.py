@@ -69,8 +69,8 @@ def test_same_seed_same_bytes_on_any_number_of_threads(tmp_path):
     assert one != other
 
 
-def test_a_missing_file_names_its_stage(tmp_path):
-    with pytest.raises(ArtifactError, match="run the autoencoder stage again"):
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(ArtifactError, match=r"autoencoder\.safetensors cannot be read"):
         load_code(tmp_path)
 
 

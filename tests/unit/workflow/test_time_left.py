@@ -104,7 +104,7 @@ def test_guesses_grow_with_the_work():
     for rule in ("poses", "masks", "clip", "contributions", "field"):
         assert first_guess(rule, stages, large, 1) > 2 * first_guess(rule, stages, small, 1), rule
         assert first_guess(rule, stages, large, 2) < first_guess(rule, stages, large, 1), rule
-    longer = parse_run({"gaussians": {"iterations": 6000}}).stages()
+    longer = parse_run({"gaussians": {"steps_per_view": 120}}).stages()
     once, twice = (first_guess("gaussians", each, small, 1) for each in (stages, longer))
     assert twice - 2 == pytest.approx(2 * (once - 2))
     halved = parse_run({"gaussians": {"image_scale": 0.5}}).stages()
