@@ -92,7 +92,7 @@ class Plan:
         named = [key for key in (*run.overrides, *run.queries) if "/" in key]
         gone = [key for key in named if key.partition("/")[0] in datasets]
         require_known("overrides", run.overrides, [*GROUPS, *scenes, *gone])
-        require_known("queries", run.queries, [*sorted(datasets), *scenes, *gone])
+        require_known("queries", run.queries, [*sorted({*datasets, *GROUPS}), *scenes, *gone])
         for key in sorted({*gone} - {*scenes}):
             if near := difflib.get_close_matches(key, scenes, n=1, cutoff=0.85):
                 raise SettingsError(
