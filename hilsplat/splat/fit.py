@@ -33,7 +33,7 @@ logger = logging.getLogger(__name__)
 
 CURVE_EVERY = 20
 """Steps between two points of the curves."""
-MIN_SIDE_PX = 32
+MIN_SIDE_PX = 64
 """Images are not shrunk below this shorter side."""
 
 
@@ -92,7 +92,9 @@ def scale_at(settings: GaussiansSettings, progress: float, side_px: int) -> floa
         side_px: shorter side of the images at full size.
     """
     scale = 0.25 if progress < settings.quarter_until else 0.5 if progress < settings.half_until else 1.0
-    return scale if scale * side_px >= MIN_SIDE_PX else 1.0
+    while scale < 1 and scale * side_px < MIN_SIDE_PX:
+        scale *= 2
+    return scale
 
 
 def control_density(

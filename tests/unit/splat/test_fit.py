@@ -129,7 +129,8 @@ def test_images_grow_from_a_quarter_to_their_size():
         return [fit.scale_at(settings, at, side_px) for at in (0.0, 0.19, 0.2, 0.59, 0.6, 1.0)]
 
     assert scales(400, quarter_until=0.2, half_until=0.6) == [0.25, 0.25, 0.5, 0.5, 1, 1]
-    assert scales(100, quarter_until=0.2, half_until=0.6) == [1, 1, 0.5, 0.5, 1, 1]  # a quarter is 25 px
+    assert scales(200, quarter_until=0.2, half_until=0.6) == [0.5, 0.5, 0.5, 0.5, 1, 1]  # a quarter is 50 px
+    assert scales(100, quarter_until=0.2, half_until=0.6) == [1] * 6
     assert scales(400, quarter_until=0, half_until=0) == [1] * 6
 
 
