@@ -53,6 +53,7 @@ rule all:
 
 
 onstart:
+    refuse_infeasible()
     for line in PLAN.answering():
         logger.info(line)
     show_progress()

@@ -25,12 +25,24 @@ except HilsplatError as error:  # a mistake that a user can fix: no traceback
 for name, reason in PLAN.absent.items():
     logger.warning(f"{name} is skipped: {reason}")
 
-if workflow.is_main_process and workflow.resource_settings.nodes is None:
-    try:  # jobs run on this machine: refuse what cannot work before anything is touched
+jobs_end_with_this_process()
+
+
+def infeasible():
+    """Why jobs on this machine cannot work; empty if they can, or run elsewhere."""
+    if workflow.resource_settings.nodes is not None:
+        return ""
+    try:
         PLAN.require_feasible()
     except HilsplatError as error:
-        raise WorkflowError(str(error)) from None
-jobs_end_with_this_process()
+        return str(error)
+    return ""
+
+
+def refuse_infeasible():
+    """Called before the first job, so that nothing is touched."""
+    if problem := infeasible():
+        raise WorkflowError(problem)
 
 
 def checked(inputs):
@@ -53,6 +65,8 @@ def settle_artifacts():
     workflow.persistence.restore_output = lambda path: Path(path).exists()
     if not workflow.is_main_process:
         return
+    if workflow.dryrun and (problem := infeasible()):
+        logger.warning(f"a run would be refused: {problem}")
     if (
         workflow.executor_plugin is not None and not workflow.dryrun
     ):  # not for a report, a plan or a graph

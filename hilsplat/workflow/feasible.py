@@ -6,6 +6,7 @@ from pathlib import Path
 from hilsplat.base.device import compute_device
 from hilsplat.base.errors import HilsplatError
 from hilsplat.configuration import StageSettings
+from hilsplat.models.store import RELEASES
 
 
 def require_feasible(stages: StageSettings, where: str) -> None:
@@ -36,8 +37,10 @@ def require_feasible(stages: StageSettings, where: str) -> None:
 def _model_problem(folder: Path, kind: str, variant: str) -> str:
     from hilsplat.models.folder import open_model_folder  # onnxruntime takes a while to import
 
+    released = any(folder.name == release.name for release in RELEASES)
+    fix = f"fetch it: hilsplat models get {folder.name}" if released else ""
     try:
-        open_model_folder(folder, kind, variant=variant)
+        open_model_folder(folder, kind, variant=variant, fix=fix)
     except HilsplatError as error:
         return str(error)
     return ""

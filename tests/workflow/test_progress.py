@@ -21,16 +21,13 @@ def test_a_stage_that_ended_is_one_line_and_the_first_answer_is_announced(copy_o
 
 
 def test_a_failed_job_is_shown_in_full_with_the_log_of_its_stage(copy_of_finished: Project) -> None:
-    project = copy_of_finished
-    shutil.rmtree(project.root / TREE)
-    masks = project.root / SCENE / "default/masks"
-    (masks / "index.json").write_text("{}")
-    failed = project.snakemake(TREE, "--rerun-triggers", "input", check=False)
+    no_masks = 'masks={"predicted_iou_min": 1.0}'
+    failed = copy_of_finished.snakemake(f"{SCENE}/default/contributions", "--config", no_masks, check=False)
     assert failed.returncode != 0
-    assert "Error in rule semantic_tree:" in failed.stderr
-    assert "shell:" in failed.stderr and "hilsplat semantic-tree" in failed.stderr
+    assert "Error in rule contributions:" in failed.stderr
+    assert "shell:" in failed.stderr and "hilsplat contributions" in failed.stderr
     assert "Logfile" in failed.stderr  # profiles/default was found
-    assert "belong to other masks" in failed.stderr.partition("Logfile")[2]
+    assert "has a mask" in failed.stderr.partition("Logfile")[2]
 
 
 def test_verbose_leaves_snakemakes_own_output(copy_of_finished: Project) -> None:
