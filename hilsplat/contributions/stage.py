@@ -14,7 +14,6 @@ The losses of the language field and the 3D semantic tree need nothing else from
 
 import hashlib
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache as cache_calls
 from pathlib import Path
@@ -37,6 +36,7 @@ from hilsplat.base.artifacts import (
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.identity import code_digest
 from hilsplat.base.levels import LEVELS
+from hilsplat.base.parallel import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.contributions.compositing import normalised_weights, visible_mass
 from hilsplat.contributions.quadratic import Gram, StackedWeights
@@ -53,6 +53,12 @@ from hilsplat.splat.rasterise.device import choose_device
 logger = logging.getLogger(__name__)
 
 MATRICES = ("A", "A_half", "S")
+
+WEIGHTS_PER_PIXEL = 40
+"""Of a typical scene."""
+
+MAX_WEIGHTS_TOGETHER = 2**24
+"""Views with more weights are prepared one at a time; 128 MiB each, and up to four are waiting."""
 
 
 def label_maps(masks: HierarchicalMasks) -> Int32[np.ndarray, "P 3"]:
@@ -154,6 +160,21 @@ class _View:
         return masks
 
 
+@dataclass(frozen=True)
+class _Prepared:
+    """What a view adds: its masks, its matrices, and the rows of W that G still lacks."""
+
+    masks: HierarchicalMasks
+    part: dict[str, np.ndarray]
+    labelled: StackedWeights | None
+
+
+def views_together(scene: Scene, threads: int) -> int:
+    """How many views to prepare at once: half of the work on one runs in one thread, but W takes memory."""
+    pixels = max((int(np.prod(scene.cameras[name].size_hw)) for name in scene.views("train")), default=0)
+    return min(2, max(1, threads)) if pixels * WEIGHTS_PER_PIXEL <= MAX_WEIGHTS_TOGETHER else 1
+
+
 def run_contributions(
     scene_folder: Path,
     gaussians_ply: Path,
@@ -165,10 +186,10 @@ def run_contributions(
 ) -> None:
     """Write A, A_half, S, mass, and G or W, in one pass over the train views.
 
-    Views are processed one by one and their rows written at once; memory holds one view, the sum of G so far,
-    and the weights waiting to be added to it (`quadratic_builder`). A run after a
-    killed one finds the matrices of finished views in the cache, and G as of at most `CHECKPOINT_SECONDS`
-    (and one view) before; it rasterises W again for the views that G lacks.
+    Views are prepared one or two at a time while rows of those before are written and added to G; memory
+    holds them, the sum of G so far, and the weights waiting to be added to it (`quadratic_builder`). A run
+    after a killed one finds the matrices of finished views in the cache, and G as of at most
+    `CHECKPOINT_SECONDS` (and one view) before; it rasterises W again for the views that G lacks.
 
     Raises:
         MisalignedArtifactError: masks and images differ in size.
@@ -196,25 +217,30 @@ def run_contributions(
         summed = checkpoint.resume(builder)
         matrices = {name: MatrixStream(folder / name) for name in MATRICES}
         with ArrayStream(folder / "mass.npy", np.float32, len(gaussians)) as mass:
-            for number, view in enumerate(track(views, "contributions of views")):
-                camera = scene.cameras[view.name]
-                masks = view.masks(camera)
+            together = views_together(scene, threads)
+
+            def prepare(number: int) -> _Prepared:
+                view = views[number]
+                masks = view.masks(scene.cameras[view.name])
 
                 @cache_calls
-                def weights(camera: Camera = camera) -> sp.csr_matrix:
+                def weights() -> sp.csr_matrix:
                     raw = pixel_weights(
-                        gaussians, camera, min_weight=settings.min_weight, threads=threads, device=device
+                        gaussians,
+                        scene.cameras[view.name],
+                        min_weight=settings.min_weight,
+                        threads=max(1, threads // together),
+                        device=device,
                     )
                     return normalised_weights(raw)
 
-                def compute(
-                    name: str = view.name,
-                    weights: Callable[[], sp.csr_matrix] = weights,
-                    masks: HierarchicalMasks = masks,
-                ) -> dict[str, np.ndarray]:
-                    return view_contributions(name, weights(), masks)
+                part = store.get(view.key, lambda: view_contributions(view.name, weights(), masks))
+                rows_of_W = labelled_rows(weights(), label_maps(masks)) if number >= summed else None
+                return _Prepared(masks, part, rows_of_W)
 
-                part = store.get(view.key, compute)
+            prepared = in_order(prepare, range(len(views)), together)
+            for number, made in enumerate(track(prepared, "contributions of views", len(views))):
+                masks, part = made.masks, made.part
                 for name, matrix in matrices.items():
                     matrix.append(*(part[f"{name}_{what}"] for what in ("data", "indices", "indptr")))
                 mass.append(part["mass"][None])
@@ -224,8 +250,8 @@ def run_contributions(
                 rows["area_px"].append(masks.area_px)
                 rows["pixels"].append(part["pixels"])
                 rows["half_pixels"].append(part["half_pixels"])
-                if number >= summed:
-                    builder.add(labelled_rows(weights(), label_maps(masks)))
+                if made.labelled is not None:
+                    builder.add(made.labelled)
                     checkpoint.offer(builder, number + 1)
         for matrix in matrices.values():
             matrix.close()
