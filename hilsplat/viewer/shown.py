@@ -10,7 +10,8 @@ import numpy as np
 
 from hilsplat.base.artifacts import read_index, sha256_of_file
 from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError
-from hilsplat.query.language_scene import LanguageScene, Opened
+from hilsplat.query.language_scene import LanguageScene
+from hilsplat.query.opening import Opened
 from hilsplat.query.view_store import ViewStore
 from hilsplat.scene.finished import FinishedScene, finished_variants
 from hilsplat.scene.scene import Scene
