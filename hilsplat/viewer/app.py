@@ -12,6 +12,7 @@ from starlette.routing import Route
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.query.names import StaleNamesError, write_names
+from hilsplat.scene.scene import Scene
 from hilsplat.viewer import answers, exports, wire
 from hilsplat.viewer.guard import Guard
 from hilsplat.viewer.payload import packed_gaussians, packed_nodes
@@ -33,6 +34,7 @@ from hilsplat.viewer.server import (
     view_name,
 )
 from hilsplat.viewer.shown import ShownScene
+from hilsplat.viewer.witness import StaleSceneError
 
 
 class Viewer:
@@ -47,6 +49,7 @@ class Viewer:
         routes = [
             *self.pages.routes(),
             Route("/api/scene", self.scene),
+            Route("/api/changes", self.changes),
             Route("/api/variant/{variant}", self.variant),
             Route("/api/splats", self.splats),
             Route("/api/nodes/{variant}", self.nodes),
@@ -61,52 +64,62 @@ class Viewer:
             Route("/api/names", self.names, methods=["PUT"]),
             *SavedFiles(self.thread, self.pages.static).routes(),
         ]
-        return guarded(routes, token, StaleNamesError)
+        return guarded(routes, token, {StaleNamesError: 412, StaleSceneError: 409})
 
     # -- the scene --------------------------------------------------------------------------------
 
     async def scene(self, request: Request) -> Response:
         """Views, counts, and the variants that answer by now."""
-        return answer_json(await self.thread.do(self.thread.shown.described))
+        return answer_json(await self.thread.opened_anew())
+
+    async def changes(self, request: Request) -> Response:
+        """Whether a page still shows what lies on the disk."""
+        return answer_json(await self.thread.changes())
 
     async def variant(self, request: Request) -> Response:
         """The outline of a variant."""
-        return answer_json(
-            await self.thread.do(self.thread.shown.described_variant, request.path_params["variant"])
-        )
+        variant = request.path_params["variant"]
+        return answer_json(await self.thread.do(request, lambda shown: shown.described_variant(variant)))
 
     async def splats(self, request: Request) -> Response:
         """The Gaussians, packed."""
-        tag = f'"{await self.thread.do(lambda: self.thread.shown.splats_tag)}"'
+        tag = f'"{await self.thread.do(request, lambda shown: shown.splats_tag)}"'
         if request.headers.get("if-none-match") == tag:
             return Response(status_code=304, headers={"etag": tag})
-        data = await self.thread.do(packed_gaussians, self.thread.shown.gaussians)
+        data = await self.thread.do(request, lambda shown: packed_gaussians(shown.gaussians))
         return Response(data, headers={"etag": tag, "cache-control": "no-cache"})
 
     async def nodes(self, request: Request) -> Response:
         """Nodes of the Gaussians, packed."""
         variant = request.path_params["variant"]
-        return plain(
-            await self.thread.do(lambda: packed_nodes(self.thread.shown.answering(variant).tree)), BYTES
-        )
+        data = await self.thread.do(request, lambda shown: packed_nodes(shown.answering(variant).tree))
+        return plain(data, BYTES)
 
     async def photo(self, request: Request) -> Response:
         """An undistorted photograph."""
-        return await self.thread.do(photograph, self.thread.shown.scene, request.path_params["number"])
+        return await self._photograph(request, photograph)
 
     async def thumb(self, request: Request) -> Response:
         """A small photograph."""
-        return await self.thread.do(thumbnail, self.thread.shown.scene, request.path_params["number"])
+        return await self._photograph(request, thumbnail)
+
+    async def _photograph(self, request: Request, send: Callable[[Scene, int], Response]) -> Response:
+        def find(shown: ShownScene) -> Response:
+            with shown.unchanged():
+                return send(shown.scene, request.path_params["number"])
+
+        return await self.thread.do(request, find)
 
     async def crop(self, request: Request) -> Response:
         """A node as its best photograph shows it."""
 
-        def draw() -> bytes:
-            scene = self.thread.shown.answering(request.path_params["variant"])
+        def draw(shown: ShownScene) -> bytes:
+            scene = shown.answering(request.path_params["variant"])
             node = node_of(scene, request.path_params["node"])
-            return encoded(exports.crop(scene, node, self.thread.shown.threads))
+            with shown.unchanged():
+                return encoded(exports.crop(scene, node, shown.threads))
 
-        return plain(await self.thread.do(draw), "image/jpeg", cached=True)
+        return plain(await self.thread.do(request, draw), "image/jpeg", cached=True)
 
     # -- answers ----------------------------------------------------------------------------------
 
@@ -114,19 +127,19 @@ class Viewer:
         """A text or a path."""
         asked = await read(request, wire.Query)
 
-        def answer() -> dict[str, Any]:
-            view = None if asked.view is None else view_name(self.thread.shown.scene, asked.view)
-            scene = self.thread.shown.answering(asked.variant)
+        def answer(shown: ShownScene) -> dict[str, Any]:
+            view = None if asked.view is None else view_name(shown.scene, asked.view)
+            scene = shown.answering(asked.variant)
             return answers.answer(scene, asked.text, asked.level, asked.answerer, view, asked.threshold)
 
-        return answer_json(await self.thread.do(answer))
+        return answer_json(await self.thread.do(request, answer))
 
     async def like(self, request: Request) -> Response:
         """What looks like a node or a picture."""
         asked = await read(request, wire.Like)
 
-        def answer() -> dict[str, Any]:
-            scene = self.thread.shown.answering(asked.variant)
+        def answer(shown: ShownScene) -> dict[str, Any]:
+            scene = shown.answering(asked.variant)
             if asked.node is not None:
                 hits = scene.like_node(asked.node, limit=answers.LISTED)
                 what = scene.names.of_node.get(asked.node) or f"node {asked.node}"
@@ -134,65 +147,58 @@ class Viewer:
             hits = scene.like_picture(_picture(asked.picture), limit=answers.LISTED)
             return answers.alike(scene, hits, "like the picture")
 
-        return answer_json(await self.thread.do(answer))
+        return answer_json(await self.thread.do(request, answer))
 
     async def field(self, request: Request) -> Response:
         """The field's relevancy of every Gaussian, a byte each."""
         asked = await read(request, wire.FieldRelevancy)
-        found = await self.thread.do(
-            self.thread.shown.field_relevancy, asked.variant, asked.text, asked.level
-        )
-        return plain(found.tobytes(), BYTES)
+
+        def answer(shown: ShownScene) -> bytes:
+            return shown.field_relevancy(asked.variant, asked.text, asked.level).tobytes()
+
+        return plain(await self.thread.do(request, answer), BYTES)
 
     async def pick(self, request: Request) -> Response:
         """What a pixel shows."""
         asked = await read(request, wire.Pick)
 
-        def find() -> dict[str, Any]:
-            has = asked.variant in self.thread.shown.variants
-            nodes = self.thread.shown.answering(asked.variant).tree.node_of_gaussian if has else None
-            found = pick(
-                self.thread.shown.gaussians,
-                nodes,
-                asked.camera.camera(),
-                asked.x,
-                asked.y,
-                self.thread.shown.threads,
-            )
+        def find(shown: ShownScene) -> dict[str, Any]:
+            has = asked.variant in shown.variants
+            nodes = shown.answering(asked.variant).tree.node_of_gaussian if has else None
+            found = pick(shown.gaussians, nodes, asked.camera.camera(), asked.x, asked.y, shown.threads)
             if found is None:
                 return {"nodes": [], "alpha": 0}
             return {"nodes": found.nodes, "alpha": found.alpha, "point": found.point}
 
-        return answer_json(await self.thread.do(find))
+        return answer_json(await self.thread.do(request, find))
 
     async def frame(self, request: Request) -> Response:
         """A picture of the scene."""
         asked = await read(request, wire.Frame)
 
-        def draw() -> bytes:
+        def draw(shown: ShownScene) -> bytes:
             from hilsplat.viewer.frames import painted
 
-            paint = self.thread.shown.paint(asked.variant, asked.style)
-            pixels = painted(
-                self.thread.shown.gaussians, asked.camera.camera(), paint, self.thread.shown.threads
-            )
+            paint = shown.paint(asked.variant, asked.style)
+            pixels = painted(shown.gaussians, asked.camera.camera(), paint, shown.threads)
             return encoded(pixels, asked.image, asked.quality)
 
-        return plain(await self.thread.do(draw), f"image/{asked.image}")
+        return plain(await self.thread.do(request, draw), f"image/{asked.image}")
 
     async def names(self, request: Request) -> Response:
         """Replace the names of a tree's nodes; `If-Match` is the version that was read."""
         asked = await read(request, wire.Names)
         version = request.headers.get("if-match", "").strip('"')
 
-        def write() -> dict[str, Any]:
-            found, scene = self.thread.shown.found(asked.variant), self.thread.shown.answering(asked.variant)
+        def write(shown: ShownScene) -> dict[str, Any]:
+            found, scene = shown.found(asked.variant), shown.answering(asked.variant)
             tree = found.parts.semantic_tree
-            names = write_names(found.folder, tree, asked.names, len(scene.tree), version)
-            self.thread.shown.renamed(asked.variant, names)
+            with shown.unchanged():  # or the names of these nodes would be given to another tree's
+                names = write_names(found.folder, tree, asked.names, len(scene.tree), version)
+            shown.renamed(asked.variant, names)
             return {"version": names.version, "names": dict(names.of_node)}
 
-        return answer_json(await self.thread.do(write))
+        return answer_json(await self.thread.do(request, write))
 
 
 def _picture(text: str) -> np.ndarray:

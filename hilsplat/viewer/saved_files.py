@@ -4,7 +4,9 @@ Films take long and read only arrays, so they have a thread of their own.
 """
 
 import asyncio
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 from starlette.requests import Request
@@ -17,6 +19,7 @@ from hilsplat.viewer import answers, exports, wire
 from hilsplat.viewer.html_page import html_page
 from hilsplat.viewer.scene_thread import SceneThread
 from hilsplat.viewer.server import BYTES, TYPES, answer_json, plain, read
+from hilsplat.viewer.shown import ShownScene
 
 
 class SavedFiles:
@@ -40,56 +43,63 @@ class SavedFiles:
         """Gaussians of nodes."""
         asked = await read(request, wire.Selection)
 
-        def make() -> bytes:
-            scene = self.thread.shown.answering(asked.variant)
+        def make(shown: ShownScene) -> bytes:
+            scene = shown.answering(asked.variant)
             rows = scene.gaussians_of(nodes_of(scene, asked.nodes))
-            return exports.selection_ply(self.thread.shown.folder / "gaussians.ply", rows)
+            with shown.unchanged():
+                return exports.selection_ply(shown.folder / "gaussians.ply", rows)
 
-        return plain(await self.thread.do(make), BYTES)
+        return plain(await self.thread.do(request, make), BYTES)
 
     async def boxes(self, request: Request) -> Response:
         """Boxes of nodes."""
         asked = await read(request, wire.Selection)
 
-        def make() -> dict[str, Any]:
-            scene = self.thread.shown.answering(asked.variant)
+        def make(shown: ShownScene) -> dict[str, Any]:
+            scene = shown.answering(asked.variant)
             return answers.boxes(scene, nodes_of(scene, asked.nodes))
 
-        return answer_json(await self.thread.do(make))
+        return answer_json(await self.thread.do(request, make))
 
     async def masks(self, request: Request) -> Response:
         """Masks of nodes in all views."""
         asked = await read(request, wire.Selection)
 
-        def make() -> bytes:
-            scene = self.thread.shown.answering(asked.variant)
+        def make(shown: ShownScene) -> bytes:
+            scene = shown.answering(asked.variant)
             return exports.masks_zip(scene, nodes_of(scene, asked.nodes))
 
-        return plain(await self.thread.do(make), "application/zip")
+        return plain(await self.thread.do(request, make), "application/zip")
 
     async def film(self, request: Request) -> Response:
         """A fly-around in the colours of the page."""
         asked = await read(request, wire.Film)
-        paint = await self.thread.do(self.thread.shown.paint, asked.variant, asked.style)
 
-        def make() -> bytes:
-            return exports.film(
-                self.thread.shown.gaussians,
-                self.thread.shown.scene,
-                paint,
+        def prepared(shown: ShownScene) -> Callable[[], bytes]:
+            return partial(
+                exports.film,
+                shown.gaussians,
+                shown.scene,
+                shown.paint(asked.variant, asked.style),
                 kind=asked.format,
                 frames=asked.frames,
                 side_px=asked.side_px,
-                threads=self.thread.shown.threads,
+                threads=shown.threads,
             )
 
+        make = await self.thread.do(request, prepared)
         data = await asyncio.get_running_loop().run_in_executor(self.films, make)
         return plain(data, "video/mp4" if asked.format == "mp4" else "image/gif")
 
     async def page(self, request: Request) -> Response:
         """The scene as one HTML file, with its answers to some texts."""
         asked = await read(request, wire.Page)
-        return plain(await self.thread.do(html_page, self.thread.shown, asked, self.static), TYPES["html"])
+
+        def make(shown: ShownScene) -> bytes:
+            with shown.unchanged():
+                return html_page(shown, asked, self.static)
+
+        return plain(await self.thread.do(request, make), TYPES["html"])
 
 
 def node_of(scene: LanguageScene, node: int) -> int:

@@ -1,13 +1,15 @@
 """Asking, choosing, naming and saving by hand, in both painters, by role and label as people find them."""
 
+import shutil
+
 import numpy as np
 import pytest
 
 import hilsplat
-from hilsplat.base.artifacts import read_json
+from hilsplat.base.artifacts import atomic_folder, read_json
 from hilsplat.base.images import write_png
 from hilsplat.splat.ply import load_ply
-from tests.browser.conftest import drawn, pixels, wire_camera
+from tests.browser.conftest import drawn, pixels, serving, wire_camera
 
 both = pytest.mark.parametrize("painter", ["gl", "server"])
 
@@ -262,3 +264,32 @@ def test_escape_and_letters_do_not_act_while_somebody_types(opened, desk_address
     assert not page.get_by_role("dialog").is_visible()
     page.locator("#view").press("?")
     assert page.get_by_role("dialog", name="Keys").is_visible()
+
+
+def test_a_scene_that_was_made_anew_is_told_and_loaded_again_without_the_old_choice(
+    opened, desk, tmp_path_factory
+):
+    project = tmp_path_factory.mktemp("changing")
+    shutil.copytree(desk.parents[2], project, dirs_exist_ok=True)
+    folder = project / desk.relative_to(desk.parents[2])
+    opened.expected.append("409")  # the browser reports what was refused
+    with serving(folder) as address:
+        page = opened(address, "server")
+        page.locator("#view").focus()
+        ask(page, "mug > handle")
+        answers(page).first.click()
+        page.locator("#overlay path.chosen").first.wait_for(state="attached")
+        page.wait_for_timeout(800)  # until the address holds the choice
+        assert "node=" in page.url and not page.get_by_role("alert").is_visible()
+        with np.load(folder / "default/semantic_tree/tree.npz") as held:
+            arrays = {**held, "quality": held["quality"] * 0.5}
+        with atomic_folder(folder / "default/semantic_tree") as new:
+            shutil.copytree(folder / "default/semantic_tree", new, dirs_exist_ok=True)
+            np.savez(new / "tree.npz", **arrays)
+        page.get_by_role("alert").get_by_text("The scene was made anew (semantic_tree)").wait_for()
+        page.locator("#overlay path.chosen").first.wait_for(state="attached")  # as it was
+        page.get_by_role("button", name="Reload").click()
+        page.get_by_role("alert").wait_for(state="hidden")
+        answers(page).first.wait_for()  # the question is asked again
+        assert page.locator("#text").input_value() == "mug > handle"
+        assert not page.locator("#overlay path.chosen").count()

@@ -3,7 +3,7 @@
 import * as api from "./api.js";
 import { $, nameOf } from "./elements.js";
 import { drawOverlay } from "./overlay.js";
-import { host, level, levelIndex, options, outlines, page, panes, variantOf } from "./state.js";
+import { host, level, levelIndex, main, options, outlines, page, panes, variantOf } from "./state.js";
 import { styleOf } from "./styles.js";
 
 const SLOW_MS = 60;
@@ -75,7 +75,7 @@ function remember() {
     const link = new URLSearchParams({ c: page.camera.toText() });
     const put = (key, value, usual) => { if (value && value !== usual) link.set(key, value); };
     put("q", page.asked?.text); put("level", level(), "auto"); put("by", panes[0].by, `${page.scene.variants[0]}|tree`); put("beside", panes[1]?.by);
-    put("node", page.chosen >= 0 ? String(page.chosen) : ""); put("colour", $("colour").value, "answers"); put("mode", $("mode").value, "tint");
+    put("node", page.chosen >= 0 ? `${page.chosen}.${main().tree}` : ""); put("colour", $("colour").value, "answers"); put("mode", $("mode").value, "tint");
     history.replaceState(null, "", `${location.pathname}${api.offline ? location.search : keptSearch()}#${link}`);
   }, 400);
 }

@@ -41,6 +41,7 @@ export function attachHands() {
   $("mode").addEventListener("change", restyle);
   $("colour").addEventListener("change", async () => { try { await fillField(); } catch (error) { failed(error); } restyle(); });
   $("blend").addEventListener("click", () => { if (page.camera.view < 0) stand(nearestView()); page.photos.cycle(); redraw(); });
+  $("reload").addEventListener("click", () => location.reload());
   $("help-button").addEventListener("click", () => $("help").showModal());
   $("picture-button").addEventListener("click", () => $("picture").click());
   $("picture").addEventListener("change", () => { if ($("picture").files[0]) askPicture($("picture").files[0]); $("picture").value = ""; });

@@ -12,7 +12,7 @@ import { Photos } from "./photos.js";
 import { describe, Renderer } from "./renderer.js";
 import { ServerPainter } from "./server_painter.js";
 import { failed, host, options, page, start, tell } from "./state.js";
-import { answersLater, fillVariants, POLL_MS, useVariants } from "./variants.js";
+import { fillVariants, useVariants, watch } from "./variants.js";
 
 function choosePainter(gl) {
   const wanted = options.get("painter") || (!gl.works || (gl.software && !api.offline) ? "server" : "gl");
@@ -57,8 +57,8 @@ async function begin() {
     fillVariants();
     $("about").textContent = `${page.scene.name}: ${counted(page.scene.gaussians, "Gaussian")}.`;
     tell("The run goes on: you can look around; questions will be answered when the semantic tree is there.");
-    setTimeout(answersLater, POLL_MS);
   }
+  if (!api.offline) watch();
 }
 
 // An exported page has no server: it answers the texts that it was made with.

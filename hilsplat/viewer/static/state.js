@@ -17,7 +17,16 @@ export const levelIndex = (answer) => Math.max(0, LEVELS.indexOf(level() === "au
 export const main = () => outlines.get(variantOf(panes[0]));
 
 export function tell(text, error = false) { $("status").textContent = text; $("status").classList.toggle("error", error); }
-export const failed = (error) => { if (error.name !== "AbortError") tell(error.message, true); };
+export const failed = (error) => {
+  if (error.status === 409) sceneChanged();
+  if (error.name !== "AbortError") tell(error.message, true);
+};
+
+// The page goes on to show what it was loaded with; another state comes with a reload and never in parts.
+export function sceneChanged(parts = []) {
+  $("changed").hidden = false;
+  $("changed-what").textContent = `The scene was made anew${parts.length ? ` (${parts.join(", ")})` : ""}. You still see it as it was.`;
+}
 
 export async function loadVariant(name, again = false) {
   if (outlines.has(name) && !again) return;

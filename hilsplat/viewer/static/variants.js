@@ -1,4 +1,4 @@
-// Who answers: variants of the scene, one or two of them side by side, as they come to exist.
+// Who answers: variants of the scene, one or two of them side by side, as they come to exist and change.
 
 import { showAnswers } from "./answers.js";
 import * as api from "./api.js";
@@ -6,9 +6,9 @@ import { ask } from "./asking.js";
 import { acts, choose } from "./choosing.js";
 import { redraw, restyle } from "./drawing.js";
 import { $, counted, make } from "./elements.js";
-import { failed, loadVariant, main, page, panes, start, tell, variantOf } from "./state.js";
+import { failed, loadVariant, main, page, panes, sceneChanged, start, tell, variantOf } from "./state.js";
 
-export const POLL_MS = 5000;
+const POLL_MS = 4000;
 
 export function fillVariants() {
   const choices = page.scene.variants.flatMap((name) => [[`${name}|tree`, `${name}, tree`], [`${name}|field`, `${name}, field`]]);
@@ -30,8 +30,8 @@ export async function useVariants() {
   fillVariants();
   showOutline();
   if (start.get("q")) { $("text").value = start.get("q"); await ask(); }
-  const node = Number(start.get("node") ?? -1);
-  if (node >= 0 && node < main().nodes.length) choose(node);
+  const [node, tree] = (start.get("node") ?? "").split(".");   // a row of another tree is another node
+  if (tree === main().tree && main().nodes[node]) choose(Number(node));
 }
 
 function showOutline() {
@@ -54,8 +54,23 @@ export async function choosePanes() {
   } catch (error) { failed(error); }
 }
 
-export async function answersLater() {   // while the run goes
-  try { page.scene.variants = (await api.scene()).variants; } catch { return; }
-  if (!page.scene.variants.length) { setTimeout(answersLater, POLL_MS); return; }
-  try { tell("Answers are ready."); await useVariants(); } catch (error) { failed(error); }
+// While the page is open: is what it shows still what lies on the disk, and does somebody else answer by now?
+export async function watch() {
+  while ($("changed").hidden) {
+    await new Promise((done) => setTimeout(done, POLL_MS));
+    if (document.hidden) continue;
+    try {
+      const now = await api.changes();
+      if (now.of !== page.scene.of || now.changed.length) sceneChanged(now.changed);
+      else if (now.variants.join() !== page.scene.variants.join()) await moreAnswer(now.variants);
+    } catch (error) { if (error.status) failed(error); }   // without a status, the server has ended
+  }
+}
+
+async function moreAnswer(variants) {
+  const first = !page.scene.variants.length;
+  page.scene.variants = variants;
+  if (!first) { fillVariants(); return; }
+  tell("Answers are ready.");
+  await useVariants();
 }
