@@ -4,13 +4,14 @@ Films take long and read only arrays, so they have a thread of their own.
 """
 
 import asyncio
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from functools import partial
+from threading import Event
 from typing import Any
 
 from starlette.requests import Request
-from starlette.responses import Response
+from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
 from hilsplat.base.errors import SettingsError
@@ -18,7 +19,7 @@ from hilsplat.query.language_scene import LanguageScene
 from hilsplat.viewer import answers, exports, wire
 from hilsplat.viewer.html_page import html_page
 from hilsplat.viewer.scene_thread import SceneThread
-from hilsplat.viewer.server import BYTES, TYPES, answer_json, plain, read
+from hilsplat.viewer.server import BYTES, TYPES, answer_json, as_json, plain, read
 from hilsplat.viewer.shown import ShownScene
 
 
@@ -72,10 +73,13 @@ class SavedFiles:
         return plain(await self.thread.do(request, make), "application/zip")
 
     async def film(self, request: Request) -> Response:
-        """A fly-around in the colours of the page."""
+        """A fly-around in the colours of the page: lines of JSON that tell how far it is, then the file.
+
+        The lines are `{"made": 3, "of": 120}` after each picture and `{"bytes": 12345}` before the file.
+        """
         asked = await read(request, wire.Film)
 
-        def prepared(shown: ShownScene) -> Callable[[], bytes]:
+        def prepared(shown: ShownScene) -> Callable[..., bytes]:
             return partial(
                 exports.film,
                 shown.gaussians,
@@ -87,9 +91,31 @@ class SavedFiles:
                 threads=shown.threads,
             )
 
-        make = await self.thread.do(request, prepared)
-        data = await asyncio.get_running_loop().run_in_executor(self.films, make)
-        return plain(data, "video/mp4" if asked.format == "mp4" else "image/gif")
+        of = -(-asked.frames // exports.STEP[asked.format])
+        return StreamingResponse(
+            self._filmed(await self.thread.do(request, prepared), of), headers={"cache-control": "no-store"}
+        )
+
+    async def _filmed(self, film: Callable[..., bytes], of: int) -> AsyncIterator[bytes]:
+        loop, made, left = asyncio.get_running_loop(), asyncio.Queue[int | None](), Event()
+
+        def told(number: int) -> None:
+            if left.is_set():
+                raise CancelledError("nobody waits for this film any more")
+            loop.call_soon_threadsafe(made.put_nowait, number)
+
+        making = loop.run_in_executor(self.films, partial(film, told=told))
+        making.add_done_callback(lambda _: made.put_nowait(None))
+        try:
+            yield _line(made=0, of=of)
+            while (number := await made.get()) is not None:
+                yield _line(made=number, of=of)
+            data = await making
+            yield _line(bytes=len(data))
+            yield data
+        finally:  # also if the page was left, or its film cancelled
+            left.set()
+            making.cancel()
 
     async def page(self, request: Request) -> Response:
         """The scene as one HTML file, with its answers to some texts."""
@@ -100,6 +126,10 @@ class SavedFiles:
                 return html_page(shown, asked, self.static)
 
         return plain(await self.thread.do(request, make), TYPES["html"])
+
+
+def _line(**told: int) -> bytes:
+    return as_json(told) + b"\n"
 
 
 def node_of(scene: LanguageScene, node: int) -> int:

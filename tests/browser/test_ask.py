@@ -4,6 +4,7 @@ import shutil
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import hilsplat
 from hilsplat.base.artifacts import atomic_folder, read_json
@@ -217,6 +218,27 @@ def test_a_selection_is_saved_as_gaussians(opened, desk_address, scene, tmp_path
     np.testing.assert_array_equal(
         load_ply(tmp_path / "saved.ply").means, scene.gaussians.means[hit.gaussians]
     )
+
+
+def test_a_film_tells_how_far_it_is_and_a_gif_has_the_chosen_size(opened, desk_address, tmp_path):
+    page = opened(desk_address)
+    page.locator("#save summary").click()
+    page.get_by_label("Longer side of the GIF").select_option("240")
+    with page.expect_download() as started:
+        page.get_by_role("button", name="Film, GIF").click()
+        page.get_by_role("progressbar", name="Film").wait_for()
+        page.get_by_text("of 60 pictures").wait_for()
+    started.value.save_as(tmp_path / "flight.gif")
+    gif = Image.open(tmp_path / "flight.gif")
+    assert max(gif.size) == 240 and gif.n_frames > 10
+    page.get_by_role("progressbar", name="Film").wait_for(state="hidden")
+    page.locator("#save summary").click()
+    page.get_by_role("button", name="Film, MP4").click()
+    page.get_by_text("of 120 pictures").wait_for()
+    page.get_by_role("button", name="Cancel").click()
+    page.get_by_role("status").get_by_text("The film was cancelled.").wait_for()
+    page.locator("#save summary").click()
+    assert page.get_by_role("button", name="Film, MP4").is_enabled()
 
 
 def test_an_exported_page_opens_from_a_file_and_answers(opened, browser, desk_address, tmp_path, scene):

@@ -1,6 +1,6 @@
 // The server's answers. The exported page has offline.js in this file's place, with the same names.
 
-import { get, send } from "./http.js";
+import { get, send, streamed } from "./http.js";
 
 export const offline = false;
 export const texts = [];   // what an exported page can answer
@@ -31,3 +31,4 @@ export const frame = async (asked, signal) => (await send(at("/api/frame"), aske
 export const names = async (asked, version) =>
   (await send(at("/api/names"), asked, { method: "PUT", headers: { "if-match": `"${version}"` } })).json();
 export const saved = async (kind, asked) => (await send(at(`/api/export/${kind}`), asked)).blob();
+export const film = async (asked, told, signal) => streamed(await send(at("/api/export/film"), asked, { signal }), told);

@@ -65,6 +65,7 @@ async function begin() {
 function onlyWhatIsHere() {
   for (const element of [$("picture-button"), $("here").parentElement, $("left").parentElement, $("right").parentElement]) element.hidden = true;
   for (const button of $("save").querySelectorAll("[data-save]:not([data-save=still])")) button.hidden = true;
+  $("gif-side").hidden = true;
   $("save").querySelector("hr").hidden = true;
   $("colour").querySelector("[value=field]").remove();
   $("levels").hidden = true;

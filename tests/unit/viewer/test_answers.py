@@ -1,10 +1,12 @@
 """Questions to the server, and the files that it gives away, against `LanguageScene` itself."""
 
+import asyncio
 import base64
 import io
 import json
 import re
 import shutil
+import threading
 import zipfile
 import zlib
 from pathlib import Path
@@ -24,6 +26,8 @@ from hilsplat.splat.ply import load_ply
 from hilsplat.viewer.app import Viewer
 from hilsplat.viewer.exports import coco_counts
 from hilsplat.viewer.payload import packed_gaussians
+from hilsplat.viewer.saved_files import SavedFiles
+from hilsplat.viewer.scene_thread import SceneThread
 from hilsplat.viewer.shown import ShownScene
 from tests.unit.finished_desk import SCENE
 from tests.unit.viewer.conftest import ADDRESS, TOKEN
@@ -153,18 +157,60 @@ def test_coco_runs_begin_with_zeros(mask):
     np.testing.assert_array_equal(coco_masks.decode(runs).astype(bool), mask)
 
 
+def filmed(client, **sent) -> tuple[list[tuple[int, int]], bytes]:
+    """How far the film was, line by line, and the film."""
+    told, rest = [], client.post("/api/export/film", json=sent).content
+    while True:
+        line, _, rest = rest.partition(b"\n")
+        said = json.loads(line)
+        if "bytes" in said:
+            assert len(rest) == said["bytes"]
+            return told, rest
+        told.append((said["made"], said["of"]))
+
+
 def test_films_have_the_frames_that_were_asked_for(client, tmp_path):
-    sent = {"frames": 6, "side_px": 64}
-    (tmp_path / "film.mp4").write_bytes(client.post("/api/export/film", json=sent).content)
+    told, data = filmed(client, frames=6, side_px=64)
+    assert told == [(made, 6) for made in range(7)]
+    (tmp_path / "film.mp4").write_bytes(data)
     with av.open(str(tmp_path / "film.mp4")) as film:
         frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
     assert len(frames) == 6 and frames[0].shape == (36, 64, 3) and frames[0].std() > 20
-    gif = Image.open(io.BytesIO(client.post("/api/export/film", json={**sent, "format": "gif"}).content))
+
+
+@pytest.mark.parametrize("side_px", [64, 96])
+def test_a_gif_has_every_other_frame_in_the_size_that_was_asked_for(client, side_px):
+    told, data = filmed(client, frames=7, side_px=side_px, format="gif")
+    assert told == [(made, 4) for made in range(5)]
+    gif = Image.open(io.BytesIO(data))
     durations = []
     for number in range(gif.n_frames):  # equal neighbours are one frame that lasts longer
         gif.seek(number)
         durations.append(gif.info["duration"])
-    assert sum(durations) == pytest.approx(3 * 1000 / 12, abs=15) and gif.info["loop"] == 0
+    assert sum(durations) == pytest.approx(4 * 1000 / 12, abs=15) and gif.info["loop"] == 0
+    assert max(gif.size) == side_px
+
+
+def test_a_film_that_nobody_waits_for_ends(shown):
+    """Its thread draws at most the picture that it had begun, and is free for the next film."""
+    files, drawn, free = SavedFiles(SceneThread(shown), {}), [], threading.Event()
+
+    def film(told) -> bytes:
+        for number in range(1000):
+            drawn.append(number)
+            told(number + 1)
+            free.wait(0.01)
+        return b""
+
+    async def leave() -> None:
+        parts = files._filmed(film, 1000)
+        assert json.loads(await anext(parts)) == {"made": 0, "of": 1000}
+        assert json.loads(await anext(parts)) == {"made": 1, "of": 1000}
+        await parts.aclose()
+
+    asyncio.run(leave())
+    files.films.submit(free.set).result(timeout=20)
+    assert len(drawn) < 500
 
 
 def test_a_crop_shows_the_node_and_dims_the_rest(client, scene):
