@@ -198,13 +198,17 @@ def film(
 
 
 def write_gif(path: Path, frames: Iterator[np.ndarray]) -> None:
-    """A GIF that repeats, with 128 colours chosen from the whole film."""
+    """A GIF that repeats, with 256 colours chosen from the whole film.
+
+    Without dithering: that took a synthetic table from 41 dB to 35 and from 2.5 MB to 3.6 (with 128 colours),
+    and strewed dots over the answer.
+    """
     kept = [Image.fromarray(frame) for frame in frames]
     sheet = Image.new("RGB", (kept[0].width, kept[0].height * min(len(kept), 8)))
     for number in range(min(len(kept), 8)):
         sheet.paste(kept[number * len(kept) // min(len(kept), 8)], (0, number * kept[0].height))
-    palette = sheet.quantize(128)
-    first, *others = [frame.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for frame in kept]
+    palette = sheet.quantize(256)
+    first, *others = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in kept]
     first.save(
         path,
         save_all=True,

@@ -24,7 +24,7 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.query.names import FILE
 from hilsplat.splat.ply import load_ply
 from hilsplat.viewer.app import Viewer
-from hilsplat.viewer.exports import coco_counts
+from hilsplat.viewer.exports import coco_counts, write_gif
 from hilsplat.viewer.payload import packed_gaussians
 from hilsplat.viewer.saved_files import SavedFiles
 from hilsplat.viewer.scene_thread import SceneThread
@@ -280,9 +280,28 @@ def test_gaussians_are_shown_while_the_run_goes_and_answers_come_later(built_des
         assert ask(client, "mug", answerer="field")["hits"]
 
 
+def test_a_scene_that_is_too_large_is_refused_with_advice(built_desk, monkeypatch):
+    monkeypatch.setattr("hilsplat.viewer.shown.MAX_GAUSSIANS", 100)
+    with pytest.raises(
+        ArtifactError, match=r"too large for the page\n.*at most 100 Gaussians\n.*\n.*max_gaussians"
+    ):
+        ShownScene(built_desk / SCENE)
+
+
 def test_a_scene_without_gaussians_says_what_to_run(tmp_path):
     with pytest.raises(ArtifactError, match=r"scene folder .* is missing"):
         ShownScene(tmp_path / "nothing")
     (tmp_path / "scene").mkdir()
     with pytest.raises(ArtifactError, match=r"snakemake --cores 2 .*gaussians\.ply"):
         ShownScene(tmp_path)
+
+
+def test_a_gif_keeps_the_shades_of_a_small_answer_in_grey_surroundings(tmp_path):
+    grey = np.clip(np.random.default_rng(0).normal(60, 16, (160, 160, 1)), 0, 255)
+    frame = np.repeat(grey, 3, axis=2)
+    x, y = np.meshgrid(*[np.linspace(0, 1, 32)] * 2)
+    frame[:32, :32] = np.stack([200 + 55 * y, 90 + 60 * x, 10 + 60 * x * y], axis=2)
+    frame = frame.astype(np.uint8)
+    write_gif(tmp_path / "still.gif", iter([frame]))
+    kept = np.asarray(Image.open(tmp_path / "still.gif").convert("RGB"), float)[:32, :32]
+    assert np.sqrt(np.square(kept - frame[:32, :32]).mean()) < 3
