@@ -108,7 +108,7 @@ class Viewer:
             with shown.unchanged():
                 return send(shown.scene, request.path_params["number"])
 
-        return await self.thread.do(request, find)
+        return await self.thread.do_behind(request, find)
 
     async def crop(self, request: Request) -> Response:
         """A node as its best photograph shows it."""
@@ -119,7 +119,7 @@ class Viewer:
             with shown.unchanged():
                 return encoded(exports.crop(scene, node, shown.threads))
 
-        return plain(await self.thread.do(request, draw), "image/jpeg", cached=True)
+        return plain(await self.thread.do_behind(request, draw), "image/jpeg", cached=True)
 
     # -- answers ----------------------------------------------------------------------------------
 

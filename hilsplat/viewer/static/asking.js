@@ -54,7 +54,7 @@ export async function ask(keepChoice = false) {
   if (!text) { clearAnswer(); return; }
   const view = $("here").checked ? page.camera.view : -1;
   if ($("here").checked && view < 0) { tell("Stand at a photograph first: choose one below.", true); return; }
-  if (!keepChoice) choose(-1);
+  if (!keepChoice && page.chosen >= 0) choose(-1);   // nothing to take back: nothing to draw before the answer
   await askAll({ text }, (pane, signal) => api.query({ variant: variantOf(pane), text, level: level(), answerer: answererOf(pane), ...(view >= 0 ? { view } : {}) }, signal));
 }
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from pycocotools import mask as coco_masks
+from starlette.requests import Request
 from starlette.testclient import TestClient
 
 from hilsplat.base.artifacts import read_json
@@ -211,6 +212,25 @@ def test_a_film_that_nobody_waits_for_ends(shown):
     asyncio.run(leave())
     files.films.submit(free.set).result(timeout=20)
     assert len(drawn) < 500
+
+
+def test_a_question_waits_for_one_crop_at_most(shown):
+    thread, order = SceneThread(shown), []
+    request = Request({"type": "http", "query_string": b""})
+
+    async def ask_among_crops() -> None:
+        crops = [thread.do_behind(request, lambda _, n=n: order.append(n)) for n in range(6)]
+        tasks = [asyncio.create_task(crop) for crop in crops]
+        for _ in range(3):  # until the first crop is with the thread, and the others wait for it
+            await asyncio.sleep(0)
+        await thread.do(request, lambda _: order.append("question"))
+        await asyncio.gather(*tasks)
+
+    held = threading.Event()
+    thread.worker.submit(held.wait, 5)  # the thread is busy until all have come
+    threading.Timer(0.5, held.set).start()
+    asyncio.run(ask_among_crops())
+    assert order == [0, "question", 1, 2, 3, 4, 5]
 
 
 def test_a_crop_shows_the_node_and_dims_the_rest(client, scene):
