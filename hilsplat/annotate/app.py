@@ -142,7 +142,7 @@ class Annotator:
             Route("/api/import", self.take_in, methods=["POST"]),
             Route("/api/export/{kind}", self.export),
         ]
-        return guarded(routes, token, StaleLabelsError, MAX_BODY_BYTES)
+        return guarded(routes, token, {StaleLabelsError: 412}, MAX_BODY_BYTES)
 
     async def _do(self, work: Callable[..., Made], *arguments: Any) -> Made:
         """Run on the one thread that touches files."""

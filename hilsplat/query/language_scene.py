@@ -6,38 +6,31 @@ Gaussians.
 """
 
 import logging
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Literal, cast, get_args
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float32, Int64, UInt8
 
-from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.device import ComputeDevice, compute_device
 from hilsplat.base.errors import ArtifactError, ModelError, SettingsError
-from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.field.code import Code, autoencoder_file, load_code
+from hilsplat.field.code import Code
 from hilsplat.field.language_field import LanguageField
-from hilsplat.models.store import is_embedded, meaningless
-from hilsplat.query.field_colours import field_colours
+from hilsplat.query.field_answers import FieldAnswers
 from hilsplat.query.hits import Hit, hit_of, hits_of
-from hilsplat.query.latent_relevancy import LatentRelevancy
-from hilsplat.query.look_up_kernels import fill_maps
 from hilsplat.query.names import PATH_SEPARATOR, NodeNames, read_names
 from hilsplat.query.node_search import NodeHits, search
+from hilsplat.query.opening import Opened, OpenedParts
 from hilsplat.query.relevancy import margins, relevancy_of_margins
-from hilsplat.query.view_nodes import ViewNodes
+from hilsplat.query.scene_views import SceneViews, members_of
 from hilsplat.query.view_store import ViewStore
-from hilsplat.scene.cameras import Camera
-from hilsplat.scene.finished import FinishedScene, SceneParts, is_drawn, require_made_for
+from hilsplat.scene.finished import FinishedScene, SceneParts
 from hilsplat.scene.scene import Scene
-from hilsplat.semantic_tree.nodes import node_means
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings
 from hilsplat.splat.gaussians import Gaussians
@@ -47,29 +40,9 @@ logger = logging.getLogger(__name__)
 NAMED = 2.0
 """Cosine margin of a node for the name that a person gave it: the largest there is, so it comes first."""
 
-MIN_SHOWN_SHARE = 1e-4
-"""Least share of a view that shows a node: 14 px of 384 x 384 show nothing."""
-
-MIN_LATENT_SHARE = 0.5
-"""A pixel has a latent at a level if Gaussians with one make up more than this share of it."""
-
 TextEncoder = Callable[[list[str]], np.ndarray]
 PictureEncoder = Callable[[np.ndarray], np.ndarray]
 Answerer = Literal["tree", "field"]
-
-
-class Opened:
-    """Artifacts by path: variants of a scene share most of them, so each is opened and hashed once."""
-
-    def __init__(self) -> None:
-        self._kept: dict[tuple[Hashable, ...], Any] = {}
-
-    def get(self, how: Callable[..., Any], path: Path, *more: Hashable) -> Any:
-        """`how(path, *more)`, or what it returned before."""
-        key = (how, Path(path).resolve(), *more)
-        if key not in self._kept:
-            self._kept[key] = how(path, *more)
-        return self._kept[key]
 
 
 @dataclass(frozen=True)
@@ -173,48 +146,29 @@ class LanguageScene:
                 another autoencoder.
             ModelError: the CLIP that embedded the masks is not found.
         """
-        from hilsplat.embed.clip import open_clip_of
-        from hilsplat.splat.ply import load_ply
         from hilsplat.splat.rasterise.api import pixel_weights
 
         if device not in get_args(ComputeDevice):
             raise SettingsError(
                 f"device {device!r} is unknown", expected=" or ".join(get_args(ComputeDevice)), found=device
             )
-        opened = opened or Opened()
-        scene = opened.get(Scene.load, parts.scene)
-        gaussians = opened.get(load_ply, parts.gaussians)
-        tree = opened.get(SemanticTree.load, parts.semantic_tree)
-        made_for = {"semantic tree": tree.gaussians_sha256}
-        clip = opened.get(open_clip_of, parts.clip, threads, settings.template)
-        language = code = None
-        if parts.field is not None and parts.autoencoder is not None:
-            language = opened.get(LanguageField.load, parts.field)
-            made_for["language field"] = language.gaussians_sha256
-            code_file = autoencoder_file(parts.autoencoder)
-            own = {"language field": language.autoencoder_sha256}
-            require_made_for(code_file, opened.get(sha256_of_file, code_file), scene.name, own)
-            code = opened.get(load_code, parts.autoencoder)
-            clip.require_width(code.channels, f"autoencoder {parts.autoencoder}")
-        require_made_for(parts.gaussians, opened.get(sha256_of_file, parts.gaussians), scene.name, made_for)
+        found = OpenedParts.of(parts, settings.template, threads, opened or Opened())
         return LanguageScene(
-            scene,
-            gaussians,
-            tree,
-            language,
-            code,
-            clip.embed_texts,
+            found.scene,
+            found.gaussians,
+            found.tree,
+            found.language,
+            found.code,
+            found.clip.embed_texts,
             lambda view: pixel_weights(
-                gaussians, scene.cameras[view], min_weight=tree.min_weight, threads=threads
+                found.gaussians, found.scene.cameras[view], min_weight=found.tree.min_weight, threads=threads
             ),
             settings,
             threads,
             compute_device(cast(ComputeDevice, device)),
-            meaningless(clip.model.folder.name)
-            if is_embedded(clip.model.config) and not is_drawn(parts.scene)
-            else "",
+            found.caution,
             names=names or NodeNames(),
-            encode_picture=clip.embed_picture,
+            encode_picture=found.clip.embed_picture,
         )
 
     def trained(self) -> tuple[LanguageField, Code]:
@@ -351,33 +305,15 @@ class LanguageScene:
 
     def nodes_shown(self, view: str) -> Bool[np.ndarray, " n"]:
         """Which nodes have a mask of at least `MIN_SHOWN_SHARE` of a view."""
-        height, width = self._camera(view).size_hw
-
-        def measure() -> np.ndarray:
-            num = len(self.tree)
-            area_px = np.sum([self._view_nodes(view, level).area_px(num) for level in LEVELS], axis=0)
-            return np.asarray(area_px >= MIN_SHOWN_SHARE * height * width)
-
-        return self._views.get(("shown", view), measure, lambda kept: kept.nbytes)
+        return self._shown.shown(view)
 
     def gaussians_of(self, ids: Sequence[int] | Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " g"]:
         """Rows of `gaussians.ply` that belong to any of the nodes."""
-        return np.flatnonzero(np.isin(self.tree.node_of_gaussian, np.asarray(ids)).any(axis=1))
+        return members_of(self.tree, ids)
 
     def node_masks(self, view: str, ids: Sequence[int] | Int64[np.ndarray, " n"]) -> Bool[np.ndarray, "H W"]:
         """Pixels that consist of the nodes' Gaussians by more than half."""
-        ids = np.asarray(ids, np.int64)
-        height, width = self._camera(view).size_hw
-        if not len(ids):
-            return np.zeros((height, width), np.bool_)
-        chosen = np.zeros(len(self.tree), np.bool_)
-        chosen[ids] = True
-        levels = np.unique(self.tree.level[ids])
-        if len(levels) == 1:
-            return self._view_nodes(view, Level(int(levels[0]))).mask(chosen).reshape(height, width)
-        member = np.zeros(len(self.tree.node_of_gaussian), np.float32)
-        member[self.gaussians_of(ids)] = 1
-        return (self.view_weights(view) @ member > 0.5).reshape(height, width)
+        return self._shown.masks(view, ids)
 
     # -- views ------------------------------------------------------------------------------------
 
@@ -388,28 +324,7 @@ class LanguageScene:
 
     def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
         """The undistorted photograph of a view; read-only because it is cached, so copy it to draw on it."""
-        self._camera(view)
-
-        def read() -> np.ndarray:
-            pixels = self.scene.image(view)
-            pixels.setflags(write=False)
-            return pixels
-
-        return self._views.get(("image", view), read, lambda kept: kept.nbytes)
-
-    def _camera(self, view: str) -> Camera:
-        """Camera of a view.
-
-        Raises:
-            SettingsError: the scene has no such view.
-        """
-        if view not in self.views:
-            raise SettingsError(
-                f"{self.scene.name} has no view {view!r}",
-                expected=f"one of {', '.join(self.views[:3])}, ... ({len(self.views)} views)",
-                found=view,
-            )
-        return self.scene.cameras[view]
+        return self._shown.image(view)
 
     # -- relevancy --------------------------------------------------------------------------------
 
@@ -443,7 +358,7 @@ class LanguageScene:
 
     def node_vectors(self, answerer: Answerer = "tree") -> Float32[np.ndarray, "n C"]:
         """Unit vectors that nodes answer with: their own, or decoded from the field of their Gaussians."""
-        return self.tree.clip if answerer == "tree" else self._node_field_vectors
+        return self.tree.clip if answerer == "tree" else self._field.node_vectors
 
     def node_relevancy_map(self, texts: Sequence[str], view: str) -> Float32[np.ndarray, "T 3 H W"]:
         """Relevancy of the nodes that a pixel shows, blended by its weights, at each level.
@@ -452,17 +367,7 @@ class LanguageScene:
         not cover get the least relevancy of the covered ones, so that they are never selected and do not
         stretch the range.
         """
-        scores = self.node_relevancy(texts)
-        height, width = self._camera(view).size_hw
-        maps = np.zeros((len(texts), len(LEVELS), height * width), np.float32)
-        for level in LEVELS:
-            nodes = self.tree.nodes_of(level)
-            if not len(nodes):
-                continue
-            shown = self._view_nodes(view, level)
-            for row, values in enumerate(scores):
-                maps[row, level.index] = shown.blend(values, float(values[nodes].min()))
-        return maps.reshape(len(texts), len(LEVELS), height, width)
+        return self._shown.blended(view, self.node_relevancy(texts))
 
     def field_relevancy(
         self, texts: Sequence[str], view: str, *, exact: bool = True
@@ -478,98 +383,30 @@ class LanguageScene:
             exact: True: a network decodes every pixel at every call; False: a view is decoded once, and
                 answers differ by at most 2e-3 (see `latent_relevancy`). No difference for a linear code.
         """
-        answer = self._latent_relevancy
-        shown, vectors = self._view_latents(view), self.text_vectors(texts)
-        placed = self._placed_latents(view) if answer.is_linear or not exact else None
-        height, width = self._camera(view).size_hw
-        maps = np.zeros((len(texts), len(LEVELS), height * width), np.float32)
-        for index, (pixels, latents) in enumerate(shown):
-            if not len(pixels):
-                continue
-            found = answer.exact(latents, vectors) if placed is None else answer.fast(placed[index], vectors)
-            fill_maps(found, found.min(axis=1), pixels, index, maps)
-        return maps.reshape(len(texts), len(LEVELS), height, width)
+        return self._field.relevancy(texts, view, exact=exact)
 
     def gaussian_relevancy(self, text: str, level: str = "auto") -> Float32[np.ndarray, " N"]:
         """The field's relevancy of every Gaussian at a level, or at its best; 0 without a latent."""
-        named = [each for each in LEVELS if level in ("auto", each.label)]
-        features = self.trained()[0].features
-        out = np.zeros(len(self.gaussians), np.float32)
-        vector = self.text_vectors([text])
-        for each in named:
-            latents = np.ascontiguousarray(features[:, each.index], np.float32)
-            has = np.flatnonzero((latents != 0).any(axis=1))
-            if len(has):
-                own = self._latent_relevancy.exact(latents[has], vector)[0]
-                out[has] = np.maximum(out[has], own)
-        return out
+        return self._field.of_gaussians(text, level)
 
     def field_image(self, view: str, level: Level) -> UInt8[np.ndarray, "H W 3"]:
         """The field of a level as colours (see `field_colours`); uncovered pixels are black."""
-        weights = self.view_weights(view)
-        colours = field_colours(self.trained()[0].features[:, level.index])
-        return to_uint8((weights @ colours).reshape(*self._camera(view).size_hw, 3))
-
-    # -- what is kept of a view -------------------------------------------------------------------
+        return self._field.image(view, level)
 
     def view_weights(self, view: str) -> sp.csr_matrix:
         """W of a view with rows divided by alpha; rows of alpha below a half are empty."""
-        return self._views.get(
-            ("weights", view),
-            lambda: normalised_weights(self.pixel_weights(view)),
-            lambda kept: kept.data.nbytes + kept.indices.nbytes + kept.indptr.nbytes,
-        )
-
-    def _view_nodes(self, view: str, level: Level) -> ViewNodes:
-        return self._views.get(
-            ("nodes", view, level),
-            lambda: ViewNodes.of(self.view_weights(view), self.tree.node_of_gaussian[:, level.index]),
-            lambda kept: kept.nbytes,
-        )
-
-    def _view_latents(self, view: str) -> list[tuple[np.ndarray, Float32[np.ndarray, "P D"]]]:
-        """Per level, the pixels that show mostly Gaussians with a latent, and their rendered latents."""
-
-        def render() -> list[tuple[np.ndarray, np.ndarray]]:
-            weights, features = self.view_weights(view), self.trained()[0].features
-            shares = weights @ (features != 0).any(axis=2).astype(np.float32)
-            rendered = (weights @ features.reshape(len(features), -1)).reshape(-1, *features.shape[1:])
-            shown = []
-            for index in range(len(LEVELS)):
-                pixels = np.flatnonzero(shares[:, index] > MIN_LATENT_SHARE)
-                # Gaussians without a latent hold zeros, which a code would decode like any other: leave them
-                # out.
-                shown.append((pixels, rendered[pixels, index] / shares[pixels, index, None]))
-            return shown
-
-        return self._views.get(
-            ("latents", view), render, lambda kept: sum(a.nbytes + b.nbytes for a, b in kept)
-        )
-
-    def _placed_latents(self, view: str) -> list:
-        """What look-ups of a view need, level by level; made at its first look-up."""
-        return self._views.get(
-            ("placed", view),
-            lambda: [self._latent_relevancy.prepare(latents) for _, latents in self._view_latents(view)],
-            lambda kept: sum(each.nbytes for each in kept),
-        )
+        return self._shown.weights(view)
 
     @cached_property
-    def _latent_relevancy(self) -> LatentRelevancy:
-        return LatentRelevancy(
-            self.trained()[1],
-            self.text_vectors(self.settings.canonical),
-            self.settings.relevancy_scale,
-            self.threads,
-            self.device,
-        )
+    def _shown(self) -> SceneViews:
+        return SceneViews(self.scene, self.tree, self.pixel_weights, self._views)
 
     @cached_property
-    def _node_field_vectors(self) -> Float32[np.ndarray, "n C"]:
-        """Decoded mean latent of each node's Gaussians at its level."""
+    def _field(self) -> FieldAnswers:
         language, code = self.trained()
-        means = node_means(self.tree.node_of_gaussian, self.tree.level, language.features)
-        return code.decode_array(means)
+        return FieldAnswers(
+            language, code, self._shown, self.text_vectors, self.settings, self.threads, self.device
+        )
 
 
 def path_of(text: str) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 import io
 import json
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -24,7 +24,8 @@ from hilsplat.splat.rasterise.cpu import blend_forward, project_gaussians
 from hilsplat.viewer.frames import Paint, painted
 
 FRAMES_PER_S = 24
-GIF_FRAMES_PER_S = 12
+STEP = {"mp4": 1, "gif": 2}
+"""A GIF has every other picture of the flight, or it would be far larger than the film."""
 CROP_PX = 160
 CROP_MARGIN = 0.15
 LEAST_ALPHA = 0.1
@@ -162,17 +163,30 @@ def film(
     frames: int = 120,
     side_px: int = 640,
     threads: int = 1,
+    told: Callable[[int], None] = lambda drawn: None,
 ) -> bytes:
-    """A closed flight around what the training cameras saw, in the colours of a style."""
+    """A closed flight around what the training cameras saw, in the colours of a style.
+
+    Args:
+        gaussians: what is flown around.
+        scene: cameras.
+        paint: the style; None: the scene's own colours.
+        kind: "mp4" or "gif".
+        frames: of the flight; a GIF has every other one.
+        side_px: the longer side.
+        threads: for drawing.
+        told: gets the number of pictures drawn, after each; what it raises ends the film.
+    """
     cameras = [scene.cameras[view] for view in scene.views("train") or scene.views()]
     height, width = cameras[0].size_hw
     scale = side_px / max(height, width)
     size_hw = (max(2, round(height * scale / 2) * 2), max(2, round(width * scale / 2) * 2))
-    path = [camera.scaled(size_hw) for camera in closed_path(cameras, frames)]
+    path = [camera.scaled(size_hw) for camera in closed_path(cameras, frames)[:: STEP[kind]]]
 
     def pictures() -> Iterator[np.ndarray]:
-        for camera in path:
+        for number, camera in enumerate(path):
             yield painted(gaussians, camera, paint, threads)
+            told(number + 1)
 
     with TemporaryDirectory() as folder:
         out = Path(folder) / f"film.{kind}"
@@ -184,18 +198,22 @@ def film(
 
 
 def write_gif(path: Path, frames: Iterator[np.ndarray]) -> None:
-    """Every other frame as a GIF that repeats, with 128 colours chosen from the whole film."""
-    kept = [Image.fromarray(frame) for number, frame in enumerate(frames) if number % 2 == 0]
+    """A GIF that repeats, with 256 colours chosen from the whole film.
+
+    Without dithering: that took a synthetic table from 41 dB to 35 and from 2.5 MB to 3.6 (with 128 colours),
+    and strewed dots over the answer.
+    """
+    kept = [Image.fromarray(frame) for frame in frames]
     sheet = Image.new("RGB", (kept[0].width, kept[0].height * min(len(kept), 8)))
     for number in range(min(len(kept), 8)):
         sheet.paste(kept[number * len(kept) // min(len(kept), 8)], (0, number * kept[0].height))
-    palette = sheet.quantize(128)
-    first, *others = [frame.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for frame in kept]
+    palette = sheet.quantize(256)
+    first, *others = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in kept]
     first.save(
         path,
         save_all=True,
         append_images=others,
-        duration=round(1000 / GIF_FRAMES_PER_S),
+        duration=round(1000 * STEP["gif"] / FRAMES_PER_S),
         loop=0,
         optimize=False,
     )

@@ -4,7 +4,7 @@ import json
 import secrets
 import socket
 import webbrowser
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from importlib.resources import files
 from typing import Any, TypeVar
 
@@ -56,10 +56,12 @@ class Pages:
         return plain(self.static[name], TYPES[name.rpartition(".")[2]])
 
 
-def guarded(routes: list[Route], token: str, stale: type[Exception], max_body: int = MAX_BODY_BYTES) -> Guard:
-    """The application: errors become text for the page; `stale` says that a version is no longer the last."""
+def guarded(
+    routes: list[Route], token: str, statuses: Mapping[type[Exception], int], max_body: int = MAX_BODY_BYTES
+) -> Guard:
+    """The application: errors become text for the page, some of them with a status of their own."""
     handlers: dict[Any, Any] = {
-        stale: _told(412),
+        **{error: _told(status) for error, status in statuses.items()},
         HilsplatError: _told(422),
         ValidationError: _told(400),
     }

@@ -1,6 +1,9 @@
 """A scene's folder as the page shows it: Gaussians at once, each variant's answers when they exist."""
 
 import logging
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +13,9 @@ import numpy as np
 
 from hilsplat.base.artifacts import read_index, sha256_of_file
 from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError
-from hilsplat.query.language_scene import LanguageScene, Opened
+from hilsplat.query.language_scene import LanguageScene
+from hilsplat.query.names import tree_digest
+from hilsplat.query.opening import Opened
 from hilsplat.query.view_store import ViewStore
 from hilsplat.scene.finished import FinishedScene, finished_variants
 from hilsplat.scene.scene import Scene
@@ -20,6 +25,7 @@ from hilsplat.splat.ply import load_ply
 from hilsplat.viewer import payload
 from hilsplat.viewer.frames import Paint
 from hilsplat.viewer.wire import Style
+from hilsplat.viewer.witness import StaleSceneError, Witness
 
 VIEWS_MIB = 256.0
 """Memory for what is kept of views, such as their compositing weights."""
@@ -44,7 +50,9 @@ class ShownScene:
 
     def __init__(self, folder: Path, variant: str = "default", threads: int = 1) -> None:
         self.folder, self.first, self.threads = Path(folder), variant, threads
-        self.opened = Opened()
+        self.opened, self.witness = Opened(), Witness()
+        self.state = secrets.token_hex(4)
+        """Names what was opened here; another opening has another name."""
         ply = self.folder / "gaussians.ply"
         if not self.folder.is_dir():
             raise ArtifactError(
@@ -57,6 +65,7 @@ class ShownScene:
             raise ArtifactError(
                 f"{folder} has no Gaussians to show yet: {ply} is missing", fix=f"snakemake --cores 2 {ply}"
             )
+        self.witness.note((self.folder / "scene", ply))
         self.scene: Scene = self.opened.get(Scene.load, self.folder / "scene")
         self.gaussians: Gaussians = self.opened.get(load_ply, ply)
         if len(self.gaussians) > MAX_GAUSSIANS:
@@ -67,9 +76,42 @@ class ShownScene:
                 fix="lower gaussians.max_gaussians",
             )
         self._variants: dict[str, LanguageScene] = {}
+        self._trees: dict[str, str] = {}
         self._found: dict[str, FinishedScene] = {}
         self._relevancy: dict[str, np.ndarray] = {}
         self._painted: tuple[Any, Paint] | None = None
+
+    # -- what is written meanwhile ----------------------------------------------------------------
+
+    def changed(self) -> list[str]:
+        """Opened parts that were written anew, or are gone; the page shows what was opened nevertheless."""
+        return sorted({path.name for path in self.witness.changed()})
+
+    @contextmanager
+    def unchanged(self) -> Iterator[None]:
+        """Around whatever reads the disk: it must read what belongs to what was opened before.
+
+        Raises:
+            StaleSceneError: a part was written anew before or meanwhile.
+        """
+        self._require_unchanged()
+        yield
+        self._require_unchanged()
+
+    def _require_unchanged(self) -> None:
+        if changed := self.changed():
+            raise StaleSceneError(
+                f"{', '.join(changed)} of {self.scene.name} changed on the disk since the page was loaded",
+                fix="reload the page",
+            )
+
+    def opened_again(self) -> "ShownScene":
+        """The scene as it is on the disk now.
+
+        Raises:
+            ArtifactError: as in the constructor.
+        """
+        return ShownScene(self.folder, self.first, self.threads)
 
     # -- variants ---------------------------------------------------------------------------------
 
@@ -84,6 +126,7 @@ class ShownScene:
 
         Raises:
             SettingsError: the variant does not exist, or not yet.
+            StaleSceneError: it must be opened, and what was opened before was written anew.
             HilsplatError: its parts cannot be opened.
         """
         before = self._variants.get(variant)
@@ -93,8 +136,11 @@ class ShownScene:
                     f"variant {variant!r} cannot answer here",
                     expected=", ".join(self.variants) or "none yet: the run goes on",
                 )
-            found = FinishedScene.locate(self.folder, variant)
-            opened = LanguageScene.of(found, threads=self.threads, opened=self.opened)
+            with self.unchanged():
+                found = FinishedScene.locate(self.folder, variant)
+                self.witness.note(found.parts.as_inputs().values())
+                opened = LanguageScene.of(found, threads=self.threads, opened=self.opened)
+                self._trees[variant] = tree_digest(found.parts.semantic_tree)[:16]
             if len(opened.tree) > payload.MAX_NODES:
                 raise ArtifactError(f"the tree of {variant} has {len(opened.tree)} nodes, too many to show")
             self._variants[variant] = replace(opened, _views=ViewStore(VIEWS_MIB))
@@ -124,24 +170,29 @@ class ShownScene:
         return {
             **payload.described_scene(self.scene, self.gaussians),
             "variants": self.variants,
+            "of": self.state,
             "folder": self.folder.name,
         }
 
     def described_variant(self, variant: str) -> dict[str, Any]:
         """The outline of a variant, and what made its masks and vectors."""
         scene, parts = self.answering(variant), self.found(variant).parts
+        with self.unchanged():
+            clip, masks = Path(read_index(parts.clip)["model"]).name, masks_label(parts.masks)
         return {
             "variant": variant,
+            "tree": self._trees[variant],
             **payload.described_nodes(scene.tree, scene.names),
-            "clip": Path(read_index(parts.clip)["model"]).name,
-            "masks": masks_label(parts.masks),
+            "clip": clip,
+            "masks": masks,
             "caution": scene.caution,
         }
 
     @cached_property
     def splats_tag(self) -> str:
         """Digest of the Gaussians, for the browser's cache."""
-        return self.opened.get(sha256_of_file, self.folder / "gaussians.ply")[:32]
+        with self.unchanged():
+            return self.opened.get(sha256_of_file, self.folder / "gaussians.ply")[:32]
 
     # -- painting ---------------------------------------------------------------------------------
 

@@ -1,13 +1,16 @@
 """Asking, choosing, naming and saving by hand, in both painters, by role and label as people find them."""
 
+import shutil
+
 import numpy as np
 import pytest
+from PIL import Image
 
 import hilsplat
-from hilsplat.base.artifacts import read_json
+from hilsplat.base.artifacts import atomic_folder, read_json
 from hilsplat.base.images import write_png
 from hilsplat.splat.ply import load_ply
-from tests.browser.conftest import drawn, pixels, wire_camera
+from tests.browser.conftest import drawn, pixels, serving, wire_camera
 
 both = pytest.mark.parametrize("painter", ["gl", "server"])
 
@@ -217,6 +220,27 @@ def test_a_selection_is_saved_as_gaussians(opened, desk_address, scene, tmp_path
     )
 
 
+def test_a_film_tells_how_far_it_is_and_a_gif_has_the_chosen_size(opened, desk_address, tmp_path):
+    page = opened(desk_address)
+    page.locator("#save summary").click()
+    page.get_by_label("Longer side of the GIF").select_option("240")
+    with page.expect_download() as started:
+        page.get_by_role("button", name="Film, GIF").click()
+        page.get_by_role("progressbar", name="Film").wait_for()
+        page.get_by_text("of 60 pictures").wait_for()
+    started.value.save_as(tmp_path / "flight.gif")
+    gif = Image.open(tmp_path / "flight.gif")
+    assert max(gif.size) == 240 and gif.n_frames > 10
+    page.get_by_role("progressbar", name="Film").wait_for(state="hidden")
+    page.locator("#save summary").click()
+    page.get_by_role("button", name="Film, MP4").click()
+    page.get_by_text("of 120 pictures").wait_for()
+    page.get_by_role("button", name="Cancel").click()
+    page.get_by_role("status").get_by_text("The film was cancelled.").wait_for()
+    page.locator("#save summary").click()
+    assert page.get_by_role("button", name="Film, MP4").is_enabled()
+
+
 def test_an_exported_page_opens_from_a_file_and_answers(opened, browser, desk_address, tmp_path, scene):
     page = opened(desk_address)
     page.locator("#text").fill("mug > handle")
@@ -262,3 +286,32 @@ def test_escape_and_letters_do_not_act_while_somebody_types(opened, desk_address
     assert not page.get_by_role("dialog").is_visible()
     page.locator("#view").press("?")
     assert page.get_by_role("dialog", name="Keys").is_visible()
+
+
+def test_a_scene_that_was_made_anew_is_told_and_loaded_again_without_the_old_choice(
+    opened, desk, tmp_path_factory
+):
+    project = tmp_path_factory.mktemp("changing")
+    shutil.copytree(desk.parents[2], project, dirs_exist_ok=True)
+    folder = project / desk.relative_to(desk.parents[2])
+    opened.expected.append("409")  # the browser reports what was refused
+    with serving(folder) as address:
+        page = opened(address, "server")
+        page.locator("#view").focus()
+        ask(page, "mug > handle")
+        answers(page).first.click()
+        page.locator("#overlay path.chosen").first.wait_for(state="attached")
+        page.wait_for_timeout(800)  # until the address holds the choice
+        assert "node=" in page.url and not page.get_by_role("alert").is_visible()
+        with np.load(folder / "default/semantic_tree/tree.npz") as held:
+            arrays = {**held, "quality": held["quality"] * 0.5}
+        with atomic_folder(folder / "default/semantic_tree") as new:
+            shutil.copytree(folder / "default/semantic_tree", new, dirs_exist_ok=True)
+            np.savez(new / "tree.npz", **arrays)
+        page.get_by_role("alert").get_by_text("The scene was made anew (semantic_tree)").wait_for()
+        page.locator("#overlay path.chosen").first.wait_for(state="attached")  # as it was
+        page.get_by_role("button", name="Reload").click()
+        page.get_by_role("alert").wait_for(state="hidden")
+        answers(page).first.wait_for()  # the question is asked again
+        assert page.locator("#text").input_value() == "mug > handle"
+        assert not page.locator("#overlay path.chosen").count()

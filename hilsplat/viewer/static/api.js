@@ -1,24 +1,34 @@
 // The server's answers. The exported page has offline.js in this file's place, with the same names.
 
-import { get, send } from "./http.js";
+import { get, send, streamed } from "./http.js";
 
 export const offline = false;
 export const texts = [];   // what an exported page can answer
 
-export const scene = async () => (await get("/api/scene")).json();
-export const variant = async (name) => (await get(`/api/variant/${encodeURIComponent(name)}`)).json();
-export const splats = async () => (await get("/api/splats")).arrayBuffer();
-export const nodes = async (name) => (await get(`/api/nodes/${encodeURIComponent(name)}`)).arrayBuffer();
-export const photoUrl = (number) => `/api/photo/${number}`;
-export const thumbUrl = (number) => `/api/thumb/${number}`;
-export const cropUrl = (variant, node) => `/api/crop/${encodeURIComponent(variant)}/${node}`;
+// Every question names the state of the scene that this page was loaded with; another state's answers are refused.
+let state = "";
+const at = (path) => `${path}?of=${state}`;
+
+export async function scene() {
+  const described = await (await get("/api/scene")).json();
+  state = described.of;
+  return described;
+}
+export const changes = async () => (await get("/api/changes")).json();
+export const variant = async (name) => (await get(at(`/api/variant/${encodeURIComponent(name)}`))).json();
+export const splats = async () => (await get(at("/api/splats"))).arrayBuffer();
+export const nodes = async (name) => (await get(at(`/api/nodes/${encodeURIComponent(name)}`))).arrayBuffer();
+export const photoUrl = (number) => at(`/api/photo/${number}`);
+export const thumbUrl = (number) => at(`/api/thumb/${number}`);
+export const cropUrl = (variant, node) => at(`/api/crop/${encodeURIComponent(variant)}/${node}`);
 export const sorter = () => new Worker("/static/sorter.js");
 
-export const query = async (asked, signal) => (await send("/api/query", asked, { signal })).json();
-export const like = async (asked, signal) => (await send("/api/like", asked, { signal })).json();
-export const field = async (asked, signal) => (await send("/api/field", asked, { signal })).arrayBuffer();
-export const pick = async (asked, signal) => (await send("/api/pick", asked, { signal })).json();
-export const frame = async (asked, signal) => (await send("/api/frame", asked, { signal })).blob();
+export const query = async (asked, signal) => (await send(at("/api/query"), asked, { signal })).json();
+export const like = async (asked, signal) => (await send(at("/api/like"), asked, { signal })).json();
+export const field = async (asked, signal) => (await send(at("/api/field"), asked, { signal })).arrayBuffer();
+export const pick = async (asked, signal) => (await send(at("/api/pick"), asked, { signal })).json();
+export const frame = async (asked, signal) => (await send(at("/api/frame"), asked, { signal })).blob();
 export const names = async (asked, version) =>
-  (await send("/api/names", asked, { method: "PUT", headers: { "if-match": `"${version}"` } })).json();
-export const saved = async (kind, asked) => (await send(`/api/export/${kind}`, asked)).blob();
+  (await send(at("/api/names"), asked, { method: "PUT", headers: { "if-match": `"${version}"` } })).json();
+export const saved = async (kind, asked) => (await send(at(`/api/export/${kind}`), asked)).blob();
+export const film = async (asked, told, signal) => streamed(await send(at("/api/export/film"), asked, { signal }), told);

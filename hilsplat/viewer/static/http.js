@@ -15,3 +15,26 @@ export const get = async (path) => checked(await fetch(path));
 export const send = async (path, value, { method = "POST", headers = {}, signal } = {}) => checked(await fetch(path, {
   method, signal, headers: { "content-type": "application/json", ...headers }, body: JSON.stringify(value),
 }));
+
+// A file after lines that tell how far it is: {"made", "of"} many times, then {"bytes"}, then as many bytes.
+export async function streamed(response, told) {
+  const reader = response.body.getReader(), decoder = new TextDecoder(), parts = [];
+  let head = new Uint8Array(0), wanted = -1, got = 0;
+  for (;;) {
+    const { value, done } = await reader.read();
+    if (done) break;
+    if (wanted < 0) {
+      const both = new Uint8Array(head.length + value.length);
+      both.set(head); both.set(value, head.length);
+      head = both;
+      for (let end; wanted < 0 && (end = head.indexOf(10)) >= 0; head = head.subarray(end + 1)) {
+        const said = JSON.parse(decoder.decode(head.subarray(0, end)));
+        if ("bytes" in said) wanted = said.bytes; else told(said.made, said.of);
+      }
+      if (wanted < 0) continue;
+      parts.push(head); got = head.length;
+    } else { parts.push(value); got += value.length; }
+  }
+  if (got !== wanted) throw new Refused("The file was cut off: the server has ended.");
+  return new Blob(parts);
+}

@@ -32,4 +32,4 @@ export async function query({ text }) {
   return found;
 }
 
-export const like = none, field = none, pick = none, frame = none, names = none, saved = none;
+export const changes = none, like = none, field = none, pick = none, frame = none, names = none, saved = none, film = none;

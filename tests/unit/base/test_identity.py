@@ -276,7 +276,7 @@ def edit_function(root: Path, place: str) -> None:
         ("field/reference_trainer.py:run_reference", {"field_reference"}),
         ("embed/langsplat_files.py:write_langsplat", {"langsplat"}),
         ("evaluate/tables/html_page.py:as_html", {"table"}),
-        ("query/field_colours.py:field_colours", {"evaluate", "figures", "comparison"}),
+        ("query/field_answers.py:field_colours", {"evaluate", "figures", "comparison"}),
         ("segment/graph.py:segment_graph", {"masks"}),
         ("cli/stage.py:stage", set()),
     ],

@@ -370,7 +370,7 @@ def test_a_view_shows_what_has_a_mask_there(scene, monkeypatch):
         np.zeros(5, np.int64), np.zeros(0, np.int32), np.zeros(0, np.float32), np.zeros(4, bool)
     )
     assert empty.area_px(7).tolist() == [0] * 7
-    monkeypatch.setattr("hilsplat.query.language_scene.MIN_SHOWN_SHARE", 8 / (HEIGHT * WIDTH))
+    monkeypatch.setattr("hilsplat.query.scene_views.MIN_SHOWN_SHARE", 8 / (HEIGHT * WIDTH))
     shown = replace(scene, _views=ViewStore()).nodes_shown("000.png")
     # B corner has 2 x 3 px, A top left 4 x 2
     assert np.flatnonzero(~shown).tolist() == [NODE["B corner"]]
@@ -460,7 +460,7 @@ def test_gaussians_without_a_latent_do_not_dilute_a_pixel(scene):
     weights = scene.view_weights("000.png").toarray()
     has = (features[:, 0] != 0).any(axis=1)
     share = weights[:, has].sum(axis=1)
-    pixels, latents = thin._view_latents("000.png")[0]
+    pixels, latents = thin._field.latents("000.png")[0]
     assert pixels.tolist() == np.flatnonzero(share > 0.5).tolist()
     assert (share[pixels] < 0.99).any()
     expected = weights[pixels] @ features[:, 0] / share[pixels, None]
@@ -469,7 +469,7 @@ def test_gaussians_without_a_latent_do_not_dilute_a_pixel(scene):
 
 def test_latents_rendered_at_once_have_the_bytes_of_each_level_alone(scene):
     weights = scene.view_weights("000.png")
-    for index, (pixels, latents) in enumerate(scene._view_latents("000.png")):
+    for index, (pixels, latents) in enumerate(scene._field.latents("000.png")):
         own = np.ascontiguousarray(scene.language.features[:, index])
         share = weights @ (own != 0).any(axis=1).astype(np.float32)
         assert len(pixels)

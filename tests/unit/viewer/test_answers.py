@@ -1,10 +1,12 @@
 """Questions to the server, and the files that it gives away, against `LanguageScene` itself."""
 
+import asyncio
 import base64
 import io
 import json
 import re
 import shutil
+import threading
 import zipfile
 import zlib
 from pathlib import Path
@@ -15,6 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from pycocotools import mask as coco_masks
+from starlette.requests import Request
 from starlette.testclient import TestClient
 
 from hilsplat.base.artifacts import read_json
@@ -22,8 +25,10 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.query.names import FILE
 from hilsplat.splat.ply import load_ply
 from hilsplat.viewer.app import Viewer
-from hilsplat.viewer.exports import coco_counts
+from hilsplat.viewer.exports import coco_counts, write_gif
 from hilsplat.viewer.payload import packed_gaussians
+from hilsplat.viewer.saved_files import SavedFiles
+from hilsplat.viewer.scene_thread import SceneThread
 from hilsplat.viewer.shown import ShownScene
 from tests.unit.finished_desk import SCENE
 from tests.unit.viewer.conftest import ADDRESS, TOKEN
@@ -153,18 +158,79 @@ def test_coco_runs_begin_with_zeros(mask):
     np.testing.assert_array_equal(coco_masks.decode(runs).astype(bool), mask)
 
 
+def filmed(client, **sent) -> tuple[list[tuple[int, int]], bytes]:
+    """How far the film was, line by line, and the film."""
+    told, rest = [], client.post("/api/export/film", json=sent).content
+    while True:
+        line, _, rest = rest.partition(b"\n")
+        said = json.loads(line)
+        if "bytes" in said:
+            assert len(rest) == said["bytes"]
+            return told, rest
+        told.append((said["made"], said["of"]))
+
+
 def test_films_have_the_frames_that_were_asked_for(client, tmp_path):
-    sent = {"frames": 6, "side_px": 64}
-    (tmp_path / "film.mp4").write_bytes(client.post("/api/export/film", json=sent).content)
+    told, data = filmed(client, frames=6, side_px=64)
+    assert told == [(made, 6) for made in range(7)]
+    (tmp_path / "film.mp4").write_bytes(data)
     with av.open(str(tmp_path / "film.mp4")) as film:
         frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
     assert len(frames) == 6 and frames[0].shape == (36, 64, 3) and frames[0].std() > 20
-    gif = Image.open(io.BytesIO(client.post("/api/export/film", json={**sent, "format": "gif"}).content))
+
+
+@pytest.mark.parametrize("side_px", [64, 96])
+def test_a_gif_has_every_other_frame_in_the_size_that_was_asked_for(client, side_px):
+    told, data = filmed(client, frames=7, side_px=side_px, format="gif")
+    assert told == [(made, 4) for made in range(5)]
+    gif = Image.open(io.BytesIO(data))
     durations = []
     for number in range(gif.n_frames):  # equal neighbours are one frame that lasts longer
         gif.seek(number)
         durations.append(gif.info["duration"])
-    assert sum(durations) == pytest.approx(3 * 1000 / 12, abs=15) and gif.info["loop"] == 0
+    assert sum(durations) == pytest.approx(4 * 1000 / 12, abs=15) and gif.info["loop"] == 0
+    assert max(gif.size) == side_px
+
+
+def test_a_film_that_nobody_waits_for_ends(shown):
+    """Its thread draws at most the picture that it had begun, and is free for the next film."""
+    files, drawn, free = SavedFiles(SceneThread(shown), {}), [], threading.Event()
+
+    def film(told) -> bytes:
+        for number in range(1000):
+            drawn.append(number)
+            told(number + 1)
+            free.wait(0.01)
+        return b""
+
+    async def leave() -> None:
+        parts = files._filmed(film, 1000)
+        assert json.loads(await anext(parts)) == {"made": 0, "of": 1000}
+        assert json.loads(await anext(parts)) == {"made": 1, "of": 1000}
+        await parts.aclose()
+
+    asyncio.run(leave())
+    files.films.submit(free.set).result(timeout=20)
+    assert len(drawn) < 500
+
+
+def test_a_question_waits_for_one_crop_at_most(shown):
+    thread, order = SceneThread(shown), []
+    request = Request({"type": "http", "query_string": b""})
+
+    async def ask_among_crops() -> None:
+        crops = [thread.do_behind(request, lambda _, n=n: order.append(n)) for n in range(6)]
+        tasks = [asyncio.create_task(crop) for crop in crops]
+        for _ in range(3):  # until the first crop is with the thread, and the others wait for it
+            await asyncio.sleep(0)
+        await thread.do(request, lambda _: order.append("question"))
+        await asyncio.gather(*tasks)
+
+    held = threading.Event()
+    thread.worker.submit(held.wait, 5)  # the thread is busy until all have come
+    threading.Timer(0.5, held.set).start()
+    asyncio.run(ask_among_crops())
+    assert order == [0, "question", 1, 2, 3, 4, 5]
 
 
 def test_a_crop_shows_the_node_and_dims_the_rest(client, scene):
@@ -234,9 +300,28 @@ def test_gaussians_are_shown_while_the_run_goes_and_answers_come_later(built_des
         assert ask(client, "mug", answerer="field")["hits"]
 
 
+def test_a_scene_that_is_too_large_is_refused_with_advice(built_desk, monkeypatch):
+    monkeypatch.setattr("hilsplat.viewer.shown.MAX_GAUSSIANS", 100)
+    with pytest.raises(
+        ArtifactError, match=r"too large for the page\n.*at most 100 Gaussians\n.*\n.*max_gaussians"
+    ):
+        ShownScene(built_desk / SCENE)
+
+
 def test_a_scene_without_gaussians_says_what_to_run(tmp_path):
     with pytest.raises(ArtifactError, match=r"scene folder .* is missing"):
         ShownScene(tmp_path / "nothing")
     (tmp_path / "scene").mkdir()
     with pytest.raises(ArtifactError, match=r"snakemake --cores 2 .*gaussians\.ply"):
         ShownScene(tmp_path)
+
+
+def test_a_gif_keeps_the_shades_of_a_small_answer_in_grey_surroundings(tmp_path):
+    grey = np.clip(np.random.default_rng(0).normal(60, 16, (160, 160, 1)), 0, 255)
+    frame = np.repeat(grey, 3, axis=2)
+    x, y = np.meshgrid(*[np.linspace(0, 1, 32)] * 2)
+    frame[:32, :32] = np.stack([200 + 55 * y, 90 + 60 * x, 10 + 60 * x * y], axis=2)
+    frame = frame.astype(np.uint8)
+    write_gif(tmp_path / "still.gif", iter([frame]))
+    kept = np.asarray(Image.open(tmp_path / "still.gif").convert("RGB"), float)[:32, :32]
+    assert np.sqrt(np.square(kept - frame[:32, :32]).mean()) < 3

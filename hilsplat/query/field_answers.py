@@ -1,0 +1,147 @@
+"""What a scene answers from its decoded language field, as in the paper."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from hilsplat.base.device import ComputeDevice
+from hilsplat.base.images import to_uint8
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.field.code import Code
+from hilsplat.field.language_field import LanguageField
+from hilsplat.query.latent_relevancy import LatentRelevancy
+from hilsplat.query.look_up_kernels import fill_maps
+from hilsplat.query.scene_views import SceneViews
+from hilsplat.semantic_tree.nodes import node_means
+from hilsplat.settings import EvaluateSettings
+
+MIN_LATENT_SHARE = 0.5
+"""A pixel has a latent at a level if Gaussians with one make up more than this share of it."""
+
+
+@dataclass(frozen=True)
+class FieldAnswers:
+    """Answers of a language field.
+
+    Attributes:
+        language: the field.
+        code: that it is written in.
+        views: of the scene.
+        text_vectors: unit CLIP vectors of texts.
+        settings: canonical phrases, scale of the relevancy.
+        threads: number of threads for look-ups.
+        device: for look-ups.
+    """
+
+    language: LanguageField
+    code: Code
+    views: SceneViews
+    text_vectors: Callable[[Sequence[str]], np.ndarray]
+    settings: EvaluateSettings
+    threads: int
+    device: ComputeDevice
+
+    def relevancy(
+        self, texts: Sequence[str], view: str, *, exact: bool = True
+    ) -> Float32[np.ndarray, "T 3 H W"]:
+        """Rendered latent -> decoder -> relevancy; see `LanguageScene.field_relevancy`."""
+        answer = self._latent_relevancy
+        shown, vectors = self.latents(view), self.text_vectors(texts)
+        placed = self._placed_latents(view) if answer.is_linear or not exact else None
+        height, width = self.views.camera(view).size_hw
+        maps = np.zeros((len(texts), len(LEVELS), height * width), np.float32)
+        for index, (pixels, latents) in enumerate(shown):
+            if not len(pixels):
+                continue
+            found = answer.exact(latents, vectors) if placed is None else answer.fast(placed[index], vectors)
+            fill_maps(found, found.min(axis=1), pixels, index, maps)
+        return maps.reshape(len(texts), len(LEVELS), height, width)
+
+    def of_gaussians(self, text: str, level: str = "auto") -> Float32[np.ndarray, " N"]:
+        """Relevancy of every Gaussian at a level, or at its best; 0 without a latent."""
+        named = [each for each in LEVELS if level in ("auto", each.label)]
+        features = self.language.features
+        out = np.zeros(len(features), np.float32)
+        vector = self.text_vectors([text])
+        for each in named:
+            latents = np.ascontiguousarray(features[:, each.index], np.float32)
+            has = np.flatnonzero((latents != 0).any(axis=1))
+            if len(has):
+                own = self._latent_relevancy.exact(latents[has], vector)[0]
+                out[has] = np.maximum(out[has], own)
+        return out
+
+    def image(self, view: str, level: Level) -> UInt8[np.ndarray, "H W 3"]:
+        """The field of a level as colours (see `field_colours`); uncovered pixels are black."""
+        weights = self.views.weights(view)
+        colours = field_colours(self.language.features[:, level.index])
+        return to_uint8((weights @ colours).reshape(*self.views.camera(view).size_hw, 3))
+
+    @cached_property
+    def node_vectors(self) -> Float32[np.ndarray, "n C"]:
+        """Decoded mean latent of each node's Gaussians at its level."""
+        tree = self.views.tree
+        means = node_means(tree.node_of_gaussian, tree.level, self.language.features)
+        return self.code.decode_array(means)
+
+    def latents(self, view: str) -> list[tuple[np.ndarray, Float32[np.ndarray, "P D"]]]:
+        """Per level, the pixels that show mostly Gaussians with a latent, and their rendered latents."""
+
+        def render() -> list[tuple[np.ndarray, np.ndarray]]:
+            weights, features = self.views.weights(view), self.language.features
+            shares = weights @ (features != 0).any(axis=2).astype(np.float32)
+            rendered = (weights @ features.reshape(len(features), -1)).reshape(-1, *features.shape[1:])
+            shown = []
+            for index in range(len(LEVELS)):
+                pixels = np.flatnonzero(shares[:, index] > MIN_LATENT_SHARE)
+                # Gaussians without a latent hold zeros, which a code would decode like any other: leave them
+                # out.
+                shown.append((pixels, rendered[pixels, index] / shares[pixels, index, None]))
+            return shown
+
+        return self.views.store.get(
+            ("latents", view), render, lambda kept: sum(a.nbytes + b.nbytes for a, b in kept)
+        )
+
+    def _placed_latents(self, view: str) -> list:
+        """What look-ups of a view need, level by level; made at its first look-up."""
+        return self.views.store.get(
+            ("placed", view),
+            lambda: [self._latent_relevancy.prepare(latents) for _, latents in self.latents(view)],
+            lambda kept: sum(each.nbytes for each in kept),
+        )
+
+    @cached_property
+    def _latent_relevancy(self) -> LatentRelevancy:
+        return LatentRelevancy(
+            self.code,
+            self.text_vectors(self.settings.canonical),
+            self.settings.relevancy_scale,
+            self.threads,
+            self.device,
+        )
+
+
+def field_colours(features: Float32[np.ndarray, "N D"]) -> Float32[np.ndarray, "N 3"]:
+    """Three principal directions of a level's features over all Gaussians, stretched to [0, 1].
+
+    The largest component of each direction is positive, and its 2nd to 98th percentile is stretched to the
+    colour range, so that views share their colours. Gaussians without a feature are black; with fewer than
+    three directions, the remaining channels are 0.
+    """
+    values = features.astype(np.float64)
+    seen = np.square(values).sum(axis=1) > 0
+    centred = values - values[seen].mean(axis=0) if seen.any() else values
+    covariance = np.einsum("nc,nd->cd", centred[seen], centred[seen])
+    _, directions = np.linalg.eigh(covariance)
+    directions = directions[:, ::-1][:, :3]
+    peak = np.abs(directions).argmax(axis=0)
+    directions = directions * np.sign(directions[peak, np.arange(directions.shape[1])])
+    colours = np.zeros((len(features), 3), np.float32)
+    for channel, along in enumerate((centred @ directions).T):
+        low, high = np.percentile(along[seen], (2, 98)) if seen.any() else (0.0, 1.0)
+        colours[:, channel] = np.clip((along - low) / max(high - low, 1e-9), 0, 1) * seen
+    return colours

@@ -1,0 +1,148 @@
+"""Files that the page lets people keep.
+
+Films take long and read only arrays, so they have a thread of their own.
+"""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+from functools import partial
+from threading import Event
+from typing import Any
+
+from starlette.requests import Request
+from starlette.responses import Response, StreamingResponse
+from starlette.routing import Route
+
+from hilsplat.base.errors import SettingsError
+from hilsplat.query.language_scene import LanguageScene
+from hilsplat.viewer import answers, exports, wire
+from hilsplat.viewer.html_page import html_page
+from hilsplat.viewer.scene_thread import SceneThread
+from hilsplat.viewer.server import BYTES, TYPES, answer_json, as_json, plain, read
+from hilsplat.viewer.shown import ShownScene
+
+
+class SavedFiles:
+    """Makes them on request."""
+
+    def __init__(self, thread: SceneThread, static: dict[str, bytes]) -> None:
+        self.thread, self.static = thread, static
+        self.films = ThreadPoolExecutor(1, thread_name_prefix="film")
+
+    def routes(self) -> list[Route]:
+        """Where they are."""
+        return [
+            Route("/api/export/ply", self.ply, methods=["POST"]),
+            Route("/api/export/boxes", self.boxes, methods=["POST"]),
+            Route("/api/export/masks", self.masks, methods=["POST"]),
+            Route("/api/export/film", self.film, methods=["POST"]),
+            Route("/api/export/page", self.page, methods=["POST"]),
+        ]
+
+    async def ply(self, request: Request) -> Response:
+        """Gaussians of nodes."""
+        asked = await read(request, wire.Selection)
+
+        def make(shown: ShownScene) -> bytes:
+            scene = shown.answering(asked.variant)
+            rows = scene.gaussians_of(nodes_of(scene, asked.nodes))
+            with shown.unchanged():
+                return exports.selection_ply(shown.folder / "gaussians.ply", rows)
+
+        return plain(await self.thread.do(request, make), BYTES)
+
+    async def boxes(self, request: Request) -> Response:
+        """Boxes of nodes."""
+        asked = await read(request, wire.Selection)
+
+        def make(shown: ShownScene) -> dict[str, Any]:
+            scene = shown.answering(asked.variant)
+            return answers.boxes(scene, nodes_of(scene, asked.nodes))
+
+        return answer_json(await self.thread.do(request, make))
+
+    async def masks(self, request: Request) -> Response:
+        """Masks of nodes in all views."""
+        asked = await read(request, wire.Selection)
+
+        def make(shown: ShownScene) -> bytes:
+            scene = shown.answering(asked.variant)
+            return exports.masks_zip(scene, nodes_of(scene, asked.nodes))
+
+        return plain(await self.thread.do(request, make), "application/zip")
+
+    async def film(self, request: Request) -> Response:
+        """A fly-around in the colours of the page: lines of JSON that tell how far it is, then the file.
+
+        The lines are `{"made": 3, "of": 120}` after each picture and `{"bytes": 12345}` before the file.
+        """
+        asked = await read(request, wire.Film)
+
+        def prepared(shown: ShownScene) -> Callable[..., bytes]:
+            return partial(
+                exports.film,
+                shown.gaussians,
+                shown.scene,
+                shown.paint(asked.variant, asked.style),
+                kind=asked.format,
+                frames=asked.frames,
+                side_px=asked.side_px,
+                threads=shown.threads,
+            )
+
+        of = -(-asked.frames // exports.STEP[asked.format])
+        return StreamingResponse(
+            self._filmed(await self.thread.do(request, prepared), of), headers={"cache-control": "no-store"}
+        )
+
+    async def _filmed(self, film: Callable[..., bytes], of: int) -> AsyncIterator[bytes]:
+        loop, made, left = asyncio.get_running_loop(), asyncio.Queue[int | None](), Event()
+
+        def told(number: int) -> None:
+            if left.is_set():
+                raise CancelledError("nobody waits for this film any more")
+            loop.call_soon_threadsafe(made.put_nowait, number)
+
+        making = loop.run_in_executor(self.films, partial(film, told=told))
+        making.add_done_callback(lambda _: made.put_nowait(None))
+        try:
+            yield _line(made=0, of=of)
+            while (number := await made.get()) is not None:
+                yield _line(made=number, of=of)
+            data = await making
+            yield _line(bytes=len(data))
+            yield data
+        finally:  # also if the page was left, or its film cancelled
+            left.set()
+            making.cancel()
+
+    async def page(self, request: Request) -> Response:
+        """The scene as one HTML file, with its answers to some texts."""
+        asked = await read(request, wire.Page)
+
+        def make(shown: ShownScene) -> bytes:
+            with shown.unchanged():
+                return html_page(shown, asked, self.static)
+
+        return plain(await self.thread.do(request, make), TYPES["html"])
+
+
+def _line(**told: int) -> bytes:
+    return as_json(told) + b"\n"
+
+
+def node_of(scene: LanguageScene, node: int) -> int:
+    """A node that the page named.
+
+    Raises:
+        SettingsError: there is none.
+    """
+    if node >= len(scene.tree):
+        raise SettingsError(f"node {node} does not exist", expected=f"0 to {len(scene.tree) - 1}")
+    return node
+
+
+def nodes_of(scene: LanguageScene, nodes: list[int]) -> list[int]:
+    """Nodes that the page named."""
+    return [node_of(scene, node) for node in nodes]

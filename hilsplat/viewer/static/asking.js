@@ -1,0 +1,119 @@
+// Questions: a text, a node, a picture, or a part of what is seen; every pane gets each of them.
+
+import { markChosen, showAnswers, summary } from "./answers.js";
+import * as api from "./api.js";
+import { acts, choose } from "./choosing.js";
+import { overlay, redraw, restyle } from "./drawing.js";
+import { $, nameOf } from "./elements.js";
+import { answererOf, failed, host, level, main, outlines, page, panes, tell, variantOf } from "./state.js";
+import { styleOf } from "./styles.js";
+
+const PICTURE_PX = 512;
+let aborting = new AbortController();
+
+async function askAll(what, work) {
+  aborting.abort();
+  aborting = new AbortController();
+  const signal = aborting.signal;
+  tell("…");
+  try {
+    for (const [k, pane] of panes.entries()) {
+      if (!outlines.has(variantOf(pane))) continue;
+      const answer = await work(pane, signal);
+      if (signal.aborted) return;
+      Object.assign(pane, { answer, field: false });
+      if (!k) answered(what, answer);
+    }
+    await fillField(signal);
+    restyle();
+  } catch (error) { failed(error); }
+}
+
+function answered(what, answer) {
+  page.asked = { ...what, shows: answer.hits[0]?.best_views ?? [] };
+  tell(summary(answer));
+  showAnswers(main(), answer, acts);
+  page.outline.answered(answer.hits.map((hit) => hit.node));
+  markChosen(page.chosen);
+  restyle();
+}
+
+export async function fillField(signal) {
+  if ($("colour").value !== "field" || !page.asked?.text) return;
+  for (const pane of panes) {
+    if (pane.field || !pane.answer) continue;
+    const bytes = new Uint8Array(await api.field({ variant: variantOf(pane), text: page.asked.text.split(">").at(-1).trim(), level: level() }, signal));
+    page.painter.loadValues(variantOf(pane), bytes);
+    pane.field = true;
+  }
+  restyle();
+}
+
+export async function ask(keepChoice = false) {
+  const text = $("text").value.trim();
+  if (!text) { clearAnswer(); return; }
+  const view = $("here").checked ? page.camera.view : -1;
+  if ($("here").checked && view < 0) { tell("Stand at a photograph first: choose one below.", true); return; }
+  if (!keepChoice && page.chosen >= 0) choose(-1);   // nothing to take back: nothing to draw before the answer
+  await askAll({ text }, (pane, signal) => api.query({ variant: variantOf(pane), text, level: level(), answerer: answererOf(pane), ...(view >= 0 ? { view } : {}) }, signal));
+}
+
+export async function like(node) {
+  if (node < 0 || api.offline) return;
+  $("text").value = "";
+  const name = nameOf(main(), node);
+  await askAll({}, (pane, signal) => api.like({ variant: variantOf(pane), node: variantOf(pane) === variantOf(panes[0]) ? node : 0 }, signal));
+  tell(`Like ${name}: ${$("status").textContent}`);
+}
+
+// A picture, or a part of one: [x, y, width, height] in its pixels.
+export async function askPicture(source, part = null) {
+  try {
+    const image = await createImageBitmap(source), [x, y, w, h] = part ?? [0, 0, image.width, image.height];
+    const scale = Math.min(1, PICTURE_PX / Math.max(w, h)), canvas = new OffscreenCanvas(Math.max(1, Math.round(w * scale)), Math.max(1, Math.round(h * scale)));
+    canvas.getContext("2d").drawImage(image, x, y, w, h, 0, 0, canvas.width, canvas.height);
+    const bytes = new Uint8Array(await (await canvas.convertToBlob({ type: "image/jpeg", quality: 0.9 })).arrayBuffer());
+    let text = "";
+    for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
+    $("text").value = "";
+    choose(-1);
+    await askAll({}, (pane, signal) => api.like({ variant: variantOf(pane), picture: btoa(text) }, signal));
+  } catch (error) { failed(error); }
+}
+
+// A frame drawn over the view: its part of the photograph, or of what is drawn.
+export async function framed(from, to, done) {
+  const [x0, x1] = [from[0], to[0]].sort((a, b) => a - b), [y0, y1] = [from[1], to[1]].sort((a, b) => a - b);
+  overlay();
+  const svg = $("overlay"), path = document.createElementNS(svg.namespaceURI, "path");
+  path.setAttribute("class", "hover");
+  path.setAttribute("d", `M${x0} ${y0}H${x1}V${y1}H${x0}Z`);
+  svg.append(path);
+  if (!done || x1 - x0 < 6 || y1 - y0 < 6 || api.offline) return;
+  if (page.camera.view >= 0) {
+    const photo = await (await fetch(api.photoUrl(page.camera.view))).blob(), { s, x, y } = page.camera.frame(host.clientWidth / panes.length, host.clientHeight);
+    await askPicture(photo, [(x0 - x) / s, (y0 - y) / s, (x1 - x0) / s, (y1 - y0) / s]);
+  } else {
+    const plain = [{ variant: "", style: styleOf({ outline: null, colour: "none", mode: "plain", chosen: -1, hover: -1 }) }];
+    await askPicture(await page.painter.capture(page.camera, plain, host.clientWidth, host.clientHeight), [x0, y0, x1 - x0, y1 - y0]);
+    redraw();
+  }
+}
+
+export function clearAnswer() {
+  aborting.abort();
+  page.asked = null;
+  for (const pane of panes) Object.assign(pane, { answer: null, field: false });
+  $("text").value = "";
+  tell("");
+  showAnswers(main(), null, {});
+  page.outline.answered([]);
+  restyle();
+}
+
+export function clear() {
+  $("save").open = false;
+  if (page.chosen >= 0) choose(-1); else clearAnswer();
+}
+
+acts.like = like;

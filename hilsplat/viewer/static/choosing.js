@@ -1,0 +1,86 @@
+// The chosen node and the one under the pointer, and the names that a person gives.
+
+import * as api from "./api.js";
+import { markChosen, showAnswers } from "./answers.js";
+import { showCard } from "./card.js";
+import { painted, restyle } from "./drawing.js";
+import { LEVELS } from "./elements.js";
+import { flyTo } from "./flights.js";
+import { latest } from "./latest.js";
+import { failed, host, level, loadVariant, main, outlines, page, panes, tell, variantOf } from "./state.js";
+
+// What lists and cards of nodes do; asking adds `like`.
+export const acts = { choose, hover: setHover, fly: () => flyTo(page.chosen), name: rename };
+
+export function choose(node) {
+  page.chosen = node;
+  page.hover = -1;
+  markChosen(node);
+  if (main()) showCard(main(), node, page.scene.unit === "metre" ? " m" : "", acts);
+  page.outline.select(node);   // after the card, which takes room from the outline
+  restyle();
+}
+
+export function setHover(node) {
+  if (node === page.hover) return;
+  page.hover = node;
+  restyle();
+}
+
+export function paneAt(x) {
+  const each = host.clientWidth / panes.length, k = Math.min(panes.length - 1, Math.floor(x / each));
+  return { k, x: x - k * each, width: each, height: host.clientHeight };
+}
+
+const exactPick = async (at, y) => {
+  const { nodes } = await api.pick({ variant: variantOf(panes[at.k]), camera: page.camera.wire(at.width, at.height), x: at.x, y });
+  return nodes.map(([node]) => node);
+};
+export const quickPick = (at, y) => page.painter.nodesAt(variantOf(panes[at.k]), page.painter.gaussianAt(page.camera, painted()[at.k], at.x, y, at.width, at.height));
+
+// A click chooses the whole; a click on what is chosen goes one level down, and from the finest up again.
+function deeper(nodes) {
+  const fixed = LEVELS.indexOf(level());
+  if (fixed >= 0) return [...nodes.slice(0, fixed + 1)].reverse().find((node) => node >= 0) ?? -1;
+  const there = nodes.filter((node) => node >= 0), at = there.indexOf(page.chosen);
+  return there[(at + 1) % Math.max(there.length, 1)] ?? -1;
+}
+
+export async function tapped(x, y) {
+  host.focus({ preventScroll: true });
+  const at = paneAt(x);
+  if (!outlines.get(variantOf(panes[at.k])) || variantOf(panes[at.k]) !== variantOf(panes[0])) return;
+  try { choose(deeper(api.offline ? quickPick(at, y) : await exactPick(at, y))); } catch (error) { failed(error); }
+}
+
+const hoverAt = latest(async (x, y) => {
+  if (x < 0 || page.moving || !main()) { setHover(-1); return; }
+  const at = paneAt(x);
+  if (variantOf(panes[at.k]) !== variantOf(panes[0])) return;
+  try {
+    const nodes = page.painter.kind === "gl" ? quickPick(at, y) : await exactPick(at, y);
+    const fixed = LEVELS.indexOf(level()), there = nodes.filter((node) => node >= 0);
+    setHover(fixed >= 0 ? deeper(nodes) : there.includes(page.chosen) ? deeper(nodes) : there[0] ?? -1);
+  } catch { setHover(-1); }
+});
+let pointing = 0;
+export const pointed = (x, y) => { clearTimeout(pointing); pointing = setTimeout(() => hoverAt(x, y), page.painter?.kind === "gl" && !page.slow ? 16 : 60); };
+
+async function rename(node, name) {
+  const own = main(), names = {};
+  own.nodes.forEach((each, row) => { if (each.name) names[row] = each.name; });
+  names[node] = name;
+  try {
+    const kept = await api.names({ variant: own.variant, names }, own.version);
+    for (const each of outlines.values()) if (each.tree === own.tree) {
+      each.version = kept.version;
+      each.nodes.forEach((entry, row) => { entry.name = kept.names[row] ?? ""; });
+    }
+    page.outline.renamed(node);
+    choose(node);
+    if (panes[0].answer) showAnswers(own, panes[0].answer, acts);
+    tell(name ? `Named “${name}”. Ask for it, here or with hilsplat query.` : "The name is taken away.");
+  } catch (error) {
+    if (error.status === 412) { await loadVariant(own.variant, true); page.outline.show(main()); choose(node); tell("Somebody else changed the names meanwhile; they are here now. Name it again.", true); } else failed(error);
+  }
+}

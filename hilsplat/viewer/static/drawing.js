@@ -1,0 +1,82 @@
+// When something changes: the picture, what lies over it, and the address that opens the same view.
+
+import * as api from "./api.js";
+import { $, nameOf } from "./elements.js";
+import { drawOverlay } from "./overlay.js";
+import { host, level, levelIndex, main, options, outlines, page, panes, variantOf } from "./state.js";
+import { styleOf } from "./styles.js";
+
+const SLOW_MS = 60;
+let dirty = true, styles = [], lastFrame = 0, frames = 0;
+
+export const redraw = () => { dirty = true; requestAnimationFrame(paint); };
+export const restyle = () => { styles = []; redraw(); };
+
+export function currentStyles() {
+  if (!styles.length) {
+    styles = panes.map((pane, k) => {
+      const own = !k || variantOf(pane) === variantOf(panes[0]);
+      return styleOf({ outline: outlines.get(variantOf(pane)), answer: pane.answer, colour: $("colour").value, mode: $("mode").value, hasField: pane.field,
+        level: levelIndex(pane.answer), chosen: own ? page.chosen : -1, hover: own ? page.hover : -1 });
+    });
+  }
+  return styles;
+}
+
+export const painted = () => currentStyles().map((style, k) => ({ variant: variantOf(panes[k]), style }));
+
+function paint(now) {
+  if (!dirty || !page.painter || !page.camera) return;
+  dirty = false;
+  if (page.moving) page.slow = now - lastFrame > SLOW_MS && now - lastFrame < 2000;
+  lastFrame = now;
+  const width = host.clientWidth, height = host.clientHeight;
+  const scale = devicePixelRatio * (page.painter.kind === "gl" && page.moving && page.slow ? 0.5 : 1);
+  page.painter.draw(page.camera, painted(), Math.max(1, Math.round(width * scale)), Math.max(1, Math.round(height * scale)));
+  overlay();
+  if (page.painter.kind === "gl" && page.painter.settled) drawn();
+}
+
+export function overlay() {
+  const width = host.clientWidth, height = host.clientHeight;
+  drawOverlay($("overlay"), page.camera, panes.map((pane, k) => ({ boxes: boxes(pane, k), label: panes.length > 1 ? pane.by.replace("|", ", ") : "" })), width, height);
+  page.photos.place(page.camera, width, height, panes.length);
+  page.photos.mark(page.camera.view, page.asked?.shows ?? []);
+}
+
+function boxes(pane, k) {
+  const own = outlines.get(variantOf(pane));
+  if (!own || $("colour").value === "none") return [];
+  const found = (pane.answer?.route === "like" ? pane.answer.hits.slice(0, 5) : pane.answer?.hits ?? [])
+    .map((hit) => ({ node: hit.node, kind: "answer", label: `${own.nodes[hit.node].name || ""} ${hit.score.toFixed(2)}`.trim() }));
+  if (!k || variantOf(pane) === variantOf(panes[0])) {
+    if (page.chosen >= 0) found.push({ node: page.chosen, kind: "chosen", label: nameOf(own, page.chosen) });
+    if (page.hover >= 0 && page.hover !== page.chosen) found.push({ node: page.hover, kind: "hover", label: nameOf(own, page.hover) });
+  }
+  const last = new Map(found.map((box) => [box.node, box]));
+  return [...last.values()].map((box) => ({ ...box, corners: own.nodes[box.node].corners }));
+}
+
+export function drawn() {
+  frames++;
+  host.dataset.drawn = frames;
+  if ($("loading").textContent && !$("loading").dataset.kept) $("loading").textContent = "";
+  if (!document.body.dataset.ready) {
+    document.body.dataset.ready = "yes";
+    performance.mark("first-frame");
+  }
+  remember();
+}
+
+let remembering = 0;
+function remember() {
+  clearTimeout(remembering);
+  remembering = setTimeout(() => {
+    const link = new URLSearchParams({ c: page.camera.toText() });
+    const put = (key, value, usual) => { if (value && value !== usual) link.set(key, value); };
+    put("q", page.asked?.text); put("level", level(), "auto"); put("by", panes[0].by, `${page.scene.variants[0]}|tree`); put("beside", panes[1]?.by);
+    put("node", page.chosen >= 0 ? `${page.chosen}.${main().tree}` : ""); put("colour", $("colour").value, "answers"); put("mode", $("mode").value, "tint");
+    history.replaceState(null, "", `${location.pathname}${api.offline ? location.search : keptSearch()}#${link}`);
+  }, 400);
+}
+const keptSearch = () => options.get("painter") ? `?painter=${options.get("painter")}` : "";

@@ -1,0 +1,59 @@
+// Where the camera goes: to a photograph, to a node, in a short flight where the painter keeps up.
+
+import { redraw } from "./drawing.js";
+import { main, page } from "./state.js";
+
+const calm = matchMedia("(prefers-reduced-motion: reduce)");
+let flight = 0;
+
+export function setMoving(now) {
+  if (page.moving === now) return;
+  page.moving = now;
+  if (page.painter) page.painter.moving = now;
+  if (!now) redraw();
+}
+
+export const touched = () => { flight++; setMoving(true); redraw(); };
+
+function goTo(target) {
+  const mine = ++flight;
+  if (calm.matches || page.painter.kind === "server" || page.slow) { page.camera = target; setMoving(false); redraw(); return; }
+  const from = page.camera.copy(), begin = performance.now(), lasts = 450;
+  setMoving(true);
+  const next = (now) => {
+    if (mine !== flight) return;
+    const t = Math.min(1, Math.max(0, (now - begin) / lasts)), eased = t * t * (3 - 2 * t);
+    page.camera = t < 1 ? from.between(target, eased) : target;
+    if (t < 1) requestAnimationFrame(next); else setMoving(false);
+    redraw();
+  };
+  requestAnimationFrame(next);
+}
+
+export function stand(number) {
+  const target = page.camera.copy();
+  target.standAt(page.scene.views[number], number);
+  goTo(target);
+}
+
+export const flyTo = (node) => {
+  if (node < 0 || !main()) return;
+  const { centroid, size } = main().nodes[node];
+  goTo(page.camera.lookingAt(centroid, Math.max(...size)));
+};
+
+export const step = (by) => {
+  const count = page.scene.views.length, from = page.camera.view;
+  stand(from < 0 ? nearestView() : (from + by + count) % count);
+};
+
+export function nearestView() {
+  let best = 0, least = Infinity;
+  page.scene.views.forEach((view, number) => {
+    const other = page.camera.copy();
+    other.standAt(view, number);
+    const away = Math.hypot(...other.c.map((v, k) => v - page.camera.c[k])) + page.scene.reach * (1 - other.R[2].reduce((sum, v, k) => sum + v * page.camera.R[2][k], 0));
+    if (away < least) { least = away; best = number; }
+  });
+  return best;
+}

@@ -1,0 +1,71 @@
+// What hands do: mouse and touch on the view, keys, and every control of the page.
+
+import * as api from "./api.js";
+import { ask, askPicture, clear, clearAnswer, fillField, framed, like } from "./asking.js";
+import { children } from "./card.js";
+import { choose, pointed, tapped } from "./choosing.js";
+import { attach } from "./controls.js";
+import { currentStyles, painted, redraw, restyle } from "./drawing.js";
+import { $, counted, nameOf } from "./elements.js";
+import { flyTo, nearestView, setMoving, stand, step, touched } from "./flights.js";
+import { attachKeys } from "./keyboard.js";
+import { save } from "./saves.js";
+import { failed, host, main, page, panes, tell, variantOf } from "./state.js";
+import { choosePanes } from "./variants.js";
+
+const MODES = ["tint", "ghost", "isolate", "plain"];
+
+export function attachHands() {
+  const rested = () => setMoving(false);
+  const touch = attach(host, { camera: () => page.camera, changed: touched, rested, tapped, pointed, framed });
+  const nudge = (work) => { work(); touch(); };
+  const setLevel = (value) => { document.querySelector(`[name=level][value=${value}]`).checked = true; levelChanged(); };
+  const levelChanged = () => { if (page.asked?.text && !api.offline) ask(true); else restyle(); };
+
+  attachKeys({
+    ask: () => { $("text").focus(); $("text").select(); },
+    clear, step, help: () => $("help").showModal(),
+    zoom: (factor) => nudge(() => page.camera.zoom(factor)), orbit: (x, y) => nudge(() => page.camera.orbit(0.1 * x, 0.1 * y)),
+    move: (x, y, z) => nudge(() => page.camera.move(0.06 * x, 0.06 * y, 0.06 * z)),
+    photo: () => $("blend").click(), fly: () => flyTo(page.chosen), like: () => like(page.chosen), level: setLevel,
+    name: () => $("card").querySelector(".name")?.focus(),
+    mode: () => { $("mode").value = MODES[(MODES.indexOf($("mode").value) + 1) % MODES.length]; restyle(); },
+    parent: () => { if (page.chosen >= 0 && main().nodes[page.chosen].parent >= 0) choose(main().nodes[page.chosen].parent); },
+    child: () => { if (page.chosen >= 0 && children(main(), page.chosen).length) choose(children(main(), page.chosen)[0]); },
+  });
+
+  $("ask").addEventListener("submit", (event) => { event.preventDefault(); ask(); });
+  $("text").addEventListener("search", () => { if (!$("text").value && page.asked?.text) clearAnswer(); });
+  for (const radio of document.querySelectorAll("[name=level]")) radio.addEventListener("change", levelChanged);
+  for (const id of ["left", "right"]) $(id).addEventListener("change", choosePanes);
+  $("mode").addEventListener("change", restyle);
+  $("colour").addEventListener("change", async () => { try { await fillField(); } catch (error) { failed(error); } restyle(); });
+  $("blend").addEventListener("click", () => { if (page.camera.view < 0) stand(nearestView()); page.photos.cycle(); redraw(); });
+  $("reload").addEventListener("click", () => location.reload());
+  $("help-button").addEventListener("click", () => $("help").showModal());
+  $("picture-button").addEventListener("click", () => $("picture").click());
+  $("picture").addEventListener("change", () => { if ($("picture").files[0]) askPicture($("picture").files[0]); $("picture").value = ""; });
+  document.addEventListener("paste", (event) => { const file = [...event.clipboardData.files].find((each) => each.type.startsWith("image/")); if (file) askPicture(file); });
+  host.addEventListener("dragover", (event) => event.preventDefault());
+  host.addEventListener("drop", (event) => { event.preventDefault(); const file = event.dataTransfer.files[0]; if (file?.type.startsWith("image/")) askPicture(file); });
+  new ResizeObserver(redraw).observe(host);
+
+  const selected = () => page.chosen >= 0 ? [page.chosen] : (panes[0].answer?.hits ?? []).map((hit) => hit.node);
+  $("save").addEventListener("toggle", () => {
+    const nodes = selected();
+    $("save-what").textContent = page.chosen >= 0 ? `Of ${nameOf(main(), page.chosen)}` : nodes.length ? `Of ${counted(nodes.length, "answer")}` : "Ask or choose something to save its Gaussians, boxes and masks.";
+    for (const button of $("save").querySelectorAll("[data-nodes]")) button.disabled = !nodes.length;
+  });
+  $("save").addEventListener("click", async (event) => {
+    const kind = event.target.closest("[data-save]")?.dataset.save;
+    if (!kind) return;
+    $("save").open = false;
+    try {
+      if (kind === "link") { await navigator.clipboard.writeText(location.href); tell("The link is copied. It opens this view while this viewer runs."); return; }
+      const scale = devicePixelRatio, size = [Math.round(host.clientWidth * scale), Math.round(host.clientHeight * scale)];
+      await save(kind, { variant: variantOf(panes[0]), nodes: selected(), style: currentStyles()[0], capture: () => page.painter.capture(page.camera, painted(), ...size),
+        texts: page.asked?.text ? [page.asked.text] : [], camera: page.camera.wire(host.clientWidth, host.clientHeight), name: page.scene.name.split("/").at(-1), told: tell });
+      redraw();
+    } catch (error) { failed(error); }
+  });
+}

@@ -1,0 +1,36 @@
+// What the page knows: what is asked, what is chosen, where the camera is. Everything else is drawn from that.
+
+import * as api from "./api.js";
+import { $, LEVELS } from "./elements.js";
+
+export const host = $("view"), options = new URLSearchParams(location.search);
+export const start = new URLSearchParams(location.hash.slice(1));
+
+export const page = { scene: null, camera: null, painter: null, photos: null, outline: null, chosen: -1, hover: -1, asked: null, moving: false, slow: false };
+export const outlines = new Map();                             // by variant
+export const panes = [{ by: "", answer: null, field: false }]; // one, or two side by side
+
+export const variantOf = (pane) => pane.by.split("|")[0];
+export const answererOf = (pane) => pane.by.split("|")[1] || "tree";
+export const level = () => document.querySelector("[name=level]:checked").value;
+export const levelIndex = (answer) => Math.max(0, LEVELS.indexOf(level() === "auto" ? answer?.level ?? "whole" : level()));
+export const main = () => outlines.get(variantOf(panes[0]));
+
+export function tell(text, error = false) { $("status").textContent = text; $("status").classList.toggle("error", error); }
+export const failed = (error) => {
+  if (error.status === 409) sceneChanged();
+  if (error.name !== "AbortError") tell(error.message, true);
+};
+
+// The page goes on to show what it was loaded with; another state comes with a reload and never in parts.
+export function sceneChanged(parts = []) {
+  $("changed").hidden = false;
+  $("changed-what").textContent = `The scene was made anew${parts.length ? ` (${parts.join(", ")})` : ""}. You still see it as it was.`;
+}
+
+export async function loadVariant(name, again = false) {
+  if (outlines.has(name) && !again) return;
+  const [described, nodes] = await Promise.all([api.variant(name), again ? null : api.nodes(name)]);
+  if (nodes) page.painter.loadNodes(name, nodes);
+  outlines.set(name, described);
+}

@@ -1,0 +1,76 @@
+// Who answers: variants of the scene, one or two of them side by side, as they come to exist and change.
+
+import { showAnswers } from "./answers.js";
+import * as api from "./api.js";
+import { ask } from "./asking.js";
+import { acts, choose } from "./choosing.js";
+import { redraw, restyle } from "./drawing.js";
+import { $, counted, make } from "./elements.js";
+import { failed, loadVariant, main, page, panes, sceneChanged, start, tell, variantOf } from "./state.js";
+
+const POLL_MS = 4000;
+
+export function fillVariants() {
+  const choices = page.scene.variants.flatMap((name) => [[`${name}|tree`, `${name}, tree`], [`${name}|field`, `${name}, field`]]);
+  const fill = (select, kept, more) => {
+    select.replaceChildren(...more, ...choices.map(([value, text]) => make("option", { value }, text)));
+    select.value = kept;
+  };
+  fill($("left"), panes[0].by, []);
+  fill($("right"), panes[1]?.by ?? "", [make("option", { value: "" }, "nothing")]);
+  $("left").disabled = $("right").disabled = api.offline || !choices.length;
+}
+
+export async function useVariants() {
+  const known = (by) => page.scene.variants.includes(by?.split("|")[0]) ? by : null;
+  panes[0].by = known(start.get("by")) ?? `${page.scene.variants[0]}|tree`;
+  const beside = known(start.get("beside"));
+  if (beside && !api.offline) panes[1] = { by: beside, answer: null, field: false };
+  for (const pane of panes) await loadVariant(variantOf(pane));
+  fillVariants();
+  showOutline();
+  if (start.get("q")) { $("text").value = start.get("q"); await ask(); }
+  const [node, tree] = (start.get("node") ?? "").split(".");   // a row of another tree is another node
+  if (tree === main().tree && main().nodes[node]) choose(Number(node));
+}
+
+function showOutline() {
+  page.outline.show(main());
+  showAnswers(main(), panes[0].answer, acts);
+  $("about").textContent = `${page.scene.name}: ${counted(page.scene.gaussians, "Gaussian")}. Masks by ${main().masks}, words and pictures by ${main().clip}.`;
+  restyle();
+}
+
+export async function choosePanes() {
+  try {
+    const left = $("left").value, right = $("right").value, changed = left.split("|")[0] !== variantOf(panes[0]);
+    panes[0] = left === panes[0].by ? panes[0] : { by: left, answer: null, field: false };
+    if (!right) panes.length = 1;
+    else if (panes[1]?.by !== right) panes[1] = { by: right, answer: null, field: false };
+    for (const pane of panes) await loadVariant(variantOf(pane));
+    if (changed) { choose(-1); showOutline(); }
+    if (page.asked?.text) await ask(true); else restyle();
+    redraw();
+  } catch (error) { failed(error); }
+}
+
+// While the page is open: is what it shows still what lies on the disk, and does somebody else answer by now?
+export async function watch() {
+  while ($("changed").hidden) {
+    await new Promise((done) => setTimeout(done, POLL_MS));
+    if (document.hidden) continue;
+    try {
+      const now = await api.changes();
+      if (now.of !== page.scene.of || now.changed.length) sceneChanged(now.changed);
+      else if (now.variants.join() !== page.scene.variants.join()) await moreAnswer(now.variants);
+    } catch (error) { if (error.status) failed(error); }   // without a status, the server has ended
+  }
+}
+
+async function moreAnswer(variants) {
+  const first = !page.scene.variants.length;
+  page.scene.variants = variants;
+  if (!first) { fillVariants(); return; }
+  tell("Answers are ready.");
+  await useVariants();
+}

@@ -1,0 +1,146 @@
+"""A scene that is written anew while its page is open: what the page shows never mixes with what is new."""
+
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from hilsplat.base.artifacts import atomic_folder
+from hilsplat.splat.ply import load_ply, save_ply
+from hilsplat.viewer.app import Viewer
+from hilsplat.viewer.shown import ShownScene
+from hilsplat.viewer.witness import Witness
+from tests.unit.finished_desk import SCENE
+from tests.unit.viewer.conftest import ADDRESS, TOKEN
+
+
+@pytest.fixture
+def desk(built_desk, tmp_path) -> Path:
+    """A copy of the finished desk, to be written to."""
+    shutil.copytree(built_desk, tmp_path / "project")
+    return tmp_path / "project" / SCENE
+
+
+@pytest.fixture
+def page(desk) -> Iterator[TestClient]:
+    """A page that was loaded and asked something."""
+    with TestClient(
+        Viewer(ShownScene(desk)).app(TOKEN), base_url=ADDRESS, headers={"origin": ADDRESS}
+    ) as client:
+        client.get(f"/?token={TOKEN}")
+        client.state = load(client)
+        assert ask(client).status_code == 200
+        yield client
+
+
+def load(client) -> str:
+    return client.get("/api/scene").json()["of"]
+
+
+def ask(client, of: str | None = None):
+    return client.post("/api/query", json={"text": "mug"}, params={"of": of or client.state})
+
+
+def made_again(artifact: Path) -> None:
+    """As a stage that was rerun leaves it."""
+    if artifact.is_dir():
+        with atomic_folder(artifact) as new:
+            shutil.copytree(artifact, new, dirs_exist_ok=True)
+    else:
+        shutil.copy(artifact, artifact.with_name("new"))
+        artifact.with_name("new").replace(artifact)
+
+
+PARTS = ("scene", "gaussians.ply", "default/semantic_tree", "default/field.safetensors", "default/clip")
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_a_part_that_was_made_anew_is_noticed_and_gone_after_a_reload(page, desk, part):
+    assert page.get("/api/changes").json() == {"of": page.state, "changed": [], "variants": ["default"]}
+    made_again(desk / part)
+    assert page.get("/api/changes").json()["changed"] == [Path(part).name]
+    again = load(page)
+    assert again != page.state and ask(page, again).status_code == 200
+    assert page.get("/api/changes").json() == {"of": again, "changed": [], "variants": ["default"]}
+
+
+def test_what_is_in_memory_goes_on_to_answer(page, desk):
+    before = ask(page).json()["hits"]
+    (desk / "gaussians.ply").unlink()
+    assert page.get("/api/changes").json()["changed"] == ["gaussians.ply"]
+    assert ask(page).json()["hits"] == before
+    assert page.get("/api/scene").status_code == 422  # it cannot be opened again: what was opened stays
+    assert ask(page).json()["hits"] == before
+
+
+def test_nothing_is_read_beside_what_was_opened_before(page, desk):
+    """Rows of the old tree in a new PLY, names of the old tree for a new one, a tree of other Gaussians."""
+    gaussians = load_ply(desk / "gaussians.ply")
+    handle = page.post("/api/query", json={"text": "handle"}).json()["hits"][0]["node"]
+    save_ply(desk / "gaussians.ply", replace(gaussians, means=gaussians.means[::-1].copy()))
+    names = {"variant": "default", "names": {str(handle): "grip"}}
+    refused: tuple[Callable, ...] = (
+        lambda: page.post("/api/export/ply", json={"nodes": [handle]}),
+        lambda: page.post("/api/export/page", json={"texts": []}),
+        lambda: page.put("/api/names", json=names, headers={"if-match": '"none"'}),
+        lambda: page.get("/api/photo/0"),
+        lambda: page.get(f"/api/crop/default/{handle}"),
+        lambda: page.get("/api/variant/default"),
+    )
+    for send in refused:
+        answer = send()
+        assert answer.status_code == 409, answer.request.url
+        assert "gaussians.ply of photos/desk changed on the disk" in answer.json()["error"]
+    assert not (desk / "names.json").exists()
+
+
+def test_a_variant_that_comes_later_is_not_opened_beside_old_parts(page, desk):
+    shutil.copytree(desk / "default", desk / "second")
+    assert page.get("/api/changes").json()["variants"] == ["default", "second"]
+    made_again(desk / "gaussians.ply")
+    answer = page.post("/api/query", json={"text": "mug", "variant": "second"})
+    assert answer.status_code == 409
+    assert page.post("/api/query", json={"text": "mug", "variant": "second"}, params={"of": load(page)})
+
+
+def test_a_page_of_before_gets_nothing_of_after(page, desk):
+    made_again(desk / "default/semantic_tree")
+    again = load(page)  # another tab
+    camera = {"cam_from_world": np.eye(4).tolist(), "K": np.eye(3).tolist(), "size_hw": [4, 4]}
+    for path, sent in (("query", {"text": "mug"}), ("frame", {"camera": camera}), ("export/film", {})):
+        answer = page.post(f"/api/{path}", json=sent, params={"of": page.state})
+        assert answer.status_code == 409 and "reload" in answer.json()["error"]
+    for path in ("splats", "nodes/default", "variant/default", "thumb/0"):
+        assert page.get(f"/api/{path}", params={"of": page.state}).status_code == 409
+        assert page.get(f"/api/{path}", params={"of": again}).status_code == 200
+
+
+def test_an_outline_names_its_tree(page, desk):
+    before = page.get("/api/variant/default").json()["tree"]
+    made_again(desk / "default/semantic_tree")
+    load(page)
+    assert page.get("/api/variant/default").json()["tree"] == before  # the same rows again
+    with np.load(desk / "default/semantic_tree/tree.npz") as held:
+        arrays = {**held, "quality": held["quality"] * 0.5}
+    np.savez(desk / "default/semantic_tree/tree.npz", **arrays)
+    made_again(desk / "default/semantic_tree")
+    load(page)
+    assert page.get("/api/variant/default").json()["tree"] != before
+
+
+def test_a_witness_sees_files_come_go_and_be_replaced(tmp_path):
+    witness, file, folder = Witness(), tmp_path / "a.npz", tmp_path / "b"
+    file.write_bytes(b"one")
+    witness.note([file, folder])
+    assert witness.changed() == []
+    made_again(file)
+    assert witness.changed() == [file]
+    witness.note([file])  # what was opened is what counts
+    assert witness.changed() == [file]
+    folder.mkdir()
+    (folder / "index.json").write_text("{}")
+    assert witness.changed() == [file, folder]
