@@ -1,8 +1,11 @@
 """What a scene must answer to be scored, and its answers while one view is scored."""
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float32
 
 from hilsplat.base.levels import Level
 
@@ -23,6 +26,17 @@ class QueryableScene(Protocol):
 
     def node_masks(self, view, ids):
         """Union of the rendered nodes in a view, (H, W)."""
+
+
+@dataclass(frozen=True)
+class ViewMaps:
+    """What one method's maps of one view say of any texts.
+
+    Attributes:
+        relevancy: texts -> relevancy, (T, 3, H, W).
+    """
+
+    relevancy: Callable[[Sequence[str]], Float32[np.ndarray, "T 3 H W"]]
 
 
 class PackedMasks:

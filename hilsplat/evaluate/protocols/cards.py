@@ -62,6 +62,9 @@ class ProtocolCard:
         rule: how relevancy maps become masks, if they do.
         missing: see `Missing`. A point without a predicted class is a miss under every protocol.
         classes: name of the `ClassSet` that is queried, if it is fixed.
+        truth: `labels`: the region that the data set defines; `any grey`: every pixel of its mask file that
+            is not black, if it has one.
+        united: text -> another text; the masks of both, united, answer the first.
     """
 
     name: str
@@ -73,6 +76,8 @@ class ProtocolCard:
     rule: RelevancyRule | None = None
     missing: Missing = "zero"
     classes: str = ""
+    truth: Literal["labels", "any grey"] = "labels"
+    united: tuple[tuple[str, str], ...] = ()
 
     @property
     def full_name(self) -> str:
@@ -209,6 +214,27 @@ INSTANCES = ProtocolCard(
 )
 
 
+OVS_LANGSPLAT_V2 = ProtocolCard(
+    "3d-ovs/langsplat-v2",
+    2,
+    MASK,
+    "pairs",
+    "min-max of the smoothed relevancy above 0.625, 7 x 7 majority; whole or part, by the highest mean in "
+    "its mask, an empty mask first; truth: any non-zero grey; wood wall is united with wood table",
+    "ZhaoYujie2002/LangSplatV2 eval_3d_ovs.py with the threshold of eval_3d_ovs.sh",
+    RelevancyRule(
+        filter_px=29,
+        threshold=0.25,
+        level_rule="mean_in_mask",
+        border="inside",
+        levels=(Level.WHOLE, Level.PART),
+        empty_wins=True,
+    ),
+    truth="any grey",
+    united=(("wood wall", "wood table"),),
+)
+
+
 def _maps(name: str, source: str, selection: str, metrics: tuple[str, ...], **rule) -> ProtocolCard:
     """A protocol that differs from LangSplat's in its rule."""
     return ProtocolCard(name, 1, metrics, "pairs", selection, source, RelevancyRule(**rule))
@@ -293,17 +319,7 @@ CARDS: tuple[ProtocolCard, ...] = (
         majority=False,
         level_rule="mean_in_mask",
     ),
-    _maps(
-        "3d-ovs/langsplat-v2",
-        "ZhaoYujie2002/LangSplatV2",
-        "min-max of the smoothed relevancy above 0.7; whole or part, by the highest mean in its mask",
-        MASK,
-        filter_px=29,
-        majority=False,
-        level_rule="mean_in_mask",
-        border="inside",
-        levels=(Level.WHOLE, Level.PART),
-    ),
+    OVS_LANGSPLAT_V2,
     _points("scannet/opengaussian-19", "scannet-19", OPENGAUSSIAN),
     _points("scannet/opengaussian-15", "scannet-15", OPENGAUSSIAN),
     _points("scannet/opengaussian-10", "scannet-10", OPENGAUSSIAN),

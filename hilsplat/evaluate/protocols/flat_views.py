@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float32
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.metrics.localization import peak_points
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
+from hilsplat.evaluate.protocols.answers import ViewMaps
 from hilsplat.evaluate.protocols.cards import (
     LERF_LANGSPLAT,
     LERF_MASK,
@@ -54,6 +55,7 @@ class FlatProtocols:
         nodes_mask: Bool[np.ndarray, "H W"] | None,
         category: Query,
         queries: Sequence[Query],
+        maps: ViewMaps,
     ) -> Iterator[Measured]:
         """Rows of one text by one method.
 
@@ -63,6 +65,7 @@ class FlatProtocols:
             nodes_mask: the tree's own answer, which LERF-Mask takes; None: the map's mask.
             category: the text with all levels united.
             queries: the same per level.
+            maps: what the method's maps say of further texts.
         """
         query = category if self.level is None else next((q for q in queries if q.level is self.level), None)
         if query is None:
@@ -80,9 +83,14 @@ class FlatProtocols:
                     yield replace(row, protocol=label)
             elif card.rule is not None:
                 smoothed = SmoothedRelevancy.of(relevancy, card.rule)
-                mask, _ = relevancy_mask(smoothed, None, card.rule)
+                other = dict(card.united).get(flat.text)
+                united = None if other is None else maps.relevancy((other,))[0]
+                mask, _ = relevancy_mask(smoothed, None, card.rule, united)
                 points, _ = peak_points(smoothed.filtered, None)
-                yield from mask_rows(method, flat, label, mask, points, card.metrics)
+                scored = flat
+                if card.truth == "any grey" and flat.any_grey is not None:
+                    scored = replace(flat, truth=flat.any_grey)
+                yield from mask_rows(method, scored, label, mask, points, card.metrics)
         if OVS_ARGMAX in self.cards:
             self._maps.setdefault(method, []).append(eighth(relevancy.max(axis=0)))
             self._truths[flat.text] = eighth(flat.truth.astype(np.uint8)) > 0

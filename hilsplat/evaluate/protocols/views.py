@@ -31,7 +31,7 @@ from hilsplat.evaluate.metrics.relevancy_rule import (
     mean_filter,
     relevancy_mask,
 )
-from hilsplat.evaluate.protocols.answers import PackedMasks, QueryableScene, Selections
+from hilsplat.evaluate.protocols.answers import PackedMasks, QueryableScene, Selections, ViewMaps
 from hilsplat.evaluate.protocols.cards import (
     ANCESTORS,
     ANNOTATIONS,
@@ -137,6 +137,9 @@ def measure_view(
     def by_nodes(text: str, level: Level | None) -> np.ndarray:
         return selections.mask(view, selections.nodes((text,), level, view), size_hw)
 
+    def maps_of(render: Callable) -> ViewMaps:
+        return ViewMaps(lambda texts: _relevancy(render, texts, view))
+
     texts = [query.text for query in truth.categories]
     per_chunk = max(1, int(RELEVANCY_CHUNK_MIB * 2**20 / (2 * 3 * 4 * size_hw[0] * size_hw[1])))
     for start in range(0, len(texts), per_chunk):
@@ -160,7 +163,9 @@ def measure_view(
                     masks,
                 )
                 if also is not None:
-                    yield from also.add("field", fields[row], None, category, queries)
+                    yield from also.add(
+                        "field", fields[row], None, category, queries, maps_of(scene.field_relevancy)
+                    )
             if nodes is not None and "tree" in settings.methods:
                 smoothed = SmoothedRelevancy.of(nodes[row], rule)
                 yield from _answer_rows(
@@ -168,7 +173,14 @@ def measure_view(
                 )
                 yield from _scene_wide_rows(queries, settings, selections, view, masks)
                 if also is not None:
-                    yield from also.add("tree", nodes[row], by_nodes(text, None), category, queries)
+                    yield from also.add(
+                        "tree",
+                        nodes[row],
+                        by_nodes(text, None),
+                        category,
+                        queries,
+                        maps_of(scene.node_relevancy_map),
+                    )
             if nodes is not None and "tree-path" in settings.methods:
                 yield from _path_rows(nodes[row], queries, settings, selections, view, masks)
     if also is not None:
