@@ -197,10 +197,10 @@ LERF_MASK_SKIPPING = ProtocolCard(
 )
 OVS_ARGMAX = ProtocolCard(
     "3d-ovs/argmax",
-    1,
+    2,
     ("iou", "pixel_accuracy"),
     "pairs",
-    f"{ARGMAX}, at an eighth of the image's size",
+    f"{ARGMAX} and over the levels, at an eighth of the image's size",
     "Kunhao-Liu/3D-OVS renderer.py",
 )
 INSTANCES = ProtocolCard(

@@ -137,8 +137,14 @@ def measure_view(
     def by_nodes(text: str, level: Level | None) -> np.ndarray:
         return selections.mask(view, selections.nodes((text,), level, view), size_hw)
 
-    def maps_of(render: Callable) -> ViewMaps:
-        return ViewMaps(lambda texts: _relevancy(render, texts, view))
+    def maps_of(render: Callable, cosine: Callable) -> ViewMaps:
+        return ViewMaps(
+            lambda texts: _relevancy(render, texts, view),
+            lambda texts, pixels: np.asarray(cosine(tuple(texts), view, pixels), np.float32),
+        )
+
+    field_maps = maps_of(scene.field_relevancy, scene.field_cosine)
+    node_maps = maps_of(scene.node_relevancy_map, scene.node_cosine)
 
     texts = [query.text for query in truth.categories]
     per_chunk = max(1, int(RELEVANCY_CHUNK_MIB * 2**20 / (2 * 3 * 4 * size_hw[0] * size_hw[1])))
@@ -163,9 +169,7 @@ def measure_view(
                     masks,
                 )
                 if also is not None:
-                    yield from also.add(
-                        "field", fields[row], None, category, queries, maps_of(scene.field_relevancy)
-                    )
+                    yield from also.add("field", fields[row], None, category, queries, field_maps)
             if nodes is not None and "tree" in settings.methods:
                 smoothed = SmoothedRelevancy.of(nodes[row], rule)
                 yield from _answer_rows(
@@ -173,14 +177,8 @@ def measure_view(
                 )
                 yield from _scene_wide_rows(queries, settings, selections, view, masks)
                 if also is not None:
-                    yield from also.add(
-                        "tree",
-                        nodes[row],
-                        by_nodes(text, None),
-                        category,
-                        queries,
-                        maps_of(scene.node_relevancy_map),
-                    )
+                    mask = by_nodes(text, None)
+                    yield from also.add("tree", nodes[row], mask, category, queries, node_maps)
             if nodes is not None and "tree-path" in settings.methods:
                 yield from _path_rows(nodes[row], queries, settings, selections, view, masks)
     if also is not None:

@@ -32,7 +32,7 @@ DECIDED = {
     "lerf/opengaussian@1": "68a14e17",
     "lerf-mask/gaussian-grouping@1": "34874a8b",
     "lerf-mask/gaussian-grouping-skipping@1": "b146f4ac",
-    "3d-ovs/argmax@1": "44dac158",
+    "3d-ovs/argmax@2": "44dac158",
     "3d-ovs/langsplat@1": "f962ef1a",
     "3d-ovs/langsplat-raw@1": "7797b61a",
     "3d-ovs/langsplat-v2@2": "107e57a0",

@@ -116,14 +116,14 @@ def halves(rows):
 
 def ious(query: Query, maps, more):
     cards = [OVS_LANGSPLAT_V2, card_named("3d-ovs/langsplat")]
-    rows = FlatProtocols(cards, None).add("field", maps, None, query, [], ViewMaps(more))
+    rows = FlatProtocols(cards, None).add("field", maps, None, query, [], ViewMaps(more, more))
     return {row.protocol.partition("@")[0]: row.value for row in rows if row.metric == "iou"}
 
 
 def test_wood_wall_is_united_with_wood_table_and_any_grey_is_true(tmp_path):
     asked = []
 
-    def more(texts):
+    def more(texts, *_):
         asked.extend(texts)
         return halves((20, 30))[None]
 
@@ -137,7 +137,7 @@ def test_other_texts_are_answered_alone(tmp_path):
     mask[:20] = True
     rabbit = ViewTruth.flat({"rabbit": mask}).categories[0]
 
-    def more(texts):
+    def more(texts, *_):
         raise AssertionError(texts)
 
     assert ious(rabbit, halves((0, 20)), more)["3d-ovs/langsplat-v2"] == 1.0

@@ -51,6 +51,11 @@ class HandMade:
 
     node_relevancy_map = field_relevancy
 
+    def field_cosine(self, texts, view, pixels):
+        return self.field_relevancy(texts, view).reshape(len(texts), 3, -1)[:, :, pixels]
+
+    node_cosine = field_cosine
+
     def select(self, path, *, level=None, view=None):
         answers = self.answers if view == "v.png" else self.answers | self.scene_wide
         found = answers.get(path, answers.get((path[0], level), []) if len(path) == 1 else [])
