@@ -3,6 +3,7 @@
 Source: minghanqin/LangSplat `eval/evaluate_iou_loc.py`; every departure is a field of `RelevancyRule`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Literal
 
@@ -32,7 +33,8 @@ class RelevancyRule:
             min-max above 0.7; `raw`: the relevancy itself.
         majority: smooth the mask with the 7 x 7 majority filter.
         level_rule: `max`: the level whose (mixed) map has the highest value; `mean_in_mask`: the
-            highest mean inside its own mask (LangSplat's text on 3D-OVS).
+            highest mean inside its own mask (LangSplat's text on 3D-OVS). Ties go to the finest level, as
+            LangSplat stacks its levels from fine to coarse.
         border: windows at the border. `langsplat`: the mean filter reflects, the majority filter
             never looks at the last row and column; `inside`: both average the part of the window inside the
             image (LangSplatV2).
@@ -176,8 +178,7 @@ def relevancy_mask(
     if level is not None:
         return mask_of(level), level
     if rule.level_rule == "max":
-        highest = [smoothed.mixed[level.index].max() for level in rule.levels]
-        chosen = rule.levels[int(np.argmax(highest))]
+        chosen = _highest(rule.levels, [float(smoothed.mixed[each.index].max()) for each in rule.levels])
         return mask_of(chosen), chosen
     masks = np.zeros(smoothed.mixed.shape, dtype=bool)
     for each in rule.levels:
@@ -198,4 +199,9 @@ def level_by_mean_in_mask(
         float(relevancy[level.index][masks[level.index]].mean()) if masks[level.index].any() else empty
         for level in levels
     ]
-    return levels[int(np.argmax(means))]
+    return _highest(levels, means)
+
+
+def _highest(levels: Sequence[Level], scores: Sequence[float]) -> Level:
+    """The level of the highest score; of equal ones, the finest."""
+    return max(zip(scores, levels, strict=True), key=lambda each: (each[0], each[1].index))[1]

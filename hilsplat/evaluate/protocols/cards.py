@@ -1,8 +1,8 @@
 """Every protocol: its name, its version, and everything that decides a number under it.
 
 A number without its protocol is not a result: the same model scores 51.4 under `lerf/langsplat` and 9.66
-under `lerf/opengaussian`. A row of `scores.csv` carries the full name, such as `lerf/langsplat@1`, followed
-in brackets by whatever its settings change: `lerf/langsplat@1 (filter 20, raw)`. A change in what a card
+under `lerf/opengaussian`. A row of `scores.csv` carries the full name, such as `lerf/langsplat@2`, followed
+in brackets by whatever its settings change: `lerf/langsplat@2 (filter 20, raw)`. A change in what a card
 decides needs a new version; a test checks that.
 """
 
@@ -26,7 +26,8 @@ below that of the best node in the view, or within three times that if it looks 
 
 Version 1 of `lerf/tree-nodes`, `hierarchy/level-given` and `-auto` used 0.85 of the range of the
 relevancies themselves. Up to version 3 of these, 2 of `hierarchy/path` and 1 of `world/view-consistency`,
-looks did not count, and nodes of the whole scene competed in every view."""
+looks did not count, and nodes of the whole scene competed in every view. Up to version 4 of `lerf/tree-nodes`
+and `hierarchy/level-auto`, and 1 of the protocols after LangSplat, equal levels went to the coarsest."""
 
 ANCESTORS = 0.2
 """Share of the mean margin of a node's ancestors that is added to its own, except on paths; version 2 of
@@ -106,7 +107,7 @@ PAPER = "Hi-LSplat, implementation details"
 
 LERF_LANGSPLAT = ProtocolCard(
     "lerf/langsplat",
-    1,
+    2,
     MASK + LOCALIZATION,
     "pairs",
     "min-max relevancy above 0.7 after a mean filter of 30 px at a height of 730, scaled; level of the "
@@ -116,7 +117,7 @@ LERF_LANGSPLAT = ProtocolCard(
 )
 TREE_NODES = ProtocolCard(
     "lerf/tree-nodes",
-    4,
+    5,
     MASK + LOCALIZATION,
     "pairs",
     "3D nodes that the view shows, at most 0.05 of the range of the level's cosine margins (with a fifth of "
@@ -135,7 +136,7 @@ LEVEL_GIVEN = ProtocolCard(
 )
 LEVEL_AUTO = ProtocolCard(
     "hierarchy/level-auto",
-    4,
+    5,
     (*MASK, *LOCALIZATION, *CONSISTENCY),
     "levels",
     "as lerf/langsplat for maps and lerf/tree-nodes for nodes, level chosen by the method",
@@ -237,7 +238,7 @@ OVS_LANGSPLAT_V2 = ProtocolCard(
 
 def _maps(name: str, source: str, selection: str, metrics: tuple[str, ...], **rule) -> ProtocolCard:
     """A protocol that differs from LangSplat's in its rule."""
-    return ProtocolCard(name, 1, metrics, "pairs", selection, source, RelevancyRule(**rule))
+    return ProtocolCard(name, 2, metrics, "pairs", selection, source, RelevancyRule(**rule))
 
 
 def _points(

@@ -131,4 +131,4 @@ def test_rules_of_3d_ovs_are_applied_to_the_maps_of_either_method():
     for method in ("field", "tree"):
         rows = list(flat.add(method, maps((0, 16)), None, cup, [cup], NO_MORE))
         assert {row.metric: row.value for row in rows} == {"iou": 1.0, "boundary_iou": 1.0}
-        assert {row.protocol for row in rows} == {"3d-ovs/langsplat@1 (wholes, relevancy scale 5)"}
+        assert {row.protocol for row in rows} == {"3d-ovs/langsplat@2 (wholes, relevancy scale 5)"}

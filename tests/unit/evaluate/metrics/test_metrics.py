@@ -133,6 +133,19 @@ def test_level_of_an_automatic_mask_has_the_highest_mixed_value():
     assert np.argwhere(mask).tolist() == [[5, 5]]
 
 
+@pytest.mark.parametrize("level_rule", ["max", "mean_in_mask"])
+def test_equal_levels_go_to_the_finest(level_rule):
+    relevancy = np.zeros((3, 8, 8), dtype=np.float32)
+    relevancy[0, 2, 2] = relevancy[1, 5, 5] = relevancy[2, 1, 1] = 0.9
+    rule = RelevancyRule(filter_px=1, majority=False, level_rule=level_rule)
+    smoothed = SmoothedRelevancy.of(relevancy, rule)
+    mask, level = relevancy_mask(smoothed, None, rule)
+    assert level is Level.SUBPART  # LangSplat stacks s, m, l, and argmax takes the first
+    assert np.argwhere(mask).tolist() == [[1, 1]]
+    points, level = peak_points(smoothed.filtered, None)
+    assert (points.tolist(), level) == ([[1, 1]], Level.SUBPART)
+
+
 def test_mixing_halves_the_filtered_and_the_raw_map():
     relevancy = np.zeros((3, 6, 6), dtype=np.float32)
     relevancy[:, 2, 3] = 1

@@ -24,17 +24,17 @@ from hilsplat.settings import EvaluateSettings
 
 DECIDED = {
     # full name: first eight digits of what `digest` makes of metrics, averaging, missing, rule and classes
-    "lerf/langsplat@1": "704f6f3d",
-    "lerf/tree-nodes@4": "2cdcbb8d",
-    "lerf/langsplat-v2@1": "f209b912",
-    "lerf/paper-filter@1": "128bc7c0",
-    "lerf/paper-mean@1": "4fed36ea",
+    "lerf/langsplat@2": "704f6f3d",
+    "lerf/tree-nodes@5": "2cdcbb8d",
+    "lerf/langsplat-v2@2": "f209b912",
+    "lerf/paper-filter@2": "128bc7c0",
+    "lerf/paper-mean@2": "4fed36ea",
     "lerf/opengaussian@1": "68a14e17",
     "lerf-mask/gaussian-grouping@1": "34874a8b",
     "lerf-mask/gaussian-grouping-skipping@1": "b146f4ac",
     "3d-ovs/argmax@2": "44dac158",
-    "3d-ovs/langsplat@1": "f962ef1a",
-    "3d-ovs/langsplat-raw@1": "7797b61a",
+    "3d-ovs/langsplat@2": "f962ef1a",
+    "3d-ovs/langsplat-raw@2": "7797b61a",
     "3d-ovs/langsplat-v2@2": "107e57a0",
     "scannet/opengaussian-19@1": "ced31f5d",
     "scannet/opengaussian-15@1": "df507111",
@@ -49,7 +49,7 @@ DECIDED = {
     "replica/conceptgraphs@1": "d89e022d",
     "waymo/segmentation@1": "06e4086c",
     "hierarchy/level-given@4": "02318fa5",
-    "hierarchy/level-auto@4": "d49b3f00",
+    "hierarchy/level-auto@5": "d49b3f00",
     "hierarchy/path@3": "2f58f979",
     "hierarchy/scene-wide@1": "a0529c13",
     "hierarchy/annotations@1": "30da2922",
@@ -103,13 +103,13 @@ def test_classes_of_protocols_exist():
 
 def test_rows_name_what_settings_change():
     plain = EvaluateSettings()
-    assert label_of(LERF_LANGSPLAT, "field", plain) == "lerf/langsplat@1"
-    assert label_of(TREE_NODES, "tree", plain) == "lerf/tree-nodes@4"
+    assert label_of(LERF_LANGSPLAT, "field", plain) == "lerf/langsplat@2"
+    assert label_of(TREE_NODES, "tree", plain) == "lerf/tree-nodes@5"
     changed = EvaluateSettings(filter_px=20, threshold_on="raw", node_select=0.7, relevancy_scale=5)
     assert (
-        label_of(LERF_LANGSPLAT, "field", changed) == "lerf/langsplat@1 (filter 20, raw, relevancy scale 5)"
+        label_of(LERF_LANGSPLAT, "field", changed) == "lerf/langsplat@2 (filter 20, raw, relevancy scale 5)"
     )
-    assert label_of(TREE_NODES, "tree", EvaluateSettings(ancestors=0)) == "lerf/tree-nodes@4 (ancestors 0)"
+    assert label_of(TREE_NODES, "tree", EvaluateSettings(ancestors=0)) == "lerf/tree-nodes@5 (ancestors 0)"
     # nodes are not thresholded, so the scale of the threshold changes nothing of theirs
     expected = "hierarchy/level-given@4 (filter 20, node share 0.7, relevancy scale 5)"
     assert label_of(LEVEL_GIVEN, "tree", changed) == expected
@@ -119,16 +119,16 @@ def test_rows_name_what_settings_change():
 
 
 def test_rows_lead_back_to_their_protocol():
-    assert card_of("lerf/langsplat@1 (filter 20, raw)") is LERF_LANGSPLAT
+    assert card_of("lerf/langsplat@2 (filter 20, raw)") is LERF_LANGSPLAT
     with pytest.raises(ArtifactError, match=r"no protocol 'lerf/langsplat@9'"):
         card_of("lerf/langsplat@9")
 
 
 def test_published_rules_differ_as_stated():
     rules = {name: card.rule for name, card in PROTOCOLS.items() if card.rule}
-    assert rules["lerf/paper-filter@1"].departures(LERF_LANGSPLAT.rule) == ("filter 20",)
-    assert rules["lerf/langsplat-v2@1"].departures(LERF_LANGSPLAT.rule) == ("filter 29", "border inside")
-    literal, reading = rules["3d-ovs/langsplat-raw@1"], rules["3d-ovs/langsplat@1"]
+    assert rules["lerf/paper-filter@2"].departures(LERF_LANGSPLAT.rule) == ("filter 20",)
+    assert rules["lerf/langsplat-v2@2"].departures(LERF_LANGSPLAT.rule) == ("filter 29", "border inside")
+    literal, reading = rules["3d-ovs/langsplat-raw@2"], rules["3d-ovs/langsplat@2"]
     assert literal.departures(reading) == ("raw",)
     assert (reading.level_rule, reading.mix, reading.majority) == ("mean_in_mask", False, False)
     released = RelevancyRule(filter_px=29, threshold=0.25, border="inside", empty_wins=True)
