@@ -46,7 +46,10 @@ pooled: counts of all scenes are added first, so scenes weigh by their points.
 
 
 Missing = Literal["zero", "left out"]
-"""A (view, query) pair without a prediction: it counts 0, or is dropped, which flatters a method."""
+"""A (view, query) pair without a prediction: it counts 0, or is dropped, which flatters a method.
+
+A point without a predicted class: a miss, or in no IoU (its accuracy still counts it).
+"""
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ class ProtocolCard:
         selection: how a prediction is chosen, threshold and level, in words.
         source: repository or text it follows.
         rule: how relevancy maps become masks, if they do.
-        missing: see `Missing`. A point without a predicted class is a miss under every protocol.
+        missing: see `Missing`.
         classes: name of the `ClassSet` that is queried, if it is fixed.
         truth: `labels`: the region that the data set defines; `any grey`: every pixel of its mask file that
             is not black, if it has one.
@@ -247,9 +250,11 @@ def _points(
     source: str,
     metrics: tuple[str, ...] = PRESENT,
     averaging: Averaging = "scenes",
+    version: int = 1,
+    missing: Missing = "zero",
 ) -> ProtocolCard:
     """A protocol of points."""
-    return ProtocolCard(name, 1, metrics, averaging, ARGMAX, source, classes=classes)
+    return ProtocolCard(name, version, metrics, averaging, ARGMAX, source, missing=missing, classes=classes)
 
 
 def card_named(name: str) -> ProtocolCard:
@@ -334,7 +339,16 @@ CARDS: tuple[ProtocolCard, ...] = (
     _points(
         "scannet/openscene",
         "scannet-20",
-        "pengsongyou/openscene",
+        "pengsongyou/openscene util/metric.py, where a point without a feature is in no IoU",
+        (*PER_CLASS, "miou_all", "macc_all"),
+        "pooled",
+        version=2,
+        missing="left out",
+    ),
+    _points(
+        "scannet/openscene-all-points",
+        "scannet-20",
+        "pengsongyou/openscene util/metric.py; departs: a point without a feature is a miss",
         (*PER_CLASS, "miou_all", "macc_all"),
         "pooled",
     ),
