@@ -96,10 +96,14 @@ class ProtocolCard:
 
 MASK = ("iou", "boundary_iou")
 LOCALIZATION = ("localization_box", "localization_mask")
-CONSISTENCY = tuple(
-    f"hc_{reading}{suffix}"
-    for suffix in ("", "_pooled")
-    for reading in ("containment", "literal", "anchored")
+CONSISTENCY = (
+    "hc_containment",
+    "hc_literal",
+    "hc_anchored",
+    "hc_containment_pooled",
+    "hc_literal_pooled",
+    "hc_anchored_pooled",
+    "hc_containment_per_child",
 )
 PRESENT = ("class_iou", "class_accuracy", "miou_present", "macc_present")
 

@@ -21,7 +21,13 @@ from functools import partial
 import numpy as np
 
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.evaluate.metrics.hierarchy import READINGS, Family, consistency_of_families, mean_over_parents
+from hilsplat.evaluate.metrics.hierarchy import (
+    READINGS,
+    Family,
+    consistency_of_families,
+    consistency_per_child,
+    mean_over_parents,
+)
 from hilsplat.evaluate.metrics.localization import peak_points
 from hilsplat.evaluate.metrics.masks import best_threshold_iou
 from hilsplat.evaluate.metrics.relevancy_rule import (
@@ -317,3 +323,5 @@ def _consistency_rows(truth: ViewTruth, masks: PackedMasks, settings: EvaluateSe
             for suffix, pooled in (("", False), ("_pooled", True)):
                 value = mean_over_parents(scores, pooled)
                 yield Measured(method, "", "", f"hc_{reading}{suffix}", protocol, value, parents)
+        per_child = consistency_per_child(families)
+        yield Measured(method, "", "", "hc_containment_per_child", protocol, per_child, parents)

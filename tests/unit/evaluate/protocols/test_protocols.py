@@ -115,6 +115,7 @@ def test_consistency_rows_match_the_worked_example(tmp_path):
         assert values[*key, "hc_literal"] == pytest.approx(0.27)
         assert values[*key, "hc_containment_pooled"] == pytest.approx(0.916667, abs=1e-6)
         assert values[*key, "hc_literal_pooled"] == pytest.approx(0.293333, abs=1e-6)
+        assert values[*key, "hc_containment_per_child"] == pytest.approx(((1 + 0.5 + 1) / 3 + 1) / 2)
     # the annotations nest perfectly: a2 is 8 px of A, so literal is ((20 + 8)/50/2 + 10/25)/2 = 0.34
     reference = ("truth", "hierarchy/annotations@1", "", "")
     assert values[*reference, "hc_containment"] == 1
