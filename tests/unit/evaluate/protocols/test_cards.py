@@ -1,7 +1,9 @@
 """Every protocol has a name and a version, and nothing it decides changes without a new one."""
 
 import hashlib
+import re
 from dataclasses import asdict
+from pathlib import Path
 
 import pytest
 
@@ -90,6 +92,25 @@ def test_names_are_unique_and_say_benchmark_and_variant():
         assert card.full_name == f"{card.name}@{card.version}"
         assert card.selection
         assert card.source
+
+
+PUBLIC = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{7} \S+\.(py|cc)(:\w+)?")
+TABLES = Path(__file__).parents[4] / "docs" / "tables.md"
+
+
+def test_a_card_names_its_public_function_or_says_that_there_is_none():
+    for card in CARDS:
+        assert bool(card.public) != card.source.startswith("none"), card.name
+        assert not card.public or PUBLIC.fullmatch(card.public), card.public
+
+
+def test_the_documentation_lists_every_protocol_with_its_public_function():
+    rows = {}
+    for line in TABLES.read_text(encoding="utf-8").splitlines():
+        if re.match(r"\| `[\w/-]+@\d", line):
+            names, public, *_ = (cell.strip() for cell in line.strip("|").split("|"))
+            rows |= dict.fromkeys(re.findall(r"`([^`]+)`", names), public.strip("`"))
+    assert rows == {card.full_name: card.public or "none" for card in CARDS}
 
 
 def test_protocols_carry_known_metrics_and_every_metric_is_carried():
