@@ -286,10 +286,6 @@ def _path_rows(
 
 def _consistency_rows(truth: ViewTruth, masks: PackedMasks, settings: EvaluateSettings) -> Iterator[Measured]:
     """HC of every method and of the annotations; a view without any parent gives no row."""
-    transitions = truth.families()
-    parents = sum(map(len, transitions))
-    if not parents:
-        return
     # (method, protocol) -> function from a path to the rest of its answer's key
     rest_of: dict[tuple[str, str], Callable[[tuple[str, ...]], tuple]] = {
         ("truth", label_of(ANNOTATIONS, "truth", settings)): lambda path: (path,)
@@ -306,22 +302,35 @@ def _consistency_rows(truth: ViewTruth, masks: PackedMasks, settings: EvaluateSe
         return truth.regions[path] if answer[0] == "truth" else masks.get((*answer, *rest_of[answer](path)))
 
     for answer in rest_of:
-        method, protocol = answer
-        families = [
-            [
-                Family(
-                    mask_of(answer, parent),
-                    tuple(mask_of(answer, child) for child in children),
-                    truth.regions[parent],
-                )
-                for parent, children in transition
-            ]
-            for transition in transitions
+        yield from consistency_rows(*answer, truth, partial(mask_of, answer))
+
+
+def consistency_rows(
+    method: str, protocol: str, truth: ViewTruth, mask_of: Callable[[tuple[str, ...]], np.ndarray]
+) -> Iterator[Measured]:
+    """HC of one method in one view; nothing if the view has no parent.
+
+    Args:
+        method: what answered.
+        protocol: full name, with departures.
+        truth: the view's regions.
+        mask_of: path of texts -> the answer to it.
+    """
+    transitions = truth.families()
+    parents = sum(map(len, transitions))
+    if not parents:
+        return
+    families = [
+        [
+            Family(mask_of(parent), tuple(mask_of(child) for child in children), truth.regions[parent])
+            for parent, children in transition
         ]
-        for reading in READINGS:
-            scores = consistency_of_families(families, reading)
-            for suffix, pooled in (("", False), ("_pooled", True)):
-                value = mean_over_parents(scores, pooled)
-                yield Measured(method, "", "", f"hc_{reading}{suffix}", protocol, value, parents)
-        per_child = consistency_per_child(families)
-        yield Measured(method, "", "", "hc_containment_per_child", protocol, per_child, parents)
+        for transition in transitions
+    ]
+    for reading in READINGS:
+        scores = consistency_of_families(families, reading)
+        for suffix, pooled in (("", False), ("_pooled", True)):
+            value = mean_over_parents(scores, pooled)
+            yield Measured(method, "", "", f"hc_{reading}{suffix}", protocol, value, parents)
+    per_child = consistency_per_child(families)
+    yield Measured(method, "", "", "hc_containment_per_child", protocol, per_child, parents)
