@@ -93,6 +93,49 @@ def evaluate(
         )
 
 
+@app.command("evaluate-files")
+def evaluate_files(
+    predictions: Annotated[Path, typer.Argument(help="folder of masks or point labels of any program")],
+    out: PathOut,
+    method: Annotated[str, typer.Option(help="name of the program in the tables")],
+    labels: Annotated[str, typer.Option(help="labels of a data set, such as lerf_ovs/figurines")] = "",
+    data_root: DataRoot = Path(),
+    truth: Truth = None,
+    scene: Annotated[
+        Path | None, typer.Option(help="posed scene of a synthetic scene: says which views are tested")
+    ] = None,
+    kind: Annotated[str, typer.Option(help="kind of a synthetic scene: tabletop, room or street")] = "",
+    dataset: Annotated[str, typer.Option(help="data set of a synthetic scene in the scores")] = "synthetic",
+    name: Annotated[str, typer.Option(help="name of a synthetic scene in the scores")] = "",
+    min_region_px: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="smaller true regions of a synthetic scene are not scored, as in its settings"
+        ),
+    ] = None,
+    log: Log = None,
+) -> None:
+    """Score masks or point labels that any program wrote, under the same protocols."""
+    inputs = {"predictions": predictions, **({"truth": truth} if truth else {})}
+    inputs |= {"scene": scene} if scene else {}
+    with stage("evaluate_files", out, log, inputs=inputs, plugins=_readers([labels] if labels else [])):
+        from hilsplat.evaluate.files_stage import run_evaluate_files
+
+        run_evaluate_files(
+            predictions,
+            out,
+            method=method,
+            labels=labels,
+            data_root=data_root,
+            truth=truth,
+            scene=scene,
+            kind=kind,
+            dataset=dataset,
+            name=name,
+            min_region_px=min_region_px,
+        )
+
+
 def _readers(labels: Sequence[str]) -> tuple[str, ...]:
     from hilsplat.datasets.registry import readers_of
 

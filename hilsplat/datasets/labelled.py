@@ -36,6 +36,8 @@ class LabelledRegion:
         boxes_xyxy: annotated boxes, borders included, label px; None if the data set has none.
         level: None if the data set has no levels.
         path: texts from the whole down to this region; just its text if there are no levels.
+        any_grey: reads every pixel of the label that is not black, for protocols that take those as truth;
+            None: the same as `pixels`.
     """
 
     text: str
@@ -44,10 +46,13 @@ class LabelledRegion:
     boxes_xyxy: Int[np.ndarray, "B 4"] | None = None
     level: Level | None = None
     path: tuple[str, ...] = ()
+    any_grey: Callable[[], Bool[np.ndarray, "H W"]] | None = None
 
-    def mask(self, size_hw: tuple[int, int] | None = None) -> Bool[np.ndarray, "H W"]:
+    def mask(
+        self, size_hw: tuple[int, int] | None = None, *, any_grey: bool = False
+    ) -> Bool[np.ndarray, "H W"]:
         """The region, at the label's size or resized to another by nearest neighbour."""
-        mask = self.pixels()
+        mask = self.any_grey() if any_grey and self.any_grey else self.pixels()
         return mask if size_hw is None else resize_nearest(mask, size_hw)
 
     def boxes(self, size_hw: tuple[int, int] | None = None) -> Int[np.ndarray, "B 4"]:

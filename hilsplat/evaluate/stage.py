@@ -148,7 +148,7 @@ def known_truths(
     if isinstance(known, LabelledScene):
         truths = labelled_truths(known, posed)
     else:
-        truths = annotated_truths(known.folder, posed, settings)
+        truths = annotated_truths(known.folder, posed, settings.min_region_px)
     if not truths:
         logger.warning("no view of %s is annotated: nothing to score", posed.name)
     return truths

@@ -9,7 +9,6 @@ from hilsplat.datasets.labelled import LabelledScene, check_label_size
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.scene.scene import Scene
-from hilsplat.settings import EvaluateSettings
 
 logger = logging.getLogger(__name__)
 
@@ -17,13 +16,11 @@ SHAPE_TOLERANCE = 0.01
 """Relative difference up to which labels fit a view: undistortion and shrinking round its sides."""
 
 
-def annotated_truths(
-    truth: Path, posed: Scene, settings: EvaluateSettings
-) -> dict[str, Callable[[], ViewTruth]]:
+def annotated_truths(truth: Path, posed: Scene, min_region_px: int) -> dict[str, Callable[[], ViewTruth]]:
     """True regions in each annotated test view, loaded on demand."""
     annotations = HierarchyAnnotations.load(truth)
     return {
-        view: partial(ViewTruth.of, annotations, view, posed.cameras[view].size_hw, settings.min_region_px)
+        view: partial(ViewTruth.of, annotations, view, posed.cameras[view].size_hw, min_region_px)
         for view in posed.views("test")
         if annotations.views.get(view)
     }

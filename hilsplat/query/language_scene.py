@@ -385,6 +385,51 @@ class LanguageScene:
         """
         return self._field.relevancy(texts, view, exact=exact)
 
+    def node_cosine(
+        self, texts: Sequence[str], view: str, pixels: Int64[np.ndarray, " P"]
+    ) -> Float32[np.ndarray, "T 3 P"]:
+        """Cosine of texts with the nodes that some pixels show, blended by their weights, at each level.
+
+        Gaussians without a node count as the least cosine of the level; -inf where Gaussians do not cover.
+
+        Args:
+            texts: queries; names that a person gave play no part.
+            view: name of the view.
+            pixels: row * width + column of each.
+        """
+        cosines = self.text_vectors(texts) @ self.tree.clip.astype(np.float32).T
+        found = np.full((len(texts), len(LEVELS), len(pixels)), -np.inf, np.float32)
+        for level in LEVELS:
+            nodes = self.tree.nodes_of(level)
+            if not len(nodes):
+                continue
+            shown = self._view_nodes(view, level)
+            for row, values in enumerate(cosines):
+                blended = shown.blend(values, float(values[nodes].min()))
+                found[row, level.index] = np.where(shown.covered, blended, -np.inf)[pixels]
+        return found
+
+    def field_cosine(
+        self, texts: Sequence[str], view: str, pixels: Int64[np.ndarray, " P"]
+    ) -> Float32[np.ndarray, "T 3 P"]:
+        """Cosine of texts with the rendered, decoded latent of some pixels, at each level.
+
+        -inf where a pixel shows mostly Gaussians without a latent at the level. Arguments as in
+        `node_cosine`.
+        """
+        vectors, code = self.text_vectors(texts), self.trained()[1]
+        height, width = self._camera(view).size_hw
+        found = np.full((len(texts), len(LEVELS), len(pixels)), -np.inf, np.float32)
+        for index, (shown, latents) in enumerate(self._view_latents(view)):
+            row_of_pixel = np.full(height * width, -1)
+            row_of_pixel[shown] = np.arange(len(shown))
+            rows = row_of_pixel[pixels]
+            spoken = np.flatnonzero(rows >= 0)
+            if len(spoken):
+                decoded = code.decode_array(np.ascontiguousarray(latents[rows[spoken]], np.float32))
+                found[:, index, spoken] = vectors @ decoded.T
+        return found
+
     def gaussian_relevancy(self, text: str, level: str = "auto") -> Float32[np.ndarray, " N"]:
         """The field's relevancy of every Gaussian at a level, or at its best; 0 without a latent."""
         return self._field.of_gaussians(text, level)

@@ -20,6 +20,7 @@ STAGES: dict[str, str] = {
     "field_reference": "hilsplat.field.reference_trainer:run_reference",
     "method": "hilsplat.methods.stage:run_method",
     "evaluate": "hilsplat.evaluate.stage:run_evaluate",
+    "evaluate_files": "hilsplat.evaluate.files_stage:run_evaluate_files",
     "table": "hilsplat.evaluate.tables.build:run_table",
     "efficiency": "hilsplat.evaluate.tables.efficiency:run_efficiency",
     "figures": "hilsplat.evaluate.figures.panel:run_figures",

@@ -1,7 +1,8 @@
 """3D-OVS: ten small scenes, five views of each segmented into the classes of the scene.
 
 `segmentations/classes.txt` names the classes; the class index is the position in the **sorted** list. Each
-test view is a folder with one mask per class. Only the value 255 is foreground.
+test view is a folder with one mask per class. Only the value 255 is foreground, except under
+protocols that take any grey.
 """
 
 from functools import partial
@@ -134,7 +135,8 @@ def _regions(
         if sentence:
             warnings.append(sentence)
         read = partial(read_mask_file, path, FOREGROUND)
-        regions.append(LabelledRegion(prompt, size_hw, read, path=(prompt,)))
+        any_grey = partial(read_mask_file, path, 1)
+        regions.append(LabelledRegion(prompt, size_hw, read, path=(prompt,), any_grey=any_grey))
     return tuple(regions)
 
 

@@ -123,7 +123,7 @@ def truths_of(
     """True regions in the views of a scene; empty if it has neither annotations nor labels."""
     if labels:
         return labelled_truths(open_labelled(labels, data_root), scene)
-    return annotated_truths(truth, scene, evaluate) if truth is not None else {}
+    return annotated_truths(truth, scene, evaluate.min_region_px) if truth is not None else {}
 
 
 def annotated_rows(truths: Mapping[str, Callable[[], ViewTruth]], settings: FiguresSettings) -> list[Shown]:

@@ -26,8 +26,8 @@ class Family:
     true_parent: Bool[np.ndarray, "H W"]
 
 
-def family_consistency(family: Family, reading: Reading) -> float:
-    """Mean over the children of one parent.
+def children_consistency(family: Family, reading: Reading) -> list[float]:
+    """One term per child of a parent.
 
     `containment`: area(p and c) / area(c), the paper's wording; 1 for perfect nesting.
     `literal`: area(p and c) / area(p), the printed symbols with l = 1 the whole.
@@ -39,7 +39,7 @@ def family_consistency(family: Family, reading: Reading) -> float:
     for child in family.children:
         area = np.count_nonzero(family.parent if reading == "literal" else child)
         terms.append(np.count_nonzero(anchor & child) / area if area else 0.0)
-    return float(np.mean(terms))
+    return terms
 
 
 def hierarchical_consistency(
@@ -47,27 +47,46 @@ def hierarchical_consistency(
 ) -> float:
     """HC of one view (paper, Sec. IV-A). Averaging: children of a parent, parents of a level, levels.
 
+    Every parent weighs the same, however many children it has: one child inside its parent and three
+    outside another give (1 + 0) / 2 = 0.5. The mean over children alone is `consistency_per_child`: 0.25.
     A scene's value is the mean over its views with at least one parent; then scenes are averaged.
 
     Departs: the printed normaliser uses N_l outside the sum over l, where it is not defined; here
     it is the mean over the parents of each level, then over the L - 1 transitions. A transition
-    without parents contributes 0, as max(N_l, 1) implies.
+    without parents contributes 0, as max(N_l, 1) implies: where a view shows no subparts, even perfect
+    nesting scores 0.5.
 
     Args:
         transitions: families per level of the parent: wholes first, then parts.
-        reading: see `family_consistency`.
+        reading: see `children_consistency`.
         pooled: mean over all parents of all levels instead.
     """
     return mean_over_parents(consistency_of_families(transitions, reading), pooled)
 
 
 def consistency_of_families(transitions: Sequence[Sequence[Family]], reading: Reading) -> list[list[float]]:
-    """Score of every parent, per level of the parent."""
-    return [[family_consistency(family, reading) for family in families] for families in transitions]
+    """Score of every parent, the mean over its children, per level of the parent."""
+    return [
+        [float(np.mean(children_consistency(family, reading))) for family in families]
+        for families in transitions
+    ]
+
+
+def consistency_per_child(transitions: Sequence[Sequence[Family]]) -> float:
+    """Containment with every child of a level weighing the same, then the mean over levels.
+
+    As in `hierarchical_consistency`, a transition without parents contributes 0.
+    """
+    return mean_over_parents(
+        [
+            [term for family in families for term in children_consistency(family, "containment")]
+            for families in transitions
+        ]
+    )
 
 
 def mean_over_parents(scores: Sequence[Sequence[float]], pooled: bool = False) -> float:
-    """Mean over the parents of each level and then over the levels, or over all parents at once."""
+    """Mean over the scores of each level and then over the levels, or over all at once."""
     if pooled:
         every = [score for level in scores for score in level]
         return float(np.mean(every)) if every else 0.0

@@ -1,7 +1,9 @@
 """Instance segmentation of points: AP, AP50 and AP25 of the ScanNet benchmark.
 
-Source: ScanNet/ScanNet `BenchmarkScripts/3d_evaluation/evaluate_semantic_instance.py`, which OpenMask3D
-uses too; the order of matching and the integration of the curve follow that code, quirks included.
+Source: OpenMask3D's copy of ScanNet/ScanNet `BenchmarkScripts/3d_evaluation/evaluate_semantic_instance.py`.
+The integration of the curve follows that code, quirks included. Predictions are matched in the order given;
+the order of ScanNet's own script is that of a dict, which Python 2 leaves undefined. OpenMask3D gives every
+prediction of ScanNet200 the confidence 1.
 """
 
 from collections.abc import Sequence

@@ -11,10 +11,10 @@ def peak_points(
 ) -> tuple[Int[np.ndarray, "P 2"], Level]:
     """All pixels (x, y) that hold the maximum of a filtered map.
 
-    Without a level, the one with the largest maximum; ties go to the coarsest.
+    Without a level, the one with the largest maximum; ties go to the finest, as in LangSplat.
     """
     if level is None:
-        level = LEVELS[int(filtered.max(axis=(1, 2)).argmax())]
+        level = max(LEVELS, key=lambda each: (filtered[each.index].max(), each.index))
     chosen = filtered[level.index]
     rows, columns = np.nonzero(chosen == chosen.max())
     return np.stack([columns, rows], axis=1), level

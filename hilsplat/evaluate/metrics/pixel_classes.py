@@ -11,12 +11,15 @@ from jaxtyping import Bool, Float
 def argmax_masks(similarity: Float[np.ndarray, "K H W"]) -> Bool[np.ndarray, "K H W"]:
     """One mask per class: pixels where its similarity is largest; ties go to the first class.
 
+    A pixel whose similarities are all -inf has no class.
+
     Args:
         similarity: cosine of each pixel's feature with each class text, no template, no canonical
             phrases. Classes in the order of the sorted texts, which decides ties.
     """
     winner = similarity.argmax(axis=0)
-    return winner[None] == np.arange(len(similarity))[:, None, None]
+    answered = similarity.max(axis=0) > -np.inf
+    return (winner[None] == np.arange(len(similarity))[:, None, None]) & answered
 
 
 def pixel_accuracy(prediction: Bool[np.ndarray, "K H W"], truth: Bool[np.ndarray, "K H W"]) -> float:

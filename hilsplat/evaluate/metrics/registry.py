@@ -50,6 +50,7 @@ METRICS: dict[str, Metric] = {
     "pixel_accuracy": Metric("pixel_classes.pixel_accuracy", True, SHARE, VIEWS),
     "hc_containment": Metric("hierarchy.hierarchical_consistency", False, SHARE, PARENTS),
     "hc_literal": Metric("hierarchy.hierarchical_consistency", False, SHARE, PARENTS, None),
+    "hc_containment_per_child": Metric("hierarchy.consistency_per_child", False, SHARE, PARENTS),
     "hc_anchored": Metric("hierarchy.hierarchical_consistency", False, SHARE, PARENTS),
     "hc_containment_pooled": Metric("hierarchy.hierarchical_consistency", False, SHARE, PARENTS),
     "hc_literal_pooled": Metric("hierarchy.hierarchical_consistency", False, SHARE, PARENTS, None),

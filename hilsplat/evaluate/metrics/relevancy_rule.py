@@ -3,6 +3,7 @@
 Source: minghanqin/LangSplat `eval/evaluate_iou_loc.py`; every departure is a field of `RelevancyRule`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Literal
 
@@ -32,11 +33,14 @@ class RelevancyRule:
             min-max above 0.7; `raw`: the relevancy itself.
         majority: smooth the mask with the 7 x 7 majority filter.
         level_rule: `max`: the level whose (mixed) map has the highest value; `mean_in_mask`: the
-            highest mean inside its own mask (LangSplat's text on 3D-OVS).
+            highest mean inside its own mask (LangSplat's text on 3D-OVS). Ties go to the finest level, as
+            LangSplat stacks its levels from fine to coarse.
         border: windows at the border. `langsplat`: the mean filter reflects, the majority filter
             never looks at the last row and column; `inside`: both average the part of the window inside the
             image (LangSplatV2).
         levels: levels among which one is chosen (LangSplatV2 on 3D-OVS: whole and part).
+        empty_wins: under `mean_in_mask`, a level with an empty mask is chosen (LangSplatV2 on 3D-OVS: its
+            mean is NaN, which torch's argmax prefers); otherwise it comes last.
     """
 
     filter_px: int = 0
@@ -47,6 +51,7 @@ class RelevancyRule:
     level_rule: LevelRule = "max"
     border: Border = "langsplat"
     levels: tuple[Level, ...] = LEVELS
+    empty_wins: bool = False
 
     def departures(self, reference: "RelevancyRule") -> tuple[str, ...]:
         """Differences from another rule in a few words each, as protocol names carry them."""
@@ -59,6 +64,7 @@ class RelevancyRule:
             "level_rule": self.level_rule,
             "border": f"border {self.border}",
             "levels": "levels " + "+".join(level.label for level in self.levels),
+            "empty_wins": "empty wins" if self.empty_wins else "empty last",
         }
         differing = [
             field.name
@@ -148,24 +154,36 @@ class SmoothedRelevancy:
 
 
 def relevancy_mask(
-    smoothed: SmoothedRelevancy, level: Level | None, rule: RelevancyRule
+    smoothed: SmoothedRelevancy,
+    level: Level | None,
+    rule: RelevancyRule,
+    united: Float[np.ndarray, "3 H W"] | None = None,
 ) -> tuple[Bool[np.ndarray, "H W"], Level]:
-    """The mask of a level, or of the level that the rule chooses if `level` is None."""
+    """The mask of a level, or of the level that the rule chooses if `level` is None.
+
+    Args:
+        smoothed: relevancy of a text.
+        level: level to answer at.
+        rule: how.
+        united: unfiltered relevancy of another text, whose mask is united with this one's before the
+            majority filter; levels are compared by the first text alone.
+    """
 
     def mask_of(level: Level) -> np.ndarray:
         mask = threshold_mask(smoothed.mixed[level.index], rule.threshold, rule.threshold_on)
+        if united is not None:
+            mask = mask | threshold_mask(united[level.index], rule.threshold, rule.threshold_on)
         return majority_smooth(mask, rule.border) if rule.majority else mask
 
     if level is not None:
         return mask_of(level), level
     if rule.level_rule == "max":
-        highest = [smoothed.mixed[level.index].max() for level in rule.levels]
-        chosen = rule.levels[int(np.argmax(highest))]
+        chosen = _highest(rule.levels, [float(smoothed.mixed[each.index].max()) for each in rule.levels])
         return mask_of(chosen), chosen
     masks = np.zeros(smoothed.mixed.shape, dtype=bool)
     for each in rule.levels:
         masks[each.index] = mask_of(each)
-    chosen = level_by_mean_in_mask(smoothed.mixed, masks, rule.levels)
+    chosen = level_by_mean_in_mask(smoothed.mixed, masks, rule.levels, rule.empty_wins)
     return masks[chosen.index], chosen
 
 
@@ -173,10 +191,17 @@ def level_by_mean_in_mask(
     relevancy: Float[np.ndarray, "3 H W"],
     masks: Bool[np.ndarray, "3 H W"],
     levels: tuple[Level, ...] = LEVELS,
+    empty_wins: bool = False,
 ) -> Level:
-    """The level whose mean relevancy inside its own mask is highest; an empty mask comes last."""
+    """The level whose mean relevancy inside its own mask is highest; an empty mask comes last, or wins."""
+    empty = np.inf if empty_wins else -np.inf
     means = [
-        float(relevancy[level.index][masks[level.index]].mean()) if masks[level.index].any() else -np.inf
+        float(relevancy[level.index][masks[level.index]].mean()) if masks[level.index].any() else empty
         for level in levels
     ]
-    return levels[int(np.argmax(means))]
+    return _highest(levels, means)
+
+
+def _highest(levels: Sequence[Level], scores: Sequence[float]) -> Level:
+    """The level of the highest score; of equal ones, the finest."""
+    return max(zip(scores, levels, strict=True), key=lambda each: (each[0], each[1].index))[1]

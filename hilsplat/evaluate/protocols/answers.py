@@ -1,8 +1,11 @@
 """What a scene must answer to be scored, and its answers while one view is scored."""
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float32, Int64
 
 from hilsplat.base.levels import Level
 
@@ -17,12 +20,32 @@ class QueryableScene(Protocol):
     def node_relevancy_map(self, texts, view):
         """Relevancy of the node at each pixel, (T, 3, H, W)."""
 
+    def field_cosine(self, texts, view, pixels):
+        """Cosine of the decoded latent of some pixels, (T, 3, P); -inf where a level does not answer."""
+
+    def node_cosine(self, texts, view, pixels):
+        """Cosine of the node at some pixels, (T, 3, P); -inf where a level does not answer."""
+
     def select(self, path, *, level=None, view=None):
         """Nodes that answer the last of one or more texts, at a given or a chosen level. With a view, only
         the nodes that it shows compete."""
 
     def node_masks(self, view, ids):
         """Union of the rendered nodes in a view, (H, W)."""
+
+
+@dataclass(frozen=True)
+class ViewMaps:
+    """What one method's maps of one view say of any texts.
+
+    Attributes:
+        relevancy: texts -> relevancy, (T, 3, H, W).
+        cosine: texts and pixels (row * width + column) -> plain cosine, (T, 3, P); -inf where a level does
+            not answer.
+    """
+
+    relevancy: Callable[[Sequence[str]], Float32[np.ndarray, "T 3 H W"]]
+    cosine: Callable[[Sequence[str], Int64[np.ndarray, " P"]], Float32[np.ndarray, "T 3 P"]]
 
 
 class PackedMasks:

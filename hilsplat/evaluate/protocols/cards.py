@@ -1,8 +1,8 @@
 """Every protocol: its name, its version, and everything that decides a number under it.
 
 A number without its protocol is not a result: the same model scores 51.4 under `lerf/langsplat` and 9.66
-under `lerf/opengaussian`. A row of `scores.csv` carries the full name, such as `lerf/langsplat@1`, followed
-in brackets by whatever its settings change: `lerf/langsplat@1 (filter 20, raw)`. A change in what a card
+under `lerf/opengaussian`. A row of `scores.csv` carries the full name, such as `lerf/langsplat@2`, followed
+in brackets by whatever its settings change: `lerf/langsplat@2 (filter 20, raw)`. A change in what a card
 decides needs a new version; a test checks that.
 """
 
@@ -26,7 +26,8 @@ below that of the best node in the view, or within three times that if it looks 
 
 Version 1 of `lerf/tree-nodes`, `hierarchy/level-given` and `-auto` used 0.85 of the range of the
 relevancies themselves. Up to version 3 of these, 2 of `hierarchy/path` and 1 of `world/view-consistency`,
-looks did not count, and nodes of the whole scene competed in every view."""
+looks did not count, and nodes of the whole scene competed in every view. Up to version 4 of `lerf/tree-nodes`
+and `hierarchy/level-auto`, and 1 of the protocols after LangSplat, equal levels went to the coarsest."""
 
 ANCESTORS = 0.2
 """Share of the mean margin of a node's ancestors that is added to its own, except on paths; version 2 of
@@ -45,7 +46,10 @@ pooled: counts of all scenes are added first, so scenes weigh by their points.
 
 
 Missing = Literal["zero", "left out"]
-"""A (view, query) pair without a prediction: it counts 0, or is dropped, which flatters a method."""
+"""A (view, query) pair without a prediction: it counts 0, or is dropped, which flatters a method.
+
+A point without a predicted class: a miss, or in no IoU (its accuracy still counts it).
+"""
 
 
 @dataclass(frozen=True)
@@ -58,10 +62,15 @@ class ProtocolCard:
         metrics: keys of `METRICS` that its rows carry.
         averaging: see `Averaging`.
         selection: how a prediction is chosen, threshold and level, in words.
-        source: repository or text it follows.
+        source: what it follows, and where it departs from that. Begins with "none" if no public code has it.
         rule: how relevancy maps become masks, if they do.
-        missing: see `Missing`. A point without a predicted class is a miss under every protocol.
+        missing: see `Missing`.
         classes: name of the `ClassSet` that is queried, if it is fixed.
+        truth: `labels`: the region that the data set defines; `any grey`: every pixel of its mask file that
+            is not black, if it has one.
+        united: text -> another text; the masks of both, united, answer the first.
+        public: the public function that it equals to rounding, apart from what `source` says it departs in:
+            `owner/repository@commit file`, with `:function` where the file has several; "" if there is none.
     """
 
     name: str
@@ -73,6 +82,9 @@ class ProtocolCard:
     rule: RelevancyRule | None = None
     missing: Missing = "zero"
     classes: str = ""
+    truth: Literal["labels", "any grey"] = "labels"
+    united: tuple[tuple[str, str], ...] = ()
+    public: str = ""
 
     @property
     def full_name(self) -> str:
@@ -87,37 +99,45 @@ class ProtocolCard:
 
 MASK = ("iou", "boundary_iou")
 LOCALIZATION = ("localization_box", "localization_mask")
-CONSISTENCY = tuple(
-    f"hc_{reading}{suffix}"
-    for suffix in ("", "_pooled")
-    for reading in ("containment", "literal", "anchored")
+CONSISTENCY = (
+    "hc_containment",
+    "hc_literal",
+    "hc_anchored",
+    "hc_containment_pooled",
+    "hc_literal_pooled",
+    "hc_anchored_pooled",
+    "hc_containment_per_child",
 )
 PRESENT = ("class_iou", "class_accuracy", "miou_present", "macc_present")
 
-LANGSPLAT = "minghanqin/LangSplat eval/evaluate_iou_loc.py"
-OPENGAUSSIAN = "yanmin-wu/OpenGaussian scripts/eval_scannet.py"
+OPENGAUSSIAN = "yanmin-wu/OpenGaussian@b70dcc6 scripts/eval_scannet.py"
+GAUSSIAN_GROUPING = "lkeab/gaussian-grouping@c93f24b script/eval_lerf_mask.py"
+OPENSCENE = "pengsongyou/openscene@ab35b89 util/metric.py:evaluate"
 ARGMAX = "argmax of the cosine over the classes, no canonical phrases"
-PAPER = "Hi-LSplat, implementation details"
+PAPER = "none: Hi-LSplat, implementation details"
+OURS = "none: ours"
+LANGSPLAT_V2 = "LangSplatV2, as its copy xuexutao/Lang_GS has it"
 
 LERF_LANGSPLAT = ProtocolCard(
     "lerf/langsplat",
-    1,
+    2,
     MASK + LOCALIZATION,
     "pairs",
     "min-max relevancy above 0.7 after a mean filter of 30 px at a height of 730, scaled; level of the "
     "highest value",
-    LANGSPLAT,
+    "LangSplat; departs: its filter of 30 px is scaled with the height of the image",
     RelevancyRule(),
+    public="minghanqin/LangSplat@26ed214 eval/evaluate_iou_loc.py:activate_stream",
 )
 TREE_NODES = ProtocolCard(
     "lerf/tree-nodes",
-    4,
+    5,
     MASK + LOCALIZATION,
     "pairs",
     "3D nodes that the view shows, at most 0.05 of the range of the level's cosine margins (with a fifth of "
     "their ancestors' mean) below the best, or 0.15 if the cosine with it is at least 0.9, rendered; level "
     "chosen by the tree",
-    "ours",
+    OURS,
 )
 LEVEL_GIVEN = ProtocolCard(
     "hierarchy/level-given",
@@ -125,12 +145,12 @@ LEVEL_GIVEN = ProtocolCard(
     (*MASK, *LOCALIZATION, "best_threshold_iou", *CONSISTENCY),
     "levels",
     "as lerf/langsplat for maps and lerf/tree-nodes for nodes, at the level of the annotation",
-    "Hi-LERF and Hi-3DOVS: l1, l2, l3 columns",
+    "none: Hi-LERF and Hi-3DOVS have columns l1, l2, l3",
     RelevancyRule(),
 )
 LEVEL_AUTO = ProtocolCard(
     "hierarchy/level-auto",
-    4,
+    5,
     (*MASK, *LOCALIZATION, *CONSISTENCY),
     "levels",
     "as lerf/langsplat for maps and lerf/tree-nodes for nodes, level chosen by the method",
@@ -144,7 +164,7 @@ PATH = ProtocolCard(
     "levels",
     "3D nodes that answer the chain of texts from the whole down, each with its ancestors; those the view "
     "shows: more text than the paper gives",
-    "ours",
+    OURS,
 )
 SCENE_WIDE = ProtocolCard(
     "hierarchy/scene-wide",
@@ -152,10 +172,10 @@ SCENE_WIDE = ProtocolCard(
     (*MASK, *CONSISTENCY),
     "levels",
     "as hierarchy/level-given for nodes, but those of the whole scene compete: one answer for all views",
-    "ours",
+    OURS,
 )
 ANNOTATIONS = ProtocolCard(
-    "hierarchy/annotations", 1, CONSISTENCY, "views", "the annotations: what perfect masks score", "ours"
+    "hierarchy/annotations", 1, CONSISTENCY, "views", "the annotations: what perfect masks score", OURS
 )
 VIEW_CONSISTENCY = ProtocolCard(
     "world/view-consistency",
@@ -163,7 +183,7 @@ VIEW_CONSISTENCY = ProtocolCard(
     ("view_consistency",),
     "levels",
     "as hierarchy/level-given, in a view and its nearest neighbour; IoU over the surface points both show",
-    "ours; exact geometry of the synthetic world",
+    f"{OURS}; exact geometry of the synthetic world",
 )
 LERF_OPENGAUSSIAN = ProtocolCard(
     "lerf/opengaussian",
@@ -171,7 +191,8 @@ LERF_OPENGAUSSIAN = ProtocolCard(
     ("iou", "acc_25", "acc_50"),
     "pairs",
     "Gaussians selected in 3D by cosine, rendered, silhouette above 0.7; another task than lerf/langsplat",
-    "yanmin-wu/OpenGaussian scripts/compute_lerf_iou.py",
+    "OpenGaussian",
+    public="yanmin-wu/OpenGaussian@b70dcc6 scripts/compute_lerf_iou.py",
 )
 LERF_MASK = ProtocolCard(
     "lerf-mask/gaussian-grouping",
@@ -179,7 +200,8 @@ LERF_MASK = ProtocolCard(
     MASK,
     "classes",
     "masks as the method gives them, one per prompt",
-    "lkeab/gaussian-grouping script/eval_lerf_mask.py; departs: a missing prediction counts 0",
+    "Gaussian Grouping; departs: a missing prediction counts 0, two empty masks 0 (there NaN)",
+    public=GAUSSIAN_GROUPING,
 )
 LERF_MASK_SKIPPING = ProtocolCard(
     "lerf-mask/gaussian-grouping-skipping",
@@ -187,16 +209,18 @@ LERF_MASK_SKIPPING = ProtocolCard(
     MASK,
     "classes",
     "masks as the method gives them, one per prompt",
-    "lkeab/gaussian-grouping script/eval_lerf_mask.py, where a missing prediction is skipped",
+    "Gaussian Grouping, where a missing prediction is skipped; departs: two empty masks count 0 (there NaN)",
     missing="left out",
+    public=GAUSSIAN_GROUPING,
 )
 OVS_ARGMAX = ProtocolCard(
     "3d-ovs/argmax",
-    1,
+    2,
     ("iou", "pixel_accuracy"),
     "pairs",
-    f"{ARGMAX}, at an eighth of the image's size",
-    "Kunhao-Liu/3D-OVS renderer.py",
+    f"{ARGMAX} and over the levels, at an eighth of the image's size",
+    "3D-OVS; departs: the highest cosine of three levels (there one); a pixel that none answers is a miss",
+    public="Kunhao-Liu/3D-OVS@80e512c renderer.py:evaluation_segmentation_test",
 )
 INSTANCES = ProtocolCard(
     "scannet200/instances",
@@ -204,14 +228,40 @@ INSTANCES = ProtocolCard(
     ("ap", "ap50", "ap25"),
     "pooled",
     "predicted instances with class and confidence; fewer than 100 points are left out",
-    "ScanNet/ScanNet evaluate_semantic_instance.py",
+    "OpenMask3D's copy of ScanNet's script; departs: confidence is the cosine (there 1 for all). Predictions "
+    "match in the order given; that of ScanNet's own script is a dict's, so undefined",
     classes="scannet200-instances",
+    public="OpenMask3D/openmask3d@6488748 openmask3d/evaluation/eval_semantic_instance.py:evaluate_matches",
 )
 
 
-def _maps(name: str, source: str, selection: str, metrics: tuple[str, ...], **rule) -> ProtocolCard:
+OVS_LANGSPLAT_V2 = ProtocolCard(
+    "3d-ovs/langsplat-v2",
+    2,
+    MASK,
+    "pairs",
+    "min-max of the smoothed relevancy above 0.625, 7 x 7 majority; whole or part, by the highest mean in "
+    "its mask, an empty mask first; truth: any non-zero grey; wood wall is united with wood table",
+    f"{LANGSPLAT_V2}, with the threshold of its .sh; departs: a text without a true pixel is not asked",
+    RelevancyRule(
+        filter_px=29,
+        threshold=0.25,
+        level_rule="mean_in_mask",
+        border="inside",
+        levels=(Level.WHOLE, Level.PART),
+        empty_wins=True,
+    ),
+    truth="any grey",
+    united=(("wood wall", "wood table"),),
+    public="xuexutao/Lang_GS@b808dfb eval_3d_ovs.py:segmentation_process_cuda_room",
+)
+
+
+def _maps(
+    name: str, source: str, selection: str, metrics: tuple[str, ...], public: str = "", **rule
+) -> ProtocolCard:
     """A protocol that differs from LangSplat's in its rule."""
-    return ProtocolCard(name, 1, metrics, "pairs", selection, source, RelevancyRule(**rule))
+    return ProtocolCard(name, 2, metrics, "pairs", selection, source, RelevancyRule(**rule), public=public)
 
 
 def _points(
@@ -220,9 +270,14 @@ def _points(
     source: str,
     metrics: tuple[str, ...] = PRESENT,
     averaging: Averaging = "scenes",
+    version: int = 1,
+    missing: Missing = "zero",
+    public: str = "",
 ) -> ProtocolCard:
     """A protocol of points."""
-    return ProtocolCard(name, 1, metrics, averaging, ARGMAX, source, classes=classes)
+    return ProtocolCard(
+        name, version, metrics, averaging, ARGMAX, source, missing=missing, classes=classes, public=public
+    )
 
 
 def card_named(name: str) -> ProtocolCard:
@@ -246,9 +301,10 @@ CARDS: tuple[ProtocolCard, ...] = (
     TREE_NODES,
     _maps(
         "lerf/langsplat-v2",
-        "ZhaoYujie2002/LangSplatV2",
+        LANGSPLAT_V2,
         "as lerf/langsplat with windows of 29 and 7 px that end at the border",
         MASK + LOCALIZATION,
+        public="xuexutao/Lang_GS@b808dfb eval_lerf.py",
         filter_px=29,
         border="inside",
     ),
@@ -276,7 +332,7 @@ CARDS: tuple[ProtocolCard, ...] = (
     OVS_ARGMAX,
     _maps(
         "3d-ovs/langsplat",
-        "LangSplat's supplement; code unreleased, so the scale of the threshold is our reading",
+        "none: LangSplat's supplement; the scale of the threshold is our reading",
         "min-max relevancy above 0.7, unfiltered; level of the highest mean in its mask",
         MASK,
         mix=False,
@@ -285,7 +341,7 @@ CARDS: tuple[ProtocolCard, ...] = (
     ),
     _maps(
         "3d-ovs/langsplat-raw",
-        "LangSplat's supplement, taken literally",
+        "none: LangSplat's supplement, taken literally",
         "relevancy above 0.4, unfiltered; level of the highest mean in its mask",
         MASK,
         mix=False,
@@ -293,59 +349,74 @@ CARDS: tuple[ProtocolCard, ...] = (
         majority=False,
         level_rule="mean_in_mask",
     ),
-    _maps(
-        "3d-ovs/langsplat-v2",
-        "ZhaoYujie2002/LangSplatV2",
-        "min-max of the smoothed relevancy above 0.7; whole or part, by the highest mean in its mask",
-        MASK,
-        filter_px=29,
-        majority=False,
-        level_rule="mean_in_mask",
-        border="inside",
-        levels=(Level.WHOLE, Level.PART),
-    ),
-    _points("scannet/opengaussian-19", "scannet-19", OPENGAUSSIAN),
-    _points("scannet/opengaussian-15", "scannet-15", OPENGAUSSIAN),
-    _points("scannet/opengaussian-10", "scannet-10", OPENGAUSSIAN),
+    OVS_LANGSPLAT_V2,
+    _points("scannet/opengaussian-19", "scannet-19", "OpenGaussian", public=OPENGAUSSIAN),
+    _points("scannet/opengaussian-15", "scannet-15", "OpenGaussian", public=OPENGAUSSIAN),
+    _points("scannet/opengaussian-10", "scannet-10", "OpenGaussian", public=OPENGAUSSIAN),
     _points(
         "scannet/benchmark",
         "scannet-20",
-        "ScanNet/ScanNet evaluate_semantic_label.py",
+        "ScanNet; departs: a class that occurs nowhere is left out (there the script stops)",
         (*PER_CLASS, "miou_occurring"),
         "pooled",
+        public="ScanNet/ScanNet@66ba107 BenchmarkScripts/3d_evaluation/evaluate_semantic_label.py:get_iou",
     ),
     _points(
         "scannet/openscene",
         "scannet-20",
-        "pengsongyou/openscene",
+        "OpenScene, where a point without a feature is in no IoU; departs: a class of which no point has a "
+        "feature counts 0 (there the script stops)",
         (*PER_CLASS, "miou_all", "macc_all"),
         "pooled",
+        version=2,
+        missing="left out",
+        public=OPENSCENE,
     ),
-    _points("scannet200/opengaussian", "scannet200", f"{OPENGAUSSIAN}, with 200 classes"),
+    _points(
+        "scannet/openscene-all-points",
+        "scannet-20",
+        "OpenScene; departs: a point without a feature is a miss",
+        (*PER_CLASS, "miou_all", "macc_all"),
+        "pooled",
+        public=OPENSCENE,
+    ),
+    _points(
+        "scannet200/opengaussian", "scannet200", "OpenGaussian; departs: 200 classes", public=OPENGAUSSIAN
+    ),
     _points(
         "scannet200/benchmark",
         "scannet200",
-        "ScanNet/ScanNet BenchmarkScripts/ScanNet200",
+        "none: ScanNet/ScanNet has classes and splits alone (BenchmarkScripts/ScanNet200); counts as in its "
+        "script for 20 classes",
         (*PER_CLASS, "miou_occurring", "miou_head", "miou_common", "miou_tail"),
         "pooled",
     ),
     INSTANCES,
-    _points("replica/per-scene", "replica-48", "ours; the paper names no code"),
+    _points("replica/per-scene", "replica-48", f"{OURS}; the paper names no code"),
     _points(
-        "replica/opennerf", "replica-51", "opennerf/opennerf", (*PER_CLASS, "miou_all", "macc_all"), "pooled"
+        "replica/opennerf",
+        "replica-51",
+        "OpenNeRF; departs: a class without a true point counts 0 (there NaN if it is predicted, else the "
+        "script stops)",
+        (*PER_CLASS, "miou_all", "macc_all"),
+        "pooled",
+        public="opennerf/opennerf@343fa06 scripts/train_eval_replica_semantics.py:get_iou",
     ),
     _points(
         "replica/conceptgraphs",
         "replica-51",
-        "ConceptGraphs' means, on mesh vertices",
+        "ConceptGraphs' means; departs: on mesh vertices, and all 51 names compete (there only the classes "
+        "that the scene has)",
         (*PER_CLASS, "macc_present", "frequency_weighted_iou"),
+        public="concept-graphs/concept-graphs@3f97d78 conceptgraph/utils/eval.py:compute_metrics",
     ),
     _points(
         "waymo/segmentation",
         "waymo-22",
-        "waymo-research/waymo-open-dataset metrics/segmentation_metrics.cc",
+        "Waymo; miou_present leaves out the classes that it counts as 1",
         (*PER_CLASS, "miou_absent_as_one", "miou_present"),
         "pooled",
+        public="waymo-research/waymo-open-dataset@2a7359b waymo_open_dataset/metrics/segmentation_metrics.cc",
     ),
     LEVEL_GIVEN,
     LEVEL_AUTO,

@@ -1,20 +1,21 @@
 """Protocols of images without levels, scored beside LangSplat's: 3D-OVS, LERF-Mask, other rules for maps.
 
-They read the relevancy maps that `views.measure_view` renders anyway. On a stand-in with levels only the
-texts of whole objects are asked, because those benchmarks do not name parts; the names of the protocols
-then carry `wholes`.
+They read the relevancy maps that `views.measure_view` renders anyway, and plain cosines. On a stand-in with
+levels only the texts of whole objects are asked, because those benchmarks do not name parts; the names of the
+protocols then carry `wholes`.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int64
+from PIL import Image
 
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.metrics.localization import peak_points
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
+from hilsplat.evaluate.protocols.answers import ViewMaps
 from hilsplat.evaluate.protocols.cards import (
     LERF_LANGSPLAT,
     LERF_MASK,
@@ -44,8 +45,8 @@ class FlatProtocols:
     def __init__(self, cards: Sequence[ProtocolCard], level: Level | None, words: Sequence[str] = ()) -> None:
         self.cards, self.level = tuple(cards), level
         self.words = [*(["wholes"] if level is Level.WHOLE else []), *words]
-        self._maps: dict[str, list[np.ndarray]] = {}
-        self._truths: dict[str, Bool[np.ndarray, "h w"]] = {}
+        self._maps: dict[str, ViewMaps] = {}
+        self._truths: dict[str, Bool[np.ndarray, "H W"]] = {}
 
     def add(
         self,
@@ -54,6 +55,7 @@ class FlatProtocols:
         nodes_mask: Bool[np.ndarray, "H W"] | None,
         category: Query,
         queries: Sequence[Query],
+        maps: ViewMaps,
     ) -> Iterator[Measured]:
         """Rows of one text by one method.
 
@@ -63,6 +65,7 @@ class FlatProtocols:
             nodes_mask: the tree's own answer, which LERF-Mask takes; None: the map's mask.
             category: the text with all levels united.
             queries: the same per level.
+            maps: what the method's maps say of further texts.
         """
         query = category if self.level is None else next((q for q in queries if q.level is self.level), None)
         if query is None:
@@ -80,39 +83,49 @@ class FlatProtocols:
                     yield replace(row, protocol=label)
             elif card.rule is not None:
                 smoothed = SmoothedRelevancy.of(relevancy, card.rule)
-                mask, _ = relevancy_mask(smoothed, None, card.rule)
+                other = dict(card.united).get(flat.text)
+                united = None if other is None else maps.relevancy((other,))[0]
+                mask, _ = relevancy_mask(smoothed, None, card.rule, united)
                 points, _ = peak_points(smoothed.filtered, None)
-                yield from mask_rows(method, flat, label, mask, points, card.metrics)
+                scored = flat
+                if card.truth == "any grey" and flat.any_grey is not None:
+                    scored = replace(flat, truth=flat.any_grey)
+                yield from mask_rows(method, scored, label, mask, points, card.metrics)
         if OVS_ARGMAX in self.cards:
-            self._maps.setdefault(method, []).append(eighth(relevancy.max(axis=0)))
-            self._truths[flat.text] = eighth(flat.truth.astype(np.uint8)) > 0
+            self._maps[method] = maps
+            self._truths[flat.text] = flat.truth
 
     def finish(self) -> Iterator[Measured]:
-        """Rows that need all texts of the view: 3D-OVS by argmax, each pixel's best level."""
-        texts = list(self._truths)
+        """Rows that need all texts of the view: 3D-OVS by argmax over texts and levels."""
+        texts = sorted(self._truths)  # ties go to the first
         if not texts:
             return
-        truth = np.stack([self._truths[text] for text in texts])
+        rows, columns = eighth(self._truths[texts[0]].shape)
+        truth = np.stack([self._truths[text][np.ix_(rows, columns)] for text in texts])
+        asked = np.full(truth.shape[1:], True)
         words = ["best level", *self.words]
         if self.level is not None:  # the surroundings of the objects have no text
             words = ["labelled pixels", *words]
-            labelled = truth.any(axis=0)
-            truth = truth[:, None, labelled]
+            asked &= truth.any(axis=0)
+        width = self._truths[texts[0]].shape[1]
+        pixels = (rows[:, None] * width + columns)[asked]
+        if not len(pixels):
+            return
         for method, maps in self._maps.items():
-            similarity = np.stack(maps)
-            if self.level is not None:
-                similarity = similarity[:, None, labelled]
-            if not truth.size:
-                continue
-            order = sorted(range(len(texts)), key=lambda row: texts[row])  # ties go to the first
-            for row in measure_class_maps(
-                method, similarity[order], truth[order], [texts[row] for row in order]
-            ):
+            similarity = maps.cosine(texts, pixels).max(axis=1)
+            for row in measure_class_maps(method, similarity[:, None], truth[:, None, asked], texts):
                 yield replace(row, protocol=OVS_ARGMAX.labelled(words))
 
 
-def eighth(picture: np.ndarray) -> np.ndarray:
-    """A map or region at an eighth of its size, by the nearest pixel."""
-    height, width = picture.shape
-    size = (max(1, width // EIGHTH), max(1, height // EIGHTH))
-    return cv2.resize(picture, size, interpolation=cv2.INTER_NEAREST)
+def eighth(size_hw: tuple[int, int]) -> tuple[Int64[np.ndarray, " h"], Int64[np.ndarray, " w"]]:
+    """Rows and columns that Pillow's nearest neighbour keeps of an image at an eighth of its size.
+
+    3D-OVS resizes with it. They are 8 i + 4 where a side is a multiple of 8.
+    """
+
+    def kept(side: int) -> Int64[np.ndarray, " n"]:
+        line = Image.fromarray(np.arange(side, dtype=np.int32)[None])
+        small = line.resize((max(1, side // EIGHTH), 1), Image.Resampling.NEAREST)
+        return np.asarray(small)[0].astype(np.int64)
+
+    return kept(size_hw[0]), kept(size_hw[1])

@@ -63,7 +63,8 @@ def measure_points(
         card: a protocol of points; its classes are `classes`.
         method: what answered.
         truth: labels 1 .. K in the order of `classes`; 0 is ignored.
-        prediction: the same; 0 is a miss. None if the scene has no prediction: all 0.
+        prediction: the same; 0 is a miss, or in no IoU if the card leaves such points out. None if the scene
+            has no prediction: all 0.
         classes: what was queried.
         carried: mode of `carry.CarriedPoints`, or another way by which predictions reached the points.
 
@@ -84,7 +85,7 @@ def measure_points(
             found=len(prediction),
             fix="carry the predictions to the points of the ground truth",
         )
-    counts = ClassCounts.of(truth, prediction, len(classes))
+    counts = ClassCounts.of(truth, prediction, len(classes), leave_out=card.missing == "left out")
     protocol = point_label(card, carried)
     for metric, values, points in (
         ("class_iou", class_iou(counts), counts.union),
@@ -118,7 +119,10 @@ def pooled_points(
 
 
 def _counts_of(rows: Sequence[Measured], classes: ClassSet) -> ClassCounts:
-    """Counts from class rows. Values carry six decimals in a file: exact up to a million points per class."""
+    """Counts from class rows. Values carry six decimals in a file: exact up to a million points per class.
+
+    Points left out are subtracted from those predicted, because the rows tell only their sum with the union.
+    """
     hits, truth, union = np.zeros((3, len(classes)), dtype=np.int64)
     place = {text: row for row, text in enumerate(classes.texts)}
     for row in rows:
@@ -127,7 +131,7 @@ def _counts_of(rows: Sequence[Measured], classes: ClassSet) -> ClassCounts:
             hits[place[row.query]] = round(row.value * row.n)
         elif row.metric == "class_accuracy":
             truth[place[row.query]] = row.n
-    return ClassCounts(hits, truth, union - truth + hits)
+    return ClassCounts(hits, truth, union - truth + hits, np.zeros_like(truth))
 
 
 def measure_instances(

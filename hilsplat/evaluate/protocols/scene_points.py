@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int32
+from jaxtyping import Bool, Float, Int, Int32
 
 from hilsplat.base.levels import Level
 from hilsplat.datasets.classes.class_set import ClassSet
@@ -98,15 +98,27 @@ class PointAnswers:
         cosines = tree.clip[nodes].astype(np.float32) @ self.scene.text_vectors(classes.texts).T
         node = np.append(tree.node_of_gaussian[:, LEVEL.index], -1)
         own = self.carried.labels(node[:-1] + 1) - 1
-        labels = classes.labels(truth.class_id)
-        ids = np.array([0, *classes.ids])[labels]
-        scan = InstanceScan(
-            np.where(labels > 0, ids * CLASS_STRIDE + truth.instance_id, 0).astype(np.int64),
+        return instance_scan(
+            truth,
+            classes,
             own[None] == nodes[:, None],
             np.array(classes.ids)[cosines.argmax(axis=1)] if len(nodes) else np.zeros(0, np.int64),
             cosines.max(axis=1) if len(nodes) else np.zeros(0, np.float32),
         )
-        return match_instances(scan, classes.ids)
+
+
+def instance_scan(
+    truth: LabelledPoints,
+    classes: ClassSet,
+    masks: Bool[np.ndarray, "M P"],
+    class_ids: Int[np.ndarray, " M"],
+    confidences: Float[np.ndarray, " M"],
+) -> InstanceMatches:
+    """Match predicted instances, with class ids as in the data set's files, to the labelled ones."""
+    labels = classes.labels(truth.class_id)
+    ids = np.array([0, *classes.ids])[labels]
+    of_points = np.where(labels > 0, ids * CLASS_STRIDE + truth.instance_id, 0).astype(np.int64)
+    return match_instances(InstanceScan(of_points, masks, class_ids, confidences), classes.ids)
 
 
 def class_set(name: str) -> tuple[str, ClassSet]:

@@ -23,6 +23,7 @@ class Query:
         paths: chains of texts that lead to its nodes, each once.
         truth: true region.
         boxes_xyxy: box of each annotated node, borders included.
+        any_grey: true region of protocols that take any grey of a mask file; None: the same as `truth`.
     """
 
     text: str
@@ -30,6 +31,7 @@ class Query:
     paths: tuple[tuple[str, ...], ...]
     truth: Bool[np.ndarray, "H W"]
     boxes_xyxy: Int[np.ndarray, "B 4"]
+    any_grey: Bool[np.ndarray, "H W"] | None = None
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,9 @@ class ViewTruth:
                 tuple(dict.fromkeys(region.path for region, _ in same)),
                 np.any([mask for _, mask in same], axis=0),
                 np.concatenate([region.boxes(size_hw) for region, _ in same]),
+                np.any([region.mask(size_hw, any_grey=True) for region, _ in same], axis=0)
+                if any(region.any_grey for region, _ in same)
+                else None,
             )
             for (text, level), same in groups.items()
         ]
@@ -161,6 +166,9 @@ def _united(queries: Iterable[Query]) -> tuple[Query, ...]:
             tuple(path for query in same for path in query.paths),
             np.any([query.truth for query in same], axis=0),
             np.concatenate([query.boxes_xyxy for query in same]),
+            np.any([query.truth if query.any_grey is None else query.any_grey for query in same], axis=0)
+            if any(query.any_grey is not None for query in same)
+            else None,
         )
         for text, same in by_text.items()
     )

@@ -21,7 +21,13 @@ from functools import partial
 import numpy as np
 
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.evaluate.metrics.hierarchy import READINGS, Family, consistency_of_families, mean_over_parents
+from hilsplat.evaluate.metrics.hierarchy import (
+    READINGS,
+    Family,
+    consistency_of_families,
+    consistency_per_child,
+    mean_over_parents,
+)
 from hilsplat.evaluate.metrics.localization import peak_points
 from hilsplat.evaluate.metrics.masks import best_threshold_iou
 from hilsplat.evaluate.metrics.relevancy_rule import (
@@ -31,7 +37,7 @@ from hilsplat.evaluate.metrics.relevancy_rule import (
     mean_filter,
     relevancy_mask,
 )
-from hilsplat.evaluate.protocols.answers import PackedMasks, QueryableScene, Selections
+from hilsplat.evaluate.protocols.answers import PackedMasks, QueryableScene, Selections, ViewMaps
 from hilsplat.evaluate.protocols.cards import (
     ANCESTORS,
     ANNOTATIONS,
@@ -137,6 +143,15 @@ def measure_view(
     def by_nodes(text: str, level: Level | None) -> np.ndarray:
         return selections.mask(view, selections.nodes((text,), level, view), size_hw)
 
+    def maps_of(render: Callable, cosine: Callable) -> ViewMaps:
+        return ViewMaps(
+            lambda texts: _relevancy(render, texts, view),
+            lambda texts, pixels: np.asarray(cosine(tuple(texts), view, pixels), np.float32),
+        )
+
+    field_maps = maps_of(scene.field_relevancy, scene.field_cosine)
+    node_maps = maps_of(scene.node_relevancy_map, scene.node_cosine)
+
     texts = [query.text for query in truth.categories]
     per_chunk = max(1, int(RELEVANCY_CHUNK_MIB * 2**20 / (2 * 3 * 4 * size_hw[0] * size_hw[1])))
     for start in range(0, len(texts), per_chunk):
@@ -160,7 +175,7 @@ def measure_view(
                     masks,
                 )
                 if also is not None:
-                    yield from also.add("field", fields[row], None, category, queries)
+                    yield from also.add("field", fields[row], None, category, queries, field_maps)
             if nodes is not None and "tree" in settings.methods:
                 smoothed = SmoothedRelevancy.of(nodes[row], rule)
                 yield from _answer_rows(
@@ -168,7 +183,8 @@ def measure_view(
                 )
                 yield from _scene_wide_rows(queries, settings, selections, view, masks)
                 if also is not None:
-                    yield from also.add("tree", nodes[row], by_nodes(text, None), category, queries)
+                    mask = by_nodes(text, None)
+                    yield from also.add("tree", nodes[row], mask, category, queries, node_maps)
             if nodes is not None and "tree-path" in settings.methods:
                 yield from _path_rows(nodes[row], queries, settings, selections, view, masks)
     if also is not None:
@@ -270,10 +286,6 @@ def _path_rows(
 
 def _consistency_rows(truth: ViewTruth, masks: PackedMasks, settings: EvaluateSettings) -> Iterator[Measured]:
     """HC of every method and of the annotations; a view without any parent gives no row."""
-    transitions = truth.families()
-    parents = sum(map(len, transitions))
-    if not parents:
-        return
     # (method, protocol) -> function from a path to the rest of its answer's key
     rest_of: dict[tuple[str, str], Callable[[tuple[str, ...]], tuple]] = {
         ("truth", label_of(ANNOTATIONS, "truth", settings)): lambda path: (path,)
@@ -290,20 +302,35 @@ def _consistency_rows(truth: ViewTruth, masks: PackedMasks, settings: EvaluateSe
         return truth.regions[path] if answer[0] == "truth" else masks.get((*answer, *rest_of[answer](path)))
 
     for answer in rest_of:
-        method, protocol = answer
-        families = [
-            [
-                Family(
-                    mask_of(answer, parent),
-                    tuple(mask_of(answer, child) for child in children),
-                    truth.regions[parent],
-                )
-                for parent, children in transition
-            ]
-            for transition in transitions
+        yield from consistency_rows(*answer, truth, partial(mask_of, answer))
+
+
+def consistency_rows(
+    method: str, protocol: str, truth: ViewTruth, mask_of: Callable[[tuple[str, ...]], np.ndarray]
+) -> Iterator[Measured]:
+    """HC of one method in one view; nothing if the view has no parent.
+
+    Args:
+        method: what answered.
+        protocol: full name, with departures.
+        truth: the view's regions.
+        mask_of: path of texts -> the answer to it.
+    """
+    transitions = truth.families()
+    parents = sum(map(len, transitions))
+    if not parents:
+        return
+    families = [
+        [
+            Family(mask_of(parent), tuple(mask_of(child) for child in children), truth.regions[parent])
+            for parent, children in transition
         ]
-        for reading in READINGS:
-            scores = consistency_of_families(families, reading)
-            for suffix, pooled in (("", False), ("_pooled", True)):
-                value = mean_over_parents(scores, pooled)
-                yield Measured(method, "", "", f"hc_{reading}{suffix}", protocol, value, parents)
+        for transition in transitions
+    ]
+    for reading in READINGS:
+        scores = consistency_of_families(families, reading)
+        for suffix, pooled in (("", False), ("_pooled", True)):
+            value = mean_over_parents(scores, pooled)
+            yield Measured(method, "", "", f"hc_{reading}{suffix}", protocol, value, parents)
+    per_child = consistency_per_child(families)
+    yield Measured(method, "", "", "hc_containment_per_child", protocol, per_child, parents)

@@ -70,8 +70,9 @@ def hierarchy_table(sources: Sources) -> Table:
     )
     footnotes = (
         "mIoU in %: mean over (view, text) pairs of a scene, then over scenes; Avg is the mean of L1 to L3.",
-        "HC containment: share of the child inside the parent (the paper's wording; 100 for perfect "
-        "nesting). HC literal: share of the parent covered by the child (the printed formula; perfect masks "
+        "HC containment: share of the child inside the parent (the paper's wording), mean over the children "
+        "of a parent, then over parents: 100 for perfect nesting, 50 in a view without subparts. HC literal: "
+        "share of the parent covered by the child (the printed formula; perfect masks "
         "score low). HC anchored: share of the child inside the annotated parent. The row of the "
         "annotations gives what perfect masks would score.",
         "A path of texts asks for whole > part > subpart: more information than the paper's protocol gives.",

@@ -176,14 +176,14 @@ def row_name(variant: str, method: str, labels: Mapping[str, str]) -> str:
     """Name of a row, from its variant and method.
 
     The default variant answers by field and tree, `hilsplat (field)` and `hilsplat (tree)`; another
-    variant's label is that of its field.
+    variant's label is that of its field. Predictions from files bear the name of their program.
     """
     if method == "truth":
         return "annotations"
     label, answer = labels.get(variant, variant), ANSWERS.get(method, method)
     if variant == "default":
         return f"{labels.get('default', 'hilsplat')} ({answer})"
-    return label if method == "field" else f"{label}, {answer}"
+    return label if method in ("field", "files") else f"{label}, {answer}"
 
 
 def kind_and_title(dataset: str) -> tuple[str, str, str]:

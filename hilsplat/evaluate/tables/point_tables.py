@@ -89,7 +89,7 @@ def scannet_table(sources: Sources) -> Table:
         "All in %. 19, 15 and 10 classes and ScanNet200 follow OpenGaussian's code: mean over the classes "
         "present in a scene, then over scenes; vertices of other classes are ignored.",
         MODE_NOTE,
-        "AP, AP@25, AP@50: ScanNet's official instance evaluation over all scans together; an instance is a "
+        "AP, AP@25, AP@50: OpenMask3D's copy of ScanNet's script, over all scans together; an instance is a "
         "node of the tree at level whole, its class the best of 198, its confidence that cosine. A field has "
         "no instances.",
         "*: reproduced by the paper's authors.",

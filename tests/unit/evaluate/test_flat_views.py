@@ -2,13 +2,23 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from hilsplat.base.levels import Level
+from hilsplat.evaluate.protocols.answers import ViewMaps
 from hilsplat.evaluate.protocols.cards import LERF_MASK, OVS_ARGMAX, card_named
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols, eighth
 from hilsplat.evaluate.protocols.view_truth import Query
+from hilsplat.query.relevancy import relevancy_of_margins
 
 SIZE = (16, 32)
+
+
+def unasked(texts, *_):
+    raise AssertionError(f"maps of {texts} were not to be asked for")
+
+
+NO_MORE = ViewMaps(unasked, unasked)
 
 
 def region(columns):
@@ -18,7 +28,8 @@ def region(columns):
 
 
 def query(text, columns, level=Level.WHOLE):
-    return Query(text, level, ((text,),), region(columns), np.array([[columns[0], 0, columns[1] - 1, 15]]))
+    box = np.array([[columns[0], 0, columns[1] - 1, 15]])
+    return Query(text, level, ((text,),), region(columns), box)
 
 
 def maps(columns, value=0.9):
@@ -27,10 +38,22 @@ def maps(columns, value=0.9):
     return found
 
 
-def test_an_eighth_takes_one_pixel_of_each_block():
-    picture = np.arange(16 * 32, dtype=np.float32).reshape(SIZE)
-    assert eighth(picture).shape == (2, 4)
-    assert set(eighth(picture).ravel()) <= set(picture.ravel())
+def cosines(**of_text):
+    """Cosines with each text, from maps (3, H, W)."""
+
+    def cosine(texts, pixels):
+        return np.stack([of_text[text].reshape(3, -1)[:, pixels] for text in texts])
+
+    return ViewMaps(unasked, cosine)
+
+
+def test_an_eighth_takes_the_pixels_that_pillow_takes():
+    rows, columns = eighth(SIZE)
+    assert (rows.tolist(), columns.tolist()) == ([4, 12], [4, 12, 20, 28])
+    rows, columns = eighth((728, 986))  # sides that 8 does not divide
+    picture = np.arange(728 * 986, dtype=np.int32).reshape(728, 986)
+    small = Image.fromarray(picture).resize((123, 91), Image.Resampling.NEAREST)
+    np.testing.assert_array_equal(picture[np.ix_(rows, columns)], np.asarray(small))
 
 
 def test_argmax_compares_labelled_pixels_of_a_stand_in_alone():
@@ -38,37 +61,65 @@ def test_argmax_compares_labelled_pixels_of_a_stand_in_alone():
     # right on its left half, and the plate wins on the right half.
     cup, plate = query("cup", (0, 16)), query("plate", (16, 24))
     flat = FlatProtocols([OVS_ARGMAX], Level.WHOLE)
-    assert list(flat.add("field", maps((0, 8)), None, cup, [cup])) == []
-    assert list(flat.add("field", np.maximum(maps((16, 24)), maps((8, 16), 0.5)), None, plate, [plate])) == []
+    found = cosines(cup=maps((0, 8)), plate=np.maximum(maps((16, 24)), maps((8, 16), 0.5)))
+    assert list(flat.add("field", maps((0, 1)), None, plate, [plate], found)) == []
+    assert list(flat.add("field", maps((0, 1)), None, cup, [cup], found)) == []
     rows = {(row.metric, row.query): row for row in flat.finish()}
     # an eighth: cup has columns 0, 1, plate column 2; predicted cup: 0, plate: 1, 2
     assert rows["iou", "cup"].value == 0.5
     assert rows["iou", "plate"].value == 0.5
     assert rows["pixel_accuracy", ""].value == pytest.approx(2 / 3)
-    assert rows["iou", "cup"].protocol == "3d-ovs/argmax@1 (labelled pixels, best level, wholes)"
+    assert rows["iou", "cup"].protocol == "3d-ovs/argmax@2 (labelled pixels, best level, wholes)"
 
 
 def test_without_levels_every_pixel_is_compared():
     cup = query("cup", (0, 16), level=None)
     flat = FlatProtocols([OVS_ARGMAX], None)
-    list(flat.add("tree", maps((0, 16)), None, cup, []))
+    list(flat.add("tree", maps((0, 16)), None, cup, [], cosines(cup=maps((0, 16)))))
     rows = {row.metric: row for row in flat.finish()}
     assert rows["pixel_accuracy"].value == 0.5  # the only text wins everywhere
-    assert rows["iou"].protocol == "3d-ovs/argmax@1 (best level)"
+    assert rows["iou"].protocol == "3d-ovs/argmax@2 (best level)"
+
+
+def test_canonical_phrases_do_not_choose_the_level():
+    # Cosines with one and two are (0.30, 0.20) at the whole and (0.22, 0.26) at the part; the nearest
+    # canonical phrase has 0.28 and 0.18 there, so that the highest relevancy is that of two at the part.
+    one, two = query("one", (0, 32), None), query("two", (0, 0), None)
+    cosine = {text: np.full((3, *SIZE), -np.inf, np.float32) for text in ("one", "two")}
+    for level, values in enumerate(((0.30, 0.20), (0.22, 0.26))):
+        for text, value in zip(cosine, values, strict=True):
+            cosine[text][level] = value
+    generic = np.array([0.28, 0.18, 0.0], np.float32)[:, None, None]
+    relevancy = {text: relevancy_of_margins(values - generic, 10.0) for text, values in cosine.items()}
+    assert relevancy["two"].max() > relevancy["one"].max()
+    flat = FlatProtocols([OVS_ARGMAX], None)
+    for each in (one, two):
+        list(flat.add("field", relevancy[each.text], None, each, [], cosines(**cosine)))
+    rows = {(row.metric, row.query): row.value for row in flat.finish()}
+    assert rows == {("iou", "one"): 1.0, ("iou", "two"): 0.0, ("pixel_accuracy", ""): 1.0}
+
+
+def test_a_pixel_that_no_level_answers_is_a_miss():
+    found = np.full((3, *SIZE), -np.inf, np.float32)
+    found[1, :, 8:] = 0.2
+    flat = FlatProtocols([OVS_ARGMAX], None)
+    cup = query("cup", (0, 32), level=None)
+    list(flat.add("field", found, None, cup, [], cosines(cup=found)))
+    assert {row.metric: row.value for row in flat.finish()} == {"iou": 0.75, "pixel_accuracy": 0.75}
 
 
 def test_parts_are_not_asked_on_a_stand_in():
     handle = query("handle", (0, 4), level=Level.PART)
     flat = FlatProtocols([LERF_MASK, OVS_ARGMAX], Level.WHOLE)
-    assert list(flat.add("field", maps((0, 4)), None, handle, [handle])) == []
+    assert list(flat.add("field", maps((0, 4)), None, handle, [handle], NO_MORE)) == []
     assert list(flat.finish()) == []
 
 
 def test_lerf_mask_takes_the_trees_own_answer_and_the_fields_mask():
     cup = query("cup", (0, 16))
     flat = FlatProtocols([LERF_MASK], Level.WHOLE)
-    tree = list(flat.add("tree", maps((0, 16)), region((0, 8)), cup, [cup]))
-    field = list(flat.add("field", maps((0, 16)), None, cup, [cup]))
+    tree = list(flat.add("tree", maps((0, 16)), region((0, 8)), cup, [cup], NO_MORE))
+    field = list(flat.add("field", maps((0, 16)), None, cup, [cup], NO_MORE))
     assert {row.metric: row.value for row in tree}["iou"] == 0.5
     assert {row.metric: row.value for row in field}["iou"] > 0.9
     assert {row.protocol for row in tree + field} == {"lerf-mask/gaussian-grouping@1 (wholes)"}
@@ -78,6 +129,6 @@ def test_rules_of_3d_ovs_are_applied_to_the_maps_of_either_method():
     cup = query("cup", (0, 16))
     flat = FlatProtocols([card_named("3d-ovs/langsplat")], Level.WHOLE, ["relevancy scale 5"])
     for method in ("field", "tree"):
-        rows = list(flat.add(method, maps((0, 16)), None, cup, [cup]))
+        rows = list(flat.add(method, maps((0, 16)), None, cup, [cup], NO_MORE))
         assert {row.metric: row.value for row in rows} == {"iou": 1.0, "boundary_iou": 1.0}
-        assert {row.protocol for row in rows} == {"3d-ovs/langsplat@1 (wholes, relevancy scale 5)"}
+        assert {row.protocol for row in rows} == {"3d-ovs/langsplat@2 (wholes, relevancy scale 5)"}

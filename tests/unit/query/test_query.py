@@ -7,7 +7,7 @@ import pytest
 
 from hilsplat.base.artifacts import provenance_path, write_json
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError
-from hilsplat.base.levels import Level
+from hilsplat.base.levels import LEVELS, Level
 from hilsplat.field.autoencoder import run_autoencoder
 from hilsplat.field.code import load_code
 from hilsplat.field.field import run_field
@@ -442,6 +442,32 @@ def test_field_answers_where_the_region_is(scene):
     assert maps[0, 0][inside].mean() > maps[0, 0][~inside].mean() + 0.05
     top = np.roll(region_mask(2), 4, axis=1)
     assert maps[1, 1][top].mean() > maps[1, 1][~top].mean() + 0.05
+
+
+def test_cosines_at_pixels_are_those_of_decoded_latents_and_of_nodes(scene):
+    weights = two_boxes_weights(0).tolil()
+    weights[0] = 0  # the first pixel shows nothing
+    thin = replace(scene, pixel_weights=lambda view: weights.tocsr(), _views=ViewStore())
+    texts, pixels = ["B", "A top"], np.arange(0, HEIGHT * WIDTH, 7)
+    vectors = thin.text_vectors(texts)
+    shares = thin.view_weights("000.png").toarray()
+    for level in LEVELS:
+        features = thin.language.features[:, level.index]
+        mass = shares @ (features != 0).any(axis=1)
+        node = thin.tree.node_of_gaussian[:, level.index]
+        by_node = (vectors @ thin.tree.clip.T)[:, thin.tree.nodes_of(level)].min(axis=1, keepdims=True)
+        of_gaussian = np.where(node >= 0, vectors @ thin.tree.clip[node].T, by_node)
+        for row, pixel in enumerate(pixels):
+            answered = mass[pixel] > 0.5
+            latent = (shares[pixel] @ features / mass[pixel])[None].astype(np.float32) if answered else None
+            expected = (vectors @ thin.autoencoder.decode_array(latent)[0]) if answered else -np.inf
+            found = thin.field_cosine(texts, "000.png", pixels)[:, level.index, row]
+            assert found == pytest.approx(np.broadcast_to(expected, 2), abs=1e-5)
+            covered = shares[pixel].any()
+            expected = of_gaussian @ shares[pixel] if covered else np.full(2, -np.inf)
+            found = thin.node_cosine(texts, "000.png", pixels)[:, level.index, row]
+            assert found == pytest.approx(expected, abs=1e-5)
+    assert np.isinf(thin.node_cosine(texts, "000.png", pixels)[:, :, 0]).all()
 
 
 def test_uncovered_pixels_get_the_least_relevancy(scene):

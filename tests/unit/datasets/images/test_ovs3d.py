@@ -38,6 +38,16 @@ def test_a_written_world_is_read_back_equal(true_world, root):
     assert "regions without a pixel: 03.png: Ring" in open_scene(root, "bed").report().warnings
 
 
+def test_grey_is_foreground_only_for_protocols_that_take_any(root):
+    path = root / "bed" / "segmentations" / "00" / "bear.png"
+    grey = np.zeros((24, 40), np.uint8)
+    grey[:2], grey[2:5] = 255, 1
+    write_png(path, grey)
+    region = open_scene(root, "bed").views["00.png"][1]
+    assert np.flatnonzero(region.mask().any(axis=1)).tolist() == [0, 1]
+    assert np.flatnonzero(region.mask(any_grey=True).any(axis=1)).tolist() == [0, 1, 2, 3, 4]
+
+
 def test_poses_of_llff_are_read_back_equal(true_world, root):
     posed = posed_images(root / "bed", "3D-OVS")
     assert list(posed) == ["00.png", "01.png", "02.png", "03.png"]

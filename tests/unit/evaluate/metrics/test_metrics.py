@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilsplat.base.levels import Level
-from hilsplat.evaluate.metrics.hierarchy import Family, hierarchical_consistency
+from hilsplat.evaluate.metrics.hierarchy import Family, consistency_per_child, hierarchical_consistency
 from hilsplat.evaluate.metrics.localization import box_of, hits_a_box, hits_the_mask, peak_points
 from hilsplat.evaluate.metrics.masks import (
     best_threshold_iou,
@@ -131,6 +131,19 @@ def test_level_of_an_automatic_mask_has_the_highest_mixed_value():
     mask, level = relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)
     assert level is Level.PART
     assert np.argwhere(mask).tolist() == [[5, 5]]
+
+
+@pytest.mark.parametrize("level_rule", ["max", "mean_in_mask"])
+def test_equal_levels_go_to_the_finest(level_rule):
+    relevancy = np.zeros((3, 8, 8), dtype=np.float32)
+    relevancy[0, 2, 2] = relevancy[1, 5, 5] = relevancy[2, 1, 1] = 0.9
+    rule = RelevancyRule(filter_px=1, majority=False, level_rule=level_rule)
+    smoothed = SmoothedRelevancy.of(relevancy, rule)
+    mask, level = relevancy_mask(smoothed, None, rule)
+    assert level is Level.SUBPART  # LangSplat stacks s, m, l, and argmax takes the first
+    assert np.argwhere(mask).tolist() == [[1, 1]]
+    points, level = peak_points(smoothed.filtered, None)
+    assert (points.tolist(), level) == ([[1, 1]], Level.SUBPART)
 
 
 def test_mixing_halves_the_filtered_and_the_raw_map():
@@ -306,6 +319,21 @@ def test_consistency_of_the_worked_example():
     # wholes: literal (0.28 + 0.4) / 2, containment (0.75 + 1) / 2; parts: 4/20 and 1
     assert hierarchical_consistency(families(), "literal") == pytest.approx(0.27)
     assert hierarchical_consistency(families(), "containment") == pytest.approx(0.9375)
+
+
+def test_children_of_a_parent_share_its_weight_unless_counted_alone():
+    left, right = rectangle((0, 10), (0, 5)), rectangle((0, 10), (5, 10))
+    inside = Family(left, (rectangle((0, 2), (0, 2)),), left)
+    outside = Family(right, tuple(rectangle((row, row + 2), (0, 2)) for row in (2, 4, 6)), right)
+    assert hierarchical_consistency([[inside, outside]]) == 0.5
+    assert consistency_per_child([[inside, outside]]) == 0.25
+    assert consistency_per_child(families()) == pytest.approx(((1 + 0.5 + 1) / 3 + 1) / 2)
+
+
+def test_perfect_nesting_in_a_view_without_subparts_scores_half():
+    whole = rectangle((0, 10), (0, 10))
+    transitions = [[Family(whole, (rectangle((0, 2), (0, 2)),), whole)], []]
+    assert hierarchical_consistency(transitions) == consistency_per_child(transitions) == 0.5
 
 
 def test_pooled_consistency_weighs_parents_equally():

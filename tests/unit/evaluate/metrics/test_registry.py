@@ -3,6 +3,7 @@
 import importlib
 import inspect
 import pkgutil
+from functools import partial
 
 import hypothesis.extra.numpy as hnp
 import numpy as np
@@ -11,7 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilsplat.evaluate import metrics
-from hilsplat.evaluate.metrics.hierarchy import READINGS, Family, hierarchical_consistency
+from hilsplat.evaluate.metrics.hierarchy import (
+    READINGS,
+    Family,
+    consistency_per_child,
+    hierarchical_consistency,
+)
 from hilsplat.evaluate.metrics.instances import (
     InstanceScan,
     ap,
@@ -63,11 +69,11 @@ def of_instances(function):
     return value
 
 
-def of_families(reading, pooled):
+def of_families(consistency):
     def value(prediction, truth):
         child = (prediction == 2) | ((prediction == 3) & (truth != 3))  # pixels wrongly labelled 3 spill over
         family = Family(np.isin(prediction, (1, 2)), (child,), np.isin(truth, (1, 2)))
-        return hierarchical_consistency([[family]], reading, pooled)
+        return consistency([[family]])
 
     return value
 
@@ -100,8 +106,14 @@ CASES = {
     "localization_box": of_points(lambda points, truth: hits_a_box(points, box_of(truth)[None])),
     "localization_mask": of_points(hits_the_mask),
     "pixel_accuracy": lambda prediction, truth: pixel_accuracy(one_hot(prediction), one_hot(truth)),
-    **{f"hc_{reading}": of_families(reading, False) for reading in READINGS},
-    **{f"hc_{reading}_pooled": of_families(reading, True) for reading in READINGS},
+    **{
+        f"hc_{reading}{suffix}": of_families(
+            partial(hierarchical_consistency, reading=reading, pooled=bool(suffix))
+        )
+        for reading in READINGS
+        for suffix in ("", "_pooled")
+    },
+    "hc_containment_per_child": of_families(consistency_per_child),
     "view_consistency": of_masks(iou),  # of two views' masks over the points that both show
     "class_iou": of_counts(lambda counts: first_class(class_iou(counts))),
     "class_accuracy": of_counts(lambda counts: first_class(class_accuracy(counts))),
@@ -139,7 +151,7 @@ BUILDING_BLOCKS = frozenset(
         "localization.box_of",
         "localization.peak_points",
         "hierarchy.consistency_of_families",
-        "hierarchy.family_consistency",
+        "hierarchy.children_consistency",
         "hierarchy.mean_over_parents",
         "instances.average_precision",
         "instances.curve_area",

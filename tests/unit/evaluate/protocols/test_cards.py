@@ -1,14 +1,16 @@
 """Every protocol has a name and a version, and nothing it decides changes without a new one."""
 
 import hashlib
+import re
 from dataclasses import asdict
+from pathlib import Path
 
 import pytest
 
 from hilsplat.base.errors import ArtifactError
-from hilsplat.base.levels import Level
 from hilsplat.datasets.classes import replica, scannet, scannet200, waymo
 from hilsplat.evaluate.metrics.registry import METRICS
+from hilsplat.evaluate.metrics.relevancy_rule import RelevancyRule
 from hilsplat.evaluate.protocols.cards import (
     CARDS,
     LERF_LANGSPLAT,
@@ -24,23 +26,24 @@ from hilsplat.settings import EvaluateSettings
 
 DECIDED = {
     # full name: first eight digits of what `digest` makes of metrics, averaging, missing, rule and classes
-    "lerf/langsplat@1": "704f6f3d",
-    "lerf/tree-nodes@4": "2cdcbb8d",
-    "lerf/langsplat-v2@1": "f209b912",
-    "lerf/paper-filter@1": "128bc7c0",
-    "lerf/paper-mean@1": "4fed36ea",
+    "lerf/langsplat@2": "704f6f3d",
+    "lerf/tree-nodes@5": "2cdcbb8d",
+    "lerf/langsplat-v2@2": "f209b912",
+    "lerf/paper-filter@2": "128bc7c0",
+    "lerf/paper-mean@2": "4fed36ea",
     "lerf/opengaussian@1": "68a14e17",
     "lerf-mask/gaussian-grouping@1": "34874a8b",
     "lerf-mask/gaussian-grouping-skipping@1": "b146f4ac",
-    "3d-ovs/argmax@1": "44dac158",
-    "3d-ovs/langsplat@1": "f962ef1a",
-    "3d-ovs/langsplat-raw@1": "7797b61a",
-    "3d-ovs/langsplat-v2@1": "03965bde",
+    "3d-ovs/argmax@2": "44dac158",
+    "3d-ovs/langsplat@2": "f962ef1a",
+    "3d-ovs/langsplat-raw@2": "7797b61a",
+    "3d-ovs/langsplat-v2@2": "107e57a0",
     "scannet/opengaussian-19@1": "ced31f5d",
     "scannet/opengaussian-15@1": "df507111",
     "scannet/opengaussian-10@1": "e9893d38",
     "scannet/benchmark@1": "fe414350",
-    "scannet/openscene@1": "1341871a",
+    "scannet/openscene@2": "03d96f4a",
+    "scannet/openscene-all-points@1": "1341871a",
     "scannet200/opengaussian@1": "367d9a7d",
     "scannet200/benchmark@1": "af79327f",
     "scannet200/instances@1": "623d86d6",
@@ -48,26 +51,35 @@ DECIDED = {
     "replica/opennerf@1": "2368b7a9",
     "replica/conceptgraphs@1": "d89e022d",
     "waymo/segmentation@1": "06e4086c",
-    "hierarchy/level-given@4": "02318fa5",
-    "hierarchy/level-auto@4": "d49b3f00",
-    "hierarchy/path@3": "2f58f979",
-    "hierarchy/scene-wide@1": "a0529c13",
-    "hierarchy/annotations@1": "30da2922",
+    "hierarchy/level-given@4": "50a68907",
+    "hierarchy/level-auto@5": "674d16a2",
+    "hierarchy/path@3": "d6216e2a",
+    "hierarchy/scene-wide@1": "2150c519",
+    "hierarchy/annotations@1": "b5a6aa09",
     "world/view-consistency@2": "c057895c",
 }
 
 
+LATER = {"empty_wins": False, "truth": "labels", "united": ()}
+
+
 def digest(card):
-    """What decides a number, without the words that explain it."""
+    """What decides a number, without the words that explain it.
+
+    What was added later counts only where it is not the default, so that the digests of other cards stand.
+    """
     rule = asdict(card.rule) if card.rule else None
     if rule:
         rule["levels"] = [int(level) for level in rule["levels"]]
+        rule = {key: value for key, value in rule.items() if key not in LATER or value != LATER[key]}
     decided = (card.metrics, card.averaging, card.missing, rule, card.classes)
+    decided += tuple((key, value) for key, value in vars(card).items() if value != LATER.get(key, value))
     return hashlib.sha256(repr(decided).encode()).hexdigest()[:8]
 
 
 def test_what_a_protocol_decides_changes_only_with_its_version():
     found = {name: digest(card) for name, card in PROTOCOLS.items()}
+    # A further metric changes no number, so it needs no new version.
     assert found == DECIDED, "raise the version of a protocol that changed, then write its digest here"
 
 
@@ -80,6 +92,25 @@ def test_names_are_unique_and_say_benchmark_and_variant():
         assert card.full_name == f"{card.name}@{card.version}"
         assert card.selection
         assert card.source
+
+
+PUBLIC = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{7} \S+\.(py|cc)(:\w+)?")
+TABLES = Path(__file__).parents[4] / "docs" / "tables.md"
+
+
+def test_a_card_names_its_public_function_or_says_that_there_is_none():
+    for card in CARDS:
+        assert bool(card.public) != card.source.startswith("none"), card.name
+        assert not card.public or PUBLIC.fullmatch(card.public), card.public
+
+
+def test_the_documentation_lists_every_protocol_with_its_public_function():
+    rows = {}
+    for line in TABLES.read_text(encoding="utf-8").splitlines():
+        if re.match(r"\| `[\w/-]+@\d", line):
+            names, public, *_ = (cell.strip() for cell in line.strip("|").split("|"))
+            rows |= dict.fromkeys(re.findall(r"`([^`]+)`", names), public.strip("`"))
+    assert rows == {card.full_name: card.public or "none" for card in CARDS}
 
 
 def test_protocols_carry_known_metrics_and_every_metric_is_carried():
@@ -95,13 +126,13 @@ def test_classes_of_protocols_exist():
 
 def test_rows_name_what_settings_change():
     plain = EvaluateSettings()
-    assert label_of(LERF_LANGSPLAT, "field", plain) == "lerf/langsplat@1"
-    assert label_of(TREE_NODES, "tree", plain) == "lerf/tree-nodes@4"
+    assert label_of(LERF_LANGSPLAT, "field", plain) == "lerf/langsplat@2"
+    assert label_of(TREE_NODES, "tree", plain) == "lerf/tree-nodes@5"
     changed = EvaluateSettings(filter_px=20, threshold_on="raw", node_select=0.7, relevancy_scale=5)
     assert (
-        label_of(LERF_LANGSPLAT, "field", changed) == "lerf/langsplat@1 (filter 20, raw, relevancy scale 5)"
+        label_of(LERF_LANGSPLAT, "field", changed) == "lerf/langsplat@2 (filter 20, raw, relevancy scale 5)"
     )
-    assert label_of(TREE_NODES, "tree", EvaluateSettings(ancestors=0)) == "lerf/tree-nodes@4 (ancestors 0)"
+    assert label_of(TREE_NODES, "tree", EvaluateSettings(ancestors=0)) == "lerf/tree-nodes@5 (ancestors 0)"
     # nodes are not thresholded, so the scale of the threshold changes nothing of theirs
     expected = "hierarchy/level-given@4 (filter 20, node share 0.7, relevancy scale 5)"
     assert label_of(LEVEL_GIVEN, "tree", changed) == expected
@@ -111,22 +142,24 @@ def test_rows_name_what_settings_change():
 
 
 def test_rows_lead_back_to_their_protocol():
-    assert card_of("lerf/langsplat@1 (filter 20, raw)") is LERF_LANGSPLAT
+    assert card_of("lerf/langsplat@2 (filter 20, raw)") is LERF_LANGSPLAT
     with pytest.raises(ArtifactError, match=r"no protocol 'lerf/langsplat@9'"):
         card_of("lerf/langsplat@9")
 
 
 def test_published_rules_differ_as_stated():
     rules = {name: card.rule for name, card in PROTOCOLS.items() if card.rule}
-    assert rules["lerf/paper-filter@1"].departures(LERF_LANGSPLAT.rule) == ("filter 20",)
-    assert rules["lerf/langsplat-v2@1"].departures(LERF_LANGSPLAT.rule) == ("filter 29", "border inside")
-    literal, reading = rules["3d-ovs/langsplat-raw@1"], rules["3d-ovs/langsplat@1"]
+    assert rules["lerf/paper-filter@2"].departures(LERF_LANGSPLAT.rule) == ("filter 20",)
+    assert rules["lerf/langsplat-v2@2"].departures(LERF_LANGSPLAT.rule) == ("filter 29", "border inside")
+    literal, reading = rules["3d-ovs/langsplat-raw@2"], rules["3d-ovs/langsplat@2"]
     assert literal.departures(reading) == ("raw",)
     assert (reading.level_rule, reading.mix, reading.majority) == ("mean_in_mask", False, False)
-    assert rules["3d-ovs/langsplat-v2@1"].levels == (Level.WHOLE, Level.PART)
+    released = RelevancyRule(filter_px=29, threshold=0.25, border="inside", empty_wins=True)
+    assert rules["3d-ovs/langsplat-v2@2"].departures(released) == ("mean_in_mask", "levels whole+part")
 
 
 def test_skipping_protocol_differs_in_nothing_but_missing_predictions():
     assert (LERF_MASK.missing, LERF_MASK_SKIPPING.missing) == ("zero", "left out")
     assert LERF_MASK.metrics == LERF_MASK_SKIPPING.metrics
-    assert all(card.missing == "zero" for card in CARDS if card is not LERF_MASK_SKIPPING)
+    left_out = {card.name for card in CARDS if card.missing == "left out"}
+    assert left_out == {LERF_MASK_SKIPPING.name, "scannet/openscene"}

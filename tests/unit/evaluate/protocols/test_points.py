@@ -7,7 +7,7 @@ import pytest
 
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.datasets.classes.class_set import ClassSet
-from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_19
+from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_19, SCANNET_20
 from hilsplat.datasets.classes.scannet200 import SCANNET200, SPLITS
 from hilsplat.datasets.classes.waymo import WAYMO_22
 from hilsplat.evaluate.metrics.instances import InstanceScan, match_instances
@@ -46,6 +46,40 @@ def test_scene_without_predictions_counts_zero():
     rows = list(measure_points(OPENGAUSSIAN, "tree", TRUTH, None, SCANNET_19, "frozen"))
     assert {row.value for row in rows} == {0.0}
     assert {row.query for row in rows} == {"", "wall", "floor", "cabinet"}
+
+
+def test_openscene_leaves_points_without_a_feature_out_of_the_iou():
+    truth, prediction = np.array([1, 1, 2]), np.array([1, 0, 2])
+    for name, wall in (("scannet/openscene@2", 1.0), ("scannet/openscene-all-points@1", 0.5)):
+        rows = list(measure_points(PROTOCOLS[name], "tree", truth, prediction, SCANNET_20, "nearest"))
+        values = {(row.query, row.metric): row.value for row in rows}
+        assert (values["wall", "class_iou"], values["floor", "class_iou"]) == (wall, 1.0)
+        assert values["wall", "class_accuracy"] == 0.5  # a miss under both
+        means = pooled_points(PROTOCOLS[name], [rows], SCANNET_20)
+        assert means == {"miou_all": pytest.approx((wall + 1) / 20), "macc_all": pytest.approx(1.5 / 20)}
+
+
+def test_openscene_is_its_confusion_matrix_without_the_row_of_no_feature():
+    rng, card, num = np.random.default_rng(1), PROTOCOLS["scannet/openscene@2"], len(SCANNET_20)
+    scenes = [(rng.integers(0, 12, 500), rng.integers(0, 15, 500)) for _ in range(3)]
+    confusion, in_truth = np.zeros((num, num)), np.zeros(num)
+    for truth, prediction in scenes:
+        for true, predicted in zip(truth, prediction, strict=True):
+            if true:
+                in_truth[true - 1] += 1
+                if predicted:
+                    confusion[predicted - 1, true - 1] += 1
+    ious = [
+        confusion[k, k] / (confusion[k].sum() + confusion[:, k].sum() - confusion[k, k])
+        for k in range(num)
+        if in_truth[k]
+    ]
+    accuracies = [confusion[k, k] / in_truth[k] for k in range(num) if in_truth[k]]
+    rows = [list(measure_points(card, "tree", *scene, SCANNET_20, "nearest")) for scene in scenes]
+    assert pooled_points(card, rows, SCANNET_20) == {
+        "miou_all": pytest.approx(sum(ious) / num),
+        "macc_all": pytest.approx(sum(accuracies) / num),
+    }
 
 
 def test_scene_without_truth_has_no_rows():

@@ -51,6 +51,11 @@ class HandMade:
 
     node_relevancy_map = field_relevancy
 
+    def field_cosine(self, texts, view, pixels):
+        return self.field_relevancy(texts, view).reshape(len(texts), 3, -1)[:, :, pixels]
+
+    node_cosine = field_cosine
+
     def select(self, path, *, level=None, view=None):
         answers = self.answers if view == "v.png" else self.answers | self.scene_wide
         found = answers.get(path, answers.get((path[0], level), []) if len(path) == 1 else [])
@@ -101,7 +106,7 @@ def test_consistency_rows_match_the_worked_example(tmp_path):
     values = measured(scene, truth, methods=("tree", "tree-path"))
     for method, protocol in (
         ("tree", "level-given@4"),
-        ("tree", "level-auto@4"),
+        ("tree", "level-auto@5"),
         ("tree", "scene-wide@1"),
         ("tree-path", "path@3"),
     ):
@@ -110,6 +115,7 @@ def test_consistency_rows_match_the_worked_example(tmp_path):
         assert values[*key, "hc_literal"] == pytest.approx(0.27)
         assert values[*key, "hc_containment_pooled"] == pytest.approx(0.916667, abs=1e-6)
         assert values[*key, "hc_literal_pooled"] == pytest.approx(0.293333, abs=1e-6)
+        assert values[*key, "hc_containment_per_child"] == pytest.approx(((1 + 0.5 + 1) / 3 + 1) / 2)
     # the annotations nest perfectly: a2 is 8 px of A, so literal is ((20 + 8)/50/2 + 10/25)/2 = 0.34
     reference = ("truth", "hierarchy/annotations@1", "", "")
     assert values[*reference, "hc_containment"] == 1
@@ -197,7 +203,7 @@ def test_automatic_level_of_the_field_follows_the_highest_value(tmp_path):
     values = measured(scene, truth, methods=("field",), filter_px=1, majority=False)
     given, auto, lerf = (
         f"{name} (filter 1, no majority)"
-        for name in ("hierarchy/level-given@4", "hierarchy/level-auto@4", "lerf/langsplat@1")
+        for name in ("hierarchy/level-given@4", "hierarchy/level-auto@5", "lerf/langsplat@2")
     )
     key = ("cup", "whole", "iou")
     assert values["field", given, *key] == 1
@@ -215,7 +221,7 @@ def test_other_protocols_are_measured_with_their_own_rules():
     relevancy[2, 8, 8], relevancy[2, 8, 9] = 0.9, 0.66  # min-max 0.7: just in the mask
     truth = ViewTruth.flat({"cup": mask_of((2, 6), (2, 6))})
     scene = HandMade([], {}, {"cup": relevancy})
-    cards = [PROTOCOLS["3d-ovs/langsplat@1"], PROTOCOLS["3d-ovs/langsplat-raw@1"]]
+    cards = [PROTOCOLS["3d-ovs/langsplat@2"], PROTOCOLS["3d-ovs/langsplat-raw@2"]]
     rows = list(
         measure_view(
             scene,
@@ -229,9 +235,9 @@ def test_other_protocols_are_measured_with_their_own_rules():
     )
     ious = {row.protocol: row.value for row in rows if row.metric == "iou"}
     assert ious == {
-        "lerf/langsplat@1 (filter 1, no mix, no majority, relevancy scale 5)": 0,
-        "3d-ovs/langsplat@1 (relevancy scale 5)": 1,
-        "3d-ovs/langsplat-raw@1 (relevancy scale 5)": 1,
+        "lerf/langsplat@2 (filter 1, no mix, no majority, relevancy scale 5)": 0,
+        "3d-ovs/langsplat@2 (relevancy scale 5)": 1,
+        "3d-ovs/langsplat-raw@2 (relevancy scale 5)": 1,
     }
     own = {row.metric for row in rows if row.protocol.startswith("3d-ovs/")}
     assert own == {"iou", "boundary_iou"}

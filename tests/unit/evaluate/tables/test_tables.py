@@ -49,11 +49,11 @@ SCORES = [
     score("iou", 0.4, method="field"),
     score("hc_containment", 1.0, method="truth", protocol="hierarchy/annotations@1", query="", level=""),
     # the LERF protocol
-    score("iou", 0.5, protocol="lerf/tree-nodes@4", level=""),
-    score("boundary_iou", 0.25, protocol="lerf/tree-nodes@4", level=""),
-    score("localization_box", 1.0, protocol="lerf/tree-nodes@4", level=""),
-    score("localization_box", 0.0, protocol="lerf/tree-nodes@4", level="", query="d"),
-    score("iou", 0.7, protocol="lerf/tree-nodes@4", level="", scene="two"),
+    score("iou", 0.5, protocol="lerf/tree-nodes@5", level=""),
+    score("boundary_iou", 0.25, protocol="lerf/tree-nodes@5", level=""),
+    score("localization_box", 1.0, protocol="lerf/tree-nodes@5", level=""),
+    score("localization_box", 0.0, protocol="lerf/tree-nodes@5", level="", query="d"),
+    score("iou", 0.7, protocol="lerf/tree-nodes@5", level="", scene="two"),
     # another variant
     score("iou", 0.9, variant="omega-2", method="field"),
 ]
@@ -119,7 +119,7 @@ def test_kinds_are_never_mixed_in_a_block(tmp_path):
 
 
 def test_rows_of_a_real_data_set_are_measured_rows(tmp_path):
-    scores = [score("iou", 0.5, dataset="lerf", protocol="lerf/langsplat@1", method="field", level="")]
+    scores = [score("iou", 0.5, dataset="lerf", protocol="lerf/langsplat@2", method="field", level="")]
     rows, forms = built(tmp_path, "lerf", scores)
     assert measured(rows, data="lerf")["kind"] == "measured"
     assert "## Measured on lerf" in forms[".md"]
@@ -128,7 +128,7 @@ def test_rows_of_a_real_data_set_are_measured_rows(tmp_path):
 
 def test_lerf_table_has_a_column_per_scene_and_the_mean_of_scenes(tmp_path):
     rows, _ = built(tmp_path, "lerf", labels={"default": "ours"})
-    row = measured(rows, method="ours (tree)", protocol="lerf/tree-nodes@4")
+    row = measured(rows, method="ours (tree)", protocol="lerf/tree-nodes@5")
     assert (row["one mIoU"], row["two mIoU"], row["Average mIoU"]) == ("50.00", "70.00", "60.00")
     assert (row["one mBIoU"], row["Average mBIoU"]) == ("25.00", "25.00")
     assert row["Average localization"] == "50.00"

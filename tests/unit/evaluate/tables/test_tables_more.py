@@ -91,7 +91,7 @@ def test_annotations_are_one_row_whatever_the_seeds(tmp_path):
 def test_view_consistency_is_shown_beside_the_level_given_rows(tmp_path):
     scores = [
         score("iou", 0.5),
-        score("iou", 0.5, protocol="hierarchy/level-auto@4"),
+        score("iou", 0.5, protocol="hierarchy/level-auto@5"),
         score("view_consistency", 0.8, protocol="world/view-consistency@2"),
         score("view_consistency", 0.6, protocol="world/view-consistency@2", query="mug"),
         score("view_consistency", 0.1, protocol="world/view-consistency@2", level="part"),

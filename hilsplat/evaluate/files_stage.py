@@ -1,0 +1,294 @@
+"""Predictions of any program in, `scores.csv` out: the protocols without the pipeline."""
+
+import difflib
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
+
+from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError
+from hilsplat.base.levels import Level
+from hilsplat.base.progress import stage_log
+from hilsplat.datasets.labelled import LabelledScene
+from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
+from hilsplat.datasets.synthetic.world_labels import labelled_points
+from hilsplat.evaluate.asked import Asked
+from hilsplat.evaluate.instance_files import write_instances
+from hilsplat.evaluate.metrics.instances import InstanceMatches
+from hilsplat.evaluate.prediction_files import read_point_classes, read_point_instances, read_view_masks
+from hilsplat.evaluate.protocols.cards import (
+    INSTANCES,
+    LERF_LANGSPLAT,
+    LERF_OPENGAUSSIAN,
+    LEVEL_GIVEN,
+    OVS_ARGMAX,
+    ProtocolCard,
+)
+from hilsplat.evaluate.protocols.flat_views import eighth
+from hilsplat.evaluate.protocols.masks import MASK_METRICS, measure_class_maps, measure_masks
+from hilsplat.evaluate.protocols.measured import Measured
+from hilsplat.evaluate.protocols.points import measure_points
+from hilsplat.evaluate.protocols.scene_points import class_set, instance_scan
+from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
+from hilsplat.evaluate.protocols.views import consistency_rows
+from hilsplat.evaluate.scores import Score, write_scores
+from hilsplat.evaluate.truths import annotated_truths
+from hilsplat.scene.scene import Scene
+from hilsplat.settings import EvaluateSettings
+
+logger = logging.getLogger(__name__)
+
+METHOD = "files"
+"""Method of the rows; their variant names the program."""
+
+WORDS = "masks of files"
+"""In brackets after a protocol's name: its rule for maps was not applied, because masks came in."""
+
+Masks = Mapping[tuple[str, str], Bool[np.ndarray, "h w"]]
+
+
+def run_evaluate_files(
+    predictions: Path,
+    out: Path,
+    *,
+    method: str,
+    labels: str = "",
+    data_root: Path = Path(),
+    truth: Path | None = None,
+    scene: Path | None = None,
+    kind: str = "",
+    dataset: str = "synthetic",
+    name: str = "",
+    min_region_px: int | None = None,
+) -> None:
+    """Score masks or point labels that any program wrote (`prediction_files` says in which form).
+
+    Masks without a level are scored under the protocols of texts, masks with levels under
+    `hierarchy/level-given`, point labels under those protocols of points for which there is a file. A text
+    without a mask counts 0, except under the protocol that leaves it out.
+
+    Args:
+        predictions: folder of the predictions.
+        out: `scores.csv`; `instances.npz` is written beside it if there are instances.
+        method: name of the program, which becomes the variant of its rows.
+        labels: labels of a published data set, such as "lerf_ovs/figurines".
+        data_root: folder of the data sets' folders.
+        truth: or the truth folder of a synthetic scene.
+        scene: its posed scene, which says which views are tested.
+        kind: its kind, as in `run_evaluate`.
+        dataset: data set of a synthetic scene's rows.
+        name: its name in rows.
+        min_region_px: smaller true regions of a synthetic scene are not scored; None: the settings' default.
+
+    Raises:
+        ArtifactError: a view has no predictions, or a file cannot be read.
+        MisalignedArtifactError: a prediction has another size than its labels, or is for an unknown text.
+        SettingsError: neither labels nor truth and scene are given, or both.
+    """
+    if bool(labels) == (truth is not None) or (truth is None) != (scene is None):
+        raise SettingsError(
+            "it is not clear what to score against",
+            expected="--labels of a data set, or --truth and --scene of a synthetic scene",
+        )
+    with stage_log("evaluate-files", str(predictions)) as counts:
+        views: Mapping[str, Callable[[], ViewTruth]] = {}
+        points: Mapping[str, LabelledPoints] = {}
+        if truth is not None and scene is not None:
+            asked = Asked.of_world(kind)
+            if any((predictions / f"{each}.txt").is_file() for each in _files_of(asked.points)):
+                points = labelled_points(truth.parent, kind)
+            else:
+                least_px = min_region_px or EvaluateSettings().min_region_px
+                views = annotated_truths(truth, Scene.load(scene), least_px)
+        else:
+            dataset, known, asked = Asked.open(labels, data_root)
+            name = labels.partition("/")[2]
+            if isinstance(known, PointScene):
+                points = known.truth
+            else:
+                views = _label_truths(known)
+        scores: list[Score] = []
+        matches: dict[tuple[str, ...], InstanceMatches] = {}
+
+        def keep(view: str, measured: Measured) -> None:
+            scores.append(Score(dataset, name, method, "-", view=view, **vars(measured)))
+
+        if views:
+            for view, row in _mask_rows(predictions, views, asked):
+                keep(view, row)
+        for each in _point_rows(predictions, points, asked) if points else ():
+            if isinstance(each, Measured):
+                keep("", each)
+            else:
+                matches[dataset, name, method, "-", METHOD] = each
+        counts["views"], counts["rows"] = len(views), len(scores)
+        write_instances(out, matches)
+        write_scores(out, scores)
+
+
+def _label_truths(known: LabelledScene) -> dict[str, Callable[[], ViewTruth]]:
+    return {
+        view: partial(ViewTruth.of_regions, regions, regions[0].size_hw)
+        for view, regions in known.views.items()
+        if regions
+    }
+
+
+def _mask_rows(
+    predictions: Path, views: Mapping[str, Callable[[], ViewTruth]], asked: Asked
+) -> Iterator[tuple[str, Measured]]:
+    """Rows of all views; all are read before the first is scored, so that a missing one is told at once."""
+    found = {view: read_view_masks(predictions, view) for view in views}
+    truths = {view: load() for view, load in views.items()}
+    levels = {level for masks in found.values() for level, _ in masks}
+    if not levels:
+        raise ArtifactError(
+            f"{predictions} holds no mask",
+            expected="<view>/<text>.png, or <view>.npz",
+            fix="check the folder",
+        )
+    texts: dict[str, set[str]] = {}
+    for each in truths.values():
+        for query in (*each.categories, *each.queries):
+            texts.setdefault(query.level.label if query.level else "", set()).add(query.text)
+    for view, truth in truths.items():
+        masks = found[view]
+        _check(view, masks, truth, texts)
+        if "" in levels:
+            for row in _flat_rows(masks, truth, asked):
+                yield view, row
+        if levels - {""}:
+            for row in _level_rows(masks, truth):
+                yield view, row
+
+
+def _check(view: str, masks: Masks, truth: ViewTruth, texts: Mapping[str, set[str]]) -> None:
+    """Sizes and texts of a view's masks, with errors that name the view."""
+    for (level, text), mask in masks.items():
+        where = f"{view}: {level}/{text}" if level else f"{view}: {text}"
+        known = sorted(texts.get(level, ()))
+        if text not in known:
+            near = difflib.get_close_matches(text, known, n=1)
+            raise MisalignedArtifactError(
+                f"{where}: the labels have no text {text!r}" + (f" at level {level}" if level else ""),
+                expected=f"one of {', '.join(known)}",
+                found=text,
+                fix=f"rename it {near[0]!r}" if near else "remove it, or correct its name",
+            )
+        shape = truth.categories[0].truth.shape if truth.categories else mask.shape
+        if mask.shape != shape:
+            raise MisalignedArtifactError(
+                f"{where}: the mask has another size than the labels",
+                expected=f"{shape[0]} x {shape[1]} (height x width)",
+                found=f"{mask.shape[0]} x {mask.shape[1]}",
+                fix="resize the prediction to the labels by the nearest pixel",
+            )
+
+
+def _flat_rows(masks: Masks, truth: ViewTruth, asked: Asked) -> Iterator[Measured]:
+    """Rows of masks without a level: every text under LERF's protocols, then those that the data set asks."""
+    for query in truth.categories:
+        for card in (LERF_LANGSPLAT, LERF_OPENGAUSSIAN):
+            yield from _text_rows(card, query, masks.get(("", query.text)), [WORDS])
+    words = [*(["wholes"] if asked.level is Level.WHOLE else []), WORDS]
+    queries = [query for query in truth.queries if query.level is asked.level]
+    flat = truth.categories if asked.level is None else queries
+    for card in asked.flat:
+        if card is OVS_ARGMAX:
+            yield from _argmax_rows(flat, masks, words, labelled=asked.level is not None)
+            continue
+        for query in flat:
+            yield from _text_rows(card, replace(query, level=None), masks.get(("", query.text)), words)
+
+
+def _text_rows(
+    card: ProtocolCard, query: Query, mask: Bool[np.ndarray, "H W"] | None, words: list[str]
+) -> Iterator[Measured]:
+    region = query.truth
+    if card.truth == "any grey" and query.any_grey is not None:
+        region = query.any_grey
+    metrics = tuple(metric for metric in card.metrics if metric in MASK_METRICS)
+    for row in measure_masks(
+        replace(card, metrics=metrics), METHOD, {query.text: mask}, {query.text: region}
+    ):
+        level = query.level.label if query.level else ""
+        yield replace(row, level=level, protocol=card.labelled(words))
+
+
+def _argmax_rows(
+    queries: tuple[Query, ...] | list[Query], masks: Masks, words: list[str], labelled: bool
+) -> Iterator[Measured]:
+    """3D-OVS by argmax: a pixel in several masks counts for the first text, one in none is a miss."""
+    if not queries:
+        return
+    ordered = sorted(queries, key=lambda query: query.text)
+    rows, columns = eighth(ordered[0].truth.shape)
+    truth = np.stack([query.truth[np.ix_(rows, columns)] for query in ordered])
+    nothing = np.zeros(ordered[0].truth.shape, bool)
+    given = [masks.get(("", query.text), nothing)[np.ix_(rows, columns)] for query in ordered]
+    similarity = np.where(np.stack(given), 1.0, -np.inf)
+    asked = truth.any(axis=0) if labelled else np.full(truth.shape[1:], True)
+    words = [*(["labelled pixels"] if labelled else []), *words]
+    texts = [query.text for query in ordered]
+    if asked.any():
+        for row in measure_class_maps(METHOD, similarity[:, None, asked], truth[:, None, asked], texts):
+            yield replace(row, protocol=OVS_ARGMAX.labelled(words))
+
+
+def _level_rows(masks: Masks, truth: ViewTruth) -> Iterator[Measured]:
+    """Rows of masks at levels, and how they nest."""
+    protocol = LEVEL_GIVEN.labelled([WORDS])
+    for query in truth.queries:
+        assert query.level is not None
+        yield from _text_rows(LEVEL_GIVEN, query, masks.get((query.level.label, query.text)), [WORDS])
+
+    def mask_of(path: tuple[str, ...]) -> Bool[np.ndarray, "H W"]:
+        found = masks.get((Level(len(path)).label, path[-1]))
+        return np.zeros_like(truth.regions[path]) if found is None else found
+
+    yield from consistency_rows(METHOD, protocol, truth, mask_of)
+
+
+def _files_of(cards: tuple[ProtocolCard, ...]) -> list[str]:
+    """Names, without suffix, of the files that protocols of points read."""
+    names = ["instances"] if INSTANCES in cards else []
+    for card in cards:
+        if card is not INSTANCES:
+            names += [card.classes, class_set(card.classes)[0]]
+    return list(dict.fromkeys(names))
+
+
+def _point_rows(
+    predictions: Path, truth: Mapping[str, LabelledPoints], asked: Asked
+) -> Iterator[Measured | InstanceMatches]:
+    """Rows of points under each protocol whose file is there, and the matches of instances."""
+    scored = []
+    for card in asked.points:
+        labelling, classes = class_set(card.classes)
+        if labelling not in truth:
+            continue
+        points = truth[labelling]
+        if card is INSTANCES:
+            path = predictions / "instances.txt"
+            if path.is_file():
+                yield instance_scan(points, classes, *read_point_instances(path, len(points)))
+                scored.append(card.name)
+            continue
+        own, shared = (predictions / f"{each}.txt" for each in (card.classes, labelling))
+        path = own if own.is_file() else shared
+        if not path.is_file():
+            logger.info("%s: not scored, neither %s nor %s is there", card.name, own.name, shared.name)
+            continue
+        predicted = classes.labels(read_point_classes(path, len(points)))
+        yield from measure_points(card, METHOD, points.labels(classes), predicted, classes, "files")
+        scored.append(card.name)
+    if not scored:
+        raise ArtifactError(
+            f"{predictions} holds no labels of points",
+            expected=" or ".join(f"{each}.txt" for each in _files_of(asked.points)),
+            fix="write one class id per point and line",
+        )

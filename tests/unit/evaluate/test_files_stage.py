@@ -1,0 +1,261 @@
+"""Predictions of any program, from files: the same numbers as the run that wrote them, and clear errors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilsplat.base.errors import ArtifactError, HilsplatError, MisalignedArtifactError, SettingsError
+from hilsplat.base.images import write_png
+from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_19
+from hilsplat.datasets.labelled import LabelledRegion, LabelledScene
+from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
+from hilsplat.evaluate.asked import Asked
+from hilsplat.evaluate.files_stage import run_evaluate_files
+from hilsplat.evaluate.instance_files import read_instances
+from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
+from hilsplat.evaluate.protocols.cards import PROTOCOLS, card_named
+from hilsplat.evaluate.protocols.points import measure_points
+from hilsplat.evaluate.protocols.view_truth import ViewTruth
+from hilsplat.evaluate.protocols.views import label_of, measure_view
+from hilsplat.evaluate.scores import read_scores
+from hilsplat.evaluate.tables.build import run_table
+from hilsplat.evaluate.tables.reported import PUBLISHED_COLUMNS
+from hilsplat.settings import EvaluateSettings
+
+VIEW = "001.png"
+SETTINGS = EvaluateSettings(methods=("tree",))
+
+
+def own_run(world):
+    """Rows and masks of a view, as the evaluate stage makes them."""
+    truth = ViewTruth.of(world.annotations, VIEW, (64, 64), SETTINGS.min_region_px)
+    kept, selections = PackedMasks((64, 64)), Selections(world.answers)
+    rows = list(measure_view(world.answers, selections, truth, VIEW, (64, 64), SETTINGS, None, kept))
+    return rows, kept, truth
+
+
+def write_answers(folder, world, packed=False):
+    """What the tree answered in the view: masks at levels, and one per text at the level it chose."""
+    rows, kept, truth = own_run(world)
+    auto, given = (
+        label_of(card_named(name), "tree", SETTINGS)
+        for name in ("hierarchy/level-auto", "hierarchy/level-given")
+    )
+    masks = {query.text: kept.get(("tree", auto, query.text)) for query in truth.categories}
+    for query in truth.queries:
+        key = ("tree", given, query.text, query.level)
+        masks[f"{query.level.label}/{query.text}"] = kept.get(key)
+    if packed:
+        folder.mkdir(parents=True)
+        np.savez(folder / "001.npz", **masks)
+    else:
+        for name, mask in masks.items():
+            write_png(folder / "001" / f"{name}.png", mask.astype(np.uint8) * 255)
+    return rows
+
+
+def score(world, predictions, out, **more):
+    run_evaluate_files(
+        predictions,
+        out,
+        method="theirs",
+        truth=world.folder / "truth",
+        scene=world.folder / "scene",
+        name="blocks",
+        **more,
+    )
+    return read_scores([out])
+
+
+def numbers(frame, protocol, metrics):
+    kept = frame[frame["protocol"].str.startswith(protocol) & frame["metric"].isin(metrics)]
+    return {(row.query, row.level, row.metric): row.value for row in kept.itertuples()}
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_files_of_our_own_run_score_what_the_run_scored(block_world, tmp_path, packed):
+    rows = write_answers(tmp_path / "theirs", block_world, packed)
+    frame = score(block_world, tmp_path / "theirs", tmp_path / "scores.csv", kind="tabletop")
+    for ours, theirs, metrics in (
+        ("lerf/tree-nodes", "lerf/langsplat", {"iou", "boundary_iou"}),
+        (
+            "hierarchy/level-given",
+            "hierarchy/level-given",
+            {"iou", "boundary_iou", "hc_containment", "hc_literal_pooled", "hc_containment_per_child"},
+        ),
+    ):
+        expected = {
+            (row.query, row.level, row.metric): pytest.approx(row.value, abs=1e-6)
+            for row in rows
+            if row.protocol.startswith(ours) and row.metric in metrics
+        }
+        assert len(expected) > 5
+        assert numbers(frame, theirs, metrics) == expected
+    assert set(frame["method"]) == {"files"}
+    assert set(frame["variant"]) == {"theirs"}
+    assert "lerf-mask/gaussian-grouping@1 (wholes, masks of files)" in set(frame["protocol"])
+    assert "3d-ovs/argmax@2 (labelled pixels, wholes, masks of files)" in set(frame["protocol"])
+
+
+def test_a_text_without_a_mask_counts_zero_or_is_left_out(block_world, tmp_path):
+    write_answers(tmp_path / "theirs", block_world)
+    (tmp_path / "theirs" / "001" / "bear.png").unlink()
+    frame = score(block_world, tmp_path / "theirs", tmp_path / "scores.csv", kind="tabletop")
+    assert numbers(frame, "lerf/langsplat", {"iou"})["bear", "", "iou"] == 0
+    assert numbers(frame, "lerf/opengaussian", {"acc_25"})["bear", "", "acc_25"] == 0
+
+
+def test_the_rows_make_a_table(block_world, tmp_path):
+    write_answers(tmp_path / "theirs", block_world)
+    score(block_world, tmp_path / "theirs", tmp_path / "scores.csv")
+    published = tmp_path / "published.csv"
+    published.write_text(",".join(PUBLISHED_COLUMNS) + "\n")
+    run_table("lerf", [tmp_path / "scores.csv"], published, {"theirs": "Their method"}, tmp_path / "lerf.csv")
+    assert "Their method" in (tmp_path / "lerf.md").read_text()
+    assert "Their method, files" not in (tmp_path / "lerf.md").read_text()
+
+
+def refused(world, predictions, tmp_path, error=ArtifactError):
+    with pytest.raises(error) as caught:
+        score(world, predictions, tmp_path / "scores.csv")
+    assert not (tmp_path / "scores.csv").exists()
+    return str(caught.value)
+
+
+def test_a_view_without_predictions_is_refused_unless_its_folder_is_empty(block_world, tmp_path):
+    message = refused(block_world, tmp_path, tmp_path)
+    assert "view 001 has no predictions" in message
+    assert "an empty folder says that nothing was found" in message
+    (tmp_path / "001").mkdir()
+    assert "holds no mask" in refused(block_world, tmp_path, tmp_path)  # nothing in any view
+
+
+def test_a_mask_of_another_size_is_refused_with_its_view_and_text(block_world, tmp_path):
+    write_png(tmp_path / "001" / "whole" / "bear.png", np.full((32, 64), 255, np.uint8))
+    message = refused(block_world, tmp_path, tmp_path, MisalignedArtifactError)
+    assert "001.png: whole/bear: the mask has another size" in message
+    assert "64 x 64" in message
+    assert "32 x 64" in message
+
+
+def test_an_unknown_text_is_refused_with_the_nearest_name(block_world, tmp_path):
+    write_png(tmp_path / "001" / "baer.png", np.full((64, 64), 255, np.uint8))
+    message = refused(block_world, tmp_path, tmp_path, MisalignedArtifactError)
+    assert "the labels have no text 'baer'" in message
+    assert "rename it 'bear'" in message
+
+
+def test_a_text_at_another_level_is_refused(block_world, tmp_path):
+    write_png(tmp_path / "001" / "whole" / "nose.png", np.full((64, 64), 255, np.uint8))
+    message = refused(block_world, tmp_path, tmp_path, MisalignedArtifactError)
+    assert "the labels have no text 'nose' at level whole" in message
+
+
+def test_masks_of_zeros_and_ones_are_refused(block_world, tmp_path):
+    write_png(tmp_path / "001" / "bear.png", np.ones((64, 64), np.uint8))
+    assert "none is foreground" in refused(block_world, tmp_path, tmp_path)
+
+
+def test_it_must_be_clear_what_to_score_against(tmp_path):
+    for given in ({}, {"truth": tmp_path}, {"labels": "lerf_ovs/ramen", "truth": tmp_path}):
+        with pytest.raises(SettingsError, match="what to score against"):
+            run_evaluate_files(tmp_path, tmp_path / "scores.csv", method="m", **given)
+
+
+# --- data sets ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def data_set(monkeypatch):
+    """Function that lets `--labels set/scene` open what it is given."""
+
+    def put(known, flat=(), points=()):
+        cards = [tuple(map(card_named, names)) for names in (flat, points)]
+        monkeypatch.setattr(
+            Asked, "open", staticmethod(lambda name, data_root: ("set", known, Asked(*cards)))
+        )
+
+    return put
+
+
+def test_labels_of_a_data_set_take_grey_where_the_protocol_does(data_set, tmp_path):
+    label, grey = np.zeros((16, 16), bool), np.zeros((16, 16), bool)
+    label[:4], grey[:8] = True, True
+    region = LabelledRegion("cup", (16, 16), lambda: label, path=("cup",), any_grey=lambda: grey)
+    data_set(
+        LabelledScene("set", "s", {}, None, {"a.png": (region,)}, ("cup",)),
+        ("3d-ovs/langsplat", "3d-ovs/langsplat-v2", "3d-ovs/argmax"),
+    )
+    write_png(tmp_path / "a" / "cup.png", grey.astype(np.uint8) * 255)
+    run_evaluate_files(tmp_path, tmp_path / "scores.csv", method="m", labels="set/s")
+    frame = read_scores([tmp_path / "scores.csv"])
+    ious = {row.protocol: row.value for row in frame[frame["metric"] == "iou"].itertuples()}
+    assert ious["3d-ovs/langsplat-v2@2 (masks of files)"] == 1
+    assert ious["3d-ovs/langsplat@2 (masks of files)"] == 0.5
+    # an eighth has rows 4 and 12: the label has neither, and row 4 is in the mask
+    assert ious["3d-ovs/argmax@2 (masks of files)"] == 0
+    assert set(frame["scene"]) == {"s"}
+
+
+def point_scene(num=400, seed=0):
+    rng = np.random.default_rng(seed)
+    class_id = rng.choice([0, 1, 2, 3, 4, 5], num).astype(np.int32)
+    places = rng.random((num, 3))
+    nyu40 = LabelledPoints(places, class_id, np.ones(num, np.int32), "nyu40")
+    fine = np.where(np.arange(num) < 150, 2, 0).astype(np.int32)  # 150 points of one chair
+    return PointScene(
+        "s", (), {"nyu40": nyu40, "scannet200": replace(nyu40, class_id=fine, labelling="scannet200")}
+    )
+
+
+SEMANTIC = ("scannet/opengaussian-19", "scannet/opengaussian-10", "scannet/openscene")
+
+
+def test_class_ids_of_points_score_as_the_same_labels_in_memory(data_set, tmp_path):
+    known = point_scene()
+    data_set(known, points=SEMANTIC)
+    predicted = np.random.default_rng(1).choice([0, 1, 2, 3, 4, 5, 40], 400)
+    (tmp_path / "nyu40.txt").write_text("\n".join(map(str, predicted)))
+    of_ten = np.full(400, SCANNET_10.ids[0])
+    (tmp_path / "scannet-10.txt").write_text("\n".join(map(str, of_ten)))
+    run_evaluate_files(tmp_path, tmp_path / "scores.csv", method="m", labels="set/s")
+    frame = read_scores([tmp_path / "scores.csv"])
+    for classes, given in ((SCANNET_19, predicted), (SCANNET_10, of_ten)):
+        card = card_named(f"scannet/opengaussian-{len(classes)}")
+        truth = known.truth["nyu40"].labels(classes)
+        rows = measure_points(card, "files", truth, classes.labels(given), classes, "files")
+        expected = {(row.query, row.metric): pytest.approx(row.value, abs=1e-6) for row in rows}
+        kept = frame[frame["protocol"] == f"{card.full_name} (points: files)"]
+        assert {(row.query, row.metric): row.value for row in kept.itertuples()} == expected
+    assert PROTOCOLS["scannet/openscene@2"].full_name in {each.split(" ")[0] for each in frame["protocol"]}
+
+
+def test_instances_in_scannets_format_are_matched(data_set, tmp_path):
+    data_set(point_scene(), points=("scannet200/instances",))
+    mask = np.arange(400) < 150
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks" / "0.txt").write_text("\n".join(map(str, mask.astype(int))))
+    (tmp_path / "instances.txt").write_text("masks/0.txt 2 0.9\n\n")
+    run_evaluate_files(tmp_path, tmp_path / "scores.csv", method="m", labels="set/s")
+    ((key, matches),) = read_instances([tmp_path / "scores.csv"]).items()
+    assert key == ("set", "s", "m", "-", "files")
+    assert matches.is_match.all()
+    assert matches.misses.sum() == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("nyu40.txt", "1\n2\n", "expected  400 lines"),
+        ("nyu40.txt", "chair\n" * 400, "whole number per line"),
+        ("instances.txt", "only-a-mask.txt\n", "line 1 of .* is not an instance"),
+        ("instances.txt", "no.txt 2 0.9\n", "no.txt cannot be read"),
+        ("other.txt", "1\n", "holds no labels of points"),
+    ],
+)
+def test_point_files_that_cannot_be_scored_are_refused(data_set, tmp_path, name, text, message):
+    data_set(point_scene(), points=(*SEMANTIC, "scannet200/instances"))
+    (tmp_path / name).write_text(text)
+    with pytest.raises(HilsplatError, match=message):
+        run_evaluate_files(tmp_path, tmp_path / "scores.csv", method="m", labels="set/s")
