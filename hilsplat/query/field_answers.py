@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Int64, UInt8
 
 from hilsplat.base.device import ComputeDevice
 from hilsplat.base.images import to_uint8
@@ -59,6 +59,23 @@ class FieldAnswers:
             found = answer.exact(latents, vectors) if placed is None else answer.fast(placed[index], vectors)
             fill_maps(found, found.min(axis=1), pixels, index, maps)
         return maps.reshape(len(texts), len(LEVELS), height, width)
+
+    def cosine(
+        self, texts: Sequence[str], view: str, pixels: Int64[np.ndarray, " P"]
+    ) -> Float32[np.ndarray, "T 3 P"]:
+        """Cosine of texts with the decoded latents of some pixels; see `LanguageScene.field_cosine`."""
+        vectors, code = self.text_vectors(texts), self.code
+        height, width = self.views.camera(view).size_hw
+        found = np.full((len(texts), len(LEVELS), len(pixels)), -np.inf, np.float32)
+        for index, (shown, latents) in enumerate(self.latents(view)):
+            row_of_pixel = np.full(height * width, -1)
+            row_of_pixel[shown] = np.arange(len(shown))
+            rows = row_of_pixel[pixels]
+            spoken = np.flatnonzero(rows >= 0)
+            if len(spoken):
+                decoded = code.decode_array(np.ascontiguousarray(latents[rows[spoken]], np.float32))
+                found[:, index, spoken] = vectors @ decoded.T
+        return found
 
     def of_gaussians(self, text: str, level: str = "auto") -> Float32[np.ndarray, " N"]:
         """Relevancy of every Gaussian at a level, or at its best; 0 without a latent."""

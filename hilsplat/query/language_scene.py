@@ -403,7 +403,7 @@ class LanguageScene:
             nodes = self.tree.nodes_of(level)
             if not len(nodes):
                 continue
-            shown = self._view_nodes(view, level)
+            shown = self._shown.nodes(view, level)
             for row, values in enumerate(cosines):
                 blended = shown.blend(values, float(values[nodes].min()))
                 found[row, level.index] = np.where(shown.covered, blended, -np.inf)[pixels]
@@ -417,18 +417,7 @@ class LanguageScene:
         -inf where a pixel shows mostly Gaussians without a latent at the level. Arguments as in
         `node_cosine`.
         """
-        vectors, code = self.text_vectors(texts), self.trained()[1]
-        height, width = self._camera(view).size_hw
-        found = np.full((len(texts), len(LEVELS), len(pixels)), -np.inf, np.float32)
-        for index, (shown, latents) in enumerate(self._view_latents(view)):
-            row_of_pixel = np.full(height * width, -1)
-            row_of_pixel[shown] = np.arange(len(shown))
-            rows = row_of_pixel[pixels]
-            spoken = np.flatnonzero(rows >= 0)
-            if len(spoken):
-                decoded = code.decode_array(np.ascontiguousarray(latents[rows[spoken]], np.float32))
-                found[:, index, spoken] = vectors @ decoded.T
-        return found
+        return self._field.cosine(texts, view, pixels)
 
     def gaussian_relevancy(self, text: str, level: str = "auto") -> Float32[np.ndarray, " N"]:
         """The field's relevancy of every Gaussian at a level, or at its best; 0 without a latent."""
