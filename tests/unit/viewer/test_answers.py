@@ -9,6 +9,8 @@ import shutil
 import threading
 import zipfile
 import zlib
+from collections.abc import Callable, Coroutine
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import av
@@ -32,6 +34,12 @@ from hilsplat.viewer.scene_thread import SceneThread
 from hilsplat.viewer.shown import ShownScene
 from tests.unit.finished_desk import SCENE
 from tests.unit.viewer.conftest import ADDRESS, TOKEN
+
+
+def run_apart(work: Callable[[], Coroutine[None, None, None]]) -> None:
+    """Run a coroutine in a thread of its own: a browser's test in this process leaves a loop running."""
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(lambda: asyncio.run(work())).result()
 
 
 @pytest.fixture
@@ -209,7 +217,7 @@ def test_a_film_that_nobody_waits_for_ends(shown):
         assert json.loads(await anext(parts)) == {"made": 1, "of": 1000}
         await parts.aclose()
 
-    asyncio.run(leave())
+    run_apart(leave)
     files.films.submit(free.set).result(timeout=20)
     assert len(drawn) < 500
 
@@ -229,7 +237,7 @@ def test_a_question_waits_for_one_crop_at_most(shown):
     held = threading.Event()
     thread.worker.submit(held.wait, 5)  # the thread is busy until all have come
     threading.Timer(0.5, held.set).start()
-    asyncio.run(ask_among_crops())
+    run_apart(ask_among_crops)
     assert order == [0, "question", 1, 2, 3, 4, 5]
 
 
