@@ -26,7 +26,10 @@ def export(folder: Path, out: Path) -> Path:
 
 
 def enliven(model) -> None:
-    """Replace the tiny initial weights, whose outputs would hardly depend on the inputs."""
+    """Replace the tiny initial weights, whose outputs would hardly depend on the inputs.
+
+    A SAM's frequencies of positions are a buffer that transformers draws anew for every model.
+    """
     import torch
 
     generator = torch.Generator().manual_seed(0)
@@ -34,6 +37,9 @@ def enliven(model) -> None:
         for parameter in model.parameters():
             if parameter.ndim > 1:
                 parameter.normal_(0, 1.6 / parameter[0].numel() ** 0.5, generator=generator)
+        for name, buffer in model.named_buffers():
+            if name.endswith("positional_embedding"):
+                buffer.normal_(generator=generator)
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ from hilsplat.segment.generate import masks_from_candidates
 from hilsplat.segment.sam import Frame, SamModel, point_grid
 from hilsplat.settings import MasksSettings
 
-TOLERANCE = 1e-3
+TOLERANCE = 1e-4
 TEXTS = ["red mug", "a Mug on red", "object"]
 
 
