@@ -1,4 +1,5 @@
 # make run     set up, then run the default configuration: synthetic scenes, tables, figures
+# make demo    set up, then run one scene with four methods: a panel and tables in a few minutes
 # make test    set up, then run lint and all tests
 # make lint    set up, then check style, imports and rules
 # make bench   set up, then time the fast paths; tables go to results/benchmarks (docs/benchmarks.md)
@@ -11,10 +12,13 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: run test lint bench report setup
+.PHONY: run demo test lint bench report setup
 
 run: $(STAMP)
 	snakemake --cores $(CORES)
+
+demo: $(STAMP)
+	snakemake --cores $(CORES) --configfile config/demo.yaml
 
 setup: $(STAMP)
 

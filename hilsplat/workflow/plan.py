@@ -526,8 +526,11 @@ class Plan:
     # ---- targets --------------------------------------------------------------------------------------
 
     def tables(self) -> list[str]:
-        """Every table, measured on the scenes that there are; all have the paper's rows."""
-        return [f"results/tables/{name}.csv" for name in TABLES]
+        """Every table that has variants to compare, measured on the scenes that there are; all have the
+        paper's rows."""
+        return [
+            f"results/tables/{name}.csv" for name, kind in TABLES.items() if getattr(self.run, kind.variants)
+        ]
 
     def targets(self) -> list[str]:
         """Pictures of every scene, scores of those that you annotated, and tables and plots if the run has a
@@ -535,7 +538,11 @@ class Plan:
 
         A run of photographs would otherwise replace a benchmark's tables by ones of reported rows alone.
         """
-        plots = [f"results/figures/sweep-{name}.png" for name in ("theta", "omega")]
+        plots = [
+            f"results/figures/sweep-{name}.png"
+            for name in ("theta", "omega")
+            if getattr(self.run, TABLES[name].variants)
+        ]
         own = [row for row in self._labelled() if not self._data_of(row)]
         scores = [f"results/{row.dataset}/{row.scene}/default/scores.csv" for row in own]
         has_tables = len(self._labelled()) > len(own)

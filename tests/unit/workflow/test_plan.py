@@ -180,12 +180,19 @@ def test_tables_take_the_scenes_and_variants_that_are_theirs(tmp_path):
     ]
 
 
+def test_a_sweep_without_variants_has_no_table_and_no_plot(tmp_path):
+    found = plan(tmp_path, ablation_variants=[], theta_variants=[], omega_variants=["theta"])
+    assert "results/tables/omega.csv" in found.tables()
+    assert not {"results/tables/ablation.csv", "results/tables/theta.csv"} & set(found.tables())
+    assert [name for name in found.targets() if "sweep-" in name] == ["results/figures/sweep-omega.png"]
+
+
 def test_a_run_of_photographs_leaves_tables_alone(tmp_path):
     assert plan(tmp_path, groups=["photos"]).targets() == [
         "results/figures/photos/desk/panel.png",
         "results/figures/photos/desk/comparison.png",
     ]
-    targets = plan(tmp_path, sweep_scenes=["one"]).targets()
+    targets = plan(tmp_path, sweep_scenes=["one"], theta_variants=["theta"]).targets()
     assert "results/figures/synthetic/one/comparison.png" in targets
     assert "results/figures/synthetic/two/comparison.png" not in targets
     assert "results/figures/synthetic/two/masks.png" in targets
