@@ -1,12 +1,13 @@
-"""Reading and writing images: upright, RGB, channel-last."""
+"""Reading and writing images: upright, sRGB, channel-last."""
 
 import functools
+import io
 import warnings
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageCms, ImageOps, UnidentifiedImageError
 
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.errors import ImageError
@@ -58,10 +59,10 @@ def _register_heif() -> None:
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
-    """Read an image as upright RGB.
+    """Read an image as upright sRGB.
 
-    The EXIF orientation is applied, alpha is dropped, grey is repeated, CMYK is converted, and 16 bits per
-    channel are rounded to 8.
+    The EXIF orientation is applied, colours of an embedded profile (Display P3 of telephones, Adobe RGB) are
+    converted, alpha is dropped, grey is repeated, CMYK is converted, 16 bits per channel are rounded to 8.
 
     Raises:
         ImageError: the file is missing, empty, truncated or not an image.
@@ -80,7 +81,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
                 upright = Image.fromarray(((values + 128) // 257).astype(np.uint8))
             if upright.mode == "F":
                 raise ValueError("its pixels are floating-point numbers of unknown range")
-            return np.asarray(upright.convert("RGB"))
+            return np.asarray(_to_srgb(upright))
     except FileNotFoundError as error:
         raise ImageError(f"image {path} is missing") from error
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, MemoryError) as error:
@@ -90,6 +91,28 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
             found=f"a file of {size} bytes",
             fix="remove it from the folder, or replace it with an intact copy",
         ) from error
+
+
+def _to_srgb(image: Image.Image) -> Image.Image:
+    """Convert to sRGB by the embedded profile; without one, or with a damaged one, pixels count as sRGB."""
+    profile = image.info.get("icc_profile")
+    if profile and image.mode in ("RGB", "RGBA", "CMYK"):
+        colours = image.convert("RGB") if image.mode == "RGBA" else image
+        try:
+            converted = ImageCms.profileToProfile(
+                colours, io.BytesIO(profile), _srgb_profile(), outputMode="RGB"
+            )
+        except ImageCms.PyCMSError:
+            pass
+        else:
+            assert converted is not None  # only a conversion in place returns nothing
+            return converted
+    return image.convert("RGB")
+
+
+@functools.cache
+def _srgb_profile() -> ImageCms.ImageCmsProfile:
+    return ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB"))
 
 
 def write_png(path: Path, pixels: np.ndarray) -> None:

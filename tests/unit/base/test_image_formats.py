@@ -1,4 +1,4 @@
-"""Images of every kind become upright RGB of 8 bits."""
+"""Images of every kind become upright sRGB of 8 bits."""
 
 import subprocess
 import sys
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pillow_heif
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms
 
 from hilsplat.base.errors import ImageError
 from hilsplat.base.files import list_images
@@ -62,6 +62,32 @@ def test_cmyk_photographs_are_converted(tmp_path):
     found = read_image(saved(tmp_path, image, ".jpg", quality=95)).astype(int)
     assert np.abs(found[8, 4] - [255, 255, 255]).max() < 12
     assert np.abs(found[8, 28] - [0, 255, 255]).max() < 12
+
+
+def red_and_green_swapped() -> bytes:
+    """sRGB's profile with its red and green primaries exchanged."""
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    return profile.replace(b"rXYZ", b"kept").replace(b"gXYZ", b"rXYZ").replace(b"kept", b"gXYZ")
+
+
+@pytest.mark.parametrize(
+    ("suffix", "options"),
+    [
+        (".png", {}),
+        (".tif", {}),
+        (".jpg", {"quality": 100, "subsampling": 0}),
+        (".heic", {"quality": 100}),
+    ],
+)
+def test_colours_of_an_embedded_profile_become_srgb(tmp_path, suffix, options):
+    red = Image.new("RGB", (16, 16), (250, 10, 40))
+    found = read_image(saved(tmp_path, red, suffix, icc_profile=red_and_green_swapped(), **options))
+    np.testing.assert_allclose(found[8, 8], (10, 250, 40), atol=6)
+
+
+def test_a_damaged_profile_leaves_the_pixels_as_they_are(tmp_path):
+    path = saved(tmp_path, Image.new("RGB", (4, 4), (250, 10, 40)), ".png", icc_profile=b"no profile")
+    assert (read_image(path) == (250, 10, 40)).all()
 
 
 def test_pixels_of_unknown_range_are_refused(tmp_path):
