@@ -401,7 +401,7 @@ class Network:
                     found=f"shape {output.shape}",
                     fix="export the model in the layout of the Hugging Face ONNX exports",
                 )
-        return [output.astype(np.float32) for output in outputs]
+        return [output.astype(np.float32, copy=False) for output in outputs]
 
 
 def _fits(shape: Sequence[Any], axes: Axes) -> bool:

@@ -23,7 +23,7 @@ def region_ious(
     guesses = masks.reshape(len(masks), flat.size)
     shared = np.zeros((len(ids), len(masks)))
     for row, guess in enumerate(guesses):
-        shared[:, row] = np.bincount(index, weights=guess, minlength=len(ids))
+        shared[:, row] = np.bincount(index[guess], minlength=len(ids))
     union = areas[:, None] + guesses.sum(axis=1)[None] - shared
     found = (shared / np.maximum(union, 1)).astype(np.float32)
     return ids[first:].astype(np.int64), areas[first:].astype(np.int64), found[first:]

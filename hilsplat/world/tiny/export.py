@@ -21,19 +21,23 @@ from hilsplat.world.tiny.sam import (
     SamDecoder,
     SamEncoder,
     positional_embeddings,
+    shared_features,
 )
 
 MEAN = (0.485, 0.456, 0.406)
 STD = (0.229, 0.224, 0.225)
 OPSET = 18
-OWN_THRESHOLDS = Thresholds(predicted_iou_min=0.35, stability_min=0.5, nms_score=0.0, points_per_batch=64)
+OWN_THRESHOLDS = Thresholds(predicted_iou_min=0.35, stability_min=0.5, nms_score=0.0, points_per_batch=16)
 """What suits the small segmenter (docs/experiments.md); it goes into its `config.json`."""
 HALF_FROM = 64
 """Initialisers with at least this many numbers are stored as float16."""
 
 
 class _VisionEncoder(nn.Module):
-    """The encoder together with the positional embeddings of a whole frame."""
+    """The encoder, and all that prompts share: what they read at their points, and features of every pixel.
+
+    They go by the names that SAM's layout has for what an encoder hands to its decoder.
+    """
 
     positional: Tensor
 
@@ -45,7 +49,19 @@ class _VisionEncoder(nn.Module):
 
     def forward(self, pixel_values: Tensor) -> tuple[Tensor, Tensor]:
         embeddings = self.encoder(pixel_values)
-        return embeddings, self.positional.expand(pixel_values.shape[0], -1, -1, -1)
+        positional = self.positional.expand(pixel_values.shape[0], -1, -1, -1)
+        return torch.cat([embeddings, positional], dim=1), shared_features(embeddings, positional)
+
+
+class _MaskDecoder(nn.Module):
+    """The decoder of what `_VisionEncoder` returns."""
+
+    def __init__(self, decoder: SamDecoder) -> None:
+        super().__init__()
+        self.decoder = decoder
+
+    def forward(self, points: Tensor, labels: Tensor, place: Tensor, shared: Tensor) -> tuple[Tensor, Tensor]:
+        return self.decoder.masks(points, labels, place, shared)
 
 
 def store_as_half(model: onnx.ModelProto) -> onnx.ModelProto:
@@ -115,15 +131,15 @@ def export_sam(encoder: SamEncoder, decoder: SamDecoder, folder: Path) -> None:
         folder / "onnx" / "vision_encoder.onnx",
     )
     with torch.no_grad():
-        embeddings, positional = vision(pixels)
+        place, shared = vision(pixels)
     export_onnx(
-        decoder,
+        _MaskDecoder(decoder),
         {
             # Two points of a prompt and three prompts: axes of length one would be traced as constants.
             "input_points": torch.full((2, 3, 2, 2), FRAME_PX / 2.0),
             "input_labels": torch.ones((2, 3, 2), dtype=torch.int64),
-            "image_embeddings": embeddings.repeat(2, 1, 1, 1),
-            "image_positional_embeddings": positional.repeat(2, 1, 1, 1),
+            "image_embeddings": place.repeat(2, 1, 1, 1),
+            "image_positional_embeddings": shared.repeat(2, 1, 1, 1),
         },
         {
             "iou_scores": {0: "batch", 1: "prompts"},

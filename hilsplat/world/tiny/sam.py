@@ -35,6 +35,9 @@ FREQUENCIES = 3
 POSITIONAL = 2 + 4 * FREQUENCIES
 HIDDEN = 16
 TOKEN = 160
+BAND = 6
+"""Rows of a mask that the decoder answers at once, an even number: the hidden values of 16 prompts there fit
+into a core's cache, those of whole masks do not, and reading and writing them takes longer than the sums."""
 STEM = 24
 WIDTHS = (64, 128, 192, 256)
 """Channels at strides 4, 8, 16, 32."""
@@ -143,6 +146,22 @@ def positional_embeddings(windows: Float[Tensor, "B 3"], cells: int) -> Float[Te
     return torch.stack(channels, dim=1)
 
 
+def shared_features(
+    embeddings: Float[Tensor, "B C s s"], positional: Float[Tensor, "B D s s"]
+) -> Float[Tensor, "B K_and_1 h w"]:
+    """Features of every pixel at stride 2, the same for all prompts of an image; the last is 1 everywhere."""
+    pixel = functional.pixel_shuffle(embeddings[:, :PACKED], STRIDE // MASK_STRIDE)
+    side = int(embeddings.shape[-1]) * (STRIDE // MASK_STRIDE)
+    here = positional[:, :2]
+    centres = embeddings[:, PACKED : PACKED + OFFSETS] + here.repeat(1, len(HEADS), 1, 1)
+    place = functional.interpolate(
+        torch.cat([here, centres], dim=1), size=(side, side), mode="bilinear", align_corners=False
+    )
+    squared = place[:, 2:].square()
+    squared = squared[:, 0::2] + squared[:, 1::2]
+    return torch.cat([pixel, place, squared, torch.ones_like(pixel[:, :1])], dim=1)
+
+
 class SamDecoder(nn.Module):
     """Prompts to masks: the prompt writes the weights of a two-layer network run at every pixel.
 
@@ -183,15 +202,39 @@ class SamDecoder(nn.Module):
             embeddings: from the encoder.
             positional: from `positional_embeddings`.
         """
-        side = int(embeddings.shape[-1]) * (STRIDE // MASK_STRIDE)  # constant in the exported graph
-        token, first, bias, second, shift = self.written(points, labels, embeddings, positional)
-        shared = self.shared_features(embeddings, positional).flatten(2)  # (B, K, h * w)
-        hidden = torch.matmul(first.flatten(1, 2), shared).unflatten(1, (-1, HIDDEN))  # (B, P, H, n)
-        hidden = functional.relu(hidden.add_(bias[..., None]), inplace=True)
-        logits = (torch.matmul(second, hidden) + shift[..., None]).unflatten(-1, (side, side))
-        # Every fourth pixel gives area and confidence well enough, in a quarter of the time.
-        seen = logits[..., ::2, ::2].flatten(3)
-        return self.predicted_iou(token, seen, seen.new_full((1, 1, 1), 4.0)), logits
+        place = torch.cat([embeddings, positional], dim=1)
+        return self.masks(points, labels, place, shared_features(embeddings, positional))
+
+    def masks(
+        self,
+        points: Float[Tensor, "B P N 2"],
+        labels: Int64[Tensor, "B P N"],
+        place: Float[Tensor, "B C_and_D s s"],
+        shared: Float[Tensor, "B K_and_1 h w"],
+    ) -> tuple[Float[Tensor, "B P 3"], Float[Tensor, "B P 3 h w"]]:
+        """`forward` from what prompts of an image share; what the exported decoder computes.
+
+        Args:
+            points: as in `forward`.
+            labels: as in `forward`.
+            place: embeddings and positional embeddings, which a prompt reads at its points.
+            shared: `shared_features`.
+        """
+        token, first, bias, second, shift = self.written(points, labels, place)
+        # the bias is the weight of the feature that is 1 everywhere
+        first = torch.cat([first, bias[..., None]], dim=-1).flatten(1, 2)  # (B, P * H, K + 1)
+        side = int(shared.shape[-1])  # constant in the exported graph
+        hidden_shape = (points.shape[0], points.shape[1], HIDDEN, -1)
+        bands, seen = [], []
+        for band in shared.split(BAND, dim=2):
+            hidden = functional.relu(torch.matmul(first, band.flatten(2))).reshape(hidden_shape)
+            answer = torch.matmul(second, hidden) + shift[..., None]  # (B, P, 3, rows * w)
+            bands.append(answer.reshape(*points.shape[:2], len(HEADS), -1, side))
+            # Every fourth pixel gives area and confidence well enough, in a quarter of the time.
+            seen.append(bands[-1][..., ::2, ::2].flatten(3))
+        sampled = torch.cat(seen, dim=-1)
+        weights = sampled.new_full((1, 1, 1), 4.0)
+        return self.predicted_iou(token, sampled, weights), torch.cat(bands, dim=3)
 
     def at_pixels(
         self,
@@ -212,12 +255,13 @@ class SamDecoder(nn.Module):
             pixels: flat indices into the mask.
             weights: how many mask pixels each of them stands for.
         """
-        token, first, bias, second, shift = self.written(points, labels, embeddings, positional)
-        shared = self.shared_features(embeddings, positional).flatten(2)
+        place = torch.cat([embeddings, positional], dim=1)
+        token, first, bias, second, shift = self.written(points, labels, place)
+        shared = shared_features(embeddings, positional)[:, :-1].flatten(2)
         batch, channels, count = shared.shape
         rows = shared.transpose(1, 2).reshape(batch * count, channels)
-        place = pixels + torch.arange(batch, device=pixels.device)[:, None, None] * count
-        chosen = rows.index_select(0, place.flatten()).view(*pixels.shape, channels)  # (B, P, K, C)
+        flat = pixels + torch.arange(batch, device=pixels.device)[:, None, None] * count
+        chosen = rows.index_select(0, flat.flatten()).view(*pixels.shape, channels)  # (B, P, K, C)
         hidden = functional.relu(torch.matmul(chosen, first.transpose(2, 3)) + bias[:, :, None])
         logits = (torch.matmul(hidden, second.transpose(2, 3)) + shift[:, :, None]).transpose(2, 3)
         return self.predicted_iou(token, logits, weights), logits
@@ -226,15 +270,13 @@ class SamDecoder(nn.Module):
         self,
         points: Float[Tensor, "B P N 2"],
         labels: Int64[Tensor, "B P N"],
-        embeddings: Float[Tensor, "B C s s"],
-        positional: Float[Tensor, "B D s s"],
+        place: Float[Tensor, "B C_and_D s s"],
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Token of each prompt, and the weights it writes: matrix and bias of both layers."""
-        cells = int(embeddings.shape[-1])
+        cells = int(place.shape[-1])  # constant in the exported graph
         grid = points / (cells * STRIDE) * 2 - 1
-        sampled = functional.grid_sample(
-            torch.cat([embeddings, positional], dim=1), grid, padding_mode="border", align_corners=False
-        ).permute(0, 2, 3, 1)  # (B, P, N, C + D)
+        sampled = functional.grid_sample(place, grid, padding_mode="border", align_corners=False)
+        sampled = sampled.permute(0, 2, 3, 1)  # (B, P, N, C + D)
         valid = (labels >= 0).to(sampled.dtype)[..., None]
         inside = (labels == 1).to(sampled.dtype)[..., None]
         features = torch.cat([sampled[..., :EMBEDDING], sampled[..., EMBEDDING + 2 :]], dim=-1)
@@ -250,21 +292,6 @@ class SamDecoder(nn.Module):
         parts = self.weights(token).split(self.sizes, dim=-1)
         first, bias = _around_anchor(parts[0].unflatten(-1, (HIDDEN, self.inputs)), parts[1], anchor)
         return token, first, bias, parts[2].unflatten(-1, (len(HEADS), HIDDEN)), parts[3]
-
-    def shared_features(
-        self, embeddings: Float[Tensor, "B C s s"], positional: Float[Tensor, "B D s s"]
-    ) -> Float[Tensor, "B K h w"]:
-        """Features of every pixel at stride 2, the same for all prompts of an image."""
-        pixel = functional.pixel_shuffle(embeddings[:, :PACKED], STRIDE // MASK_STRIDE)
-        side = int(embeddings.shape[-1]) * (STRIDE // MASK_STRIDE)
-        here = positional[:, :2]
-        centres = embeddings[:, PACKED : PACKED + OFFSETS] + here.repeat(1, len(HEADS), 1, 1)
-        place = functional.interpolate(
-            torch.cat([here, centres], dim=1), size=(side, side), mode="bilinear", align_corners=False
-        )
-        squared = place[:, 2:].square()
-        squared = squared[:, 0::2] + squared[:, 1::2]
-        return torch.cat([pixel, place, squared], dim=1)
 
     def predicted_iou(
         self,

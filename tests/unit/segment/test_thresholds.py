@@ -27,7 +27,7 @@ def test_a_released_sam_has_langsplats_thresholds(make_disc_sam, tmp_path):
 
 def test_the_embedded_sam_brings_its_own():
     model = SamModel.load(PROJECT / "models/sam-tiny")
-    assert model.thresholds(MasksSettings()) == OWN_THRESHOLDS == Thresholds(0.35, 0.5, 0.0, 64)
+    assert model.thresholds(MasksSettings()) == OWN_THRESHOLDS == Thresholds(0.35, 0.5, 0.0, 16)
 
 
 def test_check_prints_the_thresholds_of_a_model():

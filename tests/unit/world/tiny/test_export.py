@@ -18,6 +18,7 @@ from hilsplat.world.tiny.sam import (
     SamDecoder,
     SamEncoder,
     positional_embeddings,
+    shared_features,
 )
 
 
@@ -54,14 +55,14 @@ def test_exported_sam_equals_torch(sam, batch, prompts, points):
     if points > 1:
         labels[:, 0, 1], labels[:, 1, 1] = 0, -1
     vision = session(folder / "onnx" / "vision_encoder.onnx")
-    embeddings, positional = vision.run(None, {"pixel_values": pixels.numpy()})
+    place, shared = vision.run(None, {"pixel_values": pixels.numpy()})
     scores, masks = session(folder / "onnx" / "prompt_encoder_mask_decoder.onnx").run(
         ["iou_scores", "pred_masks"],
         {
             "input_points": points_xy.numpy(),
             "input_labels": labels.numpy(),
-            "image_embeddings": embeddings,
-            "image_positional_embeddings": positional,
+            "image_embeddings": place,
+            "image_positional_embeddings": shared,
         },
     )
     with torch.no_grad():
@@ -72,10 +73,30 @@ def test_exported_sam_equals_torch(sam, batch, prompts, points):
         )
     assert masks.shape == (batch, prompts, 3, FRAME_PX // MASK_STRIDE, FRAME_PX // MASK_STRIDE)
     # Batch normalisation is folded into weights before they become float16: that is the difference.
-    assert np.abs(embeddings - expected_embeddings.numpy()).max() < 5e-3
+    assert np.abs(place[:, :EMBEDDING] - expected_embeddings.numpy()).max() < 5e-3
     assert np.abs(scores - expected_scores.numpy()).max() < 1e-3
     spread = np.abs(expected_masks.numpy()).max()
     assert np.abs(masks - expected_masks.numpy()).max() / spread < 1e-3
+
+
+@pytest.mark.parametrize("cells", [16, 23])
+def test_masks_answered_in_bands_are_those_of_all_pixels_at_once(sam, cells):
+    _, decoder, _ = sam
+    generator = torch.Generator().manual_seed(cells)
+    embeddings = torch.randn(2, EMBEDDING, cells, cells, generator=generator)
+    positional = positional_embeddings(torch.tensor([[0.0, 0.0, 1.0]] * 2), cells)
+    points, labels = torch.rand(2, 3, 1, 2, generator=generator) * 60, torch.ones(2, 3, 1, dtype=torch.int64)
+    with torch.no_grad():
+        scores, logits = decoder(points, labels, embeddings, positional)
+        place = torch.cat([embeddings, positional], dim=1)
+        token, first, bias, second, shift = decoder.written(points, labels, place)
+        shared = shared_features(embeddings, positional)[:, None, :-1].flatten(3)
+        expected = second @ torch.relu(first @ shared + bias[..., None]) + shift[..., None]
+        expected = expected.reshape(2, 3, 3, 2 * cells, 2 * cells)
+        every_fourth = expected[..., ::2, ::2].flatten(3)
+        expected_scores = decoder.predicted_iou(token, every_fourth, torch.full((1, 1, 1), 4.0))
+    assert (logits - expected).abs().max() < 1e-5 * expected.abs().max()
+    assert torch.allclose(scores, expected_scores, atol=1e-5)
 
 
 def test_padding_points_change_nothing(sam):
