@@ -454,16 +454,27 @@ class MethodSettings(Section):
     """The method that computes the field: that of this repository, or a baseline (hilsplat/methods)."""
 
     name: str = knob("hilsplat", "hilsplat, or a baseline in hilsplat/methods/registry.py")
-    steps: int = knob(1800, "langsplat: steps per level, each on one view", ge=1, origin="LangSplat: 30000")
-    rate: float = knob(0.0025, "langsplat: Adam step size", gt=0, origin="LangSplat")
+    steps: int = knob(
+        1800,
+        "langsplat, langsplat_v2: steps per level, each on one view",
+        ge=1,
+        origin="LangSplat, LangSplatV2: 30000",
+    )
+    rate: float = knob(0.0025, "langsplat, langsplat_v2: Adam step size", gt=0, origin="LangSplat")
     pixel_step: int = knob(
-        2, "langsplat: every n-th pixel of every n-th row is compared", ge=1, origin="LangSplat: 1"
+        2,
+        "langsplat, langsplat_v2: every n-th pixel of every n-th row is compared",
+        ge=1,
+        origin="LangSplat: 1",
+    )
+    top_gaussians: int = knob(
+        45, "dr_splat: heaviest Gaussians of a pixel that take its vector", ge=1, origin="Dr. Splat"
     )
 
     @property
     def is_random(self) -> bool:
         """Our solver and plain averaging involve nothing random; other methods may."""
-        return self.name not in ("hilsplat", "lifted")
+        return self.name not in ("hilsplat", "lifted", "occam")
 
 
 class EvaluateSettings(Section):

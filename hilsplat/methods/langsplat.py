@@ -85,6 +85,29 @@ class ViewPixels:
         return LevelPixels(self.weights[rows], self.latents[self.labels[rows, level.index]])
 
 
+class ViewQueue:
+    """Views in random order, each once before any is repeated."""
+
+    def __init__(self, views: list[ViewPixels], seed: int) -> None:
+        self._views, self._order, self._queue = views, np.random.default_rng(seed), list[int]()
+
+    def next(self) -> ViewPixels:
+        """The view of the next step."""
+        if not self._queue:
+            self._queue = list(self._order.permutation(len(self._views)))
+        return self._views[self._queue.pop()]
+
+
+def views_of(inputs: MethodInputs, pixel_step: int) -> list[ViewPixels]:
+    """Labelled pixels of every train view, on a grid."""
+    contributions, views = inputs.contributions, []
+    for number, view in enumerate(track(list(contributions.views), "weights of views")):
+        grid = grid_pixels(inputs.view_size_hw(view), pixel_step)
+        own = inputs.latents[contributions.view == number]
+        views.append(ViewPixels.of(inputs.view_weights(view), inputs.view_labels(view), own, grid))
+    return views
+
+
 def l1_step(
     features: Float32[np.ndarray, "N D"], pixels: LevelPixels
 ) -> tuple[float, Float32[np.ndarray, "N D"]]:
@@ -109,12 +132,9 @@ def train_level(
     """
     features = np.zeros((num_gaussians, views[0].latents.shape[1]), np.float32)
     first, second = np.zeros_like(features), np.zeros_like(features)
-    order = np.random.default_rng(seed)
-    queue: list[int] = []
+    queue = ViewQueue(views, seed)
     for step in range(1, settings.steps + 1):
-        if not queue:
-            queue = list(order.permutation(len(views)))
-        _, gradient = l1_step(features, views[queue.pop()].at(level))
+        _, gradient = l1_step(features, queue.next().at(level))
         first += (1 - BETAS[0]) * (gradient - first)
         second += (1 - BETAS[1]) * (gradient * gradient - second)
         mean, spread = first / (1 - BETAS[0] ** step), second / (1 - BETAS[1] ** step)
@@ -124,14 +144,9 @@ def train_level(
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train the three levels one after the other, each with its own seed."""
-    contributions, latents = inputs.contributions, inputs.latents
-    views: list[ViewPixels] = []
-    for number, view in enumerate(track(list(contributions.views), "weights of views")):
-        grid = grid_pixels(inputs.view_size_hw(view), settings.pixel_step)
-        own = latents[contributions.view == number]
-        views.append(ViewPixels.of(inputs.view_weights(view), inputs.view_labels(view), own, grid))
-    num_gaussians = contributions.num_gaussians
-    features = np.zeros((num_gaussians, len(LEVELS), latents.shape[1]), np.float32)
+    views = views_of(inputs, settings.pixel_step)
+    num_gaussians = inputs.contributions.num_gaussians
+    features = np.zeros((num_gaussians, len(LEVELS), inputs.latents.shape[1]), np.float32)
     for level in track(list(LEVELS), "levels trained"):
         if labelled := [view for view in views if view.is_labelled(level)]:
             features[:, level.index] = train_level(

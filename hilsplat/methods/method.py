@@ -13,10 +13,13 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float32, Int32
 
+from hilsplat.base.errors import SettingsError
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.contributions.rows import Contributions
 from hilsplat.contributions.stage import label_maps
-from hilsplat.field.code import load_latents
+from hilsplat.field.code import load_code, load_latents
+from hilsplat.field.linear_code import LinearCode
+from hilsplat.scene.cameras import Camera
 from hilsplat.scene.finished import require_same
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
@@ -72,7 +75,27 @@ class MethodInputs:
 
     def view_size_hw(self, view: str) -> tuple[int, int]:
         """Height and width of a view, px."""
-        return self._loaded[1].cameras[view].size_hw
+        return self.view_camera(view).size_hw
+
+    def view_camera(self, view: str) -> Camera:
+        """Camera of a view."""
+        return self._loaded[1].cameras[view]
+
+    def linear_code(self, method: str) -> LinearCode:
+        """The scene's code, for a method whose training or averages need CLIP vectors themselves.
+
+        Raises:
+            SettingsError: the code is a network, from whose numbers no average of vectors can be read.
+        """
+        code = load_code(self.autoencoder_folder)
+        if not isinstance(code, LinearCode):
+            raise SettingsError(
+                f"method {method} needs a linear code",
+                expected="autoencoder.code pca",
+                found="autoencoder.code network",
+                fix="give its variant autoencoder: {code: pca, latent: 64, targets: mask}",
+            )
+        return code
 
     @cached_property
     def _loaded(self) -> tuple:

@@ -11,8 +11,11 @@ if TYPE_CHECKING:
 
 METHODS: Plugins["Method"] = Plugins(
     {
+        "dr_splat": "hilsplat.methods.dr_splat:METHOD",
         "langsplat": "hilsplat.methods.langsplat:METHOD",
+        "langsplat_v2": "hilsplat.methods.langsplat_v2:METHOD",
         "lifted": "hilsplat.methods.lifted:METHOD",
+        "occam": "hilsplat.methods.occam:METHOD",
     }
 )
 

@@ -4,6 +4,7 @@ import inspect
 import re
 import sys
 import types
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.methods import langsplat, lifted, registry, stage
 from hilsplat.methods.langsplat import LevelPixels, ViewPixels, grid_pixels, l1_step, train_level
-from hilsplat.methods.method import Method
+from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.methods.registry import METHODS, OURS, method_of, require_method
 from hilsplat.settings import MethodSettings
 from tests.conftest import PROJECT
@@ -109,7 +110,8 @@ def test_langsplat_trains_every_level_on_the_pixels_of_the_grid():
     # one row of five pixels, every second one compared: 0, 2 and 4; pixel 4 is not covered
     weights = sp.csr_matrix(np.array([[1, 0], [1, 0], [0, 1], [0, 1], [0, 0]], np.float32))
     labels = np.array([[0, 2, -1], [1, 2, -1], [0, -1, -1], [1, 2, 1], [1, 1, 1]], np.int32)
-    inputs = types.SimpleNamespace(
+    inputs = MethodInputs(*[Path("none")] * 5)
+    inputs.__dict__.update(
         contributions=types.SimpleNamespace(views=("a", "b"), num_gaussians=2, view=np.array([0, 1, 1, 1])),
         latents=np.array([[9.0], [0.3], [5.0], [0.6]], np.float32),  # view b has the last three
         view_weights=lambda view: weights,
@@ -135,7 +137,7 @@ def test_every_baseline_is_named_after_its_file_and_says_where_it_comes_from(nam
 
 
 def test_unknown_methods_name_those_that_exist():
-    with pytest.raises(SettingsError, match="one of hilsplat, langsplat, lifted"):
+    with pytest.raises(SettingsError, match=rf"one of hilsplat, .*{', '.join(METHODS)}"):
         require_method("langsplatt")
     require_method(OURS)
     with pytest.raises(SettingsError, match="is not a baseline"):
