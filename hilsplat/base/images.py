@@ -115,10 +115,18 @@ def _srgb_profile() -> ImageCms.ImageCmsProfile:
     return ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB"))
 
 
-def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Write an 8-bit RGB or grey, or a 16-bit grey image, as PNG, atomically."""
+def write_png(path: Path, pixels: np.ndarray, compression: int = 6) -> None:
+    """Write an 8-bit RGB or grey, or a 16-bit grey image, as PNG, atomically.
+
+    Args:
+        path: file to write.
+        pixels: (H, W, 3) or (H, W).
+        compression: level of zlib, 0 to 9.
+    """
     with atomic_path(path) as temporary:
-        Image.fromarray(np.ascontiguousarray(pixels)).save(temporary, format="PNG")
+        Image.fromarray(np.ascontiguousarray(pixels)).save(
+            temporary, format="PNG", compress_level=compression
+        )
 
 
 def to_float(pixels: UInt8[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:

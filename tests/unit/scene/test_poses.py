@@ -7,8 +7,15 @@ import pytest
 from PIL import Image
 
 from hilsplat.base.errors import ImageError, RegistrationError, SceneError
-from hilsplat.base.images import read_image
-from hilsplat.scene.features import WorkImage, camera_groups, view_name, view_names
+from hilsplat.base.images import read_image, resize_to_fit
+from hilsplat.scene.features import (
+    EXIF_ORIENTATION,
+    WorkImage,
+    camera_groups,
+    prepare_images,
+    view_name,
+    view_names,
+)
 from hilsplat.scene.poses import check_registration, run_poses
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import PosesSettings
@@ -75,6 +82,27 @@ def test_damaged_photographs_are_all_named(tmp_path):
     with pytest.raises(ImageError, match=r"2 of 5 images(.|\n)*empty\.jpg \(0 bytes\), half\.png"):
         pose_photos(folder, tmp_path / "scene")
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]  # no scene, no work folder
+
+
+def test_work_images_hold_the_pixels_of_the_photographs_upright_and_shrunk(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 256, (20, 30, 3), dtype=np.uint8)
+    turned = Image.Exif()
+    turned[EXIF_ORIENTATION] = 6
+    picture, folder = Image.fromarray(pixels), tmp_path / "photos"
+    folder.mkdir()
+    picture.save(folder / "plain.png")
+    picture.save(folder / "turned.png", exif=turned)
+    picture.convert("L").save(folder / "grey.png")
+    picture.save(folder / "photo.tif")
+    Image.fromarray(np.concatenate([pixels, pixels])).save(folder / "tall.png")
+    sources = sorted(folder.iterdir())
+    images = prepare_images(sources, tmp_path / "work", 30)
+    for source, image in zip(sources, images, strict=True):
+        expected = resize_to_fit(read_image(source), 30)
+        np.testing.assert_array_equal(read_image(tmp_path / "work" / image.view), expected)
+        with Image.open(tmp_path / "work" / image.view) as written:  # COLMAP turns nothing
+            assert (written.mode, written.size) == ("RGB", expected.shape[1::-1])
+            assert not written.getexif()
 
 
 def test_noise_registers_nowhere_and_every_photograph_has_its_reason(tmp_path):

@@ -11,7 +11,7 @@ from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
 from hilsplat.scene.cameras import Cameras
 from hilsplat.world.scenes.scene import Style, WorldScene
 from hilsplat.world.shapes import box
-from hilsplat.world.truth import refined, views_of_points, write_mesh
+from hilsplat.world.truth import refined, unique_rows, views_of_points, write_mesh
 from hilsplat.world.views import looking_at, numbered_cameras, pinhole
 
 
@@ -89,3 +89,10 @@ def test_a_point_is_seen_by_cameras_that_nothing_hides_it_from():
     assert views_of_points(scene, above, points).tolist() == [0, 1, 1, 0]
     assert views_of_points(scene, below, points).tolist() == [1, 1, 0, 0]
     assert views_of_points(scene, near, points).tolist() == [1, 0, 0, 0]
+
+
+def test_rows_are_made_unique_as_numpy_does_it():
+    rows = np.random.default_rng(0).integers(-2, 3, (2000, 4)).astype(np.float32)
+    unique, index = np.unique(rows, axis=0, return_inverse=True)
+    for found, expected in zip(unique_rows(rows), (unique, index.reshape(-1)), strict=True):
+        np.testing.assert_array_equal(found, expected)
