@@ -2,6 +2,8 @@
 #
 # Priorities lead to a scene's first answer: of the jobs that could start, the nearest to its semantic tree is
 # first, and fields, scores and pictures come after all trees. Gaussians are before masks: they can be looked at.
+# After the trees the longest chain is first: a trained code, a baseline's field, our fields, scores. Jobs of one
+# variant have one thread where there are enough of them for all cores.
 #
 # All outputs are `update(...)`: Snakemake deletes others before their job begins. A stage replaces its output when the
 # new one is whole, so a job that fails, or is killed, leaves the former one.
@@ -91,3 +93,4 @@ try:
 except WorkflowError:  # not set under --report and --lint, which run no jobs
     CORES = 1
 THREADS = PLAN.threads(CORES)
+VARIANT_THREADS = PLAN.variant_threads(CORES)

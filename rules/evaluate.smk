@@ -16,9 +16,10 @@ rule evaluate:
         "results/{dataset}/{scene}/{variant}/logs/evaluate.log",
     benchmark:
         "results/{dataset}/{scene}/{variant}/benchmarks/evaluate.jsonl"
+    priority: 2
     conda:
         ENVIRONMENT
-    threads: THREADS
+    threads: VARIANT_THREADS
     resources:
         mem_mb=4000,
     params:

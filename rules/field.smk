@@ -10,6 +10,7 @@ rule autoencoder:
         "results/{dataset}/{scene}/{variant}/logs/autoencoder.log",
     benchmark:
         "results/{dataset}/{scene}/{variant}/benchmarks/autoencoder.jsonl"
+    priority: 8
     conda:
         ENVIRONMENT
     threads: 1
@@ -38,9 +39,10 @@ rule field:
         "results/{dataset}/{scene}/{variant}/benchmarks/field.jsonl"
     wildcard_constraints:
         variant=PLAN.variants(by_baseline=False),
+    priority: 4
     conda:
         ENVIRONMENT
-    threads: THREADS
+    threads: VARIANT_THREADS
     resources:
         mem_mb=4000,
     params:

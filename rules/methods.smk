@@ -14,9 +14,10 @@ rule method:
         "results/{dataset}/{scene}/{variant}/benchmarks/field.jsonl"
     wildcard_constraints:
         variant=PLAN.variants(by_baseline=True),
+    priority: 6
     conda:
         ENVIRONMENT
-    threads: THREADS
+    threads: VARIANT_THREADS
     resources:
         mem_mb=6000,
     params:

@@ -38,7 +38,7 @@ rule figures:
         "results/{dataset}/{scene}/benchmarks/figures.jsonl"
     conda:
         ENVIRONMENT
-    threads: THREADS
+    threads: VARIANT_THREADS
     resources:
         mem_mb=4000,
     params:
@@ -124,7 +124,7 @@ rule comparison:
         "results/{dataset}/{scene}/benchmarks/comparison.jsonl"
     conda:
         ENVIRONMENT
-    threads: THREADS
+    threads: VARIANT_THREADS
     resources:
         mem_mb=6000,
     params:

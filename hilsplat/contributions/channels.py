@@ -1,4 +1,4 @@
-"""The product of G with a field of float32, sixteen channels at a time, with the bytes of the plain loop.
+"""Products of G and A with a field of float32, sixteen channels at a time, with the bytes of the plain loops.
 
 numba turns a loop over the few channels of a row into vector code behind checks, made at every pass, that the
 arrays do not overlap, and keeps the sums in memory. Here rows have a multiple of sixteen channels, one value
@@ -56,3 +56,27 @@ def gram_product(begin, end, indptr, indices, values, features, width, out):
             store(out, own, whole)
             store(out, own + width, part)
             store(out, own + 2 * width, subpart)
+
+
+@compiled
+def mask_means(indptr, indices, data, level_index, features, width, out):
+    """`mask_operator._means` for flat features and `out`, with `width` channels per row."""
+    for m in range(len(level_index)):
+        for c in range(0, width, WIDTH):
+            place = level_index[m] * width + c
+            total = load(out, m * width + c)
+            for k in range(indptr[m], indptr[m + 1]):
+                total = plus(total, lanes(data[k]), load(features, np.int64(indices[k]) * 3 * width + place))
+            store(out, m * width + c, total)
+
+
+@compiled
+def mask_spread(indptr, indices, data, level_index, values, width, out):
+    """`mask_operator._spread` for flat values and `out`, with `width` channels per row."""
+    for m in range(len(level_index)):
+        for c in range(0, width, WIDTH):
+            place = level_index[m] * width + c
+            value = load(values, m * width + c)
+            for k in range(indptr[m], indptr[m + 1]):
+                there = np.int64(indices[k]) * 3 * width + place
+                store(out, there, plus(load(out, there), lanes(data[k]), value))

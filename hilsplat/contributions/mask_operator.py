@@ -8,6 +8,8 @@ import scipy.sparse as sp
 from jaxtyping import Float, Float32, Int64, UInt8
 
 from hilsplat.base.compiled import compiled
+from hilsplat.contributions.channels import mask_means, mask_spread
+from hilsplat.splat.rasterise.lanes import WIDTH
 
 MEDIAN_SOFTENING = 1e-4
 """Least distance of a latent to the median, so that a step never divides by zero."""
@@ -52,14 +54,29 @@ class MaskOperator:
     def means(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "M D"]:
         """A F: mean rendered feature of each mask at its level."""
         out = np.zeros((len(self.level_index), features.shape[2]), features.dtype)
-        _means(self.indptr, self.indices, self.data, self.level_index, np.ascontiguousarray(features), out)
+        features = np.ascontiguousarray(features)
+        A = self.indptr, self.indices, self.data, self.level_index
+        if _fills_lanes(out):
+            mask_means(*A, features.reshape(-1), out.shape[1], out.reshape(-1))
+        else:
+            _means(*A, features, out)
         return out
 
     def spread(self, values: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "N 3 D"]:
         """A' x at each level: the adjoint of `means`."""
         out = np.zeros((self.num_gaussians, 3, values.shape[1]), values.dtype)
-        _spread(self.indptr, self.indices, self.data, self.level_index, np.ascontiguousarray(values), out)
+        values = np.ascontiguousarray(values)
+        A = self.indptr, self.indices, self.data, self.level_index
+        if _fills_lanes(out):
+            mask_spread(*A, values.reshape(-1), values.shape[1], out.reshape(-1))
+        else:
+            _spread(*A, values, out)
         return out
+
+
+def _fills_lanes(values: np.ndarray) -> bool:
+    """Whether rows of values are whole vectors of sixteen float32."""
+    return values.dtype == np.float32 and values.shape[-1] % WIDTH == 0
 
 
 def lifted_average(

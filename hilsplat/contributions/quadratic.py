@@ -14,11 +14,11 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float32
 
-from hilsplat.base.artifacts import read_into, read_npz, write_npz
 from hilsplat.base.compiled import compiled
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
 from hilsplat.contributions.channels import gram_product, padded
+from hilsplat.contributions.streams import mapped
 
 PRODUCT_PARTS = 4
 """A product with G is summed in this many parts of equally many pairs. Fixed, so that the number of threads
@@ -75,9 +75,13 @@ class Gram:
             total[begin:] += rest
         return np.ascontiguousarray(total[:, :, :channels])
 
-    def save(self, path: Path) -> None:
-        """Write `G.npz`."""
-        write_npz(path, indptr=self.indptr, indices=self.indices, values=self.values)
+    def form(self, features: Float32[np.ndarray, "N 3 D"]) -> float:
+        """Sum over levels of tr F'GF, in float64 but for the product, whose millions of roundings cancel."""
+        return float(np.multiply(features, self.product(features), dtype=np.float64).sum())
+
+    def save(self, folder: Path) -> None:
+        """Write the folder `G`, whose arrays are mapped when read."""
+        _save(folder / "G", indptr=self.indptr, indices=self.indices, values=self.values)
 
 
 @dataclass(frozen=True)
@@ -115,10 +119,15 @@ class StackedWeights:
         )
         return out
 
-    def save(self, path: Path) -> None:
-        """Write `W.npz`."""
-        write_npz(
-            path,
+    def form(self, features: Float32[np.ndarray, "N 3 D"]) -> float:
+        """Sum over levels of tr F'GF, summed in float64."""
+        features = features.astype(np.float64)
+        return float((features * self.product(features)).sum())
+
+    def save(self, folder: Path) -> None:
+        """Write the folder `W`, whose arrays are mapped when read."""
+        _save(
+            folder / "W",
             indptr=self.weights.indptr,
             indices=self.weights.indices,
             data=self.weights.data,
@@ -132,10 +141,13 @@ Quadratic = Gram | StackedWeights
 
 @runtime_checkable
 class QuadraticProduct(Protocol):
-    """The product with G that the solver needs, on any device."""
+    """What the solver needs of G, on any device."""
 
     def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
         """G_l F_l for every level."""
+
+    def form(self, features: Float32[np.ndarray, "N 3 D"]) -> float:
+        """Sum over levels of tr F'GF, summed in float64."""
 
 
 def level_mass(quadratic: Quadratic) -> Float32[np.ndarray, "N 3"]:
@@ -145,23 +157,32 @@ def level_mass(quadratic: Quadratic) -> Float32[np.ndarray, "N 3"]:
 
 
 def load_quadratic(folder: Path, threads: int = 1) -> Quadratic:
-    """Read `G.npz` or `W.npz`, whichever the contributions stage kept.
+    """Map G or W from the contributions artifact, whichever the stage kept.
 
     Args:
         folder: the contributions artifact.
         threads: number of threads that share a product with G; products with W take one.
 
     Raises:
-        ArtifactError: the folder holds neither.
+        ArtifactError: the folder holds neither, or a file of it is missing or damaged.
     """
-    if (folder / "G.npz").is_file():
-        return read_into(Gram, folder / "G.npz", threads=threads)
-    if (folder / "W.npz").is_file():
-        arrays = read_npz(folder / "W.npz", "indptr", "indices", "data", "columns", "valid")
-        shape = (len(arrays["indptr"]) - 1, int(arrays["columns"][0]))
-        matrix = sp.csr_matrix((arrays["data"], arrays["indices"], arrays["indptr"]), shape=shape)
-        return StackedWeights(matrix, arrays["valid"])
-    raise ArtifactError(f"{folder} holds neither G.npz nor W.npz", fix="run the contributions stage again")
+    if (folder / "G").is_dir():
+        indptr, indices, values = (
+            mapped(folder / "G" / f"{name}.npy") for name in ("indptr", "indices", "values")
+        )
+        return Gram(indptr, indices, values, threads)
+    if (folder / "W").is_dir():
+        names = ("indptr", "indices", "data", "columns", "valid")
+        indptr, indices, data, columns, valid = (mapped(folder / "W" / f"{name}.npy") for name in names)
+        shape = (len(indptr) - 1, int(columns[0]))
+        return StackedWeights(sp.csr_matrix((data, indices, indptr), shape=shape, copy=False), valid)
+    raise ArtifactError(f"{folder} holds neither G nor W", fix="run the contributions stage again")
+
+
+def _save(folder: Path, **arrays: np.ndarray) -> None:
+    folder.mkdir(parents=True)
+    for name, array in arrays.items():
+        np.save(folder / f"{name}.npy", np.ascontiguousarray(array), allow_pickle=False)
 
 
 @compiled

@@ -2,17 +2,16 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float32, Int32, Int64, UInt8
 
 from hilsplat.base.artifacts import read_full_index, read_into, read_npy
-from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.contributions.quadratic import Quadratic, load_quadratic
-from hilsplat.contributions.streams import HEADER_BYTES
+from hilsplat.contributions.streams import mapped
 
 
 @dataclass(frozen=True)
@@ -56,19 +55,19 @@ class Contributions:
 
     def matrix(self, name: str) -> sp.csr_matrix:
         """`A`, `A_half` or `S` (M x N), mapped from its file rather than held in memory."""
-        parts = (_mapped(self.folder / name / f"{part}.npy") for part in ("data", "indices", "indptr"))
+        parts = (mapped(self.folder / name / f"{part}.npy") for part in ("data", "indices", "indptr"))
         return sp.csr_matrix(tuple(parts), shape=(len(self), self.num_gaussians), copy=False)
 
     def mass(self) -> Float32[np.ndarray, "V N"]:
         """Visible mass of each Gaussian in each train view, px; mapped from its file."""
-        return _mapped(self.folder / "mass.npy")
+        return mapped(self.folder / "mass.npy")
 
     def means(self) -> Float32[np.ndarray, "N 3"]:
         """Centres of the Gaussians, scene units."""
         return read_npy(self.folder / "means.npy")
 
     def quadratic(self, threads: int = 1) -> Quadratic:
-        """Read G, or the stacked weights if those are smaller."""
+        """Map G, or the stacked weights if those are smaller."""
         return load_quadratic(self.folder, threads)
 
     @staticmethod
@@ -89,24 +88,6 @@ class Contributions:
             gaussians_sha256=index["gaussians_sha256"],
             min_weight=index["min_weight"],
         )
-
-
-def _mapped(path: Path) -> np.ndarray:
-    """Map an array from its file.
-
-    Raises:
-        ArtifactError: the file is missing or damaged.
-    """
-    try:
-        # A file without any number cannot be mapped.
-        mode: Literal["r"] | None = "r" if path.stat().st_size > HEADER_BYTES else None
-        return np.load(path, mmap_mode=mode, allow_pickle=False).view(np.ndarray)
-    except FileNotFoundError as error:
-        raise ArtifactError(f"{path} is missing", fix="run the contributions stage again") from error
-    except (ValueError, OSError) as error:
-        raise ArtifactError(
-            f"{path} cannot be read: {error}", fix="delete the folder and run the contributions stage again"
-        ) from error
 
 
 def mask_embeddings(clip_folder: Path, contributions: Contributions) -> Float32[np.ndarray, "M C"]:

@@ -264,7 +264,7 @@ def run_contributions(
         write_npz(folder / "rows.npz", **{name: np.concatenate(values) for name, values in rows.items()})
         quadratic = builder.finish()
         kept = "G" if isinstance(quadratic, Gram) else "W"
-        quadratic.save(folder / f"{kept}.npz")
+        quadratic.save(folder)
         counts |= {
             "views": len(views),
             "masks": sum(len(part) for part in rows["view"]),

@@ -1,9 +1,12 @@
-"""Arrays that grow on disk, so that a stage never holds all that it writes."""
+"""Arrays that grow on disk, so that a stage never holds all that it writes, and are mapped when read."""
 
 from pathlib import Path
 from types import TracebackType
+from typing import Literal
 
 import numpy as np
+
+from hilsplat.base.errors import ArtifactError
 
 HEADER_BYTES = 128
 
@@ -76,3 +79,21 @@ class MatrixStream:
         """Complete the files."""
         for stream in (self._data, self._indices, self._indptr):
             stream.close()
+
+
+def mapped(path: Path) -> np.ndarray:
+    """Map an array from its file, read-only.
+
+    Raises:
+        ArtifactError: the file is missing or damaged.
+    """
+    try:
+        # A file without any number cannot be mapped.
+        mode: Literal["r"] | None = "r" if path.stat().st_size > HEADER_BYTES else None
+        return np.load(path, mmap_mode=mode, allow_pickle=False).view(np.ndarray)
+    except FileNotFoundError as error:
+        raise ArtifactError(f"{path} is missing", fix="run the contributions stage again") from error
+    except (ValueError, OSError) as error:
+        raise ArtifactError(
+            f"{path} cannot be read: {error}", fix="delete the folder and run the contributions stage again"
+        ) from error

@@ -121,7 +121,7 @@ def run_evaluate(
                         keep(data, view, row)
                     if not seconds and of_view.categories:
                         texts = [query.text for query in of_view.categories[:TIMED_TEXTS]]
-                        seconds = timed(answers, selections, view, texts, settings)
+                        seconds = timed(answers, view, texts, settings)
                 if isinstance(known, TrueAnnotations) and truths:
                     found = measure_world_consistency(
                         answers, selections, truths, kept, known.folder, settings
@@ -188,21 +188,19 @@ def point_rows(
 
 def timed(
     answers: LanguageScene,
-    selections: Selections,
     view: str,
     texts: Sequence[str],
     settings: EvaluateSettings,
 ) -> dict[str, float]:
     """Seconds that field and tree take for one query in a view (see `costs.time_queries`)."""
     rule = rule_of(settings)
-    size_hw = answers.scene.cameras[view].size_hw
 
     def by_field(text: str) -> object:
         relevancy = answers.field_relevancy([text], view, exact=False)[0]
         return relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)
 
     def by_tree(text: str) -> object:
-        return selections.mask(view, answers.select((text,), view=view).ids, size_hw)
+        return answers.node_masks(view, answers.select((text,), view=view).ids)
 
     asks = {"field": by_field, "tree": by_tree}
     return time_queries(

@@ -6,9 +6,7 @@ Both depend on the mask means alone, so a step costs a sparse product and no ren
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from jaxtyping import Float, Float32, Int64
-from torch import Tensor
+from jaxtyping import Float32, Float64, Int64
 
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.mask_operator import MaskProducts
@@ -34,11 +32,11 @@ class ViewRelations:
         part_parent: the row of their parents in the coverage tree, -1 for none.
     """
 
-    rows: Tensor
-    depth: Tensor
-    level: Tensor
-    part_rows: tuple[Tensor, ...]
-    part_parent: tuple[Tensor, ...]
+    rows: Int64[np.ndarray, " m"]
+    depth: Int64[np.ndarray, "m m"]
+    level: Int64[np.ndarray, " m"]
+    part_rows: tuple[Int64[np.ndarray, " _"], ...]
+    part_parent: tuple[Int64[np.ndarray, " _"], ...]
 
 
 def view_relations(
@@ -80,11 +78,11 @@ def view_relations(
             part_parent.append(np.where(own == NONE, NONE, rows[own]) if len(rows) else own)
         relations.append(
             ViewRelations(
-                rows=torch.from_numpy(rows[every]),
-                depth=torch.from_numpy(depth[np.ix_(every, every)]),
-                level=torch.from_numpy(contributions.level[rows[every]].astype(np.int64)),
-                part_rows=tuple(torch.from_numpy(rows[chosen[level]]) for level in LEVELS[1:]),
-                part_parent=tuple(torch.from_numpy(np.asarray(own, dtype=np.int64)) for own in part_parent),
+                rows=rows[every],
+                depth=depth[np.ix_(every, every)],
+                level=contributions.level[rows[every]].astype(np.int64),
+                part_rows=tuple(rows[chosen[level]] for level in LEVELS[1:]),
+                part_parent=tuple(np.asarray(own, dtype=np.int64) for own in part_parent),
             )
         )
     return relations
@@ -112,34 +110,37 @@ def distinct(
 
 
 def instance_term(
-    means: Float[Tensor, "M D"], relations: list[ViewRelations], settings: FieldSettings
-) -> Tensor:
-    """L_ins, averaged over the views that have masks to compare.
+    means: Float64[np.ndarray, "M D"], relations: list[ViewRelations], settings: FieldSettings
+) -> tuple[float, Float64[np.ndarray, "M D"]]:
+    """L_ins, averaged over the views that have masks to compare, and its gradient.
 
     Args:
         means: mean feature of each mask.
         relations: per view.
         settings: the reading of L_ins, and Omega.
     """
-    losses = []
+    losses, gradient = [], np.zeros(means.shape)
     for view in relations:
         if len(view.rows) < 2:
             continue
         chosen = means[view.rows]
         if settings.instance_mode == "literal":
-            losses.append(instance_loss_literal(chosen, view.level, settings.omega))
+            loss, by_chosen = instance_loss_literal(chosen, view.level, settings.omega)
         else:
-            losses.append(instance_loss_tree(chosen, view.depth, settings.omega))
-    return torch.stack(losses).mean() if losses else means.sum() * 0
+            loss, by_chosen = instance_loss_tree(chosen, view.depth, settings.omega)
+        losses.append(loss)
+        gradient[view.rows] += by_chosen
+    count = max(len(losses), 1)
+    return sum(losses) / count, gradient / count
 
 
 def part_term(
-    means: Float[Tensor, "M D"],
-    halves: Float[Tensor, "M D"],
-    other_halves: Float[Tensor, "M D"],
+    means: Float64[np.ndarray, "M D"],
+    halves: Float64[np.ndarray, "M D"],
+    other_halves: Float64[np.ndarray, "M D"],
     relations: list[ViewRelations],
     settings: FieldSettings,
-) -> Tensor:
+) -> tuple[float, tuple[Float64[np.ndarray, "M D"], ...]]:
     """L_part, averaged over the views and levels that have masks to compare.
 
     Args:
@@ -148,23 +149,30 @@ def part_term(
         other_halves: mean feature over the other pixels.
         relations: per view.
         settings: the reading of L_part, and tau.
+
+    Returns:
+        the loss, and its gradients by means, halves and other halves.
     """
     losses = []
+    by_means, by_halves, by_others = (np.zeros(means.shape) for _ in range(3))
     for view in relations:
         for rows, parent in zip(view.part_rows, view.part_parent, strict=True):
             has_parent = parent != NONE
             if len(rows) < 2 or not has_parent.any():
                 continue
-            parent_means = means[parent.clamp(min=0)]
+            parent_means = means[np.maximum(parent, 0)]
             if settings.part_mode == "literal":
-                losses.append(part_loss_literal(means[rows], parent, parent_means, settings.tau))
+                loss, by_rows = part_loss_literal(means[rows], parent, parent_means, settings.tau)
+                by_means[rows] += by_rows
             else:
-                losses.append(
-                    part_loss_disentangle(
-                        halves[rows], other_halves[rows], has_parent.long(), parent_means, settings.tau
-                    )
+                loss, by_half, by_other = part_loss_disentangle(
+                    halves[rows], other_halves[rows], has_parent, parent_means, settings.tau
                 )
-    return torch.stack(losses).mean() if losses else means.sum() * 0
+                by_halves[rows] += by_half
+                by_others[rows] += by_other
+            losses.append(loss)
+    count = max(len(losses), 1)
+    return sum(losses) / count, (by_means / count, by_halves / count, by_others / count)
 
 
 @dataclass(frozen=True)
@@ -189,38 +197,40 @@ class Contrast:
 
     def values(self, features: Float32[np.ndarray, "N 3 D"]) -> dict[str, float]:
         """Unweighted L_ins and L_part."""
-        with torch.no_grad():
-            means, halves = self._means(features)
-            instance, part = self._losses(means, halves, (True, True))
-        return {"instance": float(instance), "part": float(part)}
+        means, halves, others = self._means(features)
+        instance, _ = instance_term(means, self.relations, self.settings)
+        part, _ = part_term(means, halves, others, self.relations, self.settings)
+        return {"instance": instance, "part": part}
 
     def weighted(
         self, features: Float32[np.ndarray, "N 3 D"], weights: tuple[float, float]
     ) -> tuple[float, Float32[np.ndarray, "N 3 D"]]:
         """The weighted sum of L_ins and L_part, and its gradient; a loss of weight 0 is not computed."""
-        means, halves = (values.requires_grad_() for values in self._means(features))
-        losses = self._losses(means, halves, (weights[0] != 0, weights[1] != 0))
-        total = weights[0] * losses[0] + weights[1] * losses[1]
-        by_means, by_halves = torch.autograd.grad(total, (means, halves), allow_unused=True)
-        gradient = self.masks.spread(by_means.float().numpy())
+        means, halves, others = self._means(features)
+        total, by_means, by_halves = 0.0, np.zeros(means.shape), None
+        if weights[0]:
+            loss, gradient = instance_term(means, self.relations, self.settings)
+            total += weights[0] * loss
+            by_means += weights[0] * gradient
+        if weights[1]:
+            loss, (own, by_half, by_other) = part_term(means, halves, others, self.relations, self.settings)
+            total += weights[1] * loss
+            n, half, rest = self._counts()
+            by_means += weights[1] * (own + n / rest * by_other)
+            by_halves = weights[1] * (by_half - half / rest * by_other)
+        gradient = self.masks.spread(by_means.astype(np.float32))
         if by_halves is not None:
-            gradient += self.half_masks.spread(by_halves.float().numpy())
-        return float(total.detach()), gradient
+            gradient += self.half_masks.spread(by_halves.astype(np.float32))
+        return total, gradient
 
-    def _means(self, features: np.ndarray) -> tuple[Tensor, Tensor]:
-        """Mean feature of each mask and of its random half, in float64."""
-        return (
-            torch.from_numpy(self.masks.means(features)).double(),
-            torch.from_numpy(self.half_masks.means(features)).double(),
-        )
+    def _means(self, features: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Mean feature of each mask, of its random half and of its other half, in float64."""
+        means = self.masks.means(features).astype(np.float64)
+        halves = self.half_masks.means(features).astype(np.float64)
+        n, half, rest = self._counts()
+        return means, halves, (n * means - half * halves) / rest
 
-    def _losses(self, means: Tensor, halves: Tensor, wanted: tuple[bool, bool]) -> tuple[Tensor, Tensor]:
-        """L_ins and L_part; 0 for one that is not asked for."""
-        n = torch.from_numpy(self.pixels).double()[:, None]
-        half = torch.from_numpy(self.half_pixels).double()[:, None]
-        others = (n * means - half * halves) / (n - half).clamp(min=1)
-        nothing = means.sum() * 0
-        return (
-            instance_term(means, self.relations, self.settings) if wanted[0] else nothing,
-            part_term(means, halves, others, self.relations, self.settings) if wanted[1] else nothing,
-        )
+    def _counts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Pixels of each mask, of its random half, and of its other half (at least 1), as columns."""
+        n, half = (count.astype(np.float64)[:, None] for count in (self.pixels, self.half_pixels))
+        return n, half, np.maximum(n - half, 1)

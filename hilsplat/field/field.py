@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from hilsplat.base.artifacts import read_index, read_npz, sha256_of_file, write_json
-from hilsplat.base.device import compute_device, one_torch_thread
+from hilsplat.base.device import compute_device
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.progress import stage_log
 from hilsplat.contributions.mask_operator import MaskOperator, MaskProducts
@@ -46,7 +46,7 @@ def run_field(
     scene = read_index(contributions_folder)["scene"]
     latents = load_latents(autoencoder_folder, contributions)
     parents = read_parents(tree_folder, contributions)
-    with stage_log("field", scene) as counts, one_torch_thread():
+    with stage_log("field", scene) as counts:
         device = compute_device(settings.device)
         masks = MaskOperator.of(contributions.matrix("A"), contributions.level)
         half_masks = MaskOperator.of(contributions.matrix("A_half"), contributions.level)

@@ -4,6 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from hilsplat.base.compiled import compiled
+
 LBFGS_MEMORY = 8
 SUFFICIENT_DECREASE = 1e-4
 MAX_HALVINGS = 12
@@ -50,13 +52,32 @@ def lbfgs(objective: Objective, start: np.ndarray, steps: int, first_step: float
 
 def dot(a: np.ndarray, b: np.ndarray) -> float:
     """Sum of products in float64 (no BLAS: its order of summation depends on the threads)."""
-    a, b = a.reshape(-1), b.reshape(-1)
-    return float(
-        sum(
-            np.multiply(a[begin : begin + CHUNK], b[begin : begin + CHUNK], dtype=np.float64).sum()
-            for begin in range(0, len(a), CHUNK)
-        )
-    )
+    return float(_dot(np.ascontiguousarray(a).reshape(-1), np.ascontiguousarray(b).reshape(-1)))
+
+
+@compiled
+def _dot(a, b):
+    s, t, u, v = 0.0, 0.0, 0.0, 0.0
+    fours = len(a) // 4 * 4
+    for i in range(0, fours, 4):
+        s += np.float64(a[i]) * np.float64(b[i])
+        t += np.float64(a[i + 1]) * np.float64(b[i + 1])
+        u += np.float64(a[i + 2]) * np.float64(b[i + 2])
+        v += np.float64(a[i + 3]) * np.float64(b[i + 3])
+    for i in range(fours, len(a)):
+        s += np.float64(a[i]) * np.float64(b[i])
+    return (s + t) + (u + v)
+
+
+def _add(factor: float, vector: np.ndarray, out: np.ndarray) -> None:
+    """Add a multiple to `out`, in float32, without a temporary."""
+    _add_flat(np.float32(factor), vector.reshape(-1), out.reshape(-1))
+
+
+@compiled
+def _add_flat(factor, vector, out):
+    for i in range(len(out)):
+        out[i] += factor * vector[i]
 
 
 def _two_loops(
@@ -67,7 +88,7 @@ def _two_loops(
     factors = []
     for moved, turned, curvature in reversed(memory):
         factor = dot(moved, result) / curvature
-        result -= np.float32(factor) * turned
+        _add(-factor, turned, result)
         factors.append(factor)
     if memory:
         _, turned, curvature = memory[-1]
@@ -75,5 +96,5 @@ def _two_loops(
     else:
         result *= np.float32(first_step)
     for (moved, turned, curvature), factor in zip(memory, reversed(factors), strict=True):
-        result += np.float32(factor - dot(turned, result) / curvature) * moved
+        _add(factor - dot(turned, result) / curvature, moved, result)
     return result

@@ -64,10 +64,13 @@ class QuadraticProblem:
         """Labelled pixels of all levels: the divisor that turns sums into means."""
         return max(float(self.pixels.sum(dtype=np.float64)), 1.0)
 
-    def hessian_product(self, features: Float32[np.ndarray, "N 3 D"]) -> Float32[np.ndarray, "N 3 D"]:
-        """Half the Hessian of the summed losses, times the features."""
+    def hessian_product(
+        self, features: Float32[np.ndarray, "N 3 D"], curved: Float32[np.ndarray, "N 3 D"] | None = None
+    ) -> Float32[np.ndarray, "N 3 D"]:
+        """Half the Hessian of the summed losses, times the features; `curved` is G F if it is known."""
         language, clustering, ridge = self.weights
-        out = np.float32(language + clustering) * self.quadratic.product(features)
+        curved = self.quadratic.product(features) if curved is None else curved
+        out = np.float32(language + clustering) * curved
         if clustering:
             means = self.masks.means(features)
             out -= np.float32(clustering) * self.masks.spread(self.pixels[:, None] * means)
@@ -84,8 +87,8 @@ class QuadraticProblem:
 
         Both losses are small differences of large sums, so everything is summed in float64.
         """
+        form = self.quadratic.form(features)
         features = features.astype(np.float64)
-        form = dot(features, self.quadratic.product(features))
         means = self.masks.means(features)
         pixels = self.pixels[:, None].astype(np.float64)
         linear = float((pixels * means * self.latents).sum())
@@ -100,9 +103,14 @@ class QuadraticProblem:
 
 
 def conjugate_gradient(
-    problem: QuadraticProblem, start: Float32[np.ndarray, "N 3 D"], steps: int
+    problem: QuadraticProblem,
+    start: Float32[np.ndarray, "N 3 D"],
+    steps: int,
+    curved: Float32[np.ndarray, "N 3 D"] | None = None,
 ) -> np.ndarray:
     """Minimise the quadratic part in a few steps, preconditioned by the visible mass.
+
+    `curved` is G times the start if it is known.
 
     Levels and channels do not interact, so each has its own step size. Dot products are summed in
     float64 in a fixed order.
@@ -110,16 +118,16 @@ def conjugate_gradient(
     scale = problem.mass[:, :, None] * np.float32(max(sum(problem.weights), 1e-12))
     inverse = np.where(scale > 0, 1 / np.maximum(scale, 1e-20), 0).astype(np.float32)
     features = start.copy()
-    residual = problem.right_side() - problem.hessian_product(features)
+    residual = problem.right_side() - problem.hessian_product(features, curved)
     step = inverse * residual
     direction = step.copy()
     power = _channel_dot(residual, step)
     for _ in range(steps):
-        curved = problem.hessian_product(direction)
-        curvature = _channel_dot(direction, curved)
+        turned = problem.hessian_product(direction)
+        curvature = _channel_dot(direction, turned)
         length = _ratio(power, curvature)
         features += length * direction
-        residual -= length * curved
+        residual -= length * turned
         step = inverse * residual
         before, power = power, _channel_dot(residual, step)
         direction = (

@@ -36,13 +36,14 @@ def solve_field(
         return value + contrastive, gradient * inverse_root
 
     lifted = problem.lifted
+    at_lift = problem.quadratic.product(lifted)
     report: dict[str, object] = {
         "lifted": problem.terms(lifted) | contrast.values(lifted),
-        "gradient_norms": gradient_norms(problem, contrast, inverse_root),
+        "gradient_norms": gradient_norms(problem, contrast, inverse_root, at_lift),
     }
     features = lifted
     if settings.cg_steps and any(problem.weights):
-        features = conjugate_gradient(problem, lifted, settings.cg_steps)
+        features = conjugate_gradient(problem, lifted, settings.cg_steps, at_lift)
         report["after_cg"] = problem.terms(features) | contrast.values(features)
     if any(weights) and settings.lbfgs_steps:
         first_step = total / (2 * max(sum(problem.weights), 1e-3))
@@ -52,11 +53,15 @@ def solve_field(
 
 
 def gradient_norms(
-    problem: QuadraticProblem, contrast: Contrast, inverse_root: Float32[np.ndarray, "N 3 1"]
+    problem: QuadraticProblem,
+    contrast: Contrast,
+    inverse_root: Float32[np.ndarray, "N 3 1"],
+    curved: Float32[np.ndarray, "N 3 D"],
 ) -> dict[str, float]:
-    """Gradient norm of each unweighted loss at the lifted average, in mass-scaled variables."""
+    """Gradient norm of each unweighted loss at the lift, whose product with G is `curved`, in mass-scaled
+    variables.
+    """
     lifted, factor = problem.lifted, np.float32(2 / problem.total_pixels)
-    curved = problem.quadratic.product(lifted)
     means = problem.masks.means(lifted)
     gradients = {
         "language": factor * (curved - problem.masks.spread(problem.pixels[:, None] * problem.latents)),

@@ -145,6 +145,11 @@ class Plan:
         """Threads of a job: with at least as many scenes as cores, one each keeps all cores busy."""
         return max(1, cores // min(len(self.scenes), cores))
 
+    def variant_threads(self, cores: int) -> int:
+        """Threads of a job of one variant: the fields of a single scene too are solved side by side."""
+        fields = sum(str(each.output).endswith("field.safetensors") for each in self.wanted())
+        return max(1, cores // min(max(fields, 1), cores))
+
     def datasets(self) -> str:
         """Regular expression of the wildcard `dataset`."""
         return any_of(row.dataset for row in self.rows)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Bool, Float32, Int64, UInt8
 
 from hilsplat.base.levels import Level
 
@@ -64,8 +64,12 @@ class PackedMasks:
 
     def get(self, key: tuple) -> np.ndarray:
         """Unpack a mask."""
-        height, width = self.size_hw
-        return np.unpackbits(self.bits[key], count=height * width).astype(bool).reshape(height, width)
+        return unpacked(self.bits[key], self.size_hw)
+
+
+def unpacked(bits: UInt8[np.ndarray, " B"], size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    """The mask that `numpy.packbits` packed."""
+    return np.unpackbits(bits, count=size_hw[0] * size_hw[1]).astype(bool).reshape(size_hw)
 
 
 class Selections:
@@ -74,6 +78,7 @@ class Selections:
     def __init__(self, scene: QueryableScene) -> None:
         self.scene = scene
         self._of: dict[tuple, np.ndarray] = {}
+        self._masks: dict[tuple[str, bytes], np.ndarray] = {}
 
     def nodes(self, path: tuple[str, ...], level: Level | None, view: str | None) -> np.ndarray:
         """Ids of the nodes that answer a text, or the last text of a path.
@@ -89,7 +94,13 @@ class Selections:
         return self._of[key]
 
     def mask(self, view: str, ids: np.ndarray, size_hw: tuple[int, int]) -> np.ndarray:
-        """Union of some nodes in a view; no nodes give an empty mask."""
+        """Union of some nodes in a view; no nodes give an empty mask.
+
+        Protocols ask for the same nodes again and again: each union is rendered once, and kept in bits.
+        """
         if len(ids) == 0:
             return np.zeros(size_hw, dtype=bool)
-        return np.asarray(self.scene.node_masks(view, ids)).astype(bool)
+        key = (view, ids.tobytes())
+        if key not in self._masks:
+            self._masks[key] = np.packbits(np.asarray(self.scene.node_masks(view, ids)).astype(bool))
+        return unpacked(self._masks[key], size_hw)

@@ -5,6 +5,7 @@ levels only the texts of whole objects are asked, because those benchmarks do no
 protocols then carry `wholes`.
 """
 
+import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -14,7 +15,12 @@ from PIL import Image
 
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.metrics.localization import peak_points
-from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
+from hilsplat.evaluate.metrics.relevancy_rule import (
+    Border,
+    RelevancyRule,
+    SmoothedRelevancy,
+    relevancy_mask,
+)
 from hilsplat.evaluate.protocols.answers import ViewMaps
 from hilsplat.evaluate.protocols.cards import (
     LERF_LANGSPLAT,
@@ -71,6 +77,15 @@ class FlatProtocols:
         if query is None:
             return
         flat = replace(query, level=None)
+
+        @functools.cache
+        def smoothed_by(filter_px: int, mix: bool, border: Border) -> SmoothedRelevancy:
+            """Most rules smooth alike, and that takes longer than the rest of them."""
+            return SmoothedRelevancy.of(relevancy, RelevancyRule(filter_px, mix, border=border))
+
+        def smoothed_for(rule: RelevancyRule) -> SmoothedRelevancy:
+            return smoothed_by(rule.filter_px, rule.mix, rule.border)
+
         for card in self.cards:
             label = card.labelled(self.words)
             if card in MASKS:
@@ -78,11 +93,11 @@ class FlatProtocols:
                 if mask is None:
                     rule = LERF_LANGSPLAT.rule
                     assert rule is not None
-                    mask, _ = relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)
+                    mask, _ = relevancy_mask(smoothed_for(rule), None, rule)
                 for row in measure_masks(card, method, {flat.text: mask}, {flat.text: flat.truth}):
                     yield replace(row, protocol=label)
             elif card.rule is not None:
-                smoothed = SmoothedRelevancy.of(relevancy, card.rule)
+                smoothed = smoothed_for(card.rule)
                 other = dict(card.united).get(flat.text)
                 united = None if other is None else maps.relevancy((other,))[0]
                 mask, _ = relevancy_mask(smoothed, None, card.rule, united)

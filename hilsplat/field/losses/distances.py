@@ -1,8 +1,13 @@
-"""Shared by the instance and part losses: softened distances, ancestors, cosines."""
+"""Shared by the instance and part losses: softened distances, ancestors, cosines, and their gradients.
+
+The losses see a few dozen masks at a time, so their gradients are written out in NumPy: torch takes longer to
+start than a solve spends on them. Autograd is their reference in the tests.
+"""
+
+from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float, Int32, Int64
-from torch import Tensor
+from jaxtyping import Float, Float64, Int32, Int64
 
 from hilsplat.base.levels import NONE
 
@@ -13,24 +18,30 @@ SHORTEST = 1e-6
 """Added in quadrature to every length in a denominator, so that the cosine of a zero vector is zero."""
 
 
-def soft_distances(means: Float[Tensor, "M D"]) -> Float[Tensor, "M M"]:
-    """Pairwise sqrt(|m_i - m_j|^2 + SOFTENING^2).
+def log_distance_loss(
+    means: Float[np.ndarray, "M D"], log_wanted: Float[np.ndarray, "M M"]
+) -> tuple[float, Float64[np.ndarray, "M D"]]:
+    """Mean over ordered pairs i != j of the squared difference of log distances, and its gradient.
 
-    Squares are computed from products: M x M numbers instead of M x M x D. In float64 the cancellation error
-    is far below the softening.
+    The distance is sqrt(|m_i - m_j|^2 + SOFTENING^2). Squares are computed from products: M x M numbers
+    instead of M x M x D. In float64 the cancellation error is far below the softening.
+
+    Args:
+        means: at least two rows.
+        log_wanted: natural logarithm of the distance that each pair should have.
     """
-    centred = means - means.detach().mean(0)
-    squares = centred.square().sum(-1)
+    rows = len(means)
+    centred = means - means.mean(axis=0)
+    squares = np.square(centred).sum(axis=1)
     apart = squares[:, None] + squares[None] - 2 * centred @ centred.T
-    return (apart.clamp(min=0) + SOFTENING**2).sqrt()
-
-
-def off_diagonal_mean(values: Float[Tensor, "M M"]) -> Float[Tensor, ""]:
-    """Mean over ordered pairs i != j; 0 for fewer than two rows."""
-    rows = len(values)
-    if rows < 2:
-        return values.sum() * 0
-    return (values.sum() - values.diagonal().sum()) / (rows * (rows - 1))
+    softened = np.maximum(apart, 0) + SOFTENING**2
+    residual = 0.5 * np.log(softened) - log_wanted
+    np.fill_diagonal(residual, 0)
+    pairs = rows * (rows - 1)
+    by_apart = np.where(apart >= 0, residual / softened, 0) / pairs
+    both = by_apart + by_apart.T
+    gradient = 2 * (both.sum(axis=1)[:, None] * centred - both @ centred)
+    return float(np.square(residual).sum() / pairs), gradient
 
 
 def common_ancestor_depth(parent: Int32[np.ndarray, " M"]) -> Int64[np.ndarray, "M M"]:
@@ -58,19 +69,34 @@ def common_ancestor_depth(parent: Int32[np.ndarray, " M"]) -> Int64[np.ndarray, 
     return (chains @ chains.T).astype(np.int64)
 
 
+Pullback = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Gradient by the similarities (A, B) -> gradients by anchors (A, D) and others (B, D)."""
+
+
 def similarity_without_parent(
-    anchors: Float[Tensor, "A D"], others: Float[Tensor, "B D"], parent: Float[Tensor, "A D"]
-) -> Float[Tensor, "A B"]:
+    anchors: Float[np.ndarray, "A D"], others: Float[np.ndarray, "B D"], parent: Float[np.ndarray, "A D"]
+) -> tuple[Float64[np.ndarray, "A B"], Pullback]:
     """s_p of Eq. 4: cosine of two mask means after the anchor's parent mean is subtracted from both.
 
     Departs: Eq. 4 prints index j twice in the denominator; we take i and j, so that s_p is a cosine. We
     read its parent mean, which has no index, as the anchor's, for positives and negatives alike. The
-    parent is detached: parts move relative to their whole, not the whole relative to its parts.
+    parent gets no gradient: parts move relative to their whole, not the whole relative to its parts.
     """
-    parent = parent.detach()
     own = anchors - parent
-    length = (own.square().sum(-1, keepdim=True) + SHORTEST**2).sqrt()
-    along = own @ others.T - (own * parent).sum(-1, keepdim=True)
+    square = np.square(own).sum(axis=1, keepdims=True) + SHORTEST**2
+    along = own @ others.T - (own * parent).sum(axis=1, keepdims=True)
     # |other - parent|^2 from products: A x B numbers instead of A x B x D.
-    squares = others.square().sum(-1) - 2 * parent @ others.T + parent.square().sum(-1, keepdim=True)
-    return along / length / (squares.clamp(min=0) + SHORTEST**2).sqrt()
+    far = np.square(others).sum(axis=1) - 2 * parent @ others.T + np.square(parent).sum(axis=1, keepdims=True)
+    softened = np.maximum(far, 0) + SHORTEST**2
+    scale = 1 / np.sqrt(square * softened)
+    similarity = along * scale
+
+    def pull_back(by: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        by_along, shrinking = by * scale, by * similarity
+        by_far = np.where(far >= 0, -0.5 * shrinking / softened, 0)
+        by_own = by_along @ others - by_along.sum(axis=1, keepdims=True) * parent
+        by_own -= shrinking.sum(axis=1, keepdims=True) / square * own
+        by_others = by_along.T @ own + 2 * (by_far.sum(axis=0)[:, None] * others - by_far.T @ parent)
+        return by_own, by_others
+
+    return similarity, pull_back

@@ -1,20 +1,18 @@
-"""The part-wise loss L_part (paper, Eq. 4 and 5) in two readings."""
+"""The part-wise loss L_part (paper, Eq. 4 and 5) in two readings, with its gradient."""
 
-import torch
-from jaxtyping import Float, Int
-from torch import Tensor
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int
 
+from hilsplat.base.levels import NONE
 from hilsplat.field.losses.distances import similarity_without_parent
-
-NO_PARENT = -1
 
 
 def part_loss_literal(
-    means: Float[Tensor, "M D"],
-    parent: Int[Tensor, " M"],
-    parent_means: Float[Tensor, "M D"],
+    means: Float[np.ndarray, "M D"],
+    parent: Int[np.ndarray, " M"],
+    parent_means: Float[np.ndarray, "M D"],
     tau: float,
-) -> Float[Tensor, ""]:
+) -> tuple[float, Float64[np.ndarray, "M D"]]:
     """L_part of one view and level as printed (Eq. 5): siblings attract, children of others repel.
 
     The denominator holds the negatives alone, as printed. This pulls siblings together ("bear nose" and
@@ -31,30 +29,32 @@ def part_loss_literal(
         tau: temperature.
 
     Returns:
-        mean over anchors; 0 if there is none.
+        mean over anchors, 0 if there is none; and its gradient by the means.
     """
-    similarity = similarity_without_parent(means, means, parent_means) / tau
-    has_parent = parent != NO_PARENT
+    similarity, pull_back = similarity_without_parent(means, means, parent_means)
+    has_parent = parent != NONE
     both = has_parent[:, None] & has_parent[None]
     same = parent[:, None] == parent[None]
-    itself = torch.eye(len(means), dtype=torch.bool, device=means.device)
-    positive, negative = both & same & ~itself, both & ~same
-    anchors = positive.any(1) & negative.any(1)
-    if not anchors.any():
-        return means.sum() * 0
-    similarity, positive, negative = similarity[anchors], positive[anchors], negative[anchors]
-    repulsion = similarity.masked_fill(~negative, -torch.inf).logsumexp(1)
-    attraction = (similarity * positive).sum(1) / positive.sum(1)
-    return (repulsion - attraction).mean()
+    positive, negative = both & same & ~np.eye(len(means), dtype=bool), both & ~same
+    anchors = np.flatnonzero(positive.any(axis=1) & negative.any(axis=1))
+    if not len(anchors):
+        return 0.0, np.zeros(means.shape)
+    scaled, positive, negative = similarity[anchors] / tau, positive[anchors], negative[anchors]
+    repulsion, shares = log_sum_exp(np.where(negative, scaled, -np.inf))
+    attracting = positive / positive.sum(axis=1, keepdims=True)
+    by_similarity = np.zeros(similarity.shape)
+    by_similarity[anchors] = (shares - attracting) / (len(anchors) * tau)
+    by_anchors, by_others = pull_back(by_similarity)
+    return float((repulsion - (scaled * attracting).sum(axis=1)).mean()), by_anchors + by_others
 
 
 def part_loss_disentangle(
-    half: Float[Tensor, "M D"],
-    other_half: Float[Tensor, "M D"],
-    has_parent: Int[Tensor, " M"],
-    parent_means: Float[Tensor, "M D"],
+    half: Float[np.ndarray, "M D"],
+    other_half: Float[np.ndarray, "M D"],
+    has_parent: Bool[np.ndarray, " M"],
+    parent_means: Float[np.ndarray, "M D"],
     tau: float,
-) -> Float[Tensor, ""]:
+) -> tuple[float, Float64[np.ndarray, "M D"], Float64[np.ndarray, "M D"]]:
     """L_part of one view and level as its prose describes it: parts of one object are separated.
 
     Departs: the positive of a mask is the other random half of its own pixels; negatives are the other
@@ -64,16 +64,32 @@ def part_loss_disentangle(
     Args:
         half: mean feature over a random half of each mask's pixels.
         other_half: mean over the remaining pixels.
-        has_parent: 1 for masks with a parent, which are the anchors.
+        has_parent: masks with a parent, which are the anchors.
         parent_means: mean feature of each mask's parent (any value for orphans).
         tau: temperature.
 
     Returns:
-        mean over anchors; 0 if there is none, or no second mask.
+        mean over anchors, 0 if there is none, or no second mask; and its gradients by the halves.
     """
-    anchors = torch.nonzero(has_parent).squeeze(1)
+    by_half = np.zeros(half.shape)
+    anchors = np.flatnonzero(has_parent)
     if not len(anchors) or len(half) < 2:
-        return half.sum() * 0
-    similarity = similarity_without_parent(half[anchors], other_half, parent_means[anchors]) / tau
-    positive = similarity[torch.arange(len(anchors)), anchors]
-    return (similarity.logsumexp(1) - positive).mean()
+        return 0.0, by_half, np.zeros(half.shape)
+    similarity, pull_back = similarity_without_parent(half[anchors], other_half, parent_means[anchors])
+    scaled = similarity / tau
+    total, shares = log_sum_exp(scaled)
+    own = np.arange(len(anchors)), anchors
+    loss = float((total - scaled[own]).mean())
+    shares[own] -= 1
+    by_half[anchors], by_other = pull_back(shares / (len(anchors) * tau))
+    return loss, by_half, by_other
+
+
+def log_sum_exp(
+    values: Float64[np.ndarray, "A B"],
+) -> tuple[Float64[np.ndarray, " A"], Float64[np.ndarray, "A B"]]:
+    """Logarithm of each row's sum of exponentials, and its gradient: their shares of the sum."""
+    most = values.max(axis=1, keepdims=True)
+    powers = np.exp(values - most)
+    total = powers.sum(axis=1, keepdims=True)
+    return (np.log(total) + most)[:, 0], powers / total

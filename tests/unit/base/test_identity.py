@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from hilsplat.base import identity
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.identity import code_digest, reached
 from hilsplat.datasets.registry import DATASETS
@@ -335,3 +336,37 @@ def test_a_command_does_nothing_for_its_stage_but_call_the_function_that_is_dige
         expected = STAGES[name]
         assert places == {expected} or {place.partition(":")[0] for place in places} == {expected}, name
     assert set(STAGES) - set(calls) == {"efficiency", "models"}
+
+
+# ---- digests kept beside the package ------------------------------------------------------------------
+
+
+def forget() -> None:
+    """Forget what this process knows, as a new one would."""
+    for cached in (identity._digest, identity._state, identity._module, identity._path):
+        cached.cache_clear()
+
+
+def test_a_digest_is_found_once_until_a_module_changes(tmp_path, monkeypatch):
+    root = package(tmp_path, **BASE)
+    first = code_digest("hilsplat.a:g", root=root)
+    forget()
+    with monkeypatch.context() as patch:
+        patch.setattr(identity, "_digest_of", None)  # a second process does not look again
+        assert code_digest("hilsplat.a:g", root=root) == first
+    forget()
+    (root / "b.py").write_text(BASE["b"].replace("ONE = 1", "ONE = 100"))
+    changed = code_digest("hilsplat.a:g", root=root)
+    assert changed != first
+    forget()
+    (kept,) = (root / "__pycache__").glob("identity.*.json")
+    kept.write_text("damaged")
+    assert code_digest("hilsplat.a:g", root=root) == changed
+    forget()
+
+
+def test_a_package_that_may_not_be_written_to_is_digested_all_the_same(tmp_path):
+    root = package(tmp_path, **BASE)
+    (root / "__pycache__").write_text("no folder")
+    other = package(tmp_path / "other", **BASE)
+    assert code_digest("hilsplat.a:g", root=root) == code_digest("hilsplat.a:g", root=other)

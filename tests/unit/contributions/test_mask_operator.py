@@ -6,7 +6,13 @@ import scipy.sparse as sp
 
 from hilsplat.base.device import compute_device, cuda_missing
 from hilsplat.contributions.cuda_algebra import DeviceMasks, DeviceQuadratic
-from hilsplat.contributions.mask_operator import MaskOperator, lifted_average, lifted_median
+from hilsplat.contributions.mask_operator import (
+    MaskOperator,
+    _means,
+    _spread,
+    lifted_average,
+    lifted_median,
+)
 from hilsplat.contributions.quadratic import StackedWeights
 from hilsplat.contributions.quadratic_builder import GramBuilder
 from hilsplat.semantic_tree.evidence import mask_evidence
@@ -38,6 +44,20 @@ def test_means_and_spread_equal_the_dense_products():
         assert spread[:, index] == pytest.approx(A[rows].T @ values[rows], abs=1e-12)
     # adjoint: <A F, x> = <F, A' x>
     assert (means * values).sum() == pytest.approx((features * spread).sum(), rel=1e-12)
+
+
+@pytest.mark.parametrize("channels", [16, 32])
+def test_sixteen_channels_at_a_time_give_the_bytes_of_the_plain_loops(channels):
+    operator, _, _ = random_operator()
+    rng = np.random.default_rng(2)
+    features = rng.normal(size=(30, 3, channels)).astype(np.float32)
+    values = rng.normal(size=(14, channels)).astype(np.float32)
+    A = operator.indptr, operator.indices, operator.data, operator.level_index
+    means, spread = np.zeros_like(values), np.zeros_like(features)
+    _means(*A, features, means)
+    _spread(*A, values, spread)
+    assert operator.means(features).tobytes() == means.tobytes()
+    assert operator.spread(values).tobytes() == spread.tobytes()
 
 
 def one_gaussian(latents: list[list[float]], weights: list[float]):

@@ -14,7 +14,7 @@ from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.quadratic import StackedWeights
 from hilsplat.contributions.stage import painted_indicator
 from hilsplat.field.autoencoder import run_autoencoder
-from hilsplat.field.contrast import Contrast, ViewRelations, distinct, instance_term, part_term
+from hilsplat.field.contrast import Contrast, ViewRelations, distinct
 from hilsplat.field.field import run_field
 from hilsplat.field.language_field import LanguageField
 from hilsplat.field.losses.latent_regression import latent_regression_loss
@@ -26,6 +26,7 @@ from hilsplat.methods.method import MethodInputs
 from hilsplat.semantic_tree.tree import run_semantic_tree
 from hilsplat.settings import AutoencoderSettings, FieldSettings, ReferenceSettings, SemanticTreeSettings
 from tests.unit.field.clustering import clustering_loss
+from tests.unit.field.torch_losses import instance_term, part_term
 from tests.unit.round_gaussians import round_gaussians
 
 PIXELS, GAUSSIANS, CHANNELS = 60, 12, 2
@@ -61,13 +62,12 @@ class Toy:
         self.features = rng.normal(size=(GAUSSIANS, 3, CHANNELS)).astype(np.float32)
 
     def contrast(self, settings: FieldSettings) -> Contrast:
-        parent = torch.tensor([-1] * 3 + [0, 0, 1] + [3, 4, 4])
-        depth = torch.zeros(9, 9, dtype=torch.long)
+        parent = np.array([-1] * 3 + [0, 0, 1] + [3, 4, 4])
         relations = ViewRelations(
-            torch.arange(9),
-            depth,
-            torch.from_numpy(self.level.astype(np.int64)),
-            (torch.tensor([3, 4, 5]), torch.tensor([6, 7, 8])),
+            np.arange(9),
+            np.zeros((9, 9), np.int64),
+            self.level.astype(np.int64),
+            (np.array([3, 4, 5]), np.array([6, 7, 8])),
             (parent[3:6], parent[6:9]),
         )
         half = MaskOperator.of(sp.csr_matrix(self.A_half), self.level)

@@ -8,19 +8,20 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilsplat.field.losses.distances import (
-    SOFTENING,
-    common_ancestor_depth,
-    similarity_without_parent,
-    soft_distances,
-)
+from hilsplat.field.losses.distances import SOFTENING, common_ancestor_depth, similarity_without_parent
 from hilsplat.field.losses.instance import (
     instance_loss_literal,
     instance_loss_tree,
 )
 from hilsplat.field.losses.latent_regression import latent_regression_loss
 from hilsplat.field.losses.part import part_loss_disentangle, part_loss_literal
+from tests.unit.field import torch_losses
 from tests.unit.field.clustering import clustering_loss
+
+LOSSES = {
+    each.__name__: each
+    for each in (instance_loss_literal, instance_loss_tree, part_loss_literal, part_loss_disentangle)
+}
 
 
 def doubles(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -75,16 +76,18 @@ def test_depth_of_common_ancestors():
 
 
 def test_distances_are_softened_at_zero():
-    assert soft_distances(torch.zeros(2, 3)).flatten().tolist() == pytest.approx([SOFTENING] * 4)
+    loss, gradient = instance_loss_tree(np.zeros((2, 3)), np.zeros((2, 2), np.int64), 10.0)
+    assert loss == pytest.approx(math.log(SOFTENING) ** 2)
+    assert not gradient.any()
 
 
 @pytest.mark.parametrize(("levels", "distance"), [((1, 1), 1.0), ((1, 2), 0.1), ((1, 3), 0.01)])
 def test_literal_instance_loss_is_least_at_omega_to_the_minus_level_difference(levels, distance):
-    level = torch.tensor(levels)
+    level = np.array(levels)
 
     def loss(d: float) -> float:
-        means = torch.tensor([[0.0], [math.sqrt(d**2 - SOFTENING**2)]], dtype=torch.float64)
-        return instance_loss_literal(means, level, 10.0).item()
+        means = np.array([[0.0], [math.sqrt(d**2 - SOFTENING**2)]])
+        return instance_loss_literal(means, level, 10.0)[0]
 
     assert loss(distance) == pytest.approx(0, abs=1e-9)
     assert loss(distance * 2) == pytest.approx(math.log(2) ** 2, rel=1e-6)
@@ -92,81 +95,99 @@ def test_literal_instance_loss_is_least_at_omega_to_the_minus_level_difference(l
 
 
 def test_tree_instance_loss_puts_relatives_close_whatever_their_level():
-    depth = torch.tensor([[1, 0], [0, 1]])  # unrelated: distance 1
-    means = torch.tensor([[0.0], [1.0]], dtype=torch.float64)
-    assert instance_loss_tree(means, depth, 10.0).item() == pytest.approx(0, abs=1e-9)
-    related = torch.tensor([[1, 1], [1, 2]])  # a part and its whole: distance 0.1
-    assert instance_loss_tree(means, related, 10.0).item() == pytest.approx(math.log(10) ** 2, rel=1e-5)
+    depth = np.array([[1, 0], [0, 1]])  # unrelated: distance 1
+    means = np.array([[0.0], [1.0]])
+    assert instance_loss_tree(means, depth, 10.0)[0] == pytest.approx(0, abs=1e-9)
+    related = np.array([[1, 1], [1, 2]])  # a part and its whole: distance 0.1
+    assert instance_loss_tree(means, related, 10.0)[0] == pytest.approx(math.log(10) ** 2, rel=1e-5)
 
 
 @given(st.permutations(range(5)))
 def test_instance_losses_ignore_the_order_of_masks(order):
-    means = doubles(5, 3)
-    depth = torch.tensor(common_ancestor_depth(np.array([-1, 0, 0, 1, -1], dtype=np.int32)))
-    level = torch.tensor([1, 2, 2, 3, 1])
-    order = torch.tensor(order)
+    means = doubles(5, 3).numpy()
+    depth = common_ancestor_depth(np.array([-1, 0, 0, 1, -1], dtype=np.int32))
+    level = np.array([1, 2, 2, 3, 1])
+    order = np.array(order)
     same = depth[order][:, order]
     for before, after in (
         (instance_loss_tree(means, depth, 10.0), instance_loss_tree(means[order], same, 10.0)),
         (instance_loss_literal(means, level, 10.0), instance_loss_literal(means[order], level[order], 10.0)),
     ):
-        assert after.item() == pytest.approx(before.item())
+        assert after[0] == pytest.approx(before[0])
 
 
 def test_similarity_subtracts_the_anchors_parent():
-    anchors, parent = torch.tensor([[2.0, 1.0]]), torch.tensor([[1.0, 1.0]])
-    others = torch.tensor([[1.0, 3.0], [0.0, 1.0], [5.0, 1.0]])
+    anchors, parent = np.array([[2.0, 1.0]]), np.array([[1.0, 1.0]])
+    others = np.array([[1.0, 3.0], [0.0, 1.0], [5.0, 1.0]])
     # anchor - parent = (1, 0); others - parent = (0, 2), (-1, 0), (4, 0)
-    assert similarity_without_parent(anchors, others, parent)[0].tolist() == pytest.approx([0, -1, 1])
+    assert similarity_without_parent(anchors, others, parent)[0][0].tolist() == pytest.approx([0, -1, 1])
 
 
 def test_literal_part_loss_matches_hand_computation():
     # parents at the origin: cosines of the masks themselves
-    means = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]], dtype=torch.float64)
-    parent = torch.tensor([7, 7, 8])
+    means = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
+    parent = np.array([7, 7, 8])
     # anchors 0 and 1 (mask 2 has no sibling): positive cosine 0; negative cosines -1 and 0.
     # -log(exp(0) / exp(-1 / 0.5)) = -2, and -log(exp(0) / exp(0)) = 0; mean -1
-    loss = part_loss_literal(means, parent, torch.zeros_like(means), tau=0.5)
-    assert loss.item() == pytest.approx(-1.0)
+    loss, _ = part_loss_literal(means, parent, np.zeros_like(means), tau=0.5)
+    assert loss == pytest.approx(-1.0)
 
 
 def test_literal_part_loss_leaves_orphans_out():
-    means = doubles(4, 3)
-    parents = torch.zeros(4, 3, dtype=torch.float64)
-    with_orphan = part_loss_literal(means, torch.tensor([7, 7, 8, -1]), parents, 0.1)
-    without = part_loss_literal(means[:3], torch.tensor([7, 7, 8]), parents[:3], 0.1)
-    assert with_orphan.item() == pytest.approx(without.item())
-    assert part_loss_literal(means, torch.tensor([-1] * 4), parents, 0.1).item() == 0
+    means = doubles(4, 3).numpy()
+    parents = np.zeros((4, 3))
+    with_orphan = part_loss_literal(means, np.array([7, 7, 8, -1]), parents, 0.1)
+    without = part_loss_literal(means[:3], np.array([7, 7, 8]), parents[:3], 0.1)
+    assert with_orphan[0] == pytest.approx(without[0])
+    assert part_loss_literal(means, np.array([-1] * 4), parents, 0.1)[0] == 0
 
 
 def test_disentangling_part_loss_matches_hand_computation():
-    half = torch.tensor([[1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)
-    parents = torch.zeros(2, 2, dtype=torch.float64)
+    half = np.array([[1.0, 0.0], [0.0, 1.0]])
+    parents = np.zeros((2, 2))
     # each half meets its twin (cosine 1) and one other mask (cosine 0): log(1 + exp(-1 / 0.5))
-    loss = part_loss_disentangle(half, half.clone(), torch.tensor([1, 1]), parents, tau=0.5)
-    assert loss.item() == pytest.approx(math.log(1 + math.exp(-2)))
+    loss, _, _ = part_loss_disentangle(half, half.copy(), np.array([True, True]), parents, tau=0.5)
+    assert loss == pytest.approx(math.log(1 + math.exp(-2)))
 
 
-def test_the_parent_is_no_target_of_the_part_loss():
-    parent_means = doubles(3, 3, seed=2).requires_grad_()
-    means = doubles(3, 3).requires_grad_()
-    loss = part_loss_literal(means, torch.tensor([0, 0, 1]), parent_means, 0.1)
-    (gradient,) = torch.autograd.grad(loss, parent_means, allow_unused=True)
-    assert gradient is None
+LEVEL = np.array([1, 2, 2, 3, 1])
+DEPTH = common_ancestor_depth(np.array([-1, 0, 0, 1, -1], dtype=np.int32))
+PARENT, HAS = np.array([0, 0, 1, 1, -1]), np.array([True, True, False, True, False])
+ANCHORS_ALONE = np.array([0, 1, 2, 3, -1])  # no mask has a sibling
+
+
+@pytest.mark.parametrize(
+    "name, own",
+    [
+        ("instance_loss_literal", (LEVEL, 10.0)),
+        ("instance_loss_tree", (DEPTH, 10.0)),
+        ("part_loss_literal", (PARENT, doubles(5, 3, seed=3).numpy(), 0.1)),
+        ("part_loss_literal", (ANCHORS_ALONE, doubles(5, 3, seed=3).numpy(), 0.1)),
+        ("part_loss_disentangle", (doubles(5, 3, seed=4).numpy(), HAS, doubles(5, 3, seed=3).numpy(), 0.1)),
+        ("part_loss_disentangle", (doubles(5, 3, seed=4).numpy(), ~HAS & HAS, doubles(5, 3).numpy(), 0.1)),
+    ],
+)
+@pytest.mark.parametrize("spread", [1.0, 1e-4])  # far, and nearer than the softening
+def test_losses_and_gradients_are_those_of_autograd(name, own, spread):
+    means = spread * doubles(5, 3).numpy()
+    means[3] = means[0]  # distance zero
+    loss, *gradients = LOSSES[name](means, *own)
+    tensors = [torch.tensor(each) if isinstance(each, np.ndarray) else each for each in (means, *own)]
+    moved = [each.requires_grad_() for each in tensors if torch.is_tensor(each) and each.is_floating_point()]
+    expected = getattr(torch_losses, name)(*tensors)
+    assert loss == pytest.approx(expected.item(), rel=1e-9)
+    by_autograd = torch.autograd.grad(expected, moved, materialize_grads=True)
+    for gradient, wanted in zip(gradients, by_autograd, strict=False):
+        assert gradient == pytest.approx(wanted.numpy(), rel=1e-6, abs=1e-6 / spread)
 
 
 def test_gradients_agree_with_finite_differences():
-    means, parents = doubles(5, 3).requires_grad_(), doubles(5, 3, seed=3)
-    depth = torch.tensor(common_ancestor_depth(np.array([-1, 0, 0, 1, -1], dtype=np.int32)))
-    level, parent = torch.tensor([1, 2, 2, 3, 1]), torch.tensor([0, 0, 1, 1, -1])
-    has = torch.tensor([1, 1, 0, 1, 0])
-    other = doubles(5, 3, seed=4)
-    labels = torch.tensor([[0, 0, 1, -1, 1]])
+    means, labels, other = (
+        doubles(5, 3).requires_grad_(),
+        torch.tensor([[0, 0, 1, -1, 1]]),
+        doubles(5, 3, seed=4),
+    )
     for loss in (
-        lambda x: instance_loss_literal(x, level, 10.0),
-        lambda x: instance_loss_tree(x, depth, 10.0),
-        lambda x: part_loss_literal(x, parent, parents, 0.5),
-        lambda x: part_loss_disentangle(x, other, has, parents, 0.5),
         lambda x: clustering_loss(x[None], labels),
         lambda x: latent_regression_loss(x[None], labels, other),
     ):

@@ -207,6 +207,8 @@ def test_queries_of_a_scene_come_before_those_of_its_data_set(tmp_path):
 
 def test_threads_go_to_scenes_first(tmp_path):
     assert plan(tmp_path).threads(6) == 2
+    # the fields of each scene's variants run side by side
+    assert plan(tmp_path).variant_threads(6) == 1
     assert plan(tmp_path, only=["one"]).threads(6) == 6
     assert plan(tmp_path).threads(2) == 1
 

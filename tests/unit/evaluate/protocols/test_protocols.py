@@ -72,6 +72,21 @@ def measured(scene, truth, **settings):
     return {(row.method, row.protocol, row.query, row.level, row.metric): row.value for row in rows}
 
 
+def test_a_union_of_nodes_is_rendered_once_in_each_view():
+    masks, asked = [mask_of((0, 3), (0, 5)), mask_of((2, 4), (1, 9))], []
+
+    class Counted(HandMade):
+        def node_masks(self, view, ids):
+            asked.append((view, ids.tolist()))
+            return super().node_masks(view, ids)
+
+    selections = Selections(Counted(masks, {}))
+    for _ in range(2):
+        assert np.array_equal(selections.mask("v.png", np.array([0, 1]), SIZE), masks[0] | masks[1])
+        assert np.array_equal(selections.mask("w.png", np.array([1]), SIZE), masks[1])
+    assert asked == [("v.png", [0, 1]), ("w.png", [1])]
+
+
 # the worked example of hierarchical consistency: A holds a1 and half of a2, B holds b1, a1 holds x
 NODES = [("A", 1, -1), ("B", 1, -1), ("a1", 2, 0), ("a2", 2, 0), ("b1", 2, 1), ("x", 3, 2)]
 REGIONS = [

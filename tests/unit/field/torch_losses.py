@@ -1,0 +1,120 @@
+"""L_ins and L_part in torch: the reference of `hilsplat.field.losses`, whose gradients are written out."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from hilsplat.base.levels import NONE
+from hilsplat.field.contrast import ViewRelations
+from hilsplat.field.losses.distances import SHORTEST, SOFTENING
+from hilsplat.settings import FieldSettings
+
+
+def soft_distances(means: Tensor) -> Tensor:
+    centred = means - means.detach().mean(0)
+    squares = centred.square().sum(-1)
+    apart = squares[:, None] + squares[None] - 2 * centred @ centred.T
+    return (apart.clamp(min=0) + SOFTENING**2).sqrt()
+
+
+def off_diagonal_mean(values: Tensor) -> Tensor:
+    rows = len(values)
+    if rows < 2:
+        return values.sum() * 0
+    return (values.sum() - values.diagonal().sum()) / (rows * (rows - 1))
+
+
+def similarity_without_parent(anchors: Tensor, others: Tensor, parent: Tensor) -> Tensor:
+    parent = parent.detach()
+    own = anchors - parent
+    length = (own.square().sum(-1, keepdim=True) + SHORTEST**2).sqrt()
+    along = own @ others.T - (own * parent).sum(-1, keepdim=True)
+    # |other - parent|^2 from products: A x B numbers instead of A x B x D.
+    squares = others.square().sum(-1) - 2 * parent @ others.T + parent.square().sum(-1, keepdim=True)
+    return along / length / (squares.clamp(min=0) + SHORTEST**2).sqrt()
+
+
+def instance_loss_literal(means: Tensor, level: Tensor, omega: float) -> Tensor:
+    apart = (level[:, None] - level[None]).abs().to(means.dtype)
+    return off_diagonal_mean((-soft_distances(means).log() - apart * math.log(omega)).square())
+
+
+def instance_loss_tree(means: Tensor, depth: Tensor, omega: float) -> Tensor:
+    target = depth.to(means.dtype) * math.log(omega)
+    return off_diagonal_mean((-soft_distances(means).log() - target).square())
+
+
+def part_loss_literal(
+    means: Tensor,
+    parent: Tensor,
+    parent_means: Tensor,
+    tau: float,
+) -> Tensor:
+    similarity = similarity_without_parent(means, means, parent_means) / tau
+    has_parent = parent != NONE
+    both = has_parent[:, None] & has_parent[None]
+    same = parent[:, None] == parent[None]
+    itself = torch.eye(len(means), dtype=torch.bool, device=means.device)
+    positive, negative = both & same & ~itself, both & ~same
+    anchors = positive.any(1) & negative.any(1)
+    if not anchors.any():
+        return means.sum() * 0
+    similarity, positive, negative = similarity[anchors], positive[anchors], negative[anchors]
+    repulsion = similarity.masked_fill(~negative, -torch.inf).logsumexp(1)
+    attraction = (similarity * positive).sum(1) / positive.sum(1)
+    return (repulsion - attraction).mean()
+
+
+def part_loss_disentangle(
+    half: Tensor,
+    other_half: Tensor,
+    has_parent: Tensor,
+    parent_means: Tensor,
+    tau: float,
+) -> Tensor:
+    anchors = torch.nonzero(has_parent).squeeze(1)
+    if not len(anchors) or len(half) < 2:
+        return half.sum() * 0
+    similarity = similarity_without_parent(half[anchors], other_half, parent_means[anchors]) / tau
+    positive = similarity[torch.arange(len(anchors)), anchors]
+    return (similarity.logsumexp(1) - positive).mean()
+
+
+def instance_term(means: Tensor, relations: list[ViewRelations], settings: FieldSettings) -> Tensor:
+    losses = []
+    for view in relations:
+        if len(view.rows) < 2:
+            continue
+        chosen = means[view.rows]
+        if settings.instance_mode == "literal":
+            losses.append(instance_loss_literal(chosen, torch.from_numpy(view.level), settings.omega))
+        else:
+            losses.append(instance_loss_tree(chosen, torch.from_numpy(view.depth), settings.omega))
+    return torch.stack(losses).mean() if losses else means.sum() * 0
+
+
+def part_term(
+    means: Tensor,
+    halves: Tensor,
+    other_halves: Tensor,
+    relations: list[ViewRelations],
+    settings: FieldSettings,
+) -> Tensor:
+    losses = []
+    for view in relations:
+        for rows, own in zip(view.part_rows, view.part_parent, strict=True):
+            parent = torch.from_numpy(own)
+            has_parent = parent != NONE
+            if len(rows) < 2 or not has_parent.any():
+                continue
+            parent_means = means[parent.clamp(min=0)]
+            if settings.part_mode == "literal":
+                losses.append(part_loss_literal(means[rows], parent, parent_means, settings.tau))
+            else:
+                losses.append(
+                    part_loss_disentangle(
+                        halves[rows], other_halves[rows], has_parent.long(), parent_means, settings.tau
+                    )
+                )
+    return torch.stack(losses).mean() if losses else means.sum() * 0
