@@ -15,6 +15,7 @@ from hilsplat.base.errors import HilsplatError
 from hilsplat.base.processes import jobs_end_with_this_process
 from hilsplat.evaluate.tables.build import TABLES
 from hilsplat.workflow.plan import CACHE, RESULTS, Plan, any_of
+from hilsplat.workflow.resources import JobResources
 from hilsplat.workflow.soundness import unsound
 from hilsplat.workflow.takeover import take_over
 
@@ -90,4 +91,7 @@ try:
     CORES = workflow.cores
 except WorkflowError:  # not set under --report and --lint, which run no jobs
     CORES = 1
-THREADS = PLAN.threads(CORES)
+# A job of a cluster plans itself again on its node, with the node's cores: `max-threads` is the same there.
+MOST_THREADS = workflow.resource_settings.max_threads
+RESOURCES = JobResources(PLAN, MOST_THREADS)
+THREADS = RESOURCES.threads if MOST_THREADS else PLAN.threads(CORES)
