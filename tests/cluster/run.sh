@@ -54,7 +54,6 @@ TaskPlugin=task/affinity,task/cgroup
 JobAcctGatherType=jobacct_gather/cgroup
 JobCompType=jobcomp/filetxt
 JobCompLoc=$slurm/jobs.txt
-AccountingStorageTRES=gres/gpu
 MpiDefault=none
 ReturnToService=2
 SelectType=select/cons_tres
@@ -130,5 +129,5 @@ on_slurm --forcerun mask_truth --set-resources "mask_truth:mem_mb=450*attempt" m
 grep -q "oom-kill event" "$folder"/slurm/slurmd-node?.log || fail "no job was killed for its memory"
 grep -q JobState=COMPLETED "$folder/slurm/jobs.txt" || fail "no attempt finished"
 echo "ok: out of memory with 450 MB, finished at attempt $(wc -l < "$folder/slurm/jobs.txt")"
-grep -q "gres/gpu=1" "$folder/slurm/jobs.txt" || fail "gpu=1 did not become a GPU of Slurm"
-echo "ok: gpu=1 became gres/gpu=1"
+scontrol show jobs | grep -q "TresPerJob=gres:gpu:1" || fail "gpu=1 did not become a GPU of Slurm"
+echo "ok: gpu=1 became gres:gpu:1"
