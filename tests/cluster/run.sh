@@ -71,7 +71,7 @@ CONF
     slurmd -N node1
     slurmd -N node2
     for _ in $(seq 30); do
-        [ "$(sinfo --noheader --Node --states=idle | wc -l)" = 2 ] && return
+        [ "$(sinfo --noheader --Node --states=idle 2> /dev/null | wc -l)" = 2 ] && return
         sleep 1
     done
     fail "the nodes do not answer: see $slurm/*.log"
