@@ -8,6 +8,7 @@
 # All outputs are `update(...)`: Snakemake deletes others before their job begins. A stage replaces its output when the
 # new one is whole, so a job that fails, or is killed, leaves the former one.
 import functools
+import gc
 from pathlib import Path
 
 from snakemake.exceptions import WorkflowError
@@ -17,8 +18,12 @@ from hilsplat.base.errors import HilsplatError
 from hilsplat.base.processes import jobs_end_with_this_process
 from hilsplat.evaluate.tables.build import TABLES
 from hilsplat.workflow.plan import CACHE, RESULTS, Plan, any_of
+from hilsplat.workflow.resources import JobResources
 from hilsplat.workflow.soundness import unsound
 from hilsplat.workflow.takeover import take_over
+
+# The plan of many scenes makes millions of objects that stay: looking through them takes a tenth of its time.
+gc.set_threshold(200_000, 50, 100)
 
 try:
     PLAN = Plan(config)
@@ -92,5 +97,8 @@ try:
     CORES = workflow.cores
 except WorkflowError:  # not set under --report and --lint, which run no jobs
     CORES = 1
-THREADS = PLAN.threads(CORES)
-VARIANT_THREADS = PLAN.variant_threads(CORES)
+# A job of a cluster plans itself again on its node, with the node's cores: `max-threads` is the same there.
+MOST_THREADS = workflow.resource_settings.max_threads
+RESOURCES = JobResources(PLAN, MOST_THREADS)
+THREADS = RESOURCES.threads if MOST_THREADS else PLAN.threads(CORES)
+VARIANT_THREADS = RESOURCES.threads if MOST_THREADS else PLAN.variant_threads(CORES)

@@ -17,7 +17,9 @@ rule contributions:
         ENVIRONMENT
     threads: THREADS
     resources:
-        mem_mb=4000,
+        mem_mb=RESOURCES.memory_mb("contributions"),
+        runtime=RESOURCES.minutes("contributions"),
+        gpu=RESOURCES.gpus("contributions"),
     params:
         settings=PLAN.settings("contributions"),
         cache="results/.cache",

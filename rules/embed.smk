@@ -14,7 +14,8 @@ rule clip:
         ENVIRONMENT
     threads: THREADS
     resources:
-        mem_mb=PLAN.memory_mb("clip", THREADS),
+        mem_mb=RESOURCES.memory_mb("clip"),
+        runtime=RESOURCES.minutes("clip"),
     params:
         settings=PLAN.settings("clip"),
         model=PLAN.model("clip"),

@@ -21,7 +21,8 @@ rule evaluate:
         ENVIRONMENT
     threads: VARIANT_THREADS
     resources:
-        mem_mb=4000,
+        mem_mb=RESOURCES.memory_mb("evaluate"),
+        runtime=RESOURCES.minutes("evaluate"),
     params:
         settings=PLAN.settings("evaluate"),
         code=PLAN.code("evaluate", PLAN.label_readers),
@@ -57,7 +58,8 @@ rule table:
     conda:
         ENVIRONMENT
     resources:
-        mem_mb=1000,
+        mem_mb=RESOURCES.memory_mb("table"),
+        runtime=RESOURCES.minutes("table"),
     params:
         labels=PLAN.names(),
         absent=lambda wildcards: PLAN.absent_options(wildcards.table),

@@ -15,7 +15,8 @@ rule autoencoder:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=2000,
+        mem_mb=RESOURCES.memory_mb("autoencoder"),
+        runtime=RESOURCES.minutes("autoencoder"),
     params:
         settings=PLAN.settings("autoencoder"),
         seed=PLAN.seed,
@@ -44,7 +45,9 @@ rule field:
         ENVIRONMENT
     threads: VARIANT_THREADS
     resources:
-        mem_mb=4000,
+        mem_mb=RESOURCES.memory_mb("field"),
+        runtime=RESOURCES.minutes("field"),
+        gpu=RESOURCES.gpus("field"),
     params:
         settings=PLAN.settings("field"),
         code=PLAN.code("field"),

@@ -19,7 +19,8 @@ rule method:
         ENVIRONMENT
     threads: VARIANT_THREADS
     resources:
-        mem_mb=6000,
+        mem_mb=RESOURCES.memory_mb("method"),
+        runtime=RESOURCES.minutes("method"),
     params:
         settings=PLAN.settings("method"),
         seed=PLAN.seed,

@@ -9,7 +9,8 @@ rule train_models:
         ENVIRONMENT
     threads: CORES
     resources:
-        mem_mb=8000,
+        mem_mb=RESOURCES.memory_mb("train_models"),
+        runtime=RESOURCES.minutes("train_models"),
     params:
         settings=PLAN.run.training.model_dump_json(),
         seed=PLAN.run.seed,

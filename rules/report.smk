@@ -40,7 +40,8 @@ rule figures:
         ENVIRONMENT
     threads: VARIANT_THREADS
     resources:
-        mem_mb=4000,
+        mem_mb=RESOURCES.memory_mb("figures"),
+        runtime=RESOURCES.minutes("figures"),
     params:
         settings=PLAN.settings("figures"),
         evaluate=PLAN.settings("evaluate"),
@@ -78,7 +79,8 @@ rule mask_truth:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=1500,
+        mem_mb=RESOURCES.memory_mb("mask_truth"),
+        runtime=RESOURCES.minutes("mask_truth"),
     params:
         code=PLAN.code("mask_truth"),
     shell:
@@ -126,7 +128,8 @@ rule comparison:
         ENVIRONMENT
     threads: VARIANT_THREADS
     resources:
-        mem_mb=6000,
+        mem_mb=RESOURCES.memory_mb("comparison"),
+        runtime=RESOURCES.minutes("comparison"),
     params:
         folder=lambda wildcards, input: str(Path(input.gaussians).parent),
         variants=PLAN.main_variants(),
@@ -162,7 +165,8 @@ rule sweep_plot:
     conda:
         ENVIRONMENT
     resources:
-        mem_mb=1000,
+        mem_mb=RESOURCES.memory_mb("sweep_plot"),
+        runtime=RESOURCES.minutes("sweep_plot"),
     params:
         code=PLAN.code("sweep"),
     shell:

@@ -13,7 +13,8 @@ rule source:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=4000,
+        mem_mb=RESOURCES.memory_mb("source"),
+        runtime=RESOURCES.minutes("source"),
     params:
         name=PLAN.source_name,
         root=str(Path(PLAN.run.data_root)),
@@ -36,7 +37,8 @@ rule poses:
         ENVIRONMENT
     threads: THREADS
     resources:
-        mem_mb=2000,
+        mem_mb=RESOURCES.memory_mb("poses"),
+        runtime=RESOURCES.minutes("poses"),
     params:
         images=PLAN.images,
         unit=lambda wildcards: PLAN.row(wildcards).unit,

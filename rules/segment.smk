@@ -14,7 +14,8 @@ rule masks:
         ENVIRONMENT
     threads: THREADS
     resources:
-        mem_mb=PLAN.memory_mb("masks", THREADS),
+        mem_mb=RESOURCES.memory_mb("masks"),
+        runtime=RESOURCES.minutes("masks"),
     params:
         settings=PLAN.settings("masks"),
         model=PLAN.model("masks"),
@@ -41,7 +42,8 @@ rule coverage_tree:
         ENVIRONMENT
     threads: 1
     resources:
-        mem_mb=2000,
+        mem_mb=RESOURCES.memory_mb("coverage_tree"),
+        runtime=RESOURCES.minutes("coverage_tree"),
     params:
         settings=PLAN.settings("coverage_tree"),
         code=PLAN.code("coverage_tree"),

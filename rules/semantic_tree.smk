@@ -17,7 +17,9 @@ rule semantic_tree:
         ENVIRONMENT
     threads: THREADS
     resources:
-        mem_mb=3000,
+        mem_mb=RESOURCES.memory_mb("semantic_tree"),
+        runtime=RESOURCES.minutes("semantic_tree"),
+        gpu=RESOURCES.gpus("semantic_tree"),
     params:
         settings=PLAN.settings("semantic_tree"),
         code=PLAN.code("semantic_tree"),

@@ -16,7 +16,9 @@ rule gaussians:
         ENVIRONMENT
     threads: THREADS
     resources:
-        mem_mb=3000,
+        mem_mb=RESOURCES.memory_mb("gaussians"),
+        runtime=RESOURCES.minutes("gaussians"),
+        gpu=RESOURCES.gpus("gaussians"),
     params:
         settings=PLAN.settings("gaussians"),
         brought=PLAN.brought_option,

@@ -14,7 +14,8 @@ rule world:
         ENVIRONMENT
     threads: THREADS
     resources:
-        mem_mb=2000,
+        mem_mb=RESOURCES.memory_mb("world"),
+        runtime=RESOURCES.minutes("world"),
     params:
         source=lambda wildcards: PLAN.row(wildcards).source,
         settings=PLAN.settings("world"),

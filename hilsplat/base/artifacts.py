@@ -11,7 +11,7 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -372,8 +372,9 @@ class ViewCache:
         if path.is_file():
             try:
                 arrays = read_npz(path)
-                os.utime(path)  # last use, for pruning
                 self.hits += 1
+                with suppress(OSError):  # another node may prune it in this moment
+                    os.utime(path)  # last use, for pruning
                 return arrays
             except ArtifactError:
                 path.unlink(missing_ok=True)

@@ -1,5 +1,6 @@
 """Gaussians as a standard 3DGS PLY, which viewers and other implementations read."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,9 @@ from plyfile import PlyData, PlyElement, PlyParseError
 from hilsplat.base.artifacts import atomic_path, remake
 from hilsplat.base.errors import ArtifactError
 from hilsplat.splat.gaussians import FIELDS, Gaussians
+
+HEADER_BYTES = 2**14
+"""In which a PLY says how many vertices it has."""
 
 
 def _names(num_bases: int) -> list[str]:
@@ -43,6 +47,17 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
     table = np.ascontiguousarray(values, dtype="<f4").view([(name, "<f4") for name in names]).reshape(n)
     with atomic_path(path) as temporary:
         PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(temporary)
+
+
+def vertex_count(path: Path) -> int | None:
+    """Number of Gaussians by the header of a PLY; None if it cannot be read, which its reader reports."""
+    try:
+        with Path(path).open("rb") as stream:
+            header = stream.read(HEADER_BYTES)
+    except OSError:
+        return None
+    found = re.search(rb"^element vertex ([0-9]+)\s*$", header, re.MULTILINE)
+    return int(found[1]) if found else None
 
 
 def load_ply(path: Path, fix: str = "") -> Gaussians:

@@ -16,8 +16,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Protocol, runtime_checkable
 
-from hilsplat.base.errors import ModelError, SettingsError
-from hilsplat.configuration import UPSTREAM, StageSettings, parse_run, require_known
+from hilsplat.base.errors import SettingsError
+from hilsplat.configuration import SECTIONS, UPSTREAM, StageSettings, parse_run, require_known
 from hilsplat.datasets.registry import readers_of
 from hilsplat.datasets.sources import (
     DATA_PREFIX,
@@ -40,14 +40,8 @@ from hilsplat.workflow.stages import stage_code
 RESULTS = Path("results")
 CACHE = RESULTS / ".cache"
 
-LEAST_MB = 4000
-"""Memory that the stages with a model declare at least."""
 
-SHARE_OF_MACHINE = 0.8
-"""Of the memory of the machine, for one stage."""
-
-
-@runtime_checkable
+@runtime_checkable  # the tests' type checker asks; the plan itself does not, since that is slow
 class Job(Protocol):
     """The wildcards of every rule."""
 
@@ -104,7 +98,8 @@ class Plan:
         chosen = choose_scenes(self.rows, run.groups, run.only)
         if more := {row.group for row in chosen} - set(run.groups):  # check their sources too
             read_sheet(sheet, {*run.groups, *more}, run.data_root)
-        reasons = {row.name: absence(row.source, run.data_root) for row in chosen}
+        self._absence = functools.cache(lambda row: absence(row.source, run.data_root))
+        reasons = {row.name: self._absence(row) for row in chosen}
         self.absent = {name: reason for name, reason in reasons.items() if reason is not None}
         self.scenes = tuple(row for row in chosen if row.name not in self.absent)
         if not self.scenes:
@@ -119,9 +114,14 @@ class Plan:
                 ),
                 fix="name other groups or scenes, or set data_root",
             )
+        # A thousand scenes have tens of thousands of jobs: settings are resolved and folders are read once.
+        self.stages_of = functools.cache(lambda *which: run.stages(*which).with_models())
+        self._seeded = functools.cache(run.seeded)
+        self._section = functools.cache(self._section_of)
+        self._folder_files = functools.cache(self._files_of)
+        self._labels = functools.cache(lambda row: label_sets(row.source, run.data_root, row.name))
         for row in self.scenes:
             self._require_no_braces(row)
-        self._stages = functools.cache(lambda *which: run.stages(*which).with_models())
 
     def require_feasible(self) -> None:
         """Refuse devices that this machine does not have, and model folders that cannot be used.
@@ -134,7 +134,7 @@ class Plan:
         seen: set[Any] = set()
         for row in self.scenes:
             for variant in self.run.variant_names():
-                stages = self._stages(variant, self._scopes(row))
+                stages = self.stages_of(variant, self._scopes(row))
                 if stages not in seen:
                     seen.add(stages)
                     require_feasible(stages, f"{row.name}, variant {variant}")
@@ -167,7 +167,7 @@ class Plan:
         return any_of(
             name
             for name in self.run.variant_names()
-            if by_baseline is None or (self._stages(name).method.name != OURS) == by_baseline
+            if by_baseline is None or (self.stages_of(name).method.name != OURS) == by_baseline
         )
 
     # ---- parameters ---------------------------------------------------------------------------------
@@ -178,11 +178,20 @@ class Plan:
 
     def stages(self, job: Job) -> StageSettings:
         """All settings of a scene and, if the job has one, a variant."""
-        return self._stages(getattr(job, "variant", "default"), self._scopes(self.row(job)))
+        return self.stages_of(*self.which(job))
+
+    def which(self, job: Job) -> tuple[str, tuple[str, ...]]:
+        """What all settings of a job follow from: its variant and the overrides of its scene."""
+        return getattr(job, "variant", "default"), self._scopes(self.row(job))
+
+    def _section_of(self, section: str, variant: str, scopes: tuple[str, ...]) -> tuple[str, dict[str, Any]]:
+        """A section's settings as JSON, and as the values in it."""
+        settings = getattr(self.stages_of(variant, scopes), section)
+        return inert(settings.model_dump_json()), settings.model_dump(mode="json")
 
     def settings(self, section: str) -> Callable[[Job], str]:
         """Parameter: a section's settings, as JSON."""
-        return lambda job: inert(getattr(self.stages(job), section).model_dump_json())
+        return lambda job: self._section(section, *self.which(job))[0]
 
     def seed(self, job: VariantJob) -> int:
         """Parameter: the seed of a variant's networks."""
@@ -211,7 +220,7 @@ class Plan:
         """Which models make the masks and the words of which scenes, one line each, doubts included."""
         scenes: dict[tuple[str, str], list[str]] = {}
         for row in self.scenes:
-            stages = self._stages("default", self._scopes(row))
+            stages = self.stages_of("default", self._scopes(row))
             key = (models_of(stages), "" if row.world else doubt_about_photographs(stages))
             scenes.setdefault(key, []).append(row.name)
         lines = []
@@ -219,21 +228,6 @@ class Plan:
             lines.append(f"{some(names)}: {models}")
             lines += [doubt] if doubt else []
         return lines
-
-    def memory_mb(self, section: str, threads: int) -> Callable[[Job], int]:
-        """Resource: memory of a stage that runs a model, with as many views at once as this machine can hold.
-
-        The stage runs fewer at once if it is given less (`--set-resources masks:mem_mb=...`).
-        """
-
-        def estimate(job: Job) -> int:
-            settings = getattr(self.stages(job), section)
-            if section == "masks" and settings.segmenter != "sam":
-                return LEAST_MB
-            batch = settings.batch if section == "clip" else settings.points_per_batch
-            return max(LEAST_MB, _model_memory_mb(Path(settings.model), settings.variant, batch, threads))
-
-        return estimate
 
     def shared(self, stage: str, path: str) -> Callable[[VariantJob], str]:
         """Input: a stage's output, from the first variant with the same settings up to that stage.
@@ -264,10 +258,10 @@ class Plan:
 
     @functools.cache  # noqa: B019  a process has one plan
     def _first_alike(self, stage: str, variant: str, scopes: tuple[str, ...]) -> str:
-        wanted = self._stages(variant, scopes)
+        wanted = self.stages_of(variant, scopes)
         seed = self.run.seed_of(variant) if wanted.depends_on_seed(stage) else None
         for name in self.run.variant_names():
-            other = self._stages(name, scopes)
+            other = self.stages_of(name, scopes)
             same = all(getattr(other, part) == getattr(wanted, part) for part in UPSTREAM[stage])
             if same and seed in (None, self.run.seed_of(name)):
                 return name
@@ -309,10 +303,7 @@ class Plan:
                 else:
                     yield self._want(job, "method", "field.safetensors", seed, self.baseline(job))
             yield self._want(job, "evaluate", "scores.csv", plugins=self.label_readers(job))
-        figures = {
-            name: getattr(self.stages(scene), name).model_dump(mode="json")
-            for name in ("figures", "evaluate")
-        }
+        figures = {name: self._section(name, *self.which(scene))[1] for name in ("figures", "evaluate")}
         for stage, picture in (("figures", "panel"), ("comparison", "comparison")):
             path = f"results/figures/{row.name}/{picture}.png"
             yield Wanted(Path(path), path, stage, figures, None, self.label_readers(scene))
@@ -322,9 +313,10 @@ class Plan:
     def _want(
         self, job: Job, stage: str, name: str, seed: int | None = None, plugins: tuple[str, ...] = ()
     ) -> Wanted:
-        path = self.output(job, *([job.variant] if isinstance(job, VariantJob) else []), name)
-        section = getattr(self.stages(job), "perturb" if stage == "truth_masks" else stage, None)
-        settings = section.model_dump(mode="json") if section is not None else {}
+        variant = getattr(job, "variant", None)
+        path = self.output(job, *([variant] if variant is not None else []), name)
+        section = "perturb" if stage == "truth_masks" else stage
+        settings = self._section(section, *self.which(job))[1] if section in SECTIONS else {}
         return Wanted(Path(path), path, stage, settings, seed, plugins)
 
     # ---- photographs and poses ----------------------------------------------------------------------
@@ -341,6 +333,10 @@ class Plan:
         row = self.row(job)
         if row.world or is_exported(row.source):
             return self.images(job)
+        return self._folder_files(row)
+
+    def _files_of(self, row: SceneRow) -> list[str]:
+        """Files of a folder of photographs, without labels."""
         assert row.folder is not None, row.name  # scenes without data were skipped
         labels = set(self._label_files(row))
         return sorted(
@@ -429,7 +425,7 @@ class Plan:
 
     def labels(self, row: SceneRow) -> tuple[str, ...]:
         """Labels of a scene, as `data set/scene`: published ones and your own annotations."""
-        return () if row.world else label_sets(row.source, self.run.data_root, row.name)
+        return () if row.world else self._labels(row)
 
     def label_readers(self, job: Job) -> tuple[str, ...]:
         """The readers of a scene's labels."""
@@ -497,14 +493,14 @@ class Plan:
             f"results/{row.dataset}/{row.scene}/{name}/scores.csv"
             for row in rows
             for variant in getattr(self.run, kind.variants)
-            for name in self.run.seeded(variant, scopes_of(row))
+            for name in self._seeded(variant, self._scopes(row))
         ]
 
     def absent_options(self, table: str) -> str:
         """Options that say which scenes of a table's data sets were not measured."""
         by_dataset: dict[str, list[tuple[str, str]]] = {}
         for row in self.rows:
-            reason = absence(row.source, self.run.data_root)
+            reason = self._absence(row)
             place = published(row.source)
             if place and place[0] in TABLES[table].data and reason is not None:
                 by_dataset.setdefault(row.dataset, []).append((row.scene, reason))
@@ -562,23 +558,6 @@ class Plan:
             pictures = ["panel", *(["masks"] if row.world else []), *(["comparison"] if compared else [])]
             found += [f"results/figures/{row.dataset}/{row.scene}/{picture}.png" for picture in pictures]
         return found
-
-
-@functools.cache
-def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int) -> int:
-    """Memory of a stage with a model; 0 if its folder cannot be read, which the stage reports."""
-    from hilsplat.models.folder import open_model_folder
-    from hilsplat.models.memory import MIB, machine_mib, needs_of  # onnxruntime takes a while to import
-    from hilsplat.segment.sam import own_thresholds
-
-    try:
-        model = open_model_folder(folder, variant=variant)
-        prompts = own_thresholds(model).points_per_batch if isinstance(batch, str) else batch
-    except ModelError:
-        return 0
-    needs = needs_of(model, prompts)
-    views = needs.views_at_once(threads, SHARE_OF_MACHINE * machine_mib())
-    return round(needs.total_mib(views) * MIB / 1e6)
 
 
 def inert(text: str) -> str:

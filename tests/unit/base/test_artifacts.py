@@ -81,6 +81,44 @@ def test_cache_computes_once_and_recovers_from_a_damaged_entry(tmp_path: Path) -
     assert len(calls) == 2
 
 
+def test_two_nodes_that_compute_one_view_leave_one_whole_entry(tmp_path: Path, monkeypatch) -> None:
+    """The other node, with the same process number, writes and ends while this one writes."""
+    cache, other, names = artifacts.ViewCache(tmp_path), artifacts.ViewCache(tmp_path), []
+    key = artifacts.sha256_of_json({"image": "abc"})
+    write = artifacts.write_npz
+
+    def write_beside_the_other(path: Path, **arrays: np.ndarray) -> None:
+        with artifacts.atomic_path(path) as temporary:
+            names.append(temporary.name)
+            temporary.write_bytes(b"half an ent")
+            with monkeypatch.context() as node:
+                node.setattr(artifacts, "write_npz", write)
+                node.setattr("hilsplat.base.processes.machine", lambda: "0" * 8)
+                other.get(key, lambda: {"x": np.arange(3)})
+                names.append(artifacts.temporary_prefix())
+            write(temporary, **arrays)
+
+    monkeypatch.setattr(artifacts, "write_npz", write_beside_the_other)
+    mine = cache.get(key, lambda: {"x": np.arange(3)})
+    np.testing.assert_array_equal(mine["x"], artifacts.read_npz(cache.path(key))["x"])
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [cache.path(key)]
+    assert not names[0].startswith(names[1])  # neither takes the other's file for its own
+
+
+def test_an_entry_that_another_node_prunes_meanwhile_is_still_read(tmp_path: Path, monkeypatch) -> None:
+    cache, key = artifacts.ViewCache(tmp_path), "abc"
+    cache.get(key, lambda: {"x": np.arange(3)})
+    read = artifacts.read_npz
+
+    def read_and_prune(path: Path) -> dict[str, np.ndarray]:
+        arrays = read(path)
+        path.unlink()
+        return arrays
+
+    monkeypatch.setattr(artifacts, "read_npz", read_and_prune)
+    assert cache.get(key, dict)["x"].tolist() == [0, 1, 2]
+
+
 def test_a_second_writer_is_refused(tmp_path: Path) -> None:
     with (
         artifacts.output_lock(tmp_path / "out"),
