@@ -32,6 +32,8 @@ class Section(BaseModel):
 
 
 Probability = Annotated[float, Field(ge=0, le=1)]
+Granularity = Annotated[float, Field(gt=0, lt=2)]
+Size = Annotated[int, Field(ge=1, le=1000)]
 Auto = Literal["auto"]
 
 
@@ -458,6 +460,17 @@ class MethodSettings(Section):
     rate: float = knob(0.0025, "langsplat: Adam step size", gt=0, origin="LangSplat")
     pixel_step: int = knob(
         2, "langsplat: every n-th pixel of every n-th row is compared", ge=1, origin="LangSplat: 1"
+    )
+
+    codebook: tuple[Size, Size] = knob(
+        (64, 10),
+        "opengaussian: groups by feature and position, and groups by feature of each of them",
+        origin="OpenGaussian: (64, 10) on LERF, (64, 5) on ScanNet",
+    )
+    thresholds: tuple[Granularity, Granularity, Granularity] | Auto = knob(
+        "auto",
+        "granularity of whole, part, subpart; omniseg3d: least average cosine of a cluster, growing; vch: "
+        "longest edge of a component, falling; auto: the method's own",
     )
 
     @property

@@ -13,6 +13,10 @@ METHODS: Plugins["Method"] = Plugins(
     {
         "langsplat": "hilsplat.methods.langsplat:METHOD",
         "lifted": "hilsplat.methods.lifted:METHOD",
+        "gaussian_grouping": "hilsplat.methods.gaussian_grouping:METHOD",
+        "omniseg3d": "hilsplat.methods.omniseg3d:METHOD",
+        "opengaussian": "hilsplat.methods.opengaussian:METHOD",
+        "vch": "hilsplat.methods.vch:METHOD",
     }
 )
 
