@@ -145,8 +145,8 @@ def level_field(
     leaf[shown] = instances(features[shown], contributions.means()[shown], codebook, seed)
     num = codebook[0] * codebook[1]
     counts = np.maximum(np.bincount(leaf[shown], minlength=num), 1)
-    of_leaf = np.stack([np.bincount(leaf[shown], column, num) for column in features[shown].T], axis=1)
-    of_leaf = of_leaf / counts[:, None]
+    sums = np.stack([np.bincount(leaf[shown], column, num) for column in features[shown].T], axis=1)
+    of_leaf = sums / counts[:, None]
     of_mask = A @ features
 
     def closeness(mask: np.ndarray, group: np.ndarray) -> np.ndarray:
