@@ -14,7 +14,8 @@ Departs:
     - vectors of 16 numbers on frozen Gaussians, not a field of 128 (instant-NGP) with its density;
     - unit length by division, no penalty of the norm; depth is not smoothed;
     - parents are those of our coverage tree (inside: 0.9), 0.95 and IoU below 0.9 there;
-    - components of Gaussians, not of voxels of 0.002; the authors know no text.
+    - components of Gaussians, not of voxels of 0.002; Gaussians beyond the 200 largest join the nearest one;
+    - the authors know no text.
 """
 
 from pathlib import Path
@@ -33,7 +34,7 @@ from hilsplat.base.levels import NONE
 from hilsplat.methods.groups import thresholds_of
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.methods.omniseg3d import cluster_field
-from hilsplat.methods.training import LabelledView, labelled_views, product, train, unit
+from hilsplat.methods.training import LabelledView, alike, labelled_views, product, train, unit
 from hilsplat.segment.coverage import coverage_tree
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import CoverageTreeSettings, MethodSettings
@@ -45,10 +46,9 @@ PAIRS = 64
 PIXEL_NEIGHBOURS = 10
 BORDER = 10.0
 """Added, in the choice of the tree, to an edge over a border of masks, per level."""
-START_NOISE = 0.1
 NEIGHBOURS = 16
 LARGEST = 200
-THRESHOLDS = (0.8, 0.5, 0.3)
+THRESHOLDS = (0.5, 0.4, 0.35)
 
 
 @compiled
@@ -168,10 +168,7 @@ def train_features(
         settings: steps and rate.
         seed: for the first vectors, pixels and triplets.
     """
-    draw = torch.Generator().manual_seed(seed)
-    # Almost alike, as a new hash grid makes them: what starts together stays together unless a mask parts it.
-    start = torch.randn(CHANNELS, generator=draw)
-    features = (start + START_NOISE * torch.randn(num_gaussians, CHANNELS, generator=draw)).requires_grad_()
+    features = alike(num_gaussians, CHANNELS, seed)
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
         a, b, c = chosen = triplets(view.labels, *trees[view.number], random)
@@ -195,7 +192,10 @@ def components(
     means: Float32[np.ndarray, "N 3"],
     thresholds: tuple[float, float, float],
 ) -> Int64[np.ndarray, "N 3"]:
-    """Component of each Gaussian at every distance, largest first; -1 beyond the 200 largest."""
+    """Component of each Gaussian at every distance, largest first.
+
+    Gaussians beyond the 200 largest components belong to that of the nearest Gaussian inside.
+    """
     num = len(means)
     count = min(NEIGHBOURS + 1, num)
     near = cKDTree(means).query(means, count)[1].reshape(num, count)
@@ -207,9 +207,12 @@ def components(
         graph = sp.csr_matrix((np.ones(kept.sum()), (a[kept], b[kept])), shape=(num, num))
         number, part = connected_components(graph, directed=False)
         order = np.argsort(-np.bincount(part, minlength=number), kind="stable")
-        renumber = np.full(number, NONE, np.int64)
-        renumber[order[:LARGEST]] = np.arange(min(number, LARGEST))
-        found.append(renumber[part])
+        rank = np.empty(number, np.int64)
+        rank[order] = np.arange(number)
+        rank = rank[part]
+        large, small = np.flatnonzero(rank < LARGEST), np.flatnonzero(rank >= LARGEST)
+        rank[small] = rank[large[cKDTree(means[large]).query(means[small])[1]]]
+        found.append(rank)
     return np.stack(found, axis=1)
 
 

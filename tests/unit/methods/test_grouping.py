@@ -35,9 +35,9 @@ FITS = {
     ),
     "omniseg3d": (
         omniseg3d,
-        MethodSettings(name="omniseg3d", steps=150, rate=0.05, pixel_step=1, thresholds=(0.1, 0.31, 0.7)),
+        MethodSettings(name="omniseg3d", steps=150, rate=0.05, pixel_step=1, thresholds=(0.05, 0.4, 0.7)),
     ),
-    "vch": (vch, MethodSettings(name="vch", steps=100, rate=0.05, pixel_step=1)),
+    "vch": (vch, MethodSettings(name="vch", steps=100, rate=0.05, pixel_step=1, thresholds=(0.8, 0.5, 0.3))),
 }
 
 
@@ -90,7 +90,7 @@ def test_methods_with_thresholds_find_the_hierarchy_from_masks_of_single_views(t
     features = fit_of(name, two_boxes_inputs(*two_boxes_contributions))
     for row in (0, 1, 2, 3, 5, 6):  # part "B top" covers its box too little to be told from the rest
         level = Level(REGIONS[row][1])
-        assert answered(features, level, row) > 0.8, REGIONS[row][0]
+        assert answered(features, level, row) > 0.6, REGIONS[row][0]  # a third of "A top" is a subpart
 
 
 @pytest.mark.parametrize("name", sorted(FITS))
@@ -302,9 +302,7 @@ def test_clusters_of_higher_thresholds_lie_inside_those_of_lower_ones():
     angle = np.deg2rad([0, 20, 90, 110]).repeat(5)
     features = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
     found = clusters(features, (0.0, 0.8, 0.99), 0)
-    assert [len(np.unique(level)) for level in found.T] == [2, 2, 4] or [
-        len(np.unique(level)) for level in found.T
-    ] == [1, 2, 4]
+    assert [len(np.unique(level)) for level in found.T][1:] == [2, 4]
     for coarse, fine in ((0, 1), (1, 2)):
         assert len(np.unique(found[:, [coarse, fine]], axis=0)) == len(np.unique(found[:, fine]))
 
@@ -364,13 +362,16 @@ def test_neighbouring_pixels_are_joined_once():
     assert [0, 1] in edges.T.tolist() and [0, 19] not in edges.T.tolist()
 
 
-def test_components_split_where_features_jump_and_small_ones_are_dropped(monkeypatch):
+def test_components_split_where_features_jump_and_those_beyond_the_largest_join_the_nearest(monkeypatch):
     means = np.stack([np.arange(60.0), np.zeros(60), np.zeros(60)], axis=1).astype(np.float32)
     features = np.zeros((60, 2), np.float32)
     features[:30, 0], features[30:50, 1] = 1, 1
-    features[50:] = [0.8, 0.6]
-    found = components(features, means, (1.0, 0.65, 0.1))
-    assert [len(np.unique(level)) for level in found.T] == [1, 2, 3] or len(np.unique(found[:, 2])) == 3
-    assert found[0, 2] == 0 and found[30, 2] == 1  # largest first
+    features[50:] = [
+        0.8,
+        0.6,
+    ]  # 1.41 from the first to the second run, 0.89 on to the third, 0.63 between these
+    found = components(features, means, (1.5, 0.95, 0.1))
+    assert [len(np.unique(level)) for level in found.T] == [1, 2, 3]
+    assert found[0, 2] == 0 and found[30, 2] == 1 and found[50, 2] == 2  # largest first
     monkeypatch.setattr(vch, "LARGEST", 2)
-    assert (components(features, means, (1.0, 0.65, 0.1))[50:, 2] == -1).all()
+    assert (components(features, means, (1.5, 0.95, 0.1))[50:, 2] == 1).all()
