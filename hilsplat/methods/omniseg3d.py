@@ -41,7 +41,7 @@ CENTRES = 256
 KMEANS_STEPS = 10
 MIN_SCORE = 0.2
 MIN_VIEWS = 2
-THRESHOLDS = (0.8, 0.9, 0.95)
+THRESHOLDS = (0.5, 0.8, 0.95)
 
 
 def patches(labels: Int32[np.ndarray, "p 3"]) -> tuple[Int64[np.ndarray, " p"], Int64[np.ndarray, "k k"]]:

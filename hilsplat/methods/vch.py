@@ -48,7 +48,7 @@ BORDER = 10.0
 """Added, in the choice of the tree, to an edge over a border of masks, per level."""
 NEIGHBOURS = 16
 LARGEST = 200
-THRESHOLDS = (0.5, 0.4, 0.35)
+THRESHOLDS = (0.6, 0.5, 0.45)
 
 
 @compiled
