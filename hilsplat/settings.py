@@ -32,6 +32,8 @@ class Section(BaseModel):
 
 
 Probability = Annotated[float, Field(ge=0, le=1)]
+Granularity = Annotated[float, Field(gt=0, lt=2)]
+Size = Annotated[int, Field(ge=1, le=1000)]
 Auto = Literal["auto"]
 
 
@@ -469,6 +471,17 @@ class MethodSettings(Section):
     )
     top_gaussians: int = knob(
         45, "dr_splat: heaviest Gaussians of a pixel that take its vector", ge=1, origin="Dr. Splat"
+    )
+
+    codebook: tuple[Size, Size] = knob(
+        (64, 10),
+        "opengaussian: groups by feature and position, and groups by feature of each of them",
+        origin="OpenGaussian: (64, 10) on LERF, (64, 5) on ScanNet",
+    )
+    thresholds: tuple[Granularity, Granularity, Granularity] | Auto = knob(
+        "auto",
+        "granularity of whole, part, subpart; omniseg3d: least average cosine of a cluster, growing; vch: "
+        "longest edge of a component, falling; auto: the method's own",
     )
 
     @property

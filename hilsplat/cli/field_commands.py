@@ -140,7 +140,7 @@ def method(
     threads: Threads = 1,
     log: Log = None,
 ) -> None:
-    """Compute the language field by a baseline, langsplat or lifted (name in the settings)."""
+    """Compute the language field by a baseline (name in the settings)."""
     section = section_of("method", settings)
     inputs = {"scene": scene, "gaussians": gaussians, "masks": masks}
     inputs |= {"contributions": contributions, "autoencoder": autoencoder}

@@ -12,10 +12,14 @@ if TYPE_CHECKING:
 METHODS: Plugins["Method"] = Plugins(
     {
         "dr_splat": "hilsplat.methods.dr_splat:METHOD",
+        "gaussian_grouping": "hilsplat.methods.gaussian_grouping:METHOD",
         "langsplat": "hilsplat.methods.langsplat:METHOD",
         "langsplat_v2": "hilsplat.methods.langsplat_v2:METHOD",
         "lifted": "hilsplat.methods.lifted:METHOD",
         "occam": "hilsplat.methods.occam:METHOD",
+        "omniseg3d": "hilsplat.methods.omniseg3d:METHOD",
+        "opengaussian": "hilsplat.methods.opengaussian:METHOD",
+        "vch": "hilsplat.methods.vch:METHOD",
     }
 )
 

@@ -1,0 +1,243 @@
+"""View-consistent hierarchy: features whose ultrametric repeats the coverage trees of the views.
+
+1. Every Gaussian learns a vector. In a view, pixels are joined to their 10 nearest by the distance of their
+   vectors; the ultrametric of two pixels is the longest edge on their path in the minimum spanning tree.
+2. For every mask, two pixels inside are nearer each other than one inside and one outside, but inside its
+   parent: by dot product and by ultrametric.
+3. Gaussians within a distance of their 16 nearest neighbours are connected; components at three distances are
+   nested, and are the levels. A component takes the CLIP vectors of the masks that fit it best in each view.
+
+Source: He et al., View-Consistent Hierarchical 3D Segmentation Using Ultrametric Feature Fields, CVPR 2024;
+hardyho/ultrametric_feature_fields. Authors' values are in the constants, `steps` 20 epochs, `rate` 0.01.
+
+Departs:
+    - vectors of 16 numbers on frozen Gaussians, not a field of 128 (instant-NGP) with its density;
+    - unit length by division, no penalty of the norm; depth is not smoothed;
+    - parents are those of our coverage tree (inside: 0.9), 0.95 and IoU below 0.9 there;
+    - components of Gaussians, not of voxels of 0.002; Gaussians beyond the 200 largest join the nearest one;
+    - the authors know no text.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+from jaxtyping import Float, Float32, Int32, Int64
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+from scipy.spatial import cKDTree
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from hilsplat.base.compiled import compiled
+from hilsplat.base.levels import NONE
+from hilsplat.methods.groups import thresholds_of
+from hilsplat.methods.method import Method, MethodInputs
+from hilsplat.methods.omniseg3d import cluster_field
+from hilsplat.methods.training import LabelledView, alike, labelled_views, product, train, unit
+from hilsplat.segment.coverage import coverage_tree
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.settings import CoverageTreeSettings, MethodSettings
+
+CHANNELS = 16
+TEMPERATURE = 0.1
+PAIRS = 64
+"""Of each mask and step."""
+PIXEL_NEIGHBOURS = 10
+BORDER = 10.0
+"""Added, in the choice of the tree, to an edge over a border of masks, per level."""
+NEIGHBOURS = 16
+LARGEST = 200
+THRESHOLDS = (0.6, 0.5, 0.45)
+
+
+@compiled
+def joining_edges(num, edge_a, edge_b, first, second):
+    """Edge, in the given order, that joins the components of the two pixels of each pair; -1 if none does."""
+    top = np.arange(num)  # union-find over pixels
+    node = np.arange(num)  # dendrogram node of a root's component
+    up = np.full(num + len(edge_a), -1, np.int64)
+    for k in range(len(edge_a)):
+        a, b = edge_a[k], edge_b[k]
+        while top[a] != a:
+            top[a] = top[top[a]]
+            a = top[a]
+        while top[b] != b:
+            top[b] = top[top[b]]
+            b = top[b]
+        if a != b:
+            up[node[a]] = num + k
+            up[node[b]] = num + k
+            top[b] = a
+            node[a] = num + k
+    out = np.full(len(first), -1, np.int64)
+    for pair in range(len(first)):
+        a, b = first[pair], second[pair]
+        while a != b:  # parents have larger numbers
+            if a < b:
+                a = up[a]
+            else:
+                b = up[b]
+            if a < 0 or b < 0:
+                break
+        if a == b and a >= num:
+            out[pair] = a - num
+    return out
+
+
+def ultrametric(
+    vectors: Float[Tensor, "p D"],
+    edges: Int64[np.ndarray, "2 e"],
+    penalty: Float[np.ndarray, " e"],
+    pairs: Int64[np.ndarray, "2 k"],
+) -> Float[Tensor, " k"]:
+    """Longest edge between the pixels of each pair, along the minimum spanning tree; differentiable.
+
+    Args:
+        vectors: of pixels.
+        edges: of the graph.
+        penalty: added to the length of an edge when the tree is chosen, not in the result.
+        pairs: pixels; pairs that no path joins, and pairs of a pixel with itself, have the distance 2 and 0.
+    """
+    num = len(vectors)
+    held = vectors.detach().numpy()
+    length = np.sqrt(np.square(held[edges[0]] - held[edges[1]]).sum(axis=1))
+    graph = sp.csr_matrix((length + penalty + 1e-6, (edges[0], edges[1])), shape=(num, num))  # 0 is no edge
+    tree = minimum_spanning_tree(graph).tocoo()
+    a, b = tree.row.astype(np.int64), tree.col.astype(np.int64)
+    order = np.argsort(np.square(held[a] - held[b]).sum(axis=1), kind="stable")
+    a, b = a[order], b[order]
+    edge = joining_edges(num, a, b, pairs[0], pairs[1])
+    found = torch.from_numpy(edge >= 0)
+    edge = np.maximum(edge, 0)
+    apart = torch.from_numpy(np.where(pairs[0] == pairs[1], 0.0, 2.0).astype(held.dtype))
+    if not len(a):
+        return apart
+    distance = ((vectors[a[edge]] - vectors[b[edge]]).square().sum(1) + 1e-12).sqrt()
+    return torch.where(found, distance, apart)
+
+
+def neighbouring_pixels(xy: Int64[np.ndarray, "p 2"]) -> Int64[np.ndarray, "2 e"]:
+    """Edges from each pixel to its nearest ones in the image, each once."""
+    count = min(PIXEL_NEIGHBOURS + 1, len(xy))
+    near = cKDTree(xy).query(xy, count)[1].reshape(len(xy), count)
+    edges = np.stack([np.repeat(np.arange(len(xy)), count), near.ravel()])
+    return np.unique(np.sort(edges[:, edges[0] != edges[1]], axis=0), axis=1)
+
+
+def triplets(
+    labels: Int32[np.ndarray, "p 3"],
+    level: np.ndarray,
+    parent: Int32[np.ndarray, " m"],
+    random: np.random.Generator,
+) -> Int64[np.ndarray, "3 k"]:
+    """For each mask pixels a and b inside, and c outside but in its parent (anywhere, for a root).
+
+    Args:
+        labels: row of the mask at each pixel and level, -1 for none.
+        level: `Level` of each mask.
+        parent: row of each mask's parent, -1 for none.
+        random: draws `PAIRS` of them for a mask.
+    """
+    found = []
+    for mask in np.unique(labels[labels >= 0]):
+        inside = labels[:, level[mask] - 1] == mask
+        above = parent[mask]
+        around = np.ones(len(labels), bool) if above == NONE else labels[:, level[above] - 1] == above
+        own, other = np.flatnonzero(inside), np.flatnonzero(around & ~inside)
+        if len(own) > 1 and len(other):
+            found.append(
+                np.stack([random.choice(own, PAIRS), random.choice(own, PAIRS), random.choice(other, PAIRS)])
+            )
+    return np.concatenate(found, axis=1) if found else np.zeros((3, 0), np.int64)
+
+
+def train_features(
+    views: list[LabelledView],
+    trees: dict[int, tuple[np.ndarray, np.ndarray]],
+    num_gaussians: int,
+    settings: MethodSettings,
+    seed: int,
+) -> Float32[np.ndarray, "N D"]:
+    """Train the vectors of Gaussians, of unit length.
+
+    Args:
+        views: pixels.
+        trees: level and parent of the masks, by number of the view.
+        num_gaussians: N.
+        settings: steps and rate.
+        seed: for the first vectors, pixels and triplets.
+    """
+    features = alike(num_gaussians, CHANNELS, seed)
+
+    def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
+        a, b, c = chosen = triplets(view.labels, *trees[view.number], random)
+        if not chosen.shape[1]:
+            return features.sum() * 0
+        vectors = unit(product(view.weights, unit(features)))
+        edges = neighbouring_pixels(view.xy)
+        borders = (view.labels[edges[0]] != view.labels[edges[1]]).sum(axis=1)
+        pairs = np.concatenate([chosen[[0, 1]], chosen[[0, 2]]], axis=1)
+        near, far = ultrametric(vectors, edges, BORDER * borders, pairs).chunk(2)
+        dots = (vectors[a] * (vectors[c] - vectors[b])).sum(1)
+        # -log of the softmax of a pair inside against the pair across
+        return softplus(dots / TEMPERATURE).mean() + softplus((near - far) / TEMPERATURE).mean()
+
+    train(views, [{"params": [features], "lr": settings.rate}], loss, settings, seed)
+    return unit(features.detach()).numpy()
+
+
+def components(
+    features: Float32[np.ndarray, "N D"],
+    means: Float32[np.ndarray, "N 3"],
+    thresholds: tuple[float, float, float],
+) -> Int64[np.ndarray, "N 3"]:
+    """Component of each Gaussian at every distance, largest first.
+
+    Gaussians beyond the 200 largest components belong to that of the nearest Gaussian inside.
+    """
+    num = len(means)
+    count = min(NEIGHBOURS + 1, num)
+    near = cKDTree(means).query(means, count)[1].reshape(num, count)
+    a, b = np.repeat(np.arange(num), count), near.ravel()
+    apart = np.sqrt(np.square(features[a] - features[b]).sum(axis=1))
+    found = []
+    for most in thresholds:
+        kept = apart < most
+        graph = sp.csr_matrix((np.ones(kept.sum()), (a[kept], b[kept])), shape=(num, num))
+        number, part = connected_components(graph, directed=False)
+        order = np.argsort(-np.bincount(part, minlength=number), kind="stable")
+        rank = np.empty(number, np.int64)
+        rank[order] = np.arange(number)
+        rank = rank[part]
+        large, small = np.flatnonzero(rank < LARGEST), np.flatnonzero(rank >= LARGEST)
+        rank[small] = rank[large[cKDTree(means[large]).query(means[small])[1]]]
+        found.append(rank)
+    return np.stack(found, axis=1)
+
+
+def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+    """Train vectors, connect Gaussians at three distances, and give components the codes of masks.
+
+    Raises:
+        SettingsError: the thresholds do not fall.
+    """
+    thresholds = thresholds_of(settings, THRESHOLDS)
+    contributions = inputs.contributions
+    views = labelled_views(inputs, settings.pixel_step)
+    trees = {}
+    for view in views:
+        masks = HierarchicalMasks.load(Path(inputs.masks_folder) / f"{contributions.views[view.number]}.npz")
+        trees[view.number] = (masks.level, coverage_tree(masks, CoverageTreeSettings().theta)[0])
+    features = train_features(views, trees, contributions.num_gaussians, settings, seed)
+    return cluster_field(inputs, components(features, contributions.means(), thresholds))
+
+
+METHOD = Method(
+    "vch",
+    "VCH",
+    "hardyho/ultrametric_feature_fields; departs: 16 numbers on frozen Gaussians in place of a radiance "
+    "field of 128, unit length by division, no smoothing of depth, components of Gaussians, not voxels, "
+    "CLIP of the masks that fit a component",
+    fit,
+)
