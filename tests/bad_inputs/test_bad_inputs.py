@@ -42,6 +42,7 @@ LINK = (*LINK, "--clip", str(CLIP), *OUT)
 ASK = ("query", "photos/desk", "mug")
 POSES = ("poses", "--images", "photos", *OUT)
 NEW = ("new", "chair", "photos")
+CHECK = ("settings", "--check")
 
 
 @dataclass(frozen=True)
@@ -480,6 +481,25 @@ ROWS = [
         write("config/config.yaml", "masks:\n\tmodel: x\n"),
         lambda: read_config(Path("config/config.yaml")),
         ("config/config.yaml, line 2, column 1",),
+    ),
+    Row(
+        "YAML for --configfile with a bracket left open",
+        write("my.yaml", "seed: 0\nonly: [a\nseeds: 1\n"),
+        (*CHECK, "my.yaml"),
+        ("my.yaml, line 3", "is not YAML"),
+    ),
+    Row(
+        "YAML for --configfile in Latin-1",
+        write("my.yaml", b"labels: {a: \xff}\n"),
+        (*CHECK, "my.yaml"),
+        ("my.yaml cannot be read", "UTF-8"),
+    ),
+    Row("a missing file for --configfile", nothing, (*CHECK, "my.yaml"), ("my.yaml is missing",)),
+    Row(
+        "a misspelt key for --configfile",
+        write("my.yaml", "field: {weight_prt: 1}\n"),
+        (*CHECK, "my.yaml"),
+        ("field.weight_prt: unknown key", "did you mean 'weight_part'"),
     ),
     Row(
         "YAML that is a list",
