@@ -139,6 +139,8 @@ def full_disk_told(path: Path) -> Iterator[None]:
                 found=f"{usage.free / 2**20:.1f} MiB free of {usage.total / 2**20:.0f} MiB on that disk",
                 fix=f"free space on the disk of {folder}, then run again; finished work is kept",
             ) from error
+        if isinstance(error, OSError) and LITTER.fullmatch(Path(str(error.filename)).name):
+            error.filename = str(path)  # the temporary name would tell nobody anything
         raise
 
 

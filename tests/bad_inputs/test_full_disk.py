@@ -106,3 +106,13 @@ def test_a_full_disk_is_told_and_costs_nothing(case: str, disk: Path, told: Call
         assert each in text
     assert snapshot(disk) == before
     assert not list(disk.rglob(".writing-*"))
+
+
+def test_a_disk_that_can_only_be_read_is_told_with_the_file_of_the_person(
+    disk: Path, told: Callable[..., str]
+) -> None:
+    shutil.copy("config/scenes.tsv", disk)
+    textured(Path("photos"))
+    subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
+    text = told(("new", "chair", "photos", "--sheet", "disk/scenes.tsv"))
+    assert "disk/scenes.tsv is on a disk that can only be read" in text
