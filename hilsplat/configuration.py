@@ -281,6 +281,10 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
     Raises:
         SettingsError: keys cannot be used; the message names each of them.
     """
+    if "\\u0000" in json.dumps(config, default=str):
+        raise SettingsError(
+            "a text of the configuration has a null byte", fix="take it out: no command takes it"
+        )
     try:
         run = RunSettings.model_validate(config)
     except ValidationError as error:

@@ -466,6 +466,14 @@ ROWS = [
         plan(overrides={"sinthetic/table-1": {}}),
         ("did you mean",),
     ),
+    Row(
+        "a misspelt scene in sweep_scenes",
+        nothing,
+        plan(sweep_scenes=["table-1", "tabel-2"]),
+        ("sweep_scenes", "tabel-2", "did you mean 'table-2'"),
+    ),
+    Row("a null byte in a label", nothing, plan(labels={"default": "a\0b"}), ("null byte",)),
+    Row("a variant whose name is a command", nothing, plan(variants={"$(touch x)": {}}), ("'$(touch x)'",)),
     Row("a misspelt data set in queries", nothing, plan(queries={"foto": ["a"]}), ("queries.foto", "photos")),
     Row(
         "a misspelt variant in labels", nothing, plan(labels={"lifeted": "x"}), ("labels.lifeted", "'lifted'")
