@@ -135,7 +135,7 @@ def torment(
             run.watch_for(chance.uniform(0, 4 * whole_s / options.kills))  # two runs' worth
             if not run.is_running():
                 break
-            fault = chance.choice(faults)
+            fault = chance.choices(faults, [3 if each.kills else 1 for each in faults])[0]
             print(f"{tally.kills} kills; now {fault.name}: {run.what_runs()}", flush=True)
             victims = fault.strike(run, chance)
             tally.faults[fault.name] = tally.faults.get(fault.name, 0) + 1
