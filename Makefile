@@ -3,16 +3,18 @@
 # make test    set up, then run lint and all tests
 # make lint    set up, then check style, imports and rules
 # make bench   set up, then time the fast paths; tables go to results/benchmarks (docs/benchmarks.md)
+# make chaos   set up, then kill, freeze and starve runs of the ci configuration, and compare tables (docs/workflow.md)
 # make report  set up, run, and write results/report.html
 # make setup   create .venv with everything that the targets above need
 PYTHON ?= python3
 CORES ?= 2
+KILLS ?= 30
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: run demo test lint bench report setup
+.PHONY: run demo test lint bench chaos report setup
 
 run: $(STAMP)
 	snakemake --cores $(CORES)
@@ -41,6 +43,9 @@ test: lint
 
 bench: $(STAMP)
 	OMP_NUM_THREADS=1 python -m pytest -c benchmarks/pytest.ini benchmarks
+
+chaos: $(STAMP)
+	python -m tests.chaos --kills $(KILLS)
 
 report: $(STAMP)
 	snakemake --cores $(CORES)

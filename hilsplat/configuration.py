@@ -3,7 +3,7 @@
 import difflib
 import json
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
@@ -35,6 +35,9 @@ from hilsplat.settings import (
     WorldSettings,
     knob,
 )
+
+CONFIG = Path("config/config.yaml")
+"""The configuration of the project; files of `--configfile` are laid over it."""
 
 
 class StageSettings(Section):
@@ -278,6 +281,10 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
     Raises:
         SettingsError: keys cannot be used; the message names each of them.
     """
+    if "\\u0000" in json.dumps(config, default=str):
+        raise SettingsError(
+            "a text of the configuration has a null byte", fix="take it out: no command takes it"
+        )
     try:
         run = RunSettings.model_validate(config)
     except ValidationError as error:
@@ -328,6 +335,8 @@ def read_config(path: Path) -> dict[str, Any]:
             f"{path}{place} is not YAML: {error.problem or error.context}",
             fix="indent with spaces, close what is open, and quote texts with a colon or braces",
         ) from error
+    except FileNotFoundError as error:
+        raise SettingsError(f"{path} is missing", fix="correct its path, which begins here") from error
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, OSError) as error:
         raise SettingsError(f"{path} cannot be read: {error}", fix="save it as YAML in UTF-8") from error
     if found is not None and not isinstance(found, dict):
@@ -335,6 +344,29 @@ def read_config(path: Path) -> dict[str, Any]:
             f"{path} does not hold settings", expected="lines of key: value", found=type(found).__name__
         )
     return found or {}
+
+
+def check_configs(paths: Sequence[Path]) -> None:
+    """Check files that are laid over the configuration of the project, in their order.
+
+    Snakemake reads files of `--configfile` before any line of the workflow, and names neither file nor line.
+
+    Raises:
+        SettingsError: a file is not YAML, a key is unknown, or a value is of the wrong type or out of range.
+    """
+    laid: dict[str, Any] = read_config(CONFIG) if CONFIG.is_file() else {}
+    for path in paths:
+        laid = _laid_over(laid, read_config(path))
+    parse_run(laid)
+
+
+def _laid_over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings with others over them, section by section, as Snakemake does it."""
+    laid = dict(below)
+    for key, value in above.items():
+        both = isinstance(value, Mapping) and isinstance(laid.get(key), Mapping)
+        laid[key] = _laid_over(laid[key], value) if both else value
+    return laid
 
 
 def config_schema() -> dict[str, Any]:

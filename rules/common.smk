@@ -16,7 +16,7 @@ from snakemake.logging import logger
 
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.processes import jobs_end_with_this_process
-from hilsplat.evaluate.tables.build import TABLES
+from hilsplat.evaluate.tables.build import TABLES, published_values
 from hilsplat.workflow.plan import CACHE, RESULTS, Plan, any_of
 from hilsplat.workflow.resources import JobResources
 from hilsplat.workflow.soundness import unsound

@@ -38,7 +38,7 @@ rule evaluate:
 rule table:
     input:
         scores=lambda wildcards: PLAN.scores(wildcards.table),
-        published="config/published/{table}.csv",
+        published=lambda wildcards: str(published_values(wildcards.table)),
     output:
         csv=update("results/tables/{table}.csv"),
         md=update("results/tables/{table}.md"),

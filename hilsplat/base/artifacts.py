@@ -18,8 +18,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from hilsplat.base.errors import ArtifactError, DiskSpaceError
-from hilsplat.base.processes import temporary_prefix
+from hilsplat.base.errors import ArtifactError, DiskSpaceError, HilsplatError
+from hilsplat.base.processes import LITTER, temporary_prefix
 
 Made = TypeVar("Made")
 
@@ -110,7 +110,10 @@ def work_folder(path: Path) -> Iterator[Path]:
 
 
 FULL_DISK = ("No space left on device", "disk is full", "Disk quota exceeded")
-"""What libraries in C++ and Rust say, whose errors are not the system's: safetensors, SQLite, COLMAP."""
+"""What libraries in C++ and Rust say, whose errors are not the system's: safetensors, SQLite."""
+
+FULL_BELOW_MIB = 1.0
+"""Other errors of libraries are put down to a full disk if less is free: COLMAP's do not say it."""
 
 
 @contextmanager
@@ -122,14 +125,37 @@ def full_disk_told(path: Path) -> Iterator[None]:
     """
     try:
         yield
-    except Exception as error:
-        full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
-        if full or any(words in str(error) for words in FULL_DISK):
-            raise DiskSpaceError(
-                f"no space left while writing {path}",
-                fix=f"free space on the disk of {path.parent}, then run again; finished work is kept",
-            ) from error
+    except HilsplatError:
         raise
+    except Exception as error:
+        folder = _lasting(path)
+        usage = shutil.disk_usage(folder)
+        full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
+        full = full or any(words in str(error) for words in FULL_DISK)
+        full = full or (isinstance(error, LIBRARY) and usage.free < FULL_BELOW_MIB * 2**20)
+        if full:
+            raise DiskSpaceError(
+                f"no space left while writing {path.name} in {folder}",
+                found=f"{usage.free / 2**20:.1f} MiB free of {usage.total / 2**20:.0f} MiB on that disk",
+                fix=f"free space on the disk of {folder}, then run again; finished work is kept",
+            ) from error
+        if isinstance(error, OSError) and LITTER.fullmatch(Path(str(error.filename)).name):
+            error.filename = str(path)  # the temporary name would tell nobody anything
+        raise
+
+
+LIBRARY = (RuntimeError, ChildProcessError)
+"""What libraries in C++ raise, and what stands for one that ended its process."""
+
+
+def _lasting(path: Path) -> Path:
+    """The folder of a path, or the one that holds its unfinished artifact: what is unfinished goes."""
+    path = Path(path)
+    hidden = [place for place in path.parents if LITTER.fullmatch(place.name)]
+    folder = hidden[-1].parent if hidden else path.parent
+    while not folder.exists():
+        folder = folder.parent
+    return folder
 
 
 def require_free_space(folder: Path, needed_mib: float) -> None:

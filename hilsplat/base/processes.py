@@ -141,3 +141,40 @@ def in_processes(
         initargs=(os.getpid(),),
     ) as pool:
         yield from pool.map(work, *zip(*items, strict=True), chunksize=chunk)
+
+
+def in_own_process(work: Callable[..., Result], *given: Any) -> Result:
+    """`work(*given)`, computed in a process of its own, for libraries that may end theirs.
+
+    What they print on their way out is no message for people: the end of it is the end of the error.
+
+    Args:
+        work: a function at the top level of a module.
+        given: its arguments.
+
+    Raises:
+        ChildProcessError: the process ended without a result.
+    """
+    from concurrent.futures import ProcessPoolExecutor  # most commands start none
+    from concurrent.futures.process import BrokenProcessPool
+    from multiprocessing import get_context
+    from tempfile import TemporaryDirectory
+
+    with TemporaryDirectory() as folder:
+        said = Path(folder) / "said"
+        try:
+            with ProcessPoolExecutor(
+                1, mp_context=get_context("spawn"), initializer=_begin_alone, initargs=(os.getpid(), said)
+            ) as pool:
+                return pool.submit(work, *given).result()
+        except BrokenProcessPool:
+            last = said.read_text(errors="replace")[-2000:] if said.exists() else ""
+            raise ChildProcessError(
+                f"{work.__module__}.{work.__name__} was ended by a library\n{last}"
+            ) from None
+
+
+def _begin_alone(parent: int, said: Path) -> None:
+    end_with_parent(parent)
+    with said.open("wb") as stream:
+        os.dup2(stream.fileno(), 2)

@@ -232,6 +232,36 @@ def register_images(
         )
 
 
+def find_matches(
+    database: Path,
+    folder: Path,
+    images: Sequence[WorkImage],
+    camera_model: str,
+    settings: PosesSettings,
+    seed: int,
+    threads: int,
+) -> str:
+    """Register images, extract features and match them; returns which matching was used.
+
+    In a process of its own: where its database cannot be written, COLMAP throws in a thread of C++.
+    """
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    register_images(database, folder, images, camera_model, settings.single_camera)
+    return features_and_matches(database, folder, [image.view for image in images], settings, seed, threads)
+
+
+def features_and_matches(
+    database: Path, folder: Path, views: Sequence[str], settings: PosesSettings, seed: int, threads: int
+) -> str:
+    """Features and matches of registered images; returns which matching was used.
+
+    In a process of its own, as `find_matches`.
+    """
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    extract_features(database, folder, views, settings, threads)
+    return match_features(database, len(views), settings, seed, threads)
+
+
 def extract_features(
     database: Path, folder: Path, views: Sequence[str], settings: PosesSettings, threads: int
 ) -> None:

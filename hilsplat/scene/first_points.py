@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, UInt8
 
+from hilsplat.base.processes import in_own_process
 from hilsplat.scene.assemble import PosedView
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.features import (
-    extract_features,
+    features_and_matches,
     incremental_options,
-    match_features,
 )
 from hilsplat.scene.model import sparse_points
 from hilsplat.settings import PosesSettings
@@ -35,8 +35,8 @@ def triangulate(
         options.camera_model = view.camera.model_name
         options.camera_params = ", ".join(repr(float(value)) for value in view.camera.params)
         pycolmap.import_images(database, folder, pycolmap.CameraMode.PER_IMAGE, [view.view], options)
-    extract_features(database, folder, [view.view for view in views], settings, threads)
-    match_features(database, len(views), settings, seed, threads)
+    names = [view.view for view in views]
+    in_own_process(features_and_matches, database, folder, names, settings, seed, threads)
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as opened:
         for view in views:

@@ -11,6 +11,7 @@ import numpy as np
 from hilsplat.base.artifacts import work_folder
 from hilsplat.base.errors import RegistrationError, SceneError
 from hilsplat.base.files import list_images
+from hilsplat.base.processes import in_own_process
 from hilsplat.base.progress import stage_log
 from hilsplat.scene.assemble import PosedView, split_views, write_scene
 from hilsplat.scene.colmap import pycolmap
@@ -19,11 +20,9 @@ from hilsplat.scene.features import (
     MatchCounts,
     WorkImage,
     count_matches,
-    extract_features,
+    find_matches,
     incremental_options,
-    match_features,
     prepare_images,
-    register_images,
 )
 from hilsplat.scene.importers import import_poses
 from hilsplat.scene.known_poses import find_known_poses
@@ -124,11 +123,10 @@ def _reconstruct(
         camera_model = "simple_pinhole" if is_render else "simple_radial"
     work_images = prepare_images(sources, work / "images", settings.max_side_px)
     database = work / "features.db"
-    register_images(database, work / "images", work_images, camera_model, settings.single_camera)
-    logger.info("%s: features of %d images", name, len(work_images))
-    extract_features(database, work / "images", [image.view for image in work_images], settings, threads)
-    logger.info("%s: matches", name)
-    matcher = match_features(database, len(work_images), settings, seed, threads)
+    logger.info("%s: features of %d images, and matches", name, len(work_images))
+    matcher = in_own_process(
+        find_matches, database, work / "images", work_images, camera_model, settings, seed, threads
+    )
     matches = count_matches(database)
     logger.info("%s: %s mapping", name, settings.mapper)
     models = map_views(database, work / "images", work / "models", settings.mapper, seed)

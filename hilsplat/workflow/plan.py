@@ -87,12 +87,17 @@ class Plan:
         gone = [key for key in named if key.partition("/")[0] in datasets]
         require_known("overrides", run.overrides, [*GROUPS, *scenes, *gone])
         require_known("queries", run.queries, [*sorted({*datasets, *GROUPS}), *scenes, *gone])
-        for key in sorted({*gone} - {*scenes}):
-            if near := difflib.get_close_matches(key, scenes, n=1, cutoff=0.85):
+        known = {
+            **dict.fromkeys(gone, ("overrides or queries", scenes)),
+            **dict.fromkeys(run.sweep_scenes, ("sweep_scenes", [row.scene for row in self.rows])),
+        }
+        for key, (where, names) in sorted(known.items()):
+            near = difflib.get_close_matches(key, names, n=1, cutoff=0.85)
+            if key not in names and near:
                 raise SettingsError(
-                    f"overrides or queries name the scene {key!r}, which {sheet} does not have",
+                    f"{where} of the configuration has the scene {key!r}, which {sheet} does not have",
                     expected=f"did you mean {near[0]!r}?",
-                    fix="correct the key, or take it out",
+                    fix="correct the name, or take it out",
                 )
         self._row_of = {(row.dataset, row.scene): row for row in self.rows}
         chosen = choose_scenes(self.rows, run.groups, run.only)

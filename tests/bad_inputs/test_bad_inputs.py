@@ -42,6 +42,7 @@ LINK = (*LINK, "--clip", str(CLIP), *OUT)
 ASK = ("query", "photos/desk", "mug")
 POSES = ("poses", "--images", "photos", *OUT)
 NEW = ("new", "chair", "photos")
+CHECK = ("settings", "--check")
 
 
 @dataclass(frozen=True)
@@ -465,6 +466,14 @@ ROWS = [
         plan(overrides={"sinthetic/table-1": {}}),
         ("did you mean",),
     ),
+    Row(
+        "a misspelt scene in sweep_scenes",
+        nothing,
+        plan(sweep_scenes=["table-1", "tabel-2"]),
+        ("sweep_scenes", "tabel-2", "did you mean 'table-2'"),
+    ),
+    Row("a null byte in a label", nothing, plan(labels={"default": "a\0b"}), ("null byte",)),
+    Row("a variant whose name is a command", nothing, plan(variants={"$(touch x)": {}}), ("'$(touch x)'",)),
     Row("a misspelt data set in queries", nothing, plan(queries={"foto": ["a"]}), ("queries.foto", "photos")),
     Row(
         "a misspelt variant in labels", nothing, plan(labels={"lifeted": "x"}), ("labels.lifeted", "'lifted'")
@@ -480,6 +489,25 @@ ROWS = [
         write("config/config.yaml", "masks:\n\tmodel: x\n"),
         lambda: read_config(Path("config/config.yaml")),
         ("config/config.yaml, line 2, column 1",),
+    ),
+    Row(
+        "YAML for --configfile with a bracket left open",
+        write("my.yaml", "seed: 0\nonly: [a\nseeds: 1\n"),
+        (*CHECK, "my.yaml"),
+        ("my.yaml, line 3", "is not YAML"),
+    ),
+    Row(
+        "YAML for --configfile in Latin-1",
+        write("my.yaml", b"labels: {a: \xff}\n"),
+        (*CHECK, "my.yaml"),
+        ("my.yaml cannot be read", "UTF-8"),
+    ),
+    Row("a missing file for --configfile", nothing, (*CHECK, "my.yaml"), ("my.yaml is missing",)),
+    Row(
+        "a misspelt key for --configfile",
+        write("my.yaml", "field: {weight_prt: 1}\n"),
+        (*CHECK, "my.yaml"),
+        ("field.weight_prt: unknown key", "did you mean 'weight_part'"),
     ),
     Row(
         "YAML that is a list",

@@ -44,7 +44,7 @@ def test_without_sweeps_every_stage_runs_once(base):
         "evaluate",
     )
     assert {stage: base[stage] for stage in stages} == dict.fromkeys(stages, 1)
-    assert base["table"] == 14
+    assert base["table"] == 17
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from hilsplat.base.artifacts import write_text
@@ -10,7 +11,7 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.evaluate.instance_files import read_instances
 from hilsplat.evaluate.scores import read_scores
 from hilsplat.evaluate.tables.ablation import ablation_table, omega_table, theta_table
-from hilsplat.evaluate.tables.cost_tables import cost_table, efficiency_table, pruning_table
+from hilsplat.evaluate.tables.cost_tables import SECONDS, cost_table, efficiency_table, pruning_table
 from hilsplat.evaluate.tables.costs import read_costs
 from hilsplat.evaluate.tables.frame_tables import hi_3dovs_frames, hi_lerf_frames
 from hilsplat.evaluate.tables.hierarchy import hierarchy_table
@@ -61,14 +62,24 @@ TABLES: dict[str, TableKind] = {
     "hierarchy": TableKind(hierarchy_table, ("tabletop", "room", "street", "lerf_ovs", "3d_ovs")),
     "ablation": TableKind(ablation_table, LEVELLED, "ablation_variants"),
     "cost": TableKind(cost_table, LEVELLED, shows_costs=True),
+    "cost-seconds": TableKind(partial(cost_table, seconds=True), LEVELLED, shows_costs=True),
     "pruning": TableKind(pruning_table, LEVELLED, "pruning_variants", shows_costs=True),
+    "pruning-seconds": TableKind(
+        partial(pruning_table, seconds=True), LEVELLED, "pruning_variants", shows_costs=True
+    ),
     "efficiency": TableKind(efficiency_table, LEVELLED, shows_costs=True),
+    "efficiency-seconds": TableKind(partial(efficiency_table, seconds=True), LEVELLED, shows_costs=True),
     "theta": TableKind(theta_table, LEVELLED, "theta_variants"),
     "omega": TableKind(omega_table, LEVELLED, "omega_variants"),
     "frames-hi-lerf": TableKind(hi_lerf_frames, ("tabletop", "lerf_ovs")),
     "frames-hi-3dovs": TableKind(hi_3dovs_frames, ("tabletop", "3d_ovs")),
 }
 """Every table by name, in the order of the report; a new one is a function and a line here."""
+
+
+def published_values(table: str) -> Path:
+    """The paper's values for a table; one of seconds shares them with the one that it completes."""
+    return Path("config/published") / f"{table.removesuffix(SECONDS)}.csv"
 
 
 def run_table(
@@ -84,7 +95,7 @@ def run_table(
     Args:
         name: a key of `TABLES`.
         scores: `scores.csv` of every scene and variant that the table shows.
-        published: the paper's values: `config/published/<name>.csv`.
+        published: the paper's values: `published_values(name)`.
         labels: variant -> its name in the table; others keep their own.
         out: the CSV; `.md`, `.tex` and `.html` are written beside it.
         absent: a sentence per data set that was not measured, with the reason.

@@ -1,11 +1,12 @@
 """Time and memory: computational cost, efficiency, pruning.
 
-Measured rows report what the jobs took on this machine. They differ from run to run, so these tables,
-unlike the others, do not repeat byte for byte.
+What the jobs took on this machine differs from run to run. It stands in tables of its own, whose names end
+with `-seconds`: the others repeat byte for byte.
 """
 
 import statistics
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LOWER = ("(min)", "(GB)", "(s)")
+SECONDS = "-seconds"
+"""End of the names of tables that do not repeat byte for byte."""
+
 COST_NOTE = (
     "Measured rows, on this machine, means over scenes: preparation is masks, trees of the views and CLIP; "
     "training is contributions, semantic tree, autoencoder and field; neither includes the 3D Gaussians. "
@@ -28,7 +32,7 @@ COST_NOTE = (
 )
 
 
-def cost_table(sources: Sources) -> Table:
+def cost_table(sources: Sources, seconds: bool = False) -> Table:
     """Training time, memory and seconds per query and scene (paper: computational costs)."""
     blocks = [reported(sources, "one RTX 3090")]
     for data, costs in by_dataset(sources.costs).items():
@@ -43,26 +47,53 @@ def cost_table(sources: Sources) -> Table:
             }
             rows.append(Row({"Method": row_name(variant, method, sources.labels)}, cells))
         blocks.append(timed(data, rows, columns))
-    return sources.finished("cost", "Computational cost", blocks, (COST_NOTE,))
+    return finished(sources, "cost", "Computational cost", blocks, seconds)
 
 
-def efficiency_table(sources: Sources) -> Table:
+def efficiency_table(sources: Sources, seconds: bool = False) -> Table:
     """Quality at three levels beside training time and memory (paper: efficiency)."""
     blocks = [reported(sources, "one RTX 3090")]
     blocks += quality_blocks(sources, ("Preparation (min)", "Training (min)", "Memory (GB)"))
-    return sources.finished("efficiency", "Efficiency", blocks, (COST_NOTE,))
+    return finished(sources, "efficiency", "Efficiency", blocks, seconds)
 
 
-def pruning_table(sources: Sources) -> Table:
+def pruning_table(sources: Sources, seconds: bool = False) -> Table:
     """Cost and quality with pruned pairs in the contrastive losses (paper: sample pruning)."""
     blocks = [reported(sources, "sample pruning")]
     blocks += quality_blocks(sources, ("Training (min)", "Memory (GB)", "Query (s)"), ("field",))
-    footnotes = (
-        COST_NOTE,
+    footnote = (
         "The paper removes redundant pairs by similarity of features and gives no rule. What our variant "
-        "removes is set in config/config.yaml (variants).",
+        "removes is set in config/config.yaml (variants)."
     )
-    return sources.finished("pruning", "Cost with pruned pairs", blocks, footnotes)
+    return finished(sources, "pruning", "Cost with pruned pairs", blocks, seconds, (footnote,))
+
+
+def finished(
+    sources: Sources,
+    name: str,
+    title: str,
+    blocks: Iterable[Block],
+    seconds: bool,
+    footnotes: Sequence[str] = (),
+) -> Table:
+    """A table with all columns, or with those alone that are the same in every run."""
+    if seconds:
+        return sources.finished(name + SECONDS, f"{title}, on this machine", blocks, (COST_NOTE, *footnotes))
+    repeated = [block if block.kind == "reported" else without_costs(block) for block in blocks]
+    elsewhere = f"What the jobs of this machine took, beside these numbers: table {name}{SECONDS}."
+    return sources.finished(
+        name, title, (block for block in repeated if block.columns), (elsewhere, *footnotes)
+    )
+
+
+def without_costs(block: Block) -> Block:
+    """A block without seconds and memory."""
+    columns = tuple(column for column in block.columns if column not in block.lower_is_better)
+    rows = (
+        replace(row, cells={column: row.cells[column] for column in columns if column in row.cells})
+        for row in block.rows
+    )
+    return replace(block, rows=tuple(rows), columns=columns)
 
 
 def reported(sources: Sources, what: str) -> Block:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from hilsplat.base.processes import in_processes
+from hilsplat.base.processes import in_own_process, in_processes
 
 
 def square(base: int, number: int) -> tuple[int, int]:
@@ -108,3 +108,11 @@ def test_the_processes_of_a_pool_end_with_it(tmp_path):
     pool.kill()
     pool.wait()
     assert ended(pool.stdout)
+
+
+def test_a_library_that_ends_its_process_is_an_error_of_ours():
+    assert in_own_process(sorted, [2, 1]) == [1, 2]
+    with pytest.raises(ChildProcessError, match="was ended by a library"):
+        in_own_process(os.abort)
+    with pytest.raises(ZeroDivisionError):
+        in_own_process(divmod, 1, 0)

@@ -9,8 +9,9 @@ import pytest
 from hilsplat.base.artifacts import provenance_path, write_json
 from hilsplat.base.errors import ArtifactError
 from hilsplat.evaluate.scores import Score, write_scores
-from hilsplat.evaluate.tables.build import run_table
+from hilsplat.evaluate.tables.build import published_values, run_table
 from hilsplat.evaluate.tables.costs import read_costs, time_queries, write_times
+from tests.conftest import PROJECT
 from tests.unit.evaluate.tables.test_tables import PUBLISHED
 
 
@@ -90,22 +91,52 @@ def test_score_files_without_times_are_named(scene):
 @pytest.mark.parametrize(
     ("table", "column", "expected"),
     [
-        ("cost", "Training (min)", ["1.00", "2.00"]),
-        ("cost", "table-1 query (s)", ["0.25", "0.25"]),
-        ("efficiency", "Memory (GB)", ["1.00", "2.00"]),
-        ("efficiency", "Hi-LERF mIoU", ["50.00", "50.00"]),
-        ("pruning", "Query (s)", ["0.25", "0.25"]),
+        ("cost-seconds", "Training (min)", ["1.00", "2.00"]),
+        ("cost-seconds", "table-1 query (s)", ["0.25", "0.25"]),
+        ("efficiency-seconds", "Memory (GB)", ["1.00", "2.00"]),
+        ("efficiency-seconds", "Hi-LERF mIoU", ["50.00", "50.00"]),
+        ("pruning-seconds", "Query (s)", ["0.25", "0.25"]),
     ],
 )
 def test_tables_of_costs_show_measured_rows_beside_the_papers(scene, tmp_path, table, column, expected):
     out = tmp_path / f"{table}.csv"
     labels = {"default": "hilsplat", "omega-2": "Omega = 2"}
-    run_table(table, scene, PUBLISHED / f"{table}.csv", labels, out)
+    run_table(table, scene, PROJECT / published_values(table), labels, out)
     with out.open(newline="") as stream:
         rows = [row for row in csv.DictReader(stream) if row["kind"] != "reported"]
     assert [row["method"] for row in rows] == ["hilsplat (field)", "Omega = 2"]
     assert [row[column] for row in rows] == expected
     assert "main memory" in out.with_suffix(".md").read_text()
+
+
+@pytest.mark.parametrize("table", ["cost", "efficiency", "pruning"])
+def test_tables_of_numbers_are_the_same_bytes_whatever_the_jobs_took(scene, tmp_path, table):
+    def built(name):
+        out = tmp_path / f"{name}.csv"
+        run_table(name, scene, PROJECT / published_values(name), {"omega-2": "Omega = 2"}, out)
+        return {kind: out.with_suffix(kind).read_bytes() for kind in (".csv", ".md", ".tex", ".html")}
+
+    before, timed = built(table), built(f"{table}-seconds")
+    for path in scene:
+        write_times(path, "synthetic", "table-1", path.parent.name, {"field": 0.75})
+        for record_path in path.parent.glob("benchmarks/*.jsonl"):
+            record(path.parent, record_path.stem, 600, 4096)
+    assert built(table) == before
+    assert all(timed[kind] != content for kind, content in built(f"{table}-seconds").items())
+    assert f"{table}-seconds".encode() in before[".md"]
+
+
+def test_efficiency_without_seconds_has_the_quality_of_every_row(scene, tmp_path):
+    out = tmp_path / "efficiency.csv"
+    run_table("efficiency", scene, PUBLISHED / "efficiency.csv", {"omega-2": "Omega = 2"}, out)
+    rows = list(csv.DictReader(out.read_text().splitlines()))
+    ours = [row for row in rows if row["kind"] != "reported"]
+    assert [(row["method"], row["Hi-LERF mIoU"]) for row in ours] == [
+        ("hilsplat (field)", "50.00"),
+        ("Omega = 2", "50.00"),
+    ]
+    assert {row["Training (min)"] for row in ours} == {""}
+    assert [row["Training (min)"] for row in rows if row["method"] == "Hi-LSplat"] == ["114"]
 
 
 def test_a_query_is_text_weights_and_answer():

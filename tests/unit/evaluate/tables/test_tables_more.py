@@ -7,7 +7,8 @@ from hilsplat.configuration import RunSettings
 from hilsplat.evaluate.instance_files import write_instances
 from hilsplat.evaluate.metrics.instances import InstanceScan, match_instances
 from hilsplat.evaluate.scores import write_scores
-from hilsplat.evaluate.tables.build import TABLES, run_table
+from hilsplat.evaluate.tables.build import TABLES, published_values, run_table
+from tests.conftest import PROJECT
 from tests.unit.evaluate.tables.test_tables import PUBLISHED, built, measured, score
 
 MODE = "(points: nearest)"
@@ -119,7 +120,9 @@ def test_frames_are_the_views_that_were_asked_at_levels(tmp_path):
 @pytest.mark.parametrize("name", sorted(TABLES))
 def test_every_table_lists_below_what_was_not_measured(tmp_path, name):
     out = tmp_path / f"{name}.csv"
-    run_table(name, [], PUBLISHED / f"{name}.csv", {}, out, ["replica (room_0): data_root is not set."])
+    run_table(
+        name, [], PROJECT / published_values(name), {}, out, ["replica (room_0): data_root is not set."]
+    )
     for suffix in (".md", ".tex", ".html"):
         assert "Not measured: replica (room" in out.with_suffix(suffix).read_text().replace(r"\_", "_")
 

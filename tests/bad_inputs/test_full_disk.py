@@ -1,0 +1,118 @@
+"""A disk that fills up while a stage writes: it is told, the former output stays, and nothing else does."""
+
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.bad_inputs.conftest import snapshot
+from tests.bad_inputs.test_bad_inputs import CODE, CONTRIBUTIONS, TREE
+from tests.unit.finished_desk import SCENE
+
+SIZE_KIB = 4096
+
+
+@pytest.fixture
+def disk(project: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A small disk in the project, which a stage does not refuse from the start."""
+    place = project / "disk"
+    place.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", f"size={SIZE_KIB}k", "tmpfs", str(place)]
+    try:
+        mounted = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError as error:
+        pytest.skip(f"no small disk: {error}")
+    if mounted.returncode:
+        pytest.skip(f"no small disk: {mounted.stderr.strip()}")
+    monkeypatch.setattr("hilsplat.cli.stage.MIN_FREE_MIB", 0.0)
+    try:
+        yield place
+    finally:
+        subprocess.run(["umount", str(place)], check=True)
+
+
+def leave(disk: Path, kib: int) -> None:
+    """Fill the disk up to some KiB."""
+    with (disk / "filler").open("wb") as stream:
+        stream.write(bytes(shutil.disk_usage(disk).free - kib * 1024))
+
+
+def textured(folder: Path) -> None:
+    """Photographs of many features."""
+    rng = np.random.default_rng(0)
+    folder.mkdir()
+    for number in range(4):
+        squares = rng.integers(0, 255, (60, 80, 3), dtype=np.uint8)
+        Image.fromarray(np.kron(squares, np.ones((6, 6, 1), np.uint8))).save(folder / f"{number}.png")
+
+
+SCENE_IN, CACHE = ("--scene", str(SCENE / "scene")), ("--cache", "disk/cache")
+SOLVE = (
+    "field",
+    "--contributions",
+    str(CONTRIBUTIONS),
+    "--coverage-tree",
+    str(TREE),
+    "--autoencoder",
+    str(CODE),
+)
+FIT = ("gaussians", *SCENE_IN, "--settings", '{"iterations": 20}', *CACHE, "--report", "disk/gaussians")
+STAGES = {
+    # output: command, KiB that are left
+    "field.safetensors": (SOLVE, 4),
+    "masks": (("masks", *SCENE_IN, "--settings", '{"segmenter": "graph"}', *CACHE), 4),
+    "gaussians.ply": (FIT, 16),
+    "world": (
+        (
+            "world",
+            "make",
+            "--source",
+            "world:tabletop:1",
+            "--settings",
+            '{"views": 3, "image_px": 64}',
+        ),
+        32,
+    ),
+    "scene": (("poses", "--images", "photos"), 100),
+    "scene, at the features": (("poses", "--images", "photos"), 400),
+    "scene, at the database": (("poses", "--images", "photos"), 200),
+}
+
+
+@pytest.mark.parametrize("case", STAGES)
+def test_a_full_disk_is_told_and_costs_nothing(case: str, disk: Path, told: Callable[..., str]) -> None:
+    command, kib = STAGES[case]
+    out = Path("disk") / case.partition(",")[0]
+    if out.suffix:
+        out.write_bytes(b"the former output")
+    else:
+        out.mkdir()
+        (out / "index.json").write_text("the former output")
+    textured(Path("photos"))
+    leave(disk, kib)
+    before = snapshot(disk)
+    text = told((*command, "--out", str(out)))
+    assert "Traceback" not in text
+    # `world` knows how much it needs, and says so before it begins.
+    words = ("too little space on the disk of disk/world", "at least 5 MiB free", "0 MiB free")
+    if case != "world":
+        words = ("no space left while writing", f"of {SIZE_KIB // 1024} MiB on that disk")
+        words = (*words, "free space on the disk of disk")
+    for each in words:
+        assert each in text
+    assert snapshot(disk) == before
+    assert not list(disk.rglob(".writing-*"))
+
+
+def test_a_disk_that_can_only_be_read_is_told_with_the_file_of_the_person(
+    disk: Path, told: Callable[..., str]
+) -> None:
+    shutil.copy("config/scenes.tsv", disk)
+    textured(Path("photos"))
+    subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
+    text = told(("new", "chair", "photos", "--sheet", "disk/scenes.tsv"))
+    assert "disk/scenes.tsv is on a disk that can only be read" in text

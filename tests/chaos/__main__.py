@@ -1,0 +1,210 @@
+"""Runs of the ci configuration that are killed, frozen, doubled and starved of disk; nobody may have to help.
+
+    make chaos                                       # 30 kills, seed 0
+    python -m tests.chaos --kills 5 --seed 3 --minutes 20 --work /tmp/chaos
+
+A run is started and, after a random time, hit. It is then started again with the same words, and so on; when
+it gets to its end, its tables are compared with those of an undisturbed run, byte by byte, and the next one
+begins from nothing. The last line says how many kills there were and what they cost. The exit code is 1 if a
+table differs, or if a start without a fault did not end with success.
+
+A full disk needs results on a disk that can be filled, a small tmpfs: that fault is left out, with a notice,
+where this user may not mount one.
+"""
+
+import argparse
+import os
+import random
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tests.chaos.faults import FAULTS, Run, Victim
+from tests.conftest import PROJECT
+from tests.workflow.conftest import Project, copy_project
+
+DISK_MIB = 1000
+"""Size of the disk of results: the ci configuration needs less than a tenth of it."""
+
+SLACK_S = 3600
+"""A start that was not hit may take this long beyond the undisturbed run."""
+
+
+@dataclass
+class Tally:
+    """What happened so far.
+
+    Attributes:
+        lost_s: seconds of the clock that each kill cost.
+        lost_cpu_s: processor seconds that each kill cost.
+        faults: how often each fault hit.
+        finished: runs that got to their end.
+        problems: what a person would have had to look at.
+    """
+
+    lost_s: list[float] = field(default_factory=list)
+    lost_cpu_s: list[float] = field(default_factory=list)
+    faults: dict[str, int] = field(default_factory=dict)
+    finished: int = 0
+    problems: list[str] = field(default_factory=list)
+    waiting: list[list[Victim]] = field(default_factory=list)
+    """Victims of the kills since the last start, by kill."""
+
+    @property
+    def kills(self) -> int:
+        """Kills so far."""
+        return len(self.lost_s) + len(self.waiting)
+
+    def settle(self, again: tuple[float, float] | None) -> None:
+        """Count the kills since the last start.
+
+        Args:
+            again: seconds, and processor seconds, until the new start began a job: the cost of the last kill.
+        """
+        for victims in self.waiting:
+            again_s, again_cpu_s = (again or (0.0, 0.0)) if victims is self.waiting[-1] else (0.0, 0.0)
+            # Victims worked side by side: the clock counts the one that lost most.
+            self.lost_s.append(again_s + max((victim.lost_s for victim in victims), default=0.0))
+            self.lost_cpu_s.append(again_cpu_s + sum(victim.lost_cpu_s for victim in victims))
+        self.waiting = []
+
+    def report(self) -> str:
+        """The last lines of the program."""
+        lines = [f"{len(self.lost_s)} kills, {self.finished} runs that got to their end"]
+        lines += [f"  {name}: {count}" for name, count in sorted(self.faults.items())]
+        for what, values in (("seconds", self.lost_s), ("processor seconds", self.lost_cpu_s)):
+            if values:
+                lines.append(
+                    f"{what} lost per kill: median {statistics.median(values):.1f}, largest {max(values):.1f}"
+                )
+        lines += [f"PROBLEM {problem}" for problem in self.problems]
+        lines.append("a person was needed" if self.problems else "nobody was needed, and no table differs")
+        return "\n".join(lines)
+
+
+def tables(project: Project) -> dict[str, bytes]:
+    """Every table that does not hold what jobs took."""
+    files = project.files("results/tables")
+    return {
+        name: content
+        for name, content in files.items()
+        if not name.endswith(".provenance.json") and "-seconds." not in name
+    }
+
+
+def undisturbed(work: Path) -> tuple[Project, float]:
+    """A copy of the project in which the run got to its end, and the seconds that it took."""
+    project, seconds = Project(work / "undisturbed"), work / "undisturbed.seconds"
+    if not seconds.exists():
+        shutil.rmtree(project.root, ignore_errors=True)
+        start = time.monotonic()
+        run = Run(copy_project(PROJECT, project.root, results=False))
+        if run.wait() != 0:
+            sys.exit(f"the undisturbed run failed:\n{run.said()}")
+        seconds.write_text(f"{time.monotonic() - start:.0f}\n")
+    return project, float(seconds.read_text())
+
+
+def small_disk(folder: Path) -> bool:
+    """Mount a disk of its own there; False where this user may not."""
+    folder.mkdir(parents=True)
+    command = ["mount", "-t", "tmpfs", "-o", f"size={DISK_MIB}m", "tmpfs", str(folder)]
+    try:
+        return subprocess.run(command, capture_output=True, check=False).returncode == 0
+    except OSError:
+        return False
+
+
+def torment(
+    project: Project, reference: Project, whole_s: float, options: argparse.Namespace, disk: bool
+) -> Tally:
+    """Hit runs until there were enough kills, and let the last one get to its end."""
+    chance, tally = random.Random(options.seed), Tally()
+    faults = [fault for fault in FAULTS if disk or not fault.needs_disk]
+    deadline = time.monotonic() + 60 * options.minutes
+    while True:
+        run, may_fail = Run(project), False
+        begun = run.wait_for_a_job(whole_s + SLACK_S)
+        tally.settle(begun)
+        while begun is not None and tally.kills < options.kills and time.monotonic() < deadline:
+            run.watch_for(chance.uniform(0, 4 * whole_s / options.kills))  # two runs' worth
+            if not run.is_running():
+                break
+            fault = chance.choices(faults, [3 if each.kills else 1 for each in faults])[0]
+            print(f"{tally.kills} kills; now {fault.name}: {run.what_runs()}", flush=True)
+            victims = fault.strike(run, chance)
+            tally.faults[fault.name] = tally.faults.get(fault.name, 0) + 1
+            tally.waiting += [victims] if fault.kills else []
+            may_fail = may_fail or fault.may_fail
+            if fault.ends_run:
+                break
+        code = run.wait(whole_s + SLACK_S)
+        over = tally.kills >= options.kills or time.monotonic() > deadline
+        tally.problems += run.problems
+        if code != 0 and not may_fail:
+            tally.problems.append(f"a start that nothing hit ended with {code}:\n{run.said()}")
+            return tally
+        if code == 0:
+            tally.finished += 1
+            tally.problems += differences(reference, project)
+        if tally.problems or (code == 0 and over):
+            tally.settle(None)
+            return tally
+        if code == 0:
+            for part in (project.root / "results").iterdir():
+                shutil.rmtree(part) if part.is_dir() else part.unlink()
+            shutil.rmtree(project.root / ".snakemake")
+
+
+def differences(reference: Project, project: Project) -> list[str]:
+    """What is not as after an undisturbed run."""
+    expected, found, results = tables(reference), tables(project), project.root / "results"
+    names = sorted(name for name in expected.keys() | found.keys() if expected.get(name) != found.get(name))
+    left = sorted(str(path) for path in results.rglob(".writing-*"))
+    return [f"results/tables/{name} differs from that of the undisturbed run" for name in names] + [
+        f"{path} was left behind" for path in left
+    ]
+
+
+def main() -> None:
+    """Parse the command line, run, and report."""
+    parser = argparse.ArgumentParser(prog="python -m tests.chaos", description=__doc__.splitlines()[0])
+    parser.add_argument("--kills", type=int, default=30, help="number of kills")
+    parser.add_argument("--seed", type=int, default=0, help="seed of times and faults")
+    parser.add_argument("--minutes", type=float, default=120, help="no fault begins later than this")
+    parser.add_argument("--work", type=Path, help="folder; its undisturbed run is used again")
+    options = parser.parse_args()
+    work = options.work or Path(tempfile.mkdtemp(prefix="hilsplat-chaos-"))
+    work.mkdir(parents=True, exist_ok=True)
+    reference, whole_s = undisturbed(work)
+    print(f"the undisturbed run in {work} took {whole_s:.0f} s", flush=True)
+    root = work / f"disturbed-{os.getpid()}"
+    project = copy_project(PROJECT, root, results=False)
+    results = root / "results"
+    disk = small_disk(results)
+    if not disk:
+        print("no full disk: this user may not mount a tmpfs", flush=True)
+    try:
+        tally = torment(project, reference, whole_s, options, disk)
+        kept = bool(tally.problems)
+        if kept:
+            shutil.copytree(results, root / "results-kept", symlinks=True)
+            print(f"kept for a look: {root}")
+    finally:
+        if disk:
+            subprocess.run(["umount", "--lazy", str(results)], check=False)
+    print(tally.report(), flush=True)
+    if not kept:
+        shutil.rmtree(root)
+    if options.work is None:
+        shutil.rmtree(work / "undisturbed" if kept else work)
+    sys.exit(1 if kept else 0)
+
+
+if __name__ == "__main__":
+    main()

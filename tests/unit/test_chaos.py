@@ -1,0 +1,36 @@
+"""What `make chaos` counts and compares."""
+
+from pathlib import Path
+
+from tests.chaos.__main__ import differences
+from tests.chaos.faults import Victim
+from tests.workflow.conftest import Project
+
+
+def test_a_kill_costs_what_no_cache_kept_and_the_way_to_the_first_view() -> None:
+    resumes = Victim(1, "masks", Path("cache"), begun_s=10, kept_s=16, kept_cpu_s=3, first_s=2, first_cpu_s=1)
+    resumes.seen_s, resumes.cpu_s = 20, 5
+    assert (resumes.lost_s, resumes.lost_cpu_s) == (4 + 2, 2 + 1)
+    keeps_nothing = Victim(2, "field", Path("cache"), begun_s=10, kept_s=10, seen_s=20, cpu_s=5)
+    assert (keeps_nothing.lost_s, keeps_nothing.lost_cpu_s) == (10, 5)
+
+
+def test_every_other_byte_of_a_table_and_every_unfinished_file_is_told(tmp_path: Path) -> None:
+    projects = []
+    for name in ("undisturbed", "disturbed"):
+        tables = tmp_path / name / "results/tables"
+        tables.mkdir(parents=True)
+        (tables / "lerf.csv").write_text("1")
+        (tables / "cost-seconds.csv").write_text(name)
+        (tables / "lerf.csv.provenance.json").write_text(name)
+        projects.append(Project(tmp_path / name))
+    assert differences(*projects) == []
+    (tables / "lerf.csv").write_text("2")
+    (tables / "lerf.md").write_text("")
+    (tables / ".writing-01234567-1-x").touch()
+    told = differences(*projects)
+    assert [line.partition(" ")[0] for line in told[:2]] == [
+        "results/tables/lerf.csv",
+        "results/tables/lerf.md",
+    ]
+    assert len(told) == 3 and "was left behind" in told[2]
