@@ -111,8 +111,8 @@ def test_memory_grows_with_the_model_and_with_views_at_once(tmp_path, monkeypatc
     def masks(threads: int, most_threads: int | None) -> int:
         return JobResources(chosen, most_threads).memory_mb("masks")(wildcards(), threads, attempt=1)
 
-    # 64 x 64 patches and 12 heads: 2688 MiB; 64 prompts at 384 px: 576 MiB
-    assert masks(2, None) - masks(1, None) == pytest.approx((2688 + 576) * 2**20 / 1e6, abs=100)
+    # 64 x 64 patches and 12 heads: 2688 MiB; 16 prompts at 384 px: 144 MiB
+    assert masks(2, None) - masks(1, None) == pytest.approx((2688 + 144) * 2**20 / 1e6, abs=100)
     assert masks(32, None) == masks(2, None)  # 80 % of this machine
     assert masks(32, 32) > 12_000 * 8  # a node of a cluster is another machine
     graph = plan(tmp_path, masks={"segmenter": "graph", "model": str(folder)})
