@@ -104,9 +104,8 @@ def unit(rows: Float[Tensor, "*n D"]) -> Float[Tensor, "*n D"]:
 def alike(num_gaussians: int, channels: int, seed: int) -> Float[Tensor, "N D"]:
     """First features, almost the same for all Gaussians, to be trained.
 
-    What starts together stays together unless a mask parts it. After independent starts every Gaussian keeps
-    some of its own: clusters of OmniSeg3D then fitted the masks of a development scene at a mean IoU of 0.32,
-    0.25 and 0.17 instead of 0.45, 0.52 and 0.40.
+    What starts together stays together unless a mask parts it; after independent starts every Gaussian keeps
+    some of its own.
     """
     draw = torch.Generator().manual_seed(seed)
     start = torch.randn(1, channels, generator=draw)
