@@ -24,7 +24,9 @@ def root(tmp_path) -> Path:
 @pytest.fixture
 def page(opened, browser, desk, root) -> Iterator:
     with serving(desk, "annotate", "--data-root", str(root)) as address:
-        yield opened(address)
+        page = opened(address)
+        yield page
+        page.close()  # before its server ends, which it may just be asking
 
 
 def saved(page) -> None:

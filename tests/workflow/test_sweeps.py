@@ -44,7 +44,7 @@ def test_without_sweeps_every_stage_runs_once(base):
         "evaluate",
     )
     assert {stage: base[stage] for stage in stages} == dict.fromkeys(stages, 1)
-    assert base["table"] == 17
+    assert base["table"] == 12  # sweeps and ablation without variants have none
 
 
 @pytest.mark.parametrize(
@@ -52,16 +52,19 @@ def test_without_sweeps_every_stage_runs_once(base):
     [
         (
             "theta_variants=[theta-0.6,theta-0.7,theta-0.8,default]",
-            {"coverage_tree": 3, "field": 3, "evaluate": 3},
+            {"coverage_tree": 3, "field": 3, "evaluate": 3, "table": 1, "sweep_plot": 1},
         ),
-        ("omega_variants=[omega-2,omega-10,omega-100,omega-1000]", {"field": 4, "evaluate": 4}),
-        ("pruning_variants=[default,pruned]", {"field": 1, "evaluate": 1}),
+        (
+            "omega_variants=[omega-2,omega-10,omega-100,omega-1000]",
+            {"field": 4, "evaluate": 4, "table": 1, "sweep_plot": 1},
+        ),
+        ("pruning_variants=[default,pruned]", {"field": 1, "evaluate": 1, "table": 2}),
         (
             "ablation_variants=[no-hierarchy,clustering,clustering-part,default,all-losses]",
-            {"field": 4, "evaluate": 4},
+            {"field": 4, "evaluate": 4, "table": 1},
         ),
         # d = 3 needs its own autoencoder, which both share; baselines write the field by another rule
-        ("ablation_variants=[regression,paper]", {"autoencoder": 1, "field": 2, "evaluate": 2}),
+        ("ablation_variants=[regression,paper]", {"autoencoder": 1, "field": 2, "evaluate": 2, "table": 1}),
         ("main_variants=[default,langsplat,lifted]", {"autoencoder": 2, "method": 2, "evaluate": 2}),
         # only what is random is repeated: PCA and our solver are not
         ("seeds=3", {}),
