@@ -2,6 +2,7 @@
 
 import functools
 import io
+import logging
 import warnings
 from pathlib import Path
 
@@ -24,6 +25,8 @@ __all__ = [
     "write_png",
 ]
 
+
+logger = logging.getLogger(__name__)
 
 DEEP_MAX = 65535
 """Largest value of a 16-bit channel; 257 of its steps are one step of 8 bits."""
@@ -81,7 +84,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
                 upright = Image.fromarray(((values + 128) // 257).astype(np.uint8))
             if upright.mode == "F":
                 raise ValueError("its pixels are floating-point numbers of unknown range")
-            return np.asarray(_to_srgb(upright))
+            return np.asarray(_to_srgb(upright, path))
     except FileNotFoundError as error:
         raise ImageError(f"image {path} is missing") from error
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, MemoryError) as error:
@@ -93,7 +96,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
         ) from error
 
 
-def _to_srgb(image: Image.Image) -> Image.Image:
+def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
     """Convert to sRGB by the embedded profile; without one, or with a damaged one, pixels count as sRGB."""
     profile = image.info.get("icc_profile")
     if profile and image.mode in ("RGB", "RGBA", "CMYK"):
@@ -102,8 +105,10 @@ def _to_srgb(image: Image.Image) -> Image.Image:
             converted = ImageCms.profileToProfile(
                 colours, io.BytesIO(profile), _srgb_profile(), outputMode="RGB"
             )
-        except ImageCms.PyCMSError:
-            pass
+        except ImageCms.PyCMSError as error:
+            logger.warning(
+                "%s: its colours count as sRGB, for its colour profile is damaged: %s", path, error
+            )
         else:
             assert converted is not None  # only a conversion in place returns nothing
             return converted

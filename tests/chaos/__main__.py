@@ -1,7 +1,7 @@
 """Runs of the ci configuration that are killed, frozen, doubled and starved of disk; nobody may have to help.
 
     make chaos                                       # 30 kills, seed 0
-    python -m tests.chaos --kills 5 --seed 3 --minutes 20 --work /tmp/chaos
+    python -m tests.chaos --kills 5 --seed 3 --minutes 20 --work ../chaos
 
 A run is started and, after a random time, hit. It is then started again with the same words, and so on; when
 it gets to its end, its tables are compared with those of an undisturbed run, byte by byte, and the next one

@@ -3,10 +3,11 @@
 # a job killed for its memory, a GPU request. Needs root, control groups (v1 or v2), 4 GB of memory, and Debian's
 # slurmctld, slurmd, slurm-client and munge; on Debian:
 #   apt-get install --no-install-recommends slurmctld slurmd slurm-client munge
-#   tests/cluster/run.sh [FOLDER]        logs and both runs stay in FOLDER
+#   tests/cluster/run.sh [FOLDER]        logs and both runs stay in FOLDER (default: a temporary one)
 set -euo pipefail
 project=$(cd "$(dirname "$0")/../.." && pwd)
-folder=$(mkdir -p "${1:-/tmp/hilsplat-cluster}" && cd "${1:-/tmp/hilsplat-cluster}" && pwd)
+folder=${1:-$(mktemp -d -t hilsplat-cluster.XXXXXX)}
+folder=$(mkdir -p "$folder" && cd "$folder" && pwd)
 etc=/etc/slurm # srun inside a job forgets SLURM_CONF, so the configuration must lie here
 mark="# written by hilsplat's tests/cluster/run.sh"
 
