@@ -49,7 +49,7 @@ include: "rules/report.smk"
 rule all:
     default_target: True
     input:
-        PLAN.targets(),
+        targets.default(PLAN),
 
 
 onstart:

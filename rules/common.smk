@@ -17,10 +17,13 @@ from snakemake.logging import logger
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.processes import jobs_end_with_this_process
 from hilsplat.evaluate.tables.build import TABLES, published_values
-from hilsplat.workflow.plan import CACHE, RESULTS, Plan, any_of
-from hilsplat.workflow.resources import JobResources
+from hilsplat.workflow import targets
+from hilsplat.workflow.jobs import CACHE, RESULTS, any_of
+from hilsplat.workflow.plan import Plan
+from hilsplat.workflow.resources import JobResources, scene_threads, variant_threads
 from hilsplat.workflow.soundness import unsound
 from hilsplat.workflow.takeover import take_over
+from hilsplat.workflow.wanted import wanted
 
 # The plan of many scenes makes millions of objects that stay: looking through them takes a tenth of its time.
 gc.set_threshold(200_000, 50, 100)
@@ -81,7 +84,7 @@ def settle_artifacts():
             logger.warning(notice)
     triggers = {str(trigger) for trigger in workflow.rerun_triggers}
     wrong = unsound(
-        PLAN.wanted(),
+        wanted(PLAN),
         CACHE,
         compare_settings="params" in triggers,
         compare_inputs="input" in triggers,
@@ -100,5 +103,5 @@ except WorkflowError:  # not set under --report and --lint, which run no jobs
 # A job of a cluster plans itself again on its node, with the node's cores: `max-threads` is the same there.
 MOST_THREADS = workflow.resource_settings.max_threads
 RESOURCES = JobResources(PLAN, MOST_THREADS)
-THREADS = RESOURCES.threads if MOST_THREADS else PLAN.threads(CORES)
-VARIANT_THREADS = RESOURCES.threads if MOST_THREADS else PLAN.variant_threads(CORES)
+THREADS = RESOURCES.threads if MOST_THREADS else scene_threads(PLAN, CORES)
+VARIANT_THREADS = RESOURCES.threads if MOST_THREADS else variant_threads(PLAN, CORES)

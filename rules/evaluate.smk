@@ -2,7 +2,7 @@
 rule evaluate:
     input:
         scene="results/{dataset}/{scene}/scene",
-        truth=PLAN.truth_or_labels,
+        truth=PLAN.data.truth_or_labels,
         gaussians="results/{dataset}/{scene}/gaussians.ply",
         semantic_tree=PLAN.shared("semantic_tree", "semantic_tree"),
         field=PLAN.shared("field", "field.safetensors"),
@@ -25,8 +25,8 @@ rule evaluate:
         runtime=RESOURCES.minutes("evaluate"),
     params:
         settings=PLAN.settings("evaluate"),
-        code=PLAN.code("evaluate", PLAN.label_readers),
-        truth=PLAN.truth_option,
+        code=PLAN.code("evaluate", PLAN.data.label_readers),
+        truth=PLAN.data.truth_option,
     shell:
         "hilsplat evaluate --scene {input.scene:q} {params.truth} --gaussians {input.gaussians:q}"
         " --semantic-tree {input.semantic_tree:q} --field {input.field:q}"
@@ -37,7 +37,7 @@ rule evaluate:
 
 rule table:
     input:
-        scores=lambda wildcards: PLAN.scores(wildcards.table),
+        scores=lambda wildcards: targets.scores(PLAN, wildcards.table),
         published=lambda wildcards: str(published_values(wildcards.table)),
     output:
         csv=update("results/tables/{table}.csv"),
@@ -62,7 +62,7 @@ rule table:
         runtime=RESOURCES.minutes("table"),
     params:
         labels=PLAN.names(),
-        absent=lambda wildcards: PLAN.absent_options(wildcards.table),
+        absent=lambda wildcards: targets.absent_options(PLAN, wildcards.table),
         code=PLAN.code("table"),
     shell:
         "hilsplat table {wildcards.table:q} --published {input.published:q} --labels {params.labels:q}"
@@ -71,4 +71,4 @@ rule table:
 
 rule tables:
     input:
-        PLAN.tables(),
+        targets.tables(PLAN),

@@ -30,7 +30,9 @@ def show_progress():
     ]
     # A cluster takes all that can start.
     cores = CORES if workflow.local_exec else sum(job.threads for job in jobs)
-    run = RunProgress(jobs, Pace(earlier_ratios(PLAN, PLAN.threads(CORES))), cores)
+    run = RunProgress(
+        jobs, Pace(earlier_ratios(PLAN, scene_threads(PLAN, CORES))), cores
+    )
     logger.removeHandler(terminal)
     logger.addHandler(ProgressHandler(run, terminal))
     os.environ[IN_RUN] = "1"

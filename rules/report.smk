@@ -3,7 +3,7 @@ rule figures:
     input:
         scene="results/{dataset}/{scene}/scene",
         fit="results/{dataset}/{scene}/gaussians",
-        truth=PLAN.truth_or_labels,
+        truth=PLAN.data.truth_or_labels,
         gaussians="results/{dataset}/{scene}/gaussians.ply",
         masks="results/{dataset}/{scene}/default/masks",
         clip="results/{dataset}/{scene}/default/clip",
@@ -46,8 +46,8 @@ rule figures:
         settings=PLAN.settings("figures"),
         evaluate=PLAN.settings("evaluate"),
         queries=PLAN.queries,
-        truth=PLAN.figure_truth_option,
-        code=PLAN.code("figures", PLAN.label_readers),
+        truth=PLAN.data.figure_truth_option,
+        code=PLAN.code("figures", PLAN.data.label_readers),
     shell:
         "hilsplat figures --scene {input.scene:q} {params.truth} --gaussians {input.gaussians:q}"
         " --fit {input.fit:q} --masks {input.masks:q} --clip {input.clip:q}"
@@ -60,7 +60,7 @@ rule figures:
 rule mask_truth:
     input:
         scene="results/{dataset}/{scene}/scene",
-        truth=PLAN.truth,
+        truth=PLAN.data.truth,
         masks="results/{dataset}/{scene}/default/masks",
     output:
         picture=report(
@@ -90,7 +90,7 @@ rule mask_truth:
 rule comparison:
     input:
         scene="results/{dataset}/{scene}/scene",
-        truth=PLAN.truth_or_labels,
+        truth=PLAN.data.truth_or_labels,
         gaussians="results/{dataset}/{scene}/gaussians.ply",
         masks=PLAN.compared("masks", "masks"),
         clip=PLAN.compared("clip", "clip"),
@@ -137,8 +137,8 @@ rule comparison:
         settings=PLAN.settings("figures"),
         evaluate=PLAN.settings("evaluate"),
         queries=PLAN.queries,
-        truth=PLAN.figure_truth_option,
-        code=PLAN.code("comparison", PLAN.label_readers),
+        truth=PLAN.data.figure_truth_option,
+        code=PLAN.code("comparison", PLAN.data.label_readers),
     shell:
         "hilsplat comparison --folder {params.folder:q} --variants {params.variants:q}"
         " --names {params.names:q} {params.truth} --queries {params.queries:q}"

@@ -1,7 +1,7 @@
 # Camera poses: structure from motion, or import.
 rule source:
     input:
-        checked(PLAN.source_files),
+        checked(PLAN.data.source_files),
     output:
         directory(update("results/{dataset}/{scene}/source")),
     log:
@@ -16,16 +16,16 @@ rule source:
         mem_mb=RESOURCES.memory_mb("source"),
         runtime=RESOURCES.minutes("source"),
     params:
-        name=PLAN.source_name,
+        name=PLAN.data.source_name,
         root=str(Path(PLAN.run.data_root)),
-        code=PLAN.code("source", PLAN.source_reader),
+        code=PLAN.code("source", PLAN.data.source_reader),
     shell:
         "hilsplat datasets export {params.name:q} --data-root {params.root:q} --out {output:q} --log {log:q}"
 
 
 rule poses:
     input:
-        checked(PLAN.image_files),
+        checked(PLAN.data.image_files),
     output:
         scene=directory(update("results/{dataset}/{scene}/scene")),
     log:
@@ -40,9 +40,9 @@ rule poses:
         mem_mb=RESOURCES.memory_mb("poses"),
         runtime=RESOURCES.minutes("poses"),
     params:
-        images=PLAN.images,
+        images=PLAN.data.images,
         unit=lambda wildcards: PLAN.row(wildcards).unit,
-        lens=PLAN.lens,
+        lens=PLAN.data.lens,
         settings=PLAN.settings("poses"),
         seed=PLAN.run.seed,
         code=PLAN.code("poses"),

@@ -2,7 +2,7 @@
 rule gaussians:
     input:
         scene="results/{dataset}/{scene}/scene",
-        brought=PLAN.brought,
+        brought=PLAN.data.brought,
     output:
         ply=update("results/{dataset}/{scene}/gaussians.ply"),
         coordinates=update("results/{dataset}/{scene}/gaussians.json"),
@@ -21,7 +21,7 @@ rule gaussians:
         gpu=RESOURCES.gpus("gaussians"),
     params:
         settings=PLAN.settings("gaussians"),
-        brought=PLAN.brought_option,
+        brought=PLAN.data.brought_option,
         seed=PLAN.run.seed,
         cache="results/.cache",
         code=PLAN.code("gaussians"),

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 from PIL import Image
 
 from hilsplat.scene.sheet import SceneRow
+from hilsplat.workflow.jobs import scene_path
 from hilsplat.workflow.plan import Plan, scopes_of
 from hilsplat.workflow.time_left import (
     START_S,
@@ -68,14 +69,14 @@ def planned_job(
 def size_of(plan: Plan, row: SceneRow) -> Size:
     """Size of a scene: as its poses say, else as its settings or the headers of its images do."""
     job = SimpleNamespace(dataset=row.dataset, scene=row.scene)
-    known = finished_size(Path(plan.output(job, "scene")))
+    known = finished_size(Path(scene_path(job, "scene")))
     if known is not None:
         return known
     stages = plan.stages(job)
     if row.world:
         return Size(stages.world.views, stages.world.image_px**2 / 1e6)
-    files = plan.image_files(job)
-    images = plan.source_files(job) if isinstance(files, str) else files
+    files = plan.data.image_files(job)
+    images = plan.data.source_files(job) if isinstance(files, str) else files
     return Size(len(images), _first_mp(images, stages.poses.max_side_px))
 
 
@@ -101,7 +102,7 @@ def earlier_ratios(plan: Plan, threads: int) -> dict[str, list[float]]:
     ratios: dict[str, list[float]] = {}
     variants = set(plan.run.variant_names())
     for row in plan.rows:
-        folder = Path(plan.output(SimpleNamespace(dataset=row.dataset, scene=row.scene)))
+        folder = Path(scene_path(SimpleNamespace(dataset=row.dataset, scene=row.scene)))
         size = finished_size(folder / "scene")
         if size is None:
             continue

@@ -18,8 +18,10 @@ from hilsplat.base.errors import ModelError
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.splat.ply import vertex_count
 from hilsplat.workflow.job_times import size_of
-from hilsplat.workflow.plan import Job, Plan
+from hilsplat.workflow.jobs import Job
+from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.time_left import Size, first_guess
+from hilsplat.workflow.wanted import wanted
 
 MP_PER_THREAD = 2.0
 """Megapixels of all views that keep a thread busy; a job of a small scene gets fewer threads than it may."""
@@ -95,6 +97,17 @@ MEMORY = {
 
 COMPARED = Memory(450, thousand=4)
 """What `comparison` takes for each method beside the other."""
+
+
+def scene_threads(plan: Plan, cores: int) -> int:
+    """Threads of a job on this machine: one, if there are as many scenes as cores."""
+    return max(1, cores // min(len(plan.scenes), cores))
+
+
+def variant_threads(plan: Plan, cores: int) -> int:
+    """Threads of a job of one variant: the fields of a single scene too are solved side by side."""
+    fields = sum(str(each.output).endswith("field.safetensors") for each in wanted(plan))
+    return max(1, cores // min(max(fields, 1), cores))
 
 
 class JobResources:

@@ -9,9 +9,12 @@ import pytest
 
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.configuration import SECTIONS
+from hilsplat.workflow import targets
 from hilsplat.workflow.answering import models_of_photographs
+from hilsplat.workflow.jobs import any_of
 from hilsplat.workflow.model_digests import model_digest
-from hilsplat.workflow.plan import Plan, any_of, some
+from hilsplat.workflow.plan import Plan, some
+from hilsplat.workflow.resources import scene_threads, variant_threads
 
 SHEET = """dataset\tscene\tgroup\tsource\tunit
 synthetic\tone\tbenchmark\tworld:tabletop:1\tmetre
@@ -50,9 +53,9 @@ def test_scenes_of_the_groups_are_run_and_missing_data_is_named(tmp_path):
     found = plan(tmp_path, groups=["benchmark", "lerf"])
     assert [row.name for row in found.scenes] == ["synthetic/one", "synthetic/two", "rooms/room"]
     assert found.absent == {"lerf/figurines": "data_root is not set"}
-    options = found.absent_options("lerf")
+    options = targets.absent_options(found, "lerf")
     assert options == "--absent 'lerf (figurines): data_root is not set.'"
-    assert found.absent_options("replica") == ""
+    assert targets.absent_options(found, "replica") == ""
 
 
 def test_a_run_without_scenes_says_what_there_is(tmp_path):
@@ -66,19 +69,19 @@ def test_an_unknown_method_stops_at_once(tmp_path):
 
 
 def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(tmp_path):
-    alone = plan(tmp_path, groups=["photos"], data_root=str(tmp_path)).targets()
+    alone = targets.default(plan(tmp_path, groups=["photos"], data_root=str(tmp_path)))
     file = tmp_path / "annotated/photos/desk/1.json"
     file.parent.mkdir(parents=True)
     file.write_text("{}")
     found = plan(tmp_path, groups=["photos"], data_root=str(tmp_path))
     job = Job("photos", "desk")
-    assert found.targets() == [*alone, "results/photos/desk/default/scores.csv"]
-    assert found.truth_or_labels(job) == [str(file)] and str(file) not in found.image_files(job)
-    assert f"--labels annotated/photos/desk --data-root {tmp_path}" in found.truth_option(job)
-    assert found.label_readers(job) == ("hilsplat.datasets.images.annotated:DATASET",)
+    assert targets.default(found) == [*alone, "results/photos/desk/default/scores.csv"]
+    assert found.data.truth_or_labels(job) == [str(file)] and str(file) not in found.data.image_files(job)
+    assert f"--labels annotated/photos/desk --data-root {tmp_path}" in found.data.truth_option(job)
+    assert found.data.label_readers(job) == ("hilsplat.datasets.images.annotated:DATASET",)
     both = plan(tmp_path, groups=["photos", "benchmark"], data_root=str(tmp_path))
-    assert "results/tables/lerf.csv" in both.targets() and not any(
-        "desk" in path for path in both.scores("lerf")
+    assert "results/tables/lerf.csv" in targets.default(both) and not any(
+        "desk" in path for path in targets.scores(both, "lerf")
     )
 
 
@@ -146,11 +149,11 @@ def test_each_photograph_is_an_input_and_hidden_files_are_not(tmp_path):
     (tmp_path / "desk/.hidden").touch()
     (tmp_path / "desk/0.jpg").touch()
     found = plan(tmp_path, groups=["photos"])
-    files = found.image_files(Job("photos", "desk"))
+    files = found.data.image_files(Job("photos", "desk"))
     assert [Path(file).name for file in files] == ["0.jpg", "1.jpg"]
-    assert found.lens(Job("photos", "desk")) == "--no-render"
-    assert found.image_files(Job("synthetic", "one")) == "results/synthetic/one/world/images"
-    assert found.lens(Job("synthetic", "one")) == "--render"
+    assert found.data.lens(Job("photos", "desk")) == "--no-render"
+    assert found.data.image_files(Job("synthetic", "one")) == "results/synthetic/one/world/images"
+    assert found.data.lens(Job("synthetic", "one")) == "--render"
 
 
 def test_labels_of_a_published_scene_bring_their_reader_and_their_options(tmp_path):
@@ -159,20 +162,25 @@ def test_labels_of_a_published_scene_bring_their_reader_and_their_options(tmp_pa
     (tmp_path / "lerf_ovs/label/figurines/frame_1.json").touch()
     found = plan(tmp_path, groups=["lerf"], data_root=str(tmp_path))
     job = Job("lerf", "figurines")
-    assert found.label_readers(job) == ("hilsplat.datasets.images.lerf_ovs:DATASET",)
-    assert [Path(file).name for file in found.truth_or_labels(job)] == ["frame_1.json"]
-    assert found.truth_option(job) == f"--labels lerf_ovs/figurines --data-root {tmp_path}"
-    assert found.truth_option(Job("rooms", "room")) == "--truth results/rooms/room/world/truth --kind room"
-    assert found.label_readers(Job("rooms", "room")) == ()
+    assert found.data.label_readers(job) == ("hilsplat.datasets.images.lerf_ovs:DATASET",)
+    assert [Path(file).name for file in found.data.truth_or_labels(job)] == ["frame_1.json"]
+    assert found.data.truth_option(job) == f"--labels lerf_ovs/figurines --data-root {tmp_path}"
+    assert (
+        found.data.truth_option(Job("rooms", "room")) == "--truth results/rooms/room/world/truth --kind room"
+    )
+    assert found.data.label_readers(Job("rooms", "room")) == ()
 
 
 def test_tables_take_the_scenes_and_variants_that_are_theirs(tmp_path):
     found = plan(tmp_path, main_variants=["default"], theta_variants=["theta"], sweep_scenes=["two"], seeds=2)
-    assert found.scores("replica") == ["results/rooms/room/default/scores.csv"]
-    assert found.scores("theta") == ["results/synthetic/two/theta/scores.csv"]
-    assert found.scores("waymo") == []
+    assert targets.scores(found, "replica") == ["results/rooms/room/default/scores.csv"]
+    assert targets.scores(found, "theta") == ["results/synthetic/two/theta/scores.csv"]
+    assert targets.scores(found, "waymo") == []
     with_network = plan(tmp_path, main_variants=["default", "network"], seeds=2)
-    assert [path.split("/")[3] for path in with_network.scores("waymo") + with_network.scores("replica")] == [
+    assert [
+        path.split("/")[3]
+        for path in targets.scores(with_network, "waymo") + targets.scores(with_network, "replica")
+    ] == [
         "default",
         "network",
         "network.seed1",
@@ -181,21 +189,23 @@ def test_tables_take_the_scenes_and_variants_that_are_theirs(tmp_path):
 
 def test_a_sweep_without_variants_has_no_table_and_no_plot(tmp_path):
     found = plan(tmp_path, ablation_variants=[], theta_variants=[], omega_variants=["theta"])
-    assert "results/tables/omega.csv" in found.tables()
-    assert not {"results/tables/ablation.csv", "results/tables/theta.csv"} & set(found.tables())
-    assert [name for name in found.targets() if "sweep-" in name] == ["results/figures/sweep-omega.png"]
+    assert "results/tables/omega.csv" in targets.tables(found)
+    assert not {"results/tables/ablation.csv", "results/tables/theta.csv"} & set(targets.tables(found))
+    assert [name for name in targets.default(found) if "sweep-" in name] == [
+        "results/figures/sweep-omega.png"
+    ]
 
 
 def test_a_run_of_photographs_leaves_tables_alone(tmp_path):
-    assert plan(tmp_path, groups=["photos"]).targets() == [
+    assert targets.default(plan(tmp_path, groups=["photos"])) == [
         "results/figures/photos/desk/panel.png",
         "results/figures/photos/desk/comparison.png",
     ]
-    targets = plan(tmp_path, sweep_scenes=["one"], theta_variants=["theta"]).targets()
-    assert "results/figures/synthetic/one/comparison.png" in targets
-    assert "results/figures/synthetic/two/comparison.png" not in targets
-    assert "results/figures/synthetic/two/masks.png" in targets
-    assert "results/tables/lerf.csv" in targets and "results/figures/sweep-theta.png" in targets
+    wanted = targets.default(plan(tmp_path, sweep_scenes=["one"], theta_variants=["theta"]))
+    assert "results/figures/synthetic/one/comparison.png" in wanted
+    assert "results/figures/synthetic/two/comparison.png" not in wanted
+    assert "results/figures/synthetic/two/masks.png" in wanted
+    assert "results/tables/lerf.csv" in wanted and "results/figures/sweep-theta.png" in wanted
 
 
 def test_queries_of_a_scene_come_before_those_of_its_data_set(tmp_path):
@@ -205,11 +215,11 @@ def test_queries_of_a_scene_come_before_those_of_its_data_set(tmp_path):
 
 
 def test_threads_go_to_scenes_first(tmp_path):
-    assert plan(tmp_path).threads(6) == 2
+    assert scene_threads(plan(tmp_path), 6) == 2
     # the fields of each scene's variants run side by side
-    assert plan(tmp_path).variant_threads(6) == 1
-    assert plan(tmp_path, only=["one"]).threads(6) == 6
-    assert plan(tmp_path).threads(2) == 1
+    assert variant_threads(plan(tmp_path), 6) == 1
+    assert scene_threads(plan(tmp_path, only=["one"]), 6) == 6
+    assert scene_threads(plan(tmp_path), 2) == 1
 
 
 def test_a_model_folder_counts_by_its_bytes(tmp_path):

@@ -10,10 +10,12 @@ import pytest
 
 from hilsplat.configuration import RunSettings
 from hilsplat.splat.ply import vertex_count
+from hilsplat.workflow import targets
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.resources import MEMORY, SNAKEMAKE_MB, JobResources
 from hilsplat.workflow.stages import STAGES
 from hilsplat.workflow.time_left import Size
+from hilsplat.workflow.wanted import wanted
 from tests.conftest import PROJECT
 
 SHEET = "dataset\tscene\tgroup\tsource\tunit\n"
@@ -154,7 +156,7 @@ def test_a_plan_of_many_scenes_reads_and_validates_no_more_than_one_of_few(tmp_p
 
 def ask_everything(chosen: Plan, scenes: int) -> None:
     """What Snakemake asks for each job."""
-    chosen.wanted(), chosen.targets(), [chosen.scores(name) for name in ("lerf", "theta")]
+    wanted(chosen), targets.default(chosen), [targets.scores(chosen, name) for name in ("lerf", "theta")]
     asked = JobResources(chosen, 2)
     for scene in range(scenes):
         for variant in ("default", *VARIANTS):

@@ -1,0 +1,152 @@
+"""What the jobs of a scene read from outside the run: photographs, Gaussians and labels.
+
+Labels are given to evaluation and figures alone.
+"""
+
+import functools
+import shlex
+from collections.abc import Iterable
+from pathlib import Path
+from types import SimpleNamespace
+
+from hilsplat.base.errors import SettingsError
+from hilsplat.datasets.registry import readers_of
+from hilsplat.datasets.sources import (
+    DATA_PREFIX,
+    absence,
+    image_files,
+    is_exported,
+    label_files,
+    label_sets,
+)
+from hilsplat.scene.sheet import SceneRow
+from hilsplat.workflow.jobs import Job, scene_path
+
+
+class SceneData:
+    """Inputs and options of the jobs that read a scene's photographs, Gaussians and labels."""
+
+    def __init__(self, rows: Iterable[SceneRow], data_root: str) -> None:
+        """Data of the scenes of a sheet.
+
+        Args:
+            rows: scenes of the sheet.
+            data_root: folder of the published data sets.
+        """
+        self.data_root = data_root
+        self._row_of = {(row.dataset, row.scene): row for row in rows}
+        # a thousand scenes have tens of thousands of jobs: folders are read once
+        self.absence = functools.cache(lambda row: absence(row.source, data_root))
+        self._folder_files = functools.cache(self._files_of)
+        self._labels = functools.cache(lambda row: label_sets(row.source, data_root, row.name))
+
+    def row(self, job: Job) -> SceneRow:
+        """Row of the scene sheet."""
+        return self._row_of[job.dataset, job.scene]
+
+    def images(self, job: Job) -> str:
+        """Folder of the images that the poses of a scene are found from."""
+        row = self.row(job)
+        if row.world:
+            return scene_path(job, "world/images")
+        return scene_path(job, "source") if is_exported(row.source) else str(row.folder)
+
+    def image_files(self, job: Job) -> str | list[str]:
+        """Input of poses: a folder that a rule writes, or each file of a folder of photographs."""
+        row = self.row(job)
+        if row.world or is_exported(row.source):
+            return self.images(job)
+        return self._folder_files(row)
+
+    def _files_of(self, row: SceneRow) -> list[str]:
+        """Files of a folder of photographs, without labels."""
+        assert row.folder is not None, row.name  # scenes without data were skipped
+        labels = set(self._label_files(row))
+        return sorted(
+            str(path)
+            for path in row.folder.rglob("*")
+            if path.is_file() and not path.name.startswith(".") and str(path) not in labels
+        )
+
+    def lens(self, job: Job) -> str:
+        """Option of poses: whether the images are renders."""
+        return "--render" if self.row(job).world else "--no-render"
+
+    def require_no_braces(self, row: SceneRow) -> None:
+        """Refuse files in whose names Snakemake would see wildcards; it knows no way to quote them."""
+        job = SimpleNamespace(dataset=row.dataset, scene=row.scene)
+        files = self.image_files(job) if row.folder is not None else []
+        for path in [*([files] if isinstance(files, str) else files), *self.brought(job)]:
+            if "{" in path or "}" in path:
+                raise SettingsError(
+                    f"{path} of {row.name} cannot be read by the workflow: its name has braces",
+                    fix="rename it, or its folder",
+                )
+
+    def source_files(self, job: Job) -> list[str]:
+        """Input of source: files of a data set with the images and poses."""
+        return [str(path) for path in image_files(self.row(job).source, self.data_root)]
+
+    def source_name(self, job: Job) -> str:
+        """Parameter of source: data set and scene."""
+        return self.row(job).source.removeprefix(DATA_PREFIX)
+
+    def source_reader(self, job: Job) -> tuple[str, ...]:
+        """The reader of the data set that a scene's images are exported from."""
+        return readers_of([self.source_name(job)])
+
+    def brought(self, job: Job) -> list[str]:
+        """Input: a PLY that replaces the fit, with the JSON beside it if there is one; usually nothing."""
+        ply = self.row(job).gaussians
+        if ply is None:
+            return []
+        beside = ply.with_suffix(".json")
+        return [str(ply), *([str(beside)] if beside.is_file() else [])]
+
+    def brought_option(self, job: Job) -> str:
+        """Option that names such a PLY, if there is one."""
+        ply = self.row(job).gaussians
+        return f"--brought {shlex.quote(str(ply))}" if ply is not None else ""
+
+    def labels(self, row: SceneRow) -> tuple[str, ...]:
+        """Labels of a scene, as `data set/scene`: published ones and your own annotations."""
+        return () if row.world else self._labels(row)
+
+    def label_readers(self, job: Job) -> tuple[str, ...]:
+        """The readers of a scene's labels."""
+        return readers_of(self.labels(self.row(job)))
+
+    def _label_files(self, row: SceneRow) -> list[str]:
+        """Files that only evaluation reads: editing one reruns nothing before it."""
+        return [
+            str(path.resolve()) for labels in self.labels(row) for path in label_files(labels, self.data_root)
+        ]
+
+    def truth(self, job: Job) -> list[str]:
+        """Input: the annotations of a synthetic scene; nothing for others."""
+        return [scene_path(job, "world/truth")] if self.row(job).world else []
+
+    def truth_or_labels(self, job: Job) -> list[str]:
+        """Input of evaluate: the annotations of a synthetic scene, or the label files of a published one."""
+        return self.truth(job) or self._label_files(self.row(job))
+
+    def truth_option(self, job: Job) -> str:
+        """Options of evaluate: the truth that a scene is scored against."""
+        row = self.row(job)
+        if row.world:
+            return f"--truth {shlex.quote(self.truth(job)[0])} --kind {row.world[0]}"
+        options = [f"--labels {shlex.quote(labels)}" for labels in self.labels(row)]
+        return " ".join([*options, self._data_root_option()])
+
+    def figure_truth_option(self, job: Job) -> str:
+        """Options of figures: the truth or labels that give queries and outlines, if there are any."""
+        row = self.row(job)
+        if row.world:
+            return f"--truth {shlex.quote(self.truth(job)[0])}"
+        on_images = [labels for labels in self.labels(row) if not is_exported(f"{DATA_PREFIX}{labels}")]
+        if not on_images:
+            return ""
+        return f"--labels {shlex.quote(on_images[-1])} {self._data_root_option()}"
+
+    def _data_root_option(self) -> str:
+        return f"--data-root {shlex.quote(str(Path(self.data_root)))}"

@@ -1,0 +1,86 @@
+"""The targets of a run: tables, the scores that they are built from, and pictures."""
+
+import shlex
+
+from hilsplat.datasets.sources import published
+from hilsplat.evaluate.tables.build import TABLES
+from hilsplat.scene.sheet import SceneRow
+from hilsplat.workflow.plan import Plan, some
+
+
+def scores(plan: Plan, table: str) -> list[str]:
+    """Score files that a table is built from; sweeps take the scenes configured for them."""
+    kind = TABLES[table]
+    rows = [row for row in labelled(plan) if data_of(row) in kind.data]
+    if kind.is_sweep and plan.run.sweep_scenes:
+        rows = [row for row in rows if row.scene in plan.run.sweep_scenes]
+    return [
+        f"results/{row.dataset}/{row.scene}/{name}/scores.csv"
+        for row in rows
+        for variant in getattr(plan.run, kind.variants)
+        for name in plan.seeded(variant, row)
+    ]
+
+
+def absent_options(plan: Plan, table: str) -> str:
+    """Options that say which scenes of a table's data sets were not measured."""
+    by_dataset: dict[str, list[tuple[str, str]]] = {}
+    for row in plan.rows:
+        reason = plan.data.absence(row)
+        place = published(row.source)
+        if place and place[0] in TABLES[table].data and reason is not None:
+            by_dataset.setdefault(row.dataset, []).append((row.scene, reason))
+    sentences = []
+    for dataset, scenes in by_dataset.items():
+        reasons = {reason for _, reason in scenes}
+        others = "" if len(reasons) == 1 else " The others cannot be read either."
+        listed = some([scene for scene, _ in scenes])
+        sentences.append(f"{dataset} ({listed}): {scenes[0][1]}.{others}")
+    return " ".join(f"--absent {shlex.quote(sentence)}" for sentence in sentences)
+
+
+def labelled(plan: Plan) -> list[SceneRow]:
+    """Scenes with annotations or labels to be scored against."""
+    return [row for row in plan.scenes if row.world or plan.data.labels(row)]
+
+
+def data_of(row: SceneRow) -> str:
+    """A scene's data as tables name it: its kind of synthetic scene, or its published data set."""
+    if row.world:
+        return row.world[0]
+    place = published(row.source)
+    return place[0] if place else ""
+
+
+def tables(plan: Plan) -> list[str]:
+    """Every table that has variants to compare, measured on the scenes that there are; all have the
+    paper's rows."""
+    return [f"results/tables/{name}.csv" for name, kind in TABLES.items() if getattr(plan.run, kind.variants)]
+
+
+def default(plan: Plan) -> list[str]:
+    """Pictures of every scene, scores of those that you annotated, and tables and plots if the run has a
+    scene of theirs.
+
+    A run of photographs would otherwise replace a benchmark's tables by ones of reported rows alone.
+    """
+    plots = [
+        f"results/figures/sweep-{name}.png"
+        for name in ("theta", "omega")
+        if getattr(plan.run, TABLES[name].variants)
+    ]
+    own = [row for row in labelled(plan) if not data_of(row)]
+    scores = [f"results/{row.dataset}/{row.scene}/default/scores.csv" for row in own]
+    has_tables = len(labelled(plan)) > len(own)
+    return [*figures(plan), *scores, *(tables(plan) + plots if has_tables else [])]
+
+
+def figures(plan: Plan) -> list[str]:
+    """The panel of every scene, masks against the truth if it is known, and a comparison of methods for
+    the scenes of the sweeps."""
+    found = []
+    for row in plan.scenes:
+        compared = not plan.run.sweep_scenes or row.scene in plan.run.sweep_scenes
+        pictures = ["panel", *(["masks"] if row.world else []), *(["comparison"] if compared else [])]
+        found += [f"results/figures/{row.dataset}/{row.scene}/{picture}.png" for picture in pictures]
+    return found
