@@ -83,8 +83,8 @@ def export_clip(out: Path) -> None:
 def measure(step: str, models: Path, photograph: Path, points: int) -> dict[str, float]:
     """Processor seconds and peak of memory of one step on one photograph, in this process."""
     from hilsplat.base.images import read_image, resize_to_fit
-    from hilsplat.models.folder import Network
     from hilsplat.models.layouts import LAYOUTS
+    from hilsplat.models.network import Network
     from hilsplat.segment.candidates import decode_candidates
     from hilsplat.segment.graph import segment_graph
     from hilsplat.segment.sam import SamModel

@@ -8,7 +8,8 @@ from typing import Any
 import numba
 from numba.core import event
 
-from hilsplat.base.identity import PACKAGE, code_digest
+from hilsplat.base.definitions import PACKAGE
+from hilsplat.base.identity import code_digest
 
 logger = logging.getLogger(__name__)
 

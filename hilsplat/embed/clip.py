@@ -13,7 +13,8 @@ from hilsplat.base.artifacts import read_full_index, read_json
 from hilsplat.base.crops import crop_to_square
 from hilsplat.base.errors import MisalignedArtifactError, ModelError
 from hilsplat.base.parallel import in_order
-from hilsplat.models.folder import ModelFolder, Network, input_side_px, open_model_folder, require_one_space
+from hilsplat.models.folder import ModelFolder, input_side_px, open_model_folder
+from hilsplat.models.network import Network, require_one_space
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ClipSettings
 

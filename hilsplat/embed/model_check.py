@@ -6,12 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from hilsplat.embed.clip import ClipModel
-from hilsplat.models.folder import (
-    input_side_px,
-    open_model_folder,
-    require_one_space,
-    require_three_heads,
-)
+from hilsplat.models.folder import input_side_px, open_model_folder
+from hilsplat.models.network import require_one_space, require_three_heads
 from hilsplat.segment.sam import own_thresholds
 
 

@@ -1,20 +1,16 @@
-"""Model folders in the layouts of published ONNX exports: finding, checking, running.
+"""Model folders in the layouts of published ONNX exports: finding and checking.
 
 A folder holds `config.json`, what prepares its inputs, and its networks as `.onnx` files
 (`layouts.LAYOUTS`). Everything needed to turn a photograph into a network's input is read from the
 folder, so its digest identifies the model.
 """
 
-import logging
 import mmap
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-import onnxruntime
 
 from hilsplat.base.artifacts import read_json, sha256_of_file, sha256_of_json
 from hilsplat.base.errors import ArtifactError, ModelError
@@ -25,27 +21,13 @@ from hilsplat.models.layouts import (
     SECTIONS,
     SUPPORTED,
     TORCH_SUFFIXES,
-    Axes,
     NetworkSpec,
     layout_of,
 )
-
-logger = logging.getLogger(__name__)
-
+from hilsplat.models.network import Network
 
 SWITCHES = ("do_resize", "do_rescale", "do_normalize")
 """Preprocessing steps that our code always performs."""
-
-POINTER_BYTES = 1024
-"""Files smaller than this may be the pointers that a clone without Git LFS leaves."""
-
-DTYPES = {
-    "tensor(float)": np.float32,
-    "tensor(float16)": np.float16,
-    "tensor(double)": np.float64,
-    "tensor(int64)": np.int64,
-    "tensor(int32)": np.int32,
-}
 
 
 @dataclass(frozen=True)
@@ -85,7 +67,7 @@ class ModelFolder:
             [(path.relative_to(self.folder).as_posix(), sha256_of_file(path)) for path in self.files]
         )
 
-    def network(self, name: str, threads: int = 1) -> "Network":
+    def network(self, name: str, threads: int = 1) -> Network:
         """Open one of the model's networks and check its inputs and outputs.
 
         Raises:
@@ -295,125 +277,6 @@ def _tensors(graph: Any) -> Iterator[Any]:
                 yield from _tensors(inner)
 
 
-def execution_providers() -> list[str]:
-    """onnxruntime's execution providers in our order of preference: CUDA if there is one, then CPU."""
-    available = onnxruntime.get_available_providers()
-    return [name for name in ("CUDAExecutionProvider", "CPUExecutionProvider") if name in available]
-
-
-class Network:
-    """One ONNX network: checked names, inputs cast to its types, outputs as float32.
-
-    A call runs in one thread by default: stages are faster when they process several views at once, and the
-    sums inside a call then do not depend on the number of threads. Several threads may call it.
-    """
-
-    def __init__(self, path: Path, spec: NetworkSpec, threads: int = 1) -> None:
-        self.path = path
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.inter_op_num_threads = 1
-        options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
-        options.log_severity_level = 3
-        if path.stat().st_size < POINTER_BYTES and path.read_bytes().startswith(b"version https://git-lfs"):
-            raise ModelError(
-                f"network {path} is a Git LFS pointer, not the network",
-                found=f"a text file of {path.stat().st_size} bytes",
-                fix="fetch the file itself: git lfs pull, or download it from the model's page",
-            )
-        try:
-            self.session = onnxruntime.InferenceSession(str(path), options, providers=execution_providers())
-        except Exception as error:  # onnxruntime's errors share no public base class
-            raise ModelError(
-                f"network {path} cannot be opened: {error}",
-                found=f"a file of {path.stat().st_size} bytes",
-                fix="export it again, or fetch a whole copy (with its file of weights, if it has one)",
-            ) from error
-        self.inputs = {item.name: item for item in self.session.get_inputs()}
-        self.outputs = {item.name: item for item in self.session.get_outputs()}
-        names = {
-            name: other
-            for name, other in spec.synonyms.items()
-            if name not in self.outputs and other in self.outputs
-        }
-        self.spec = spec = replace(
-            spec, outputs={names.get(name, name): axes for name, axes in spec.outputs.items()}
-        )
-        self._check("inputs", spec.inputs, self.inputs, spec.optional)
-        self._check("outputs", spec.outputs, self.outputs, tuple(self.outputs))
-        self.providers = self.session.get_providers()
-        logger.info("network %s runs on %s", path.name, self.providers[0])
-
-    def _check(
-        self, what: str, expected: Mapping[str, Axes], found: dict[str, Any], optional: tuple[str, ...]
-    ) -> None:
-        """Compare names, axes and types with the expected ones."""
-        wrong = [name for name in expected if name not in found]
-        wrong += [name for name in found if name not in expected and name not in optional]
-        wrong += [
-            name
-            for name, axes in expected.items()
-            if name in found and not (_fits(found[name].shape, axes) and found[name].type in DTYPES)
-        ]
-        if wrong:
-            raise ModelError(
-                f"network {self.path} has other {what} than expected: {', '.join(dict.fromkeys(wrong))}",
-                expected=", ".join(
-                    f"{name} ({', '.join('any' if axis is None else str(axis) for axis in axes)})"
-                    for name, axes in expected.items()
-                ),
-                found=", ".join(f"{name} {list(item.shape)} {item.type}" for name, item in found.items()),
-                fix="export the model in the layout of the Hugging Face ONNX exports",
-            )
-
-    def declared_axis(self, name: str, axis: int) -> int | None:
-        """Length of an output's axis, if the network states it."""
-        shape = self.outputs[name].shape
-        return shape[axis] if shape and isinstance(shape[axis], int) else None
-
-    def fixed_axis(self, name: str, axis: int) -> int | None:
-        """Length of an input's axis, if the network fixes it."""
-        shape = self.inputs[name].shape
-        return shape[axis] if shape and isinstance(shape[axis], int) else None
-
-    def __call__(self, **feeds: np.ndarray) -> list[np.ndarray]:
-        """Run once; outputs come in the order of the spec.
-
-        Raises:
-            ModelError: the network refuses the inputs.
-        """
-        wanted = {name: value for name, value in feeds.items() if name in self.inputs}
-        cast = {name: np.asarray(value, DTYPES[self.inputs[name].type]) for name, value in wanted.items()}
-        try:
-            outputs = self.session.run(list(self.spec.outputs), cast)
-        except Exception as error:  # as above
-            shapes = ", ".join(f"{name} {value.shape}" for name, value in cast.items())
-            raise ModelError(
-                f"network {self.path} failed: {error}",
-                found=shapes,
-                fix="check that preprocessor_config.json belongs to this network",
-            ) from error
-        for (name, axes), output in zip(self.spec.outputs.items(), outputs, strict=True):
-            if output.ndim != len(axes):
-                raise ModelError(
-                    f"network {self.path} returned {name} with {output.ndim} axes",
-                    expected=f"{len(axes)} axes",
-                    found=f"shape {output.shape}",
-                    fix="export the model in the layout of the Hugging Face ONNX exports",
-                )
-        return [output.astype(np.float32, copy=False) for output in outputs]
-
-
-def _fits(shape: Sequence[Any], axes: Axes) -> bool:
-    """Whether a declared shape, which may be empty or hold names, can be an array of these axes."""
-    if not shape:
-        return True
-    return len(shape) == len(axes) and all(
-        wanted is None or not isinstance(length, int) or length == wanted
-        for length, wanted in zip(shape, axes, strict=True)
-    )
-
-
 def side_px(size: Any, default: int) -> int:
     """Side of a square input, from a preprocessor's size: a number, or a dict in any of its forms."""
     if isinstance(size, dict):
@@ -432,33 +295,3 @@ def input_side_px(model: ModelFolder) -> int:
         if model.preprocessing.get(key):
             return side_px(model.preprocessing[key], default)
     return default
-
-
-def require_three_heads(path: Path, iou_scores: np.ndarray, pred_masks: np.ndarray) -> None:
-    """Refuse a decoder that does not return three masks per prompt.
-
-    Raises:
-        ModelError: the third axis is not 3 long.
-    """
-    if iou_scores.shape[2] != 3 or pred_masks.shape[2] != 3:
-        raise ModelError(
-            f"decoder {path} does not return three masks per prompt",
-            expected="iou_scores (images, prompts, 3) and pred_masks (images, prompts, 3, h, w)",
-            found=f"{iou_scores.shape} and {pred_masks.shape}",
-            fix="export it with multimask output",
-        )
-
-
-def require_one_space(folder: Path, image_numbers: int | None, text_numbers: int | None) -> None:
-    """Refuse a CLIP whose two networks return vectors of different widths; None means not known yet.
-
-    Raises:
-        ModelError: the widths differ.
-    """
-    if None not in (image_numbers, text_numbers) and image_numbers != text_numbers:
-        raise ModelError(
-            f"the two networks of {folder} do not belong together",
-            expected=f"text vectors of {image_numbers} numbers, as the image vectors",
-            found=f"{text_numbers} numbers",
-            fix="export both networks, with their projections, from one model",
-        )

@@ -17,7 +17,8 @@ from PIL import Image
 
 from hilsplat.base.errors import ModelError
 from hilsplat.base.levels import Level
-from hilsplat.models.folder import ModelFolder, open_model_folder, require_three_heads, side_px
+from hilsplat.models.folder import ModelFolder, open_model_folder, side_px
+from hilsplat.models.network import require_three_heads
 from hilsplat.segment.kernels import areas_and_boxes, upscaled_runs
 from hilsplat.segment.logit_kernels import quantise_logits
 from hilsplat.settings import MasksSettings

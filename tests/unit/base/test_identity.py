@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from hilsplat.base import identity
+from hilsplat.base import definitions, identity
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.identity import code_digest, reached
 from hilsplat.datasets.registry import DATASETS
@@ -343,7 +343,7 @@ def test_a_command_does_nothing_for_its_stage_but_call_the_function_that_is_dige
 
 def forget() -> None:
     """Forget what this process knows, as a new one would."""
-    for cached in (identity._digest, identity._state, identity._module, identity._path):
+    for cached in (identity._digest, identity._state, definitions.module_of, definitions.path_of):
         cached.cache_clear()
 
 

@@ -16,7 +16,7 @@ from hilsplat.configuration import parse_section
 from hilsplat.embed.clip import ClipModel, open_clip_of, unit
 from hilsplat.embed.model_check import check_model
 from hilsplat.embed.stage import run_clip
-from hilsplat.models.folder import Network
+from hilsplat.models.network import Network
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks

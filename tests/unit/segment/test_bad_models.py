@@ -8,7 +8,8 @@ import pytest
 from onnx import TensorProto, helper
 
 from hilsplat.base.errors import ModelError
-from hilsplat.models.folder import open_model_folder, require_one_space, require_three_heads
+from hilsplat.models.folder import open_model_folder
+from hilsplat.models.network import require_one_space, require_three_heads
 from hilsplat.segment.sam import SamModel
 
 

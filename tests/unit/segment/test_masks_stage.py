@@ -8,7 +8,8 @@ import pytest
 from hilsplat.base.artifacts import read_index, read_npz, sha256_of_path
 from hilsplat.base.errors import ArtifactError, ModelError
 from hilsplat.base.images import read_image
-from hilsplat.models.folder import Network, open_model_folder
+from hilsplat.models.folder import open_model_folder
+from hilsplat.models.network import Network
 from hilsplat.segment.coverage_stage import run_coverage_tree
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.pictures import THUMB_PX, masks_overview

@@ -1,0 +1,367 @@
+"""The definitions of a module, as far as they can change a result: their text, and the names they look up.
+
+`identity` follows these names from definition to definition; its docstring says what does not count.
+"""
+
+import ast
+import functools
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from hilsplat.base.errors import HilsplatError
+
+PACKAGE = "hilsplat"
+
+NEUTRAL_DECORATORS = frozenset(
+    [
+        "cache",
+        "cached_property",
+        "compiled",
+        "contextmanager",
+        "dataclass",
+        "lru_cache",
+        "no_type_check",
+        "overload",
+    ]
+)
+"""Decorators that register nothing: what they decorate counts only if it is reached."""
+
+PROSE = {
+    "knob": ("unit", "origin"),
+    "Dataset": ("licence", "terms", "citation", "layout"),
+    "Segments": ("licence", "terms", "citation", "layout"),
+}
+"""Called name -> keywords that only people read."""
+
+LOG_METHODS = frozenset({"debug", "info", "warning", "error", "exception"})
+
+
+@dataclass(frozen=True)
+class Import:
+    """What an imported name means: a module, or a name in one."""
+
+    module: str
+    name: str
+
+
+@dataclass
+class Statement:
+    """A statement at the top of a module.
+
+    Attributes:
+        text: the parts that count.
+        names: dotted names that it looks up in the module.
+        inner: what it imports itself, inside functions, and the attributes that it takes from that.
+        imports: for import statements, what each name means.
+        signature: names in the annotations of a function's arguments, or of a class's methods.
+    """
+
+    text: bytes = b""
+    names: list[tuple[str, ...]] = field(default_factory=list)
+    inner: list[tuple[Import, tuple[str, ...]]] = field(default_factory=list)
+    imports: dict[str, Import] = field(default_factory=dict)
+    signature: list[tuple[str, ...]] = field(default_factory=list)
+
+
+@dataclass
+class Module:
+    """The statements of a module: those that bind names, by name, and those that importing runs."""
+
+    bindings: dict[str, Statement] = field(default_factory=dict)
+    effects: list[Statement] = field(default_factory=list)
+
+
+@functools.cache
+def path_of(module: str, root: Path) -> Path | None:
+    parts = module.split(".")
+    if parts[0] != PACKAGE:
+        return None
+    base = root.joinpath(*parts[1:])
+    return next((p for p in (base.with_suffix(".py"), base / "__init__.py") if p.is_file()), None)
+
+
+@functools.cache
+def module_of(module: str, root: Path) -> Module:
+    path = path_of(module, root)
+    assert path is not None, module
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    return _parse(path.read_text(encoding="utf-8"), package)
+
+
+@functools.cache
+def _parse(text: str, package: str) -> Module:
+    facts = Module()
+    for node in ast.parse(text).body:
+        if _is_bare_string(node):
+            continue
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            imports = _imports(node, package)
+            for name in imports:
+                facts.bindings[name] = Statement(imports=imports)
+            continue
+        if isinstance(node, ast.If) and _chain(node.test)[-1:] == ("TYPE_CHECKING",):
+            for inner in node.body:
+                imports = _imports(inner, package)
+                facts.bindings.update({name: Statement(imports=imports) for name in imports})
+            continue
+        statement = _statement(node, package)
+        names = _bound_at_top(node)
+        for name in names:
+            if (earlier := facts.bindings.get(name)) is not None:  # bound twice: both count
+                statement = _both(earlier, statement)
+            facts.bindings[name] = statement
+        if not names or _registers(node):
+            facts.effects.append(statement)
+    return facts
+
+
+def _statement(node: ast.stmt, package: str) -> Statement:
+    signature: list[tuple[str, ...]] = []
+    for inner in (node, *getattr(node, "body", ())):  # a function, or the methods of a class
+        if isinstance(inner, ast.FunctionDef | ast.AsyncFunctionDef):
+            for annotation in _annotations(inner):
+                signature += _Names(package).of(annotation)[0]
+    _strip(node)
+    names, inner = _Names(package).of(node)
+    return Statement(ast.dump(node).encode(), names, inner, signature=signature)
+
+
+def _both(one: Statement, other: Statement) -> Statement:
+    return Statement(
+        one.text + other.text,
+        one.names + other.names,
+        one.inner + other.inner,
+        {**one.imports, **other.imports},
+        one.signature + other.signature,
+    )
+
+
+def _imports(node: ast.stmt, package: str) -> dict[str, Import]:
+    """Meaning of each name that an import statement binds."""
+    if isinstance(node, ast.Import):
+        return {
+            alias.asname or alias.name.split(".")[0]: Import(
+                alias.name if alias.asname else alias.name.split(".")[0], ""
+            )
+            for alias in node.names
+        }
+    if not isinstance(node, ast.ImportFrom):
+        return {}
+    base = node.module or ""
+    if node.level:
+        parents = package.split(".")
+        parent = parents[: len(parents) - node.level + 1]
+        base = ".".join([*parent, *([base] if base else [])])
+    if any(alias.name == "*" for alias in node.names) and base.split(".")[0] == PACKAGE:
+        raise HilsplatError(f"a star import of {base} in {package} hides what is used", fix="name the names")
+    return {alias.asname or alias.name: Import(base, alias.name) for alias in node.names}
+
+
+def _bound_at_top(node: ast.stmt) -> list[str]:
+    """Names that a statement binds in its module, also inside its blocks."""
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        return [node.name]
+    return sorted(_bound(node))
+
+
+def _registers(node: ast.stmt) -> bool:
+    """Whether a decorator may register what it decorates."""
+    decorators = getattr(node, "decorator_list", ())
+    chains = [_chain(each.func if isinstance(each, ast.Call) else each) for each in decorators]
+    return any(not chain or chain[-1] not in NEUTRAL_DECORATORS for chain in chains)
+
+
+# ---- what does not count --------------------------------------------------------------------------
+
+
+def _is_bare_string(node: ast.AST) -> bool:
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )
+
+
+def _annotations(node: ast.FunctionDef | ast.AsyncFunctionDef) -> list[ast.expr]:
+    args = node.args
+    every = [*args.posonlyargs, *args.args, *args.kwonlyargs, args.vararg, args.kwarg]
+    return [each.annotation for each in every if each is not None and each.annotation is not None]
+
+
+def _strip(top: ast.AST) -> None:
+    """Take out of a syntax tree, in place, what cannot change a result."""
+    waiting = [(top, False)]
+    while waiting:
+        node, is_local = waiting.pop()  # local: a statement of a function, whose annotations do nothing
+        for block in ("body", "orelse", "finalbody"):
+            statements = getattr(node, block, None)
+            if isinstance(statements, list):
+                kept = [each for each in statements if not _is_bare_string(each)]
+                setattr(node, block, kept or ([ast.Pass()] if statements else []))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            args = node.args
+            for each in (*args.posonlyargs, *args.args, *args.kwonlyargs, args.vararg, args.kwarg):
+                if each is not None:
+                    each.annotation = None
+            node.returns = None
+            is_local = True
+        elif isinstance(node, ast.ClassDef):
+            is_local = False
+        elif isinstance(node, ast.AnnAssign) and is_local:
+            node.annotation = ast.Constant(None)
+        elif isinstance(node, ast.Raise) or (isinstance(node, ast.Expr) and _is_log_call(node.value)):
+            for inner in ast.walk(node):
+                if isinstance(inner, ast.Constant) and isinstance(inner.value, str):
+                    inner.value = ""
+                elif isinstance(inner, ast.JoinedStr):  # its words also separate its values
+                    inner.values = [part for part in inner.values if isinstance(part, ast.FormattedValue)]
+        elif isinstance(node, ast.Call):
+            called = (_chain(node.func) or ("",))[-1]
+            node.keywords = [each for each in node.keywords if each.arg not in PROSE.get(called, ())]
+            if called == "knob":
+                node.args = node.args[:1]  # the second is its description
+            elif called == "Plugins":
+                node.args = []
+        waiting += [(child, is_local) for child in _children(node)]
+
+
+_LEAVES = (ast.expr_context, ast.operator, ast.unaryop, ast.boolop, ast.cmpop)
+
+
+def _children(node: ast.AST) -> Iterator[ast.AST]:
+    """Nodes right below one, but for those that hold nothing, such as operators."""
+    for name in node._fields:
+        value = getattr(node, name, None)
+        if isinstance(value, list):
+            for each in value:
+                if isinstance(each, ast.AST) and not isinstance(each, _LEAVES):
+                    yield each
+        elif isinstance(value, ast.AST) and not isinstance(value, _LEAVES):
+            yield value
+
+
+def _is_log_call(node: ast.AST) -> bool:
+    chain = _chain(node.func) if isinstance(node, ast.Call) else ()
+    return chain[:1] == ("logger",) and chain[-1] in LOG_METHODS
+
+
+def _chain(node: ast.AST) -> tuple[str, ...]:
+    """A dotted name as its parts; empty for other expressions."""
+    parts: list[str] = []
+    while isinstance(node, ast.Attribute):
+        parts.append(node.attr)
+        node = node.value
+    return (node.id, *reversed(parts)) if isinstance(node, ast.Name) else ()
+
+
+# ---- names and scopes -----------------------------------------------------------------------------
+
+_FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
+_COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
+
+
+@dataclass
+class _Scope:
+    """Names of a function, comprehension or class, and the meaning of those that it imports."""
+
+    names: set[str]
+    imports: dict[str, Import]
+    is_class: bool = False
+
+
+class _Names:
+    """Finds the names that a statement looks up outside itself."""
+
+    def __init__(self, package: str) -> None:
+        self.package = package
+        self.scopes: list[_Scope] = []
+        self.names: dict[tuple[str, ...], None] = {}
+        self.inner: dict[tuple[Import, tuple[str, ...]], None] = {}
+
+    def of(self, node: ast.AST) -> tuple[list[tuple[str, ...]], list[tuple[Import, tuple[str, ...]]]]:
+        """Dotted names of the module, and what is taken from modules that functions import themselves."""
+        self._visit(node)
+        return list(self.names), list(self.inner)
+
+    def _visit(self, node: ast.AST) -> None:
+        chain = _chain(node)
+        if chain:
+            self._look_up(chain)
+        elif isinstance(node, _FUNCTIONS):
+            defaults = [*node.args.defaults, *node.args.kw_defaults]
+            for outside in (*getattr(node, "decorator_list", ()), *filter(None, defaults)):
+                self._visit(outside)
+            body = node.body if isinstance(node.body, list) else [node.body]
+            arguments = {each.arg for each in ast.walk(node.args) if isinstance(each, ast.arg)}
+            bound = arguments | _bound_in(body) - _declared_global(body)
+            self._inside(_Scope(bound, self._imported(body)), body)
+        elif isinstance(node, ast.ClassDef):
+            for outside in (*node.decorator_list, *node.bases, *node.keywords):
+                self._visit(outside)
+            scope = _Scope(_bound_in(node.body), self._imported(node.body), is_class=True)
+            self._inside(scope, node.body)
+        elif isinstance(node, _COMPREHENSIONS):
+            self._inside(_Scope(_bound(node), {}), list(_children(node)))
+        else:
+            for child in _children(node):
+                self._visit(child)
+
+    def _inside(self, scope: _Scope, body: Sequence[ast.AST]) -> None:
+        self.scopes.append(scope)
+        for each in body:
+            self._visit(each)
+        self.scopes.pop()
+
+    def _look_up(self, chain: tuple[str, ...]) -> None:
+        for depth, scope in enumerate(reversed(self.scopes)):
+            if scope.is_class and depth:
+                continue  # methods do not see the names of their class
+            if chain[0] in scope.imports:
+                self.inner[scope.imports[chain[0]], chain[1:]] = None
+                return
+            if chain[0] in scope.names and not scope.is_class:
+                return
+        self.names[chain] = None
+
+    def _imported(self, body: Sequence[ast.AST]) -> dict[str, Import]:
+        found: dict[str, Import] = {}
+        for node in _own(body):
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                found |= _imports(node, self.package)
+        return found
+
+
+def _own(body: Iterable[ast.AST]) -> Iterator[ast.AST]:
+    """Nodes of a block, without those inside functions and classes that it defines."""
+    waiting = list(body)
+    while waiting:
+        node = waiting.pop()
+        yield node
+        if not isinstance(node, (*_FUNCTIONS, ast.ClassDef)):
+            waiting += _children(node)
+
+
+def _bound_in(body: Iterable[ast.AST]) -> set[str]:
+    """Names that a block binds."""
+    names: set[str] = set()
+    for node in _own(body):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store | ast.Del):
+            names.add(node.id)
+        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            names.add(node.name)
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            names |= {alias.asname or alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ExceptHandler | ast.MatchAs | ast.MatchStar) and node.name:
+            names.add(node.name)
+        elif isinstance(node, ast.MatchMapping) and node.rest:
+            names.add(node.rest)
+    return names
+
+
+def _bound(node: ast.AST) -> set[str]:
+    return _bound_in([node])
+
+
+def _declared_global(body: Iterable[ast.AST]) -> set[str]:
+    return {name for node in _own(body) if isinstance(node, ast.Global) for name in node.names}
