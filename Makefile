@@ -3,6 +3,7 @@
 # make test    set up, then run lint and all tests
 # make lint    set up, then check style, imports and rules
 # make bench   set up, then time the fast paths; tables go to results/benchmarks (docs/benchmarks.md)
+#              with BASE=<commit>: what got slower since then, by runs of both versions in turn
 # make chaos   set up, then kill, freeze and starve runs of the ci configuration, and compare tables (docs/workflow.md)
 # make report  set up, run, and write results/report.html
 # make setup   create .venv with everything that the targets above need
@@ -42,7 +43,7 @@ test: lint
 	python -m pytest --numprocesses $(CORES) --dist loadfile --no-loadscope-reorder tests/workflow tests/browser tests/bad_inputs tests/unit
 
 bench: $(STAMP)
-	OMP_NUM_THREADS=1 python -m pytest -c benchmarks/pytest.ini benchmarks
+	$(if $(BASE),python -m benchmarks.compare $(BASE),OMP_NUM_THREADS=1 python -m pytest -c benchmarks/pytest.ini benchmarks)
 
 chaos: $(STAMP)
 	python -m tests.chaos --kills $(KILLS)

@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 
 from benchmarks.machine import fma_peak_gflops
+from benchmarks.table import markdown_table
 
 HEAD = ("room", "case", "least ms", "median ms", "rounds", "rate", "share of FMA peak", "peak MiB")
 
@@ -50,14 +51,6 @@ def _cases(session: Any, peak_gflops: float) -> list[dict[str, Any]]:
             record["peak_mib"] = info["peak_mib"]
         out.append(record)
     return out
-
-
-def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    """A Markdown table that is also readable as text."""
-    lines = [head, *rows]
-    widths = [max(len(line[k]) for line in lines) for k in range(len(head))]
-    text = ["| " + " | ".join(cell.ljust(widths[k]) for k, cell in enumerate(line)) + " |" for line in lines]
-    return "\n".join([text[0], "|" + "|".join("-" * (width + 2) for width in widths) + "|", *text[1:]])
 
 
 def _row(case: dict[str, Any]) -> tuple[str, ...]:
@@ -101,8 +94,8 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
     text = "\n\n".join(
         [
             ", ".join(f"{name.replace('_', ' ')}: {value}" for name, value in machine.items()),
-            _table(HEAD, [_row(case) for case in cases]),
-            *([_table(("goal", "found", "wanted", "met"), goals)] if goals else []),
+            markdown_table(HEAD, [_row(case) for case in cases]),
+            *([markdown_table(("goal", "found", "wanted", "met"), goals)] if goals else []),
         ]
     )
     terminalreporter.write_line(f"\n{text}\n")

@@ -31,7 +31,11 @@ class Answers:
     def field_relevancy(self, texts, view):
         return np.stack([self.maps[text] for text in texts])
 
+    def field_cosine(self, texts, view, pixels):
+        return np.stack([self.maps[text].reshape(len(LEVELS), -1)[:, pixels] for text in texts])
+
     node_relevancy_map = field_relevancy
+    node_cosine = field_cosine
 
     def select(self, path, *, level=None, view=None):
         return SimpleNamespace(ids=np.array([list(self.regions).index(path[-1])]), level=level)
