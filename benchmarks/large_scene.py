@@ -6,10 +6,11 @@
 makes a floor with 400 balls on it, a ring of cameras, and masks of each view at three levels (balls, halves,
 eighths; the largest of each level) with a CLIP vector each, and then runs coverage tree, contributions,
 semantic tree, autoencoder and field one after the other, each in its own process. It keeps what already
-exists, and prints times and peaks and writes them to `times.md`.
+exists, and prints times and peaks and writes them to `times.md` and `times.json`.
 """
 
 import argparse
+import json
 import os
 import subprocess
 import sys
@@ -229,6 +230,8 @@ def main() -> None:
     )
     table = markdown_table(("stage", "s", "peak MiB"), rows, 1)
     (asked.out / "times.md").write_text(table + "\n")
+    times = {stage: [float(seconds), float(peak)] for stage, seconds, peak in rows}
+    (asked.out / "times.json").write_text(json.dumps(times) + "\n")
     print(table)
 
 

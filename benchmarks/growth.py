@@ -1,0 +1,124 @@
+"""How seconds and memory of the stages after the fit grow with Gaussians, views, pixels and masks.
+
+    python -m benchmarks.growth FOLDER        # thirteen scenes, some 20 minutes on two cores
+
+Each series makes the base scene of `large_scene` with one quantity at half, once, twice and four times its
+size, and runs every stage in a process of its own. It writes `growth.json` and `growth.png`, and prints
+exponents: the slopes of straight lines through the logarithms. It keeps what already exists.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
+
+from benchmarks.large_scene import STAGES
+from benchmarks.table import markdown_table
+
+FACTORS = (0.5, 1.0, 2.0, 4.0)
+MEASURES = ("seconds", "MiB")
+
+
+@dataclass(frozen=True)
+class Size:
+    """Size of a made scene; pixels are those of a view, masks those of a view at all levels together."""
+
+    gaussians: int = 50_000
+    views: int = 24
+    pixels: int = 400 * 300
+    masks: int = 150
+
+    def grown(self, quantity: str, factor: float) -> "Size":
+        """The scene with one quantity multiplied."""
+        return replace(self, **{quantity: round(getattr(self, quantity) * factor)})
+
+    def options(self) -> list[str]:
+        """Options of `large_scene`; views are 4 : 3."""
+        width = round((self.pixels * 4 / 3) ** 0.5)
+        sizes = {"gaussians": self.gaussians, "views": self.views, "masks": self.masks}
+        sizes |= {"width": width, "height": round(width * 3 / 4)}
+        return [part for name, size in sizes.items() for part in (f"--{name}", str(size))]
+
+
+QUANTITIES = tuple(Size.__annotations__)
+
+
+def measured(size: Size, folder: Path) -> dict[str, list[float]]:
+    """Seconds and peak MiB of every stage on a made scene, made and timed unless it was before."""
+    name = f"{size.gaussians}-{size.views}-{size.pixels}-{size.masks}"
+    kept = folder / name / "times.json"
+    if not kept.exists():
+        command = [sys.executable, "-m", "benchmarks.large_scene", str(folder / name), *size.options()]
+        subprocess.run(command, check=True, stdout=sys.stderr)
+    return json.loads(kept.read_text(encoding="utf-8"))
+
+
+def exponent(sizes: list[float], values: list[float]) -> float:
+    """Slope of the straight line through the logarithms: 1 is linear."""
+    return float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
+
+
+def draw(series: dict[str, dict[str, dict[str, list[float]]]]) -> Figure:
+    """One column per quantity; seconds above, peak memory below."""
+    figure = Figure(figsize=(3.6 * len(series), 6.4), layout="constrained")
+    panels = figure.subplots(len(MEASURES), len(series), sharey="row")
+    for column, (quantity, found) in enumerate(series.items()):
+        sizes = found["size"]["values"]
+        for row, measure in enumerate(MEASURES):
+            axes = panels[row, column]
+            for stage in STAGES:
+                values = found[stage][measure]
+                label = f"{stage.replace('_', ' ')}, {exponent(sizes, values):.1f}"
+                axes.loglog(sizes, values, marker="o", markersize=3, label=label)
+            axes.set_xticks(sizes, [f"{size:,.0f}" for size in sizes])
+            axes.minorticks_off()
+            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.yaxis.set_major_formatter("{x:g}")
+            axes.grid(alpha=0.3)
+            axes.legend(fontsize=7, title="stage, exponent", title_fontsize=7)
+            axes.set_xlabel(
+                {"pixels": "pixels of a view", "masks": "masks of a view"}.get(quantity, quantity)
+            )
+        panels[0, 0].set_ylabel("seconds, 2 threads")
+        panels[1, 0].set_ylabel("peak memory, MiB")
+    return figure
+
+
+def main() -> None:
+    """Measure, print and draw."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("out", type=Path)
+    folder = parser.parse_args().out
+    series: dict[str, dict[str, dict[str, list[float]]]] = {}
+    for quantity in QUANTITIES:
+        sizes = [Size().grown(quantity, factor) for factor in FACTORS]
+        times = [measured(size, folder) for size in sizes]
+        series[quantity] = {"size": {"values": [float(getattr(size, quantity)) for size in sizes]}}
+        for stage in STAGES:
+            columns = zip(*(each[stage] for each in times), strict=True)
+            series[quantity][stage] = dict(zip(MEASURES, map(list, columns), strict=True))
+    (folder / "growth.json").write_text(json.dumps(series, indent=1) + "\n", encoding="utf-8")
+    draw(series).savefig(folder / "growth.png", dpi=110)
+    rows = [
+        (
+            stage,
+            *(
+                f"{exponent(found['size']['values'], found[stage][measure]):.2f}"
+                for found in series.values()
+                for measure in MEASURES
+            ),
+        )
+        for stage in STAGES
+    ]
+    head = ("exponent", *(f"{quantity}: {measure}" for quantity in series for measure in MEASURES))
+    print(markdown_table(head, rows))
+
+
+if __name__ == "__main__":
+    main()
