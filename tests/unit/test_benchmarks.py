@@ -1,6 +1,28 @@
-"""A case is slower only if every pair of runs says so, and clearly."""
+"""Benchmarks run, untimed; and a case is slower only if every pair of runs says so, and clearly."""
+
+import subprocess
+import sys
+from pathlib import Path
 
 from benchmarks.compare import paired
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_every_room_runs():
+    """Once and untimed, so that a change of what they call is noticed before somebody wants to time it."""
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-c",
+        "benchmarks/pytest.ini",
+        "benchmarks",
+        "--benchmark-disable",
+    ]
+    heavy = "not (two_threads or suppression or linkage or memory or 100k or 800x600)"
+    done = subprocess.run([*command, "-k", heavy], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert done.returncode == 0, done.stdout
 
 
 def verdicts(before: list[dict[str, float]], now: list[dict[str, float]]) -> dict[str, str]:
