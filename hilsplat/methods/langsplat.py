@@ -24,9 +24,11 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float32, Int32, Int64
 
+from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
 from hilsplat.methods.method import Method, MethodInputs
+from hilsplat.methods.quads import WIDTH, load, plus, signs_of_difference, store, zeros
 from hilsplat.settings import MethodSettings
 
 BETAS = (0.9, 0.999)
@@ -108,16 +110,6 @@ def views_of(inputs: MethodInputs, pixel_step: int) -> list[ViewPixels]:
     return views
 
 
-def l1_step(
-    features: Float32[np.ndarray, "N D"], pixels: LevelPixels
-) -> tuple[float, Float32[np.ndarray, "N D"]]:
-    """Mean absolute difference of rendered and painted codes, and its gradient by the features."""
-    apart = pixels.weights @ features - pixels.targets
-    scale = np.float32(1 / max(apart.size, 1))
-    gradient = pixels.weights.T @ (np.sign(apart) * scale)
-    return float(np.abs(apart).sum(dtype=np.float64) * scale), gradient.astype(np.float32)
-
-
 def train_level(
     views: list[ViewPixels], level: Level, num_gaussians: int, settings: MethodSettings, seed: int
 ) -> Float32[np.ndarray, "N D"]:
@@ -130,16 +122,65 @@ def train_level(
         settings: steps and rate.
         seed: for the order of views.
     """
-    features = np.zeros((num_gaussians, views[0].latents.shape[1]), np.float32)
-    first, second = np.zeros_like(features), np.zeros_like(features)
+    channels = views[0].latents.shape[1]
+    wide = channels + -channels % WIDTH
+    features, gradient, first, second = np.zeros((4, num_gaussians * wide), np.float32)
+    codes = {id(view): np.pad(view.latents, ((0, 0), (0, wide - channels))).reshape(-1) for view in views}
     queue = ViewQueue(views, seed)
     for step in range(1, settings.steps + 1):
-        _, gradient = l1_step(features, queue.next().at(level))
-        first += (1 - BETAS[0]) * (gradient - first)
-        second += (1 - BETAS[1]) * (gradient * gradient - second)
-        mean, spread = first / (1 - BETAS[0] ** step), second / (1 - BETAS[1] ** step)
-        features -= settings.rate * mean / (np.sqrt(spread) + EPS)
-    return features
+        view = queue.next()
+        weights, labels = view.weights, view.labels[:, level.index]
+        rows = weights.indptr, weights.indices, weights.data
+        l1_gradient(*rows, labels, codes[id(view)], channels, wide, features, gradient)
+        unbiased = (np.float32(1 - beta**step) for beta in BETAS)
+        adam_step(gradient, first, second, features, np.float32(settings.rate), *unbiased)
+    return features.reshape(num_gaussians, wide)[:, :channels].copy()
+
+
+@compiled
+def l1_gradient(indptr, indices, data, labels, codes, channels, wide, features, gradient):
+    """Add the gradient of the mean absolute difference of rendered and painted codes by the features.
+
+    A row of weights is read once for its sum and, while it is in the fastest cache, once for what it passes
+    back. Sums have the order of the products with the matrix and its transpose; there is one thread.
+
+    Args:
+        indptr, indices, data: weights (pixels x Gaussians), CSR.
+        labels: row of the code that is painted at each pixel, -1 for none.
+        codes: float32, flat, `wide` numbers a row.
+        channels: of a code; the numbers after them are 0.
+        wide: numbers of a Gaussian, a multiple of `WIDTH`.
+        features: float32, flat, `wide` numbers a Gaussian.
+        gradient: of the same shape; added to.
+    """
+    labelled = 0
+    for p in range(len(labels)):
+        labelled += labels[p] >= 0
+    share = np.float32(1 / max(labelled * channels, 1))
+    for p in range(len(labels)):
+        if labels[p] < 0:
+            continue
+        begin, end = np.uint64(indptr[p]), np.uint64(indptr[p + 1])  # unsigned: no look for negative indices
+        for c in range(0, wide, WIDTH):
+            total = zeros()
+            for k in range(begin, end):
+                total = plus(total, data[k], load(features, np.int64(indices[k]) * wide + c))
+            pull = signs_of_difference(total, load(codes, np.int64(labels[p]) * wide + c), share)
+            for k in range(begin, end):
+                there = np.int64(indices[k]) * wide + c
+                store(gradient, there, plus(load(gradient, there), data[k], pull))
+
+
+@compiled(error_model="numpy")
+def adam_step(gradient, first, second, features, rate, unbiased1, unbiased2):
+    """One step of Adam on flat arrays in place; the gradient becomes 0 for the next."""
+    rest1, rest2 = np.float32(1 - BETAS[0]), np.float32(1 - BETAS[1])
+    for k in range(len(features)):
+        g = gradient[k]
+        gradient[k] = 0
+        first[k] += rest1 * (g - first[k])
+        second[k] += rest2 * (g * g - second[k])
+        features[k] -= rate * (first[k] / unbiased1) / (np.sqrt(second[k] / unbiased2) + np.float32(EPS))
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:

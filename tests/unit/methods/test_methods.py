@@ -13,7 +13,7 @@ import scipy.sparse as sp
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.methods import langsplat, lifted, registry, stage
-from hilsplat.methods.langsplat import LevelPixels, ViewPixels, grid_pixels, l1_step, train_level
+from hilsplat.methods.langsplat import LevelPixels, ViewPixels, ViewQueue, grid_pixels, train_level
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.methods.registry import METHODS, OURS, method_of, require_method
 from hilsplat.settings import MethodSettings
@@ -44,6 +44,14 @@ def test_a_gaussian_gets_the_average_of_its_masks_weighed_by_their_share_of_it()
     assert not features[:, 2].any()
 
 
+def l1_step(features, pixels):
+    """Mean absolute difference of rendered and painted codes, and its gradient by the features, by scipy."""
+    apart = pixels.weights @ features - pixels.targets
+    scale = np.float32(1 / max(apart.size, 1))
+    gradient = pixels.weights.T @ (np.sign(apart) * scale)
+    return float(np.abs(apart).sum(dtype=np.float64) * scale), gradient.astype(np.float32)
+
+
 def test_l1_gradient_matches_finite_differences():
     rng = np.random.default_rng(0)
     weights = sp.csr_matrix(rng.random((5, 4)).astype(np.float32))
@@ -56,6 +64,33 @@ def test_l1_gradient_matches_finite_differences():
         down[place] -= 1e-3
         slope = (l1_step(up, pixels)[0] - l1_step(down, pixels)[0]) / 2e-3
         assert gradient[place] == pytest.approx(slope, abs=2e-3)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4, 6])
+def test_training_has_the_bytes_of_products_with_the_matrix_and_of_adam_in_numpy(channels):
+    rng = np.random.default_rng(channels)
+    views = []
+    for _ in range(3):
+        weights = sp.random(40, 9, 0.4, "csr", np.float32, rng)
+        labels = rng.integers(-1, 5, (40, 3)).astype(np.int32)
+        views.append(ViewPixels(weights, labels, rng.normal(size=(5, channels)).astype(np.float32)))
+    settings = MethodSettings(name="langsplat", steps=50)
+    features = np.zeros((9, channels), np.float32)
+    first, second = np.zeros_like(features), np.zeros_like(features)
+    queue = ViewQueue(views, 4)
+    for step in range(1, settings.steps + 1):
+        _, gradient = l1_step(features, queue.next().at(Level.PART))
+        first += (1 - 0.9) * (gradient - first)
+        second += (1 - 0.999) * (gradient * gradient - second)
+        mean, spread = first / (1 - 0.9**step), second / (1 - 0.999**step)
+        features -= settings.rate * mean / (np.sqrt(spread) + 1e-15)
+    assert np.array_equal(train_level(views, Level.PART, 9, settings, seed=4), features)
+
+
+def test_a_code_that_is_no_number_is_not_trained_on_in_silence():
+    view = all_whole(np.ones((1, 1)), np.array([[np.nan]]))
+    settings = MethodSettings(name="langsplat", steps=2)
+    assert np.isnan(train_level([view], Level.WHOLE, 1, settings, seed=0)).all()
 
 
 def all_whole(weights, latents):
