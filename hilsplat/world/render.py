@@ -7,22 +7,26 @@ from view to view, and the Gaussians would average it to a blur.
 """
 
 import math
+from collections.abc import Callable
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Int32, UInt8
+from jaxtyping import Float32, Int32, UInt8
 
 from hilsplat.base.compiled import compiled
 from hilsplat.scene.cameras import Camera
 from hilsplat.world.paints import srgb_from_linear
 from hilsplat.world.scenes.scene import Style, WorldScene
-from hilsplat.world.textures import albedo, hash01
+from hilsplat.world.textures import albedo, grains, hash01
 
 RAYS_PER_PIXEL = 9
 """Shadow rays and occlusion rays per pixel, at least; with fewer sub-samples each casts more."""
 
 OCCLUSION_REACH = 0.55
 """Farther things do not darken a surface, scene units at `Style.scale` 1."""
+
+BAND_RAYS = 1 << 15
+"""Rays from the camera that are shaded at once: what is known of each takes 120 bytes."""
 
 _LIFT = 2e-3  # rays start this far off the surface, scene units at scale 1
 _HASH_CELLS = 160.0  # cells per unit, at scale 1, of the hash that moves rays: about a pixel at 384 px
@@ -34,10 +38,7 @@ def label_view(scene: WorldScene, camera: Camera) -> Int32[np.ndarray, "3 H W"]:
     Returns:
         Levels whole, part, subpart along the first axis; -1 where the level has no node.
     """
-    origins, directions = _rays(camera, 1)
-    hit = _cast(scene, origins, directions)["primID"]
-    ids = np.where((hit >= 0)[:, None], scene.node_ids[hit], -1)
-    return np.ascontiguousarray(ids.T.reshape(3, *camera.size_hw)).astype(np.int32)
+    return _labels(scene, _cast(scene, *_rays(camera, 1))["primID"], camera.size_hw)
 
 
 def render_view(
@@ -51,13 +52,50 @@ def render_view(
         samples: sub-samples per pixel side; 3 gives clean edges, 1 is for previews.
         style: light and exposure; None takes the scene's own.
     """
-    style = style or scene.style
-    origins, directions = _rays(camera, samples)
-    hit = _cast(scene, origins, directions)
+    return _rendered(scene, camera, samples, style or scene.style)[0]
+
+
+def render_and_label(
+    scene: WorldScene, camera: Camera, samples: int
+) -> tuple[UInt8[np.ndarray, "H W 3"], Int32[np.ndarray, "3 H W"]]:
+    """`render_view` and `label_view`; where `samples` is odd, the middle sub-samples' hits are the labels."""
+    image, middle = _rendered(scene, camera, samples, scene.style)
+    return image, _labels(scene, middle, camera.size_hw) if samples % 2 else label_view(scene, camera)
+
+
+def _labels(scene: WorldScene, prim: np.ndarray, size_hw: tuple[int, int]) -> Int32[np.ndarray, "3 H W"]:
+    ids = np.where((prim >= 0)[:, None], scene.node_ids[prim], -1)
+    return np.ascontiguousarray(ids.T.reshape(3, *size_hw)).astype(np.int32)
+
+
+def _rendered(
+    scene: WorldScene, camera: Camera, samples: int, style: Style
+) -> tuple[UInt8[np.ndarray, "H W 3"], Int32[np.ndarray, " P"]]:
+    """A view, and the triangle that the middle sub-sample of each pixel hits (-1 none).
+
+    Rows are taken in bands whose rays stay in the processor's cache.
+    """
+    height, width = camera.size_hw
+    band = max(1, BAND_RAYS // (width * samples**2))
+    image, middle = np.empty((height * width, 3), np.float32), np.empty(height * width, np.int32)
+    for top in range(0, height, band):
+        rows = range(top, min(top + band, height))
+        origins, directions = _rays(camera, samples, rows)
+        hit = _cast(scene, origins, directions)
+        pixels = slice(rows.start * width, rows.stop * width)
+        image[pixels] = _reflected(scene, hit, directions, samples, style)
+        middle[pixels] = hit["primID"][samples**2 // 2 :: samples**2]
+    srgb = srgb_from_linear(np.clip(image, 0, 1))
+    return (srgb * 255 + 0.5).astype(np.uint8).reshape(height, width, 3), middle
+
+
+def _reflected(
+    scene: WorldScene, hit: dict[str, np.ndarray], directions: np.ndarray, samples: int, style: Style
+) -> Float32[np.ndarray, "P 3"]:
+    """Linear light of the pixels whose sub-samples hit something from some directions."""
     prim = hit["primID"]
     count = len(prim)
-    points, facets, shading = (np.empty((count, 3), np.float32) for _ in range(3))
-    colours = np.empty((count, 3), np.float32)
+    points, facets, shading, colours = (np.empty((count, 3), np.float32) for _ in range(4))
     gloss = np.empty((count, 2), np.float32)
     _surfaces(
         prim,
@@ -76,20 +114,21 @@ def render_view(
         gloss,
     )
     rays_each = math.ceil(RAYS_PER_PIXEL / samples**2)
-    lit, open_sky = np.zeros(count, np.float32), np.zeros(count, np.float32)
-    starts = points + np.float32(_LIFT * style.scale) * facets
-    toward = np.empty((count, 3), np.float32)
-    reach = np.empty(count, np.float32)
     light = np.array([*style.light_position, style.light_radius], np.float32)
-    cells = _HASH_CELLS / style.scale
-    for ray in range(rays_each):
-        _light_rays(points, starts, light, samples, ray, rays_each, cells, toward, reach)
-        np.minimum(reach, np.float32(style.shadow_reach), out=reach)
-        lit += _cast(scene, starts, toward, reach) < 0
-        _sky_rays(points, facets, samples, ray, rays_each, cells, toward)
-        reach.fill(OCCLUSION_REACH * style.scale)
-        open_sky += _cast(scene, starts, toward, reach) < 0
-    image = np.zeros((camera.size_hw[0] * camera.size_hw[1], 3), np.float32)
+    cells, lift = _HASH_CELLS / style.scale, np.float32(_LIFT * style.scale)
+
+    def free(rows: np.ndarray, rays: Callable[..., None], *given: object) -> np.ndarray:
+        """Share of each sub-sample's rays that meet nothing; 0 for sub-samples outside `rows`."""
+        share = np.zeros(count, np.float32)
+        starts, toward = (np.empty((len(rows), 3), np.float32) for _ in range(2))
+        reach = np.empty(len(rows), np.float32)
+        for ray in range(rays_each):
+            rays(rows, points, facets, lift, samples, ray, rays_each, cells, *given, starts, toward, reach)
+            share[rows] += _cast(scene, starts, toward, reach) < 0
+        return share / np.float32(rays_each)
+
+    under_sky, lit = _receivers(prim, points, facets, shading, gloss, light)
+    image = np.zeros((count // samples**2, 3), np.float32)
     _shade(
         prim,
         directions,
@@ -98,15 +137,15 @@ def render_view(
         shading,
         colours,
         gloss,
-        lit / np.float32(rays_each),
-        open_sky / np.float32(rays_each),
+        free(lit, _light_rays, light, np.float32(style.shadow_reach)),
+        free(under_sky, _sky_rays, np.float32(OCCLUSION_REACH * style.scale)),
         light,
         np.array([style.light_colour, style.sky_colour, style.ground_colour], np.float32),
         np.float32(style.exposure),
         samples,
         image,
     )
-    return (srgb_from_linear(np.clip(image, 0, 1)) * 255 + 0.5).astype(np.uint8).reshape(*camera.size_hw, 3)
+    return image
 
 
 def _cast(scene: WorldScene, origins: np.ndarray, directions: np.ndarray, reach: np.ndarray | None = None):
@@ -116,21 +155,44 @@ def _cast(scene: WorldScene, origins: np.ndarray, directions: np.ndarray, reach:
     return scene.embree.run(origins, directions, dists=reach, query="OCCLUDED")
 
 
-def _rays(camera: Camera, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rays of all sub-samples, pixel by pixel: origins and unit directions, (H*W*samples^2, 3)."""
+def _rays(camera: Camera, samples: int, rows: range | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Rays of all sub-samples of some rows (None: all), pixel by pixel: origins and unit directions."""
     height, width = camera.size_hw
+    rows = rows or range(height)
     step = (np.arange(samples) + 0.5) / samples
     x = (np.arange(width)[:, None] + step).reshape(-1)
-    y = (np.arange(height)[:, None] + step).reshape(-1)
-    x_cam = (x - camera.K[0, 2]) / camera.K[0, 0]
-    y_cam = (y - camera.K[1, 2]) / camera.K[1, 1]
-    grid = np.ones((height, samples, width, samples, 3))
-    grid[..., 0] = x_cam.reshape(1, 1, width, samples)
-    grid[..., 1] = y_cam.reshape(height, samples, 1, 1)
-    directions = grid.transpose(0, 2, 1, 3, 4).reshape(-1, 3) @ camera.cam_from_world[:3, :3]
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    y = (np.arange(rows.start, rows.stop)[:, None] + step).reshape(-1)
+    directions = np.empty((len(rows) * width * samples**2, 3), np.float32)
+    _directions(
+        (x - camera.K[0, 2]) / camera.K[0, 0],
+        (y - camera.K[1, 2]) / camera.K[1, 1],
+        np.ascontiguousarray(camera.cam_from_world[:3, :3]),
+        samples,
+        directions,
+    )
     origins = np.broadcast_to(camera.centre.astype(np.float32), directions.shape)
-    return np.ascontiguousarray(origins), np.ascontiguousarray(directions, dtype=np.float32)
+    return np.ascontiguousarray(origins), directions
+
+
+@compiled
+@no_type_check  # the shape checks of the test-suite cannot be compiled
+def _directions(x_cam, y_cam, rotation, samples, directions):
+    """Unit directions of the rays through a grid of points at depth 1, pixel by pixel."""
+    i = 0
+    for row in range(0, len(y_cam), samples):
+        for column in range(0, len(x_cam), samples):
+            for y in y_cam[row : row + samples]:
+                for x in x_cam[column : column + samples]:
+                    dx = x * rotation[0, 0] + y * rotation[1, 0] + rotation[2, 0]
+                    dy = x * rotation[0, 1] + y * rotation[1, 1] + rotation[2, 1]
+                    dz = x * rotation[0, 2] + y * rotation[1, 2] + rotation[2, 2]
+                    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+                    directions[i, 0], directions[i, 1], directions[i, 2] = (
+                        dx / length,
+                        dy / length,
+                        dz / length,
+                    )
+                    i += 1
 
 
 @compiled
@@ -152,6 +214,7 @@ def _surfaces(
     gloss,
 ):
     """Position, facet normal, shading normal, colour and highlight at each hit."""
+    places = np.zeros((3, len(prim)))  # in the solid texture, scene units
     for i in range(len(prim)):
         f = prim[i]
         if f < 0:
@@ -183,56 +246,94 @@ def _surfaces(
         total = math.sqrt(max(total, 1e-12))
         for c in range(3):
             shading[i, c] /= total
-        x = w0 * coords[f, 0, 0] + w1 * coords[f, 1, 0] + w2 * coords[f, 2, 0]
-        y = w0 * coords[f, 0, 1] + w1 * coords[f, 1, 1] + w2 * coords[f, 2, 1]
-        z = w0 * coords[f, 0, 2] + w1 * coords[f, 1, 2] + w2 * coords[f, 2, 2]
         material = materials[material_ids[f]]
-        red, green, blue = albedo(material, x, y, z)
-        colours[i, 0], colours[i, 1], colours[i, 2] = red, green, blue
+        for c in range(3):
+            w = w0 * coords[f, 0, c] + w1 * coords[f, 1, c] + w2 * coords[f, 2, c]
+            places[c, i] = w + material[11 + c]
         gloss[i, 0], gloss[i, 1] = material[8], material[9]
+    grain = grains(places[0], places[1], places[2])
+    for i in range(len(prim)):
+        if prim[i] >= 0:
+            material = materials[material_ids[prim[i]]]
+            red, green, blue = albedo(material, places[0, i], places[1, i], places[2, i], grain[i])
+            colours[i, 0], colours[i, 1], colours[i, 2] = red, green, blue
 
 
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
-def _cell(point, cells, salt):
-    """Hash in [0, 1) of the small cell of space that a point lies in."""
+def _to_light(points, facets, shading, i, light):
+    """Direction and distance of the light, and the cosine at which it falls on point i; 0 from behind."""
+    lx, ly, lz = light[0] - points[i, 0], light[1] - points[i, 1], light[2] - points[i, 2]
+    distance = math.sqrt(lx * lx + ly * ly + lz * lz)
+    lx, ly, lz = lx / distance, ly / distance, lz / distance
+    diffuse = max(0.0, shading[i, 0] * lx + shading[i, 1] * ly + shading[i, 2] * lz)
+    if facets[i, 0] * lx + facets[i, 1] * ly + facets[i, 2] * lz <= 0:
+        diffuse = 0.0
+    return lx, ly, lz, distance, diffuse
+
+
+@compiled
+@no_type_check  # the shape checks of the test-suite cannot be compiled
+def _receivers(prim, points, facets, shading, gloss, light):
+    """Rows that the sky lights (not the void nor what shines by itself), and those that face the light."""
+    under_sky, lit = np.empty(len(prim), np.int64), np.empty(len(prim), np.int64)
+    skies = lights = 0
+    for i in range(len(prim)):
+        if prim[i] < 0 or gloss[i, 1] <= 0:
+            continue
+        under_sky[skies] = i
+        skies += 1
+        if _to_light(points, facets, shading, i, light)[4] > 0:
+            lit[lights] = i
+            lights += 1
+    return under_sky[:skies], lit[:lights]
+
+
+@compiled
+@no_type_check  # the shape checks of the test-suite cannot be compiled
+def _cell(points, i, cells, salt):
+    """Hash in [0, 1) of the small cell of space that point i lies in."""
     return hash01(
-        math.floor(point[0] * cells),
-        math.floor(point[1] * cells),
-        math.floor(point[2] * cells),
+        math.floor(points[i, 0] * cells),
+        math.floor(points[i, 1] * cells),
+        math.floor(points[i, 2] * cells),
         salt,
     )
 
 
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
-def _light_rays(points, starts, light, samples, ray, rays_each, cells, toward, reach):
-    """Direction and distance from each point to its stratum of the (horizontal, round) light."""
+def _light_rays(
+    rows, points, facets, lift, samples, ray, rays_each, cells, light, shadow_reach, starts, toward, reach
+):
+    """From points, by row, to their stratum of the (horizontal, round) light: start, direction, distance."""
     per_pixel = samples * samples
     strata = per_pixel * rays_each
-    for i in range(len(points)):
+    for n, i in enumerate(rows):
         stratum = (i % per_pixel) * rays_each + ray
         # Sunflower arrangement: equal areas, all directions, for any number of strata.
-        radius = light[3] * math.sqrt((stratum + 0.15 + 0.7 * _cell(points[i], cells, 301)) / strata)
-        angle = 2.399963 * stratum + 0.9 * (_cell(points[i], cells, 302) - 0.5)
-        dx = light[0] + radius * math.cos(angle) - starts[i, 0]
-        dy = light[1] + radius * math.sin(angle) - starts[i, 1]
-        dz = light[2] - starts[i, 2]
+        radius = light[3] * math.sqrt((stratum + 0.15 + 0.7 * _cell(points, i, cells, 301)) / strata)
+        angle = 2.399963 * stratum + 0.9 * (_cell(points, i, cells, 302) - 0.5)
+        for c in range(3):
+            starts[n, c] = points[i, c] + lift * facets[i, c]
+        dx = light[0] + radius * math.cos(angle) - starts[n, 0]
+        dy = light[1] + radius * math.sin(angle) - starts[n, 1]
+        dz = light[2] - starts[n, 2]
         distance = math.sqrt(dx * dx + dy * dy + dz * dz)
-        toward[i, 0], toward[i, 1], toward[i, 2] = dx / distance, dy / distance, dz / distance
-        reach[i] = distance
+        toward[n, 0], toward[n, 1], toward[n, 2] = dx / distance, dy / distance, dz / distance
+        reach[n] = min(distance, shadow_reach)
 
 
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
-def _sky_rays(points, facets, samples, ray, rays_each, cells, toward):
-    """A cosine-weighted direction of the hemisphere above each point, by stratum."""
+def _sky_rays(rows, points, facets, lift, samples, ray, rays_each, cells, sky_reach, starts, toward, reach):
+    """A cosine-weighted direction of the hemisphere above points, by row, by stratum."""
     per_pixel = samples * samples
     strata = per_pixel * rays_each
-    for i in range(len(points)):
+    for n, i in enumerate(rows):
         stratum = (i % per_pixel) * rays_each + ray
-        share = (stratum + 0.15 + 0.7 * _cell(points[i], cells, 303)) / strata
-        angle = 2.399963 * stratum + 0.9 * (_cell(points[i], cells, 304) - 0.5)
+        share = (stratum + 0.15 + 0.7 * _cell(points, i, cells, 303)) / strata
+        angle = 2.399963 * stratum + 0.9 * (_cell(points, i, cells, 304) - 0.5)
         radius, up = math.sqrt(share), math.sqrt(max(0.0, 1.0 - share))
         nx, ny, nz = facets[i, 0], facets[i, 1], facets[i, 2]
         # Frame around the normal (Duff et al. 2017, "Building an Orthonormal Basis, Revisited").
@@ -240,9 +341,12 @@ def _sky_rays(points, facets, samples, ray, rays_each, cells, toward):
         a = -1.0 / (sign + nz)
         b = nx * ny * a
         c, s = radius * math.cos(angle), radius * math.sin(angle)
-        toward[i, 0] = c * (1.0 + sign * nx * nx * a) + s * b + up * nx
-        toward[i, 1] = c * sign * b + s * (sign + ny * ny * a) + up * ny
-        toward[i, 2] = -c * sign * nx - s * ny + up * nz
+        toward[n, 0] = c * (1.0 + sign * nx * nx * a) + s * b + up * nx
+        toward[n, 1] = c * sign * b + s * (sign + ny * ny * a) + up * ny
+        toward[n, 2] = -c * sign * nx - s * ny + up * nz
+        for axis in range(3):
+            starts[n, axis] = points[i, axis] + lift * facets[i, axis]
+        reach[n] = sky_reach
 
 
 @compiled
@@ -275,14 +379,9 @@ def _shade(
             for c in range(3):
                 image[pixel, c] += colours[i, c] / per_pixel
             continue
-        lx, ly, lz = light[0] - points[i, 0], light[1] - points[i, 1], light[2] - points[i, 2]
-        distance = math.sqrt(lx * lx + ly * ly + lz * lz)
-        lx, ly, lz = lx / distance, ly / distance, lz / distance
+        lx, ly, lz, distance, diffuse = _to_light(points, facets, shading, i, light)
         falloff = 13.0 / (distance * distance)
         nx, ny, nz = shading[i, 0], shading[i, 1], shading[i, 2]
-        diffuse = max(0.0, nx * lx + ny * ly + nz * lz)
-        if facets[i, 0] * lx + facets[i, 1] * ly + facets[i, 2] * lz <= 0:
-            diffuse = 0.0
         hx, hy, hz = lx - directions[i, 0], ly - directions[i, 1], lz - directions[i, 2]
         length = math.sqrt(hx * hx + hy * hy + hz * hz)
         facing = max(0.0, (nx * hx + ny * hy + nz * hz) / length)

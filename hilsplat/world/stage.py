@@ -18,7 +18,7 @@ from hilsplat.datasets.synthetic.hierarchy import write_hierarchy
 from hilsplat.settings import WorldSettings
 from hilsplat.world.lidar import scan_street
 from hilsplat.world.objects.catalogue import GENERATOR_VERSION
-from hilsplat.world.render import label_view, render_view
+from hilsplat.world.render import render_and_label
 from hilsplat.world.scenes.kinds import KINDS, build_scene, scene_cameras
 from hilsplat.world.scenes.scene import WorldScene
 from hilsplat.world.seeds import TRAINING_SEEDS, split_of_seed
@@ -133,8 +133,7 @@ def _render(kind: str, seed: int, settings: WorldSettings, row: int) -> tuple[np
     """Image and labels of one view; top level, so that worker processes can call it."""
     scene = _scene(kind, seed, settings.objects)
     cameras = scene_cameras(scene, settings.views, settings.image_px, settings.arc_deg)
-    camera = cameras[cameras.names[row]]
-    return render_view(scene, camera, settings.samples), label_view(scene, camera)
+    return render_and_label(scene, cameras[cameras.names[row]], settings.samples)
 
 
 def _rendered(

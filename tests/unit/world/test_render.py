@@ -5,13 +5,14 @@ import pytest
 
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
 from hilsplat.scene.cameras import Camera
+from hilsplat.world import render
 from hilsplat.world.paints import Paint
-from hilsplat.world.render import label_view, render_view
+from hilsplat.world.render import label_view, render_and_label, render_view
 from hilsplat.world.scenes.kinds import build_scene
 from hilsplat.world.scenes.scene import Style, WorldScene
 from hilsplat.world.scenes.tabletop import ring_cameras, training_camera
 from hilsplat.world.shapes import Mesh, box, joined, sphere
-from hilsplat.world.textures import albedo, pattern
+from hilsplat.world.textures import albedo, fractal_noise, grains, hash01, pattern
 from hilsplat.world.views import looking_at, pinhole
 from tests.unit.world.depth import depth_view
 
@@ -121,10 +122,54 @@ def test_a_shadow_falls_where_the_light_is_hidden():
 def test_textures_depend_on_the_point_alone_and_vary():
     material = STONE.row()
     points = np.random.default_rng(0).uniform(-1, 1, (200, 3))
-    first = np.array([albedo(material, *point) for point in points])
-    assert np.array_equal(first, np.array([albedo(material, *point) for point in points]))
+    first = np.array([albedo(material, *point, 0.5) for point in points])
+    assert np.array_equal(first, np.array([albedo(material, *point, 0.5) for point in points]))
     assert first.std(axis=0).min() > 0.01
     assert first.min() >= 0 and first.max() <= 1
+
+
+def test_the_hash_of_a_cell_is_its_chain_of_mixing_steps():
+    def reference(*cell):
+        h = (
+            sum(a * b for a, b in zip(cell, (0x27D4EB2D, 0x165667B1, 0x1B873593, 0x2545F491), strict=True))
+            % 2**32
+        )
+        h = (h ^ h >> 15) * 0x2C1B3C6D % 2**32
+        h = (h ^ h >> 12) * 0x297A2D39 % 2**32
+        return (h ^ h >> 15) / 2**32
+
+    cells = np.random.default_rng(0).integers(-5000, 5000, (200, 4)) * [1, 1, 1, 0] + [0, 0, 0, 203]
+    assert [hash01(*cell) for cell in cells] == [reference(*cell) for cell in cells.tolist()]
+
+
+def test_grain_of_many_points_has_the_bits_of_plain_noise():
+    points = np.random.default_rng(0).uniform(-5, 5, (1001, 3))
+    plain = [fractal_noise(*(16.0 * point), 4, 201) for point in points]
+    assert np.array_equal(grains(*np.ascontiguousarray(points.T)), plain)
+
+
+@pytest.mark.parametrize("samples", (2, 3))
+def test_image_and_labels_at_once_are_those_of_one_at_a_time_in_bands_of_any_height(monkeypatch, samples):
+    scene = build_scene("tabletop", 100, 3)
+    camera = ring_cameras(scene, 12, 48, 100.0)["005.png"]
+    plain = render_view(scene, camera, samples), label_view(scene, camera)
+    for rays in (1, 48 * 5 * samples**2, 10**9):
+        monkeypatch.setattr(render, "BAND_RAYS", rays)
+        assert all(map(np.array_equal, render_and_label(scene, camera, samples), plain))
+
+
+def test_only_shadow_rays_that_cannot_matter_are_left_out(monkeypatch):
+    scene = scene_of(joined(box((4, 4, 0.1), (0, 0, -0.05)), box((0.6, 0.6, 0.6), (0, 0, 0.8))))
+    style = Style(light_position=(1.0, 0.0, 4.0))
+    camera = Camera("a.png", looking_at(np.array([-2.0, 0, 0.9]), np.zeros(3)), pinhole(64, 50), (64, 64))
+    cast, rays = render._cast, []
+    monkeypatch.setattr(render, "BAND_RAYS", 10**9)
+    monkeypatch.setattr(render, "_cast", lambda scene, *of: (rays.append(len(of[0])), cast(scene, *of))[1])
+    image = render_view(scene, camera, 3, style)
+    assert rays[1] < rays[2] < rays[0]  # to the light, to the sky, from the camera
+    # each receives light and sky, if it is there at all
+    monkeypatch.setattr(render, "_receivers", lambda prim, *_: (np.flatnonzero(prim >= 0),) * 2)
+    assert np.array_equal(image, render_view(scene, camera, 3, style)) and rays[4] == rays[5] == rays[2]
 
 
 def test_bricks_have_joints_along_every_upright_wall():
