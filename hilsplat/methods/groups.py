@@ -1,55 +1,17 @@
-"""Groups of Gaussians: k-means, and the code of a group from the masks that show it."""
+"""Groups of Gaussians, and the code of a group from the masks that show it."""
 
 from collections.abc import Callable
 
 import numpy as np
 import scipy.sparse as sp
-import torch
 from jaxtyping import Bool, Float, Float32, Int32, Int64
 
-from hilsplat.base.device import one_torch_thread
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import NONE
 from hilsplat.contributions.rows import Contributions
 from hilsplat.settings import MethodSettings
 
-CHUNK_ROWS = 8192
-
 Closeness = Callable[[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]], Float[np.ndarray, " k"]]
-
-
-def kmeans(
-    rows: Float32[np.ndarray, "n D"], k: int, steps: int, random: np.random.Generator
-) -> Int64[np.ndarray, " n"]:
-    """Nearest of k centres for every row, after some of Lloyd's steps from k-means++ centres.
-
-    Fewer distinct rows than k give fewer clusters; an empty cluster keeps its centre.
-    """
-    data = torch.from_numpy(np.ascontiguousarray(rows))
-    with one_torch_thread():
-        centres = data[:1].repeat(k, 1) if len(data) else data.new_zeros(k, data.shape[1])
-        square = torch.full((len(data),), torch.inf, dtype=data.dtype)
-        for place in range(k if len(data) else 0):
-            chances = square.double().numpy().cumsum() if place else np.arange(1.0, len(data) + 1)
-            if chances[-1] == 0:
-                break  # every row is a centre already
-            chosen = int(np.searchsorted(chances, random.random() * chances[-1], side="right"))
-            centres[place] = data[min(chosen, len(data) - 1)]
-            square = torch.minimum(square, (data - centres[place]).square().sum(1))
-        for _ in range(steps):
-            nearest = _nearest(data, centres)
-            counts = torch.bincount(nearest, minlength=k)[:, None]
-            sums = torch.zeros_like(centres).index_add(0, nearest, data)
-            centres = torch.where(counts > 0, sums / counts.clamp(min=1), centres)
-        return _nearest(data, centres).numpy()
-
-
-def _nearest(data: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
-    """Row of the nearest centre; of equally near ones, the first."""
-    # without |x|^2, which is the same for all centres
-    lengths = centres.square().sum(1) / 2
-    parts = [(lengths - chunk @ centres.T).argmin(1) for chunk in data.split(CHUNK_ROWS)]
-    return torch.cat(parts) if parts else torch.zeros(0, dtype=torch.int64)
 
 
 def group_latents(

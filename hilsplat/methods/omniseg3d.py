@@ -27,8 +27,9 @@ from torch import Tensor
 from torch.nn.functional import log_softmax
 
 from hilsplat.base.levels import LEVELS
-from hilsplat.methods.groups import features_of_groups, group_latents, kmeans, thresholds_of
+from hilsplat.methods.groups import features_of_groups, group_latents, thresholds_of
 from hilsplat.methods.method import Method, MethodInputs
+from hilsplat.methods.quantise import kmeans
 from hilsplat.methods.training import LabelledView, alike, labelled_views, product, segment_means, train, unit
 from hilsplat.settings import MethodSettings
 
@@ -121,7 +122,7 @@ def clusters(
     features: Float32[np.ndarray, "N D"], thresholds: tuple[float, float, float], seed: int
 ) -> Int64[np.ndarray, "N 3"]:
     """Cluster of each Gaussian at every threshold of the cosine; a higher threshold splits clusters only."""
-    centre = kmeans(features, CENTRES, KMEANS_STEPS, np.random.default_rng(seed))
+    _, centre = kmeans(features, CENTRES, seed, KMEANS_STEPS)
     used, centre = np.unique(centre, return_inverse=True)
     counts = np.bincount(centre)
     means = np.stack([np.bincount(centre, column) / counts for column in features.T], axis=1)

@@ -14,7 +14,7 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.methods import gaussian_grouping, omniseg3d, opengaussian, vch
 from hilsplat.methods.gaussian_grouping import mask_identities, neighbour_loss
-from hilsplat.methods.groups import features_of_groups, group_latents, kmeans, thresholds_of
+from hilsplat.methods.groups import features_of_groups, group_latents, thresholds_of
 from hilsplat.methods.method import MethodInputs
 from hilsplat.methods.omniseg3d import clusters, hierarchical_loss, patches
 from hilsplat.methods.opengaussian import contrast_loss, instances, smoothing_loss
@@ -198,16 +198,6 @@ def test_codebooks_split_by_position_first_and_by_feature_then():
     kinds = leaf.reshape(2, 10, 2)
     assert all(len(np.unique(kinds[side, :, turn])) == 1 for side in (0, 1) for turn in (0, 1))
     assert len(np.unique(leaf)) == 4
-
-
-def test_kmeans_finds_well_separated_groups_and_survives_few_distinct_rows():
-    rows = np.repeat(np.float32([[0, 0], [5, 0], [0, 5]]), 10, axis=0)
-    rows += 0.01 * RNG.random(rows.shape).astype(np.float32)
-    found = kmeans(rows, 3, 5, np.random.default_rng(0)).reshape(3, 10)
-    assert (found == found[:, :1]).all() and len(np.unique(found)) == 3
-    same = kmeans(np.ones((4, 2), np.float32), 3, 5, np.random.default_rng(0))
-    assert len(np.unique(same)) == 1
-    assert len(kmeans(np.zeros((0, 2), np.float32), 3, 5, np.random.default_rng(0))) == 0
 
 
 def association(S, mass, view):
