@@ -20,7 +20,6 @@ from jaxtyping import Float32, Int64
 from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
-from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.field.linear_code import LinearCode
 from hilsplat.methods.descent import Adam
 from hilsplat.methods.langsplat import LevelPixels, ViewPixels, ViewQueue, views_of
@@ -125,9 +124,7 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
             features[:, level.index] = train_level(
                 labelled, level, len(features), codebook, code, settings, seed + level.index
             )
-    masks = MaskOperator.of(contributions.matrix("A"), contributions.level)
-    seen = masks.spread(np.ones((len(latents), 1), np.float32)) > 0
-    return np.where(seen, features, np.float32(0))
+    return np.where(inputs.seen()[..., None], features, np.float32(0))
 
 
 @compiled
