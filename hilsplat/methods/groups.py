@@ -1,55 +1,28 @@
-"""Groups of Gaussians: k-means, and the code of a group from the masks that show it."""
+"""Groups of Gaussians by their features, and the code of a group from the masks that show it."""
 
 from collections.abc import Callable
 
 import numpy as np
+import scipy.cluster.hierarchy
 import scipy.sparse as sp
-import torch
 from jaxtyping import Bool, Float, Float32, Int32, Int64
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
-from hilsplat.base.device import one_torch_thread
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import NONE
 from hilsplat.contributions.rows import Contributions
+from hilsplat.methods.method import MethodInputs
+from hilsplat.methods.quantise import kmeans
 from hilsplat.settings import MethodSettings
 
-CHUNK_ROWS = 8192
+CENTRES = 256
+KMEANS_ROUNDS = 10
+MIN_SCORE = 0.2
+MIN_VIEWS = 2
+"""Least score of a mask, and least views, for a code of a cluster (OpenGaussian, for ScanNet)."""
 
 Closeness = Callable[[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]], Float[np.ndarray, " k"]]
-
-
-def kmeans(
-    rows: Float32[np.ndarray, "n D"], k: int, steps: int, random: np.random.Generator
-) -> Int64[np.ndarray, " n"]:
-    """Nearest of k centres for every row, after some of Lloyd's steps from k-means++ centres.
-
-    Fewer distinct rows than k give fewer clusters; an empty cluster keeps its centre.
-    """
-    data = torch.from_numpy(np.ascontiguousarray(rows))
-    with one_torch_thread():
-        centres = data[:1].repeat(k, 1) if len(data) else data.new_zeros(k, data.shape[1])
-        square = torch.full((len(data),), torch.inf, dtype=data.dtype)
-        for place in range(k if len(data) else 0):
-            chances = square.double().numpy().cumsum() if place else np.arange(1.0, len(data) + 1)
-            if chances[-1] == 0:
-                break  # every row is a centre already
-            chosen = int(np.searchsorted(chances, random.random() * chances[-1], side="right"))
-            centres[place] = data[min(chosen, len(data) - 1)]
-            square = torch.minimum(square, (data - centres[place]).square().sum(1))
-        for _ in range(steps):
-            nearest = _nearest(data, centres)
-            counts = torch.bincount(nearest, minlength=k)[:, None]
-            sums = torch.zeros_like(centres).index_add(0, nearest, data)
-            centres = torch.where(counts > 0, sums / counts.clamp(min=1), centres)
-        return _nearest(data, centres).numpy()
-
-
-def _nearest(data: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
-    """Row of the nearest centre; of equally near ones, the first."""
-    # without |x|^2, which is the same for all centres
-    lengths = centres.square().sum(1) / 2
-    parts = [(lengths - chunk @ centres.T).argmin(1) for chunk in data.split(CHUNK_ROWS)]
-    return torch.cat(parts) if parts else torch.zeros(0, dtype=torch.int64)
 
 
 def group_latents(
@@ -111,6 +84,59 @@ def features_of_groups(
     """Code of its group for every Gaussian, 0 without a group."""
     nothing = np.zeros((1, latents.shape[1]), np.float32)
     return np.concatenate([latents, nothing])[group]
+
+
+def clusters(
+    features: Float32[np.ndarray, "N D"], thresholds: tuple[float, ...], seed: int
+) -> Int64[np.ndarray, "N K"]:
+    """Cluster of each Gaussian at every threshold of the cosine; a higher threshold splits clusters only."""
+    _, centre = kmeans(features, CENTRES, seed, KMEANS_ROUNDS)
+    used, centre = np.unique(centre, return_inverse=True)
+    counts = np.bincount(centre)
+    means = np.stack([np.bincount(centre, column) / counts for column in features.T], axis=1)
+    means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12)
+    if len(used) < 2:
+        return np.zeros((len(features), len(thresholds)), np.int64)
+    joined = scipy.cluster.hierarchy.linkage(means, "average", metric="cosine")
+    cut = [scipy.cluster.hierarchy.fcluster(joined, 1 - least, "distance") - 1 for least in thresholds]
+    return np.stack(cut, axis=1)[centre].astype(np.int64)
+
+
+def cluster_field(inputs: MethodInputs, group: Int64[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3 D"]:
+    """Code of its cluster at each level for every Gaussian; masks of all levels compete."""
+    every = np.arange(len(inputs.contributions))
+    features = []
+    for own in group.T:
+        num = int(own.max(initial=-1)) + 1
+        latents, _ = group_latents(
+            own,
+            num,
+            inputs.contributions,
+            every,
+            inputs.latents,
+            min_score=MIN_SCORE,
+            min_views=MIN_VIEWS,
+        )
+        features.append(features_of_groups(own, latents))
+    return np.stack(features, axis=1)
+
+
+def density_clusters(
+    points: Float32[np.ndarray, "n D"], radius: float, least: int
+) -> Int64[np.ndarray, " n"]:
+    """Cluster of each point, -1 for none: dense points within the radius of each other are one (DBSCAN*).
+
+    A point is dense with at least `least` points within the radius, itself among them. Clusters are numbered
+    by their first point (Campello et al., PAKDD 2013).
+    """
+    tree = cKDTree(points)
+    dense = tree.query_ball_point(points, radius, return_length=True) >= least
+    found = np.full(len(points), NONE, np.int64)
+    where = np.flatnonzero(dense)
+    pairs = cKDTree(points[where]).query_pairs(radius, output_type="ndarray")
+    graph = sp.csr_matrix((np.ones(len(pairs), bool), pairs.T), shape=(len(where), len(where)))
+    found[where] = connected_components(graph, directed=False)[1]
+    return found
 
 
 def thresholds_of(settings: MethodSettings, own: tuple[float, float, float]) -> tuple[float, float, float]:

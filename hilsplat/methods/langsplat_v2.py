@@ -20,12 +20,11 @@ from jaxtyping import Float32, Int64
 from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
-from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.field.linear_code import LinearCode
 from hilsplat.methods.descent import Adam
 from hilsplat.methods.langsplat import LevelPixels, ViewPixels, ViewQueue, views_of
 from hilsplat.methods.method import Method, MethodInputs
-from hilsplat.methods.quantise import centroids
+from hilsplat.methods.quantise import kmeans
 from hilsplat.settings import MethodSettings
 
 ENTRIES = 64
@@ -121,13 +120,11 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     features = np.zeros((contributions.num_gaussians, len(LEVELS), latents.shape[1]), np.float32)
     for level in track(list(LEVELS), "levels trained"):
         if labelled := [view for view in views if view.is_labelled(level)]:
-            codebook = centroids(latents[contributions.rows_of(level)], ENTRIES, seed + level.index)
+            codebook, _ = kmeans(latents[contributions.rows_of(level)], ENTRIES, seed + level.index)
             features[:, level.index] = train_level(
                 labelled, level, len(features), codebook, code, settings, seed + level.index
             )
-    masks = MaskOperator.of(contributions.matrix("A"), contributions.level)
-    seen = masks.spread(np.ones((len(latents), 1), np.float32)) > 0
-    return np.where(seen, features, np.float32(0))
+    return np.where(inputs.seen()[..., None], features, np.float32(0))
 
 
 @compiled

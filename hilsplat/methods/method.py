@@ -11,10 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float32, Int32
+from jaxtyping import Bool, Float32, Int32
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.contributions.compositing import normalised_weights
+from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.rows import Contributions
 from hilsplat.contributions.stage import label_maps
 from hilsplat.field.code import load_code, load_latents
@@ -80,6 +81,11 @@ class MethodInputs:
     def view_camera(self, view: str) -> Camera:
         """Camera of a view."""
         return self._loaded[1].cameras[view]
+
+    def seen(self) -> Bool[np.ndarray, "N 3"]:
+        """Whether a mask of the level shows the Gaussian."""
+        masks = MaskOperator.of(self.contributions.matrix("A"), self.contributions.level)
+        return masks.spread(np.ones((len(self.latents), 1), np.float32))[:, :, 0] > 0
 
     def linear_code(self, method: str) -> LinearCode:
         """The scene's code, for a method whose training or averages need CLIP vectors themselves.

@@ -20,14 +20,13 @@ Departs:
 """
 
 import numpy as np
-import scipy.cluster.hierarchy
 import torch
 from jaxtyping import Float, Float32, Int32, Int64
 from torch import Tensor
 from torch.nn.functional import log_softmax
 
 from hilsplat.base.levels import LEVELS
-from hilsplat.methods.groups import features_of_groups, group_latents, kmeans, thresholds_of
+from hilsplat.methods.groups import cluster_field, clusters, thresholds_of
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.methods.training import LabelledView, alike, labelled_views, product, segment_means, train, unit
 from hilsplat.settings import MethodSettings
@@ -37,10 +36,6 @@ MIN_PATCH_PX = 3
 LEVEL_WEIGHT = 0.2
 """Weight of a level of sharing, relative to the one before: a fifth."""
 SPREAD, LEAST_TEMPERATURE, MOST_TEMPERATURE = 10.0, 0.5, 1.0
-CENTRES = 256
-KMEANS_STEPS = 10
-MIN_SCORE = 0.2
-MIN_VIEWS = 2
 THRESHOLDS = (0.5, 0.8, 0.95)
 
 
@@ -115,41 +110,6 @@ def train_features(
 
     train(views, [{"params": [features], "lr": settings.rate}], loss, settings, seed)
     return unit(features.detach()).numpy()
-
-
-def clusters(
-    features: Float32[np.ndarray, "N D"], thresholds: tuple[float, float, float], seed: int
-) -> Int64[np.ndarray, "N 3"]:
-    """Cluster of each Gaussian at every threshold of the cosine; a higher threshold splits clusters only."""
-    centre = kmeans(features, CENTRES, KMEANS_STEPS, np.random.default_rng(seed))
-    used, centre = np.unique(centre, return_inverse=True)
-    counts = np.bincount(centre)
-    means = np.stack([np.bincount(centre, column) / counts for column in features.T], axis=1)
-    means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12)
-    if len(used) < 2:
-        return np.zeros((len(features), len(LEVELS)), np.int64)
-    joined = scipy.cluster.hierarchy.linkage(means, "average", metric="cosine")
-    cut = [scipy.cluster.hierarchy.fcluster(joined, 1 - least, "distance") - 1 for least in thresholds]
-    return np.stack(cut, axis=1)[centre].astype(np.int64)
-
-
-def cluster_field(inputs: MethodInputs, group: Int64[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3 D"]:
-    """Code of its cluster at each level for every Gaussian; masks of all levels compete."""
-    every = np.arange(len(inputs.contributions))
-    features = []
-    for own in group.T:
-        num = int(own.max(initial=-1)) + 1
-        latents, _ = group_latents(
-            own,
-            num,
-            inputs.contributions,
-            every,
-            inputs.latents,
-            min_score=MIN_SCORE,
-            min_views=MIN_VIEWS,
-        )
-        features.append(features_of_groups(own, latents))
-    return np.stack(features, axis=1)
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:

@@ -27,8 +27,9 @@ from torch import Tensor
 
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.rows import Contributions
-from hilsplat.methods.groups import features_of_groups, group_latents, kmeans
+from hilsplat.methods.groups import features_of_groups, group_latents
 from hilsplat.methods.method import Method, MethodInputs
+from hilsplat.methods.quantise import kmeans
 from hilsplat.methods.training import LabelledView, labelled_views, product, segment_means, train, unit
 from hilsplat.settings import MethodSettings
 
@@ -118,14 +119,13 @@ def instances(
         seed: for the first centres.
     """
     num_coarse, num_fine = codebook
-    random = np.random.default_rng(seed)
     spread = max(float((means - means.mean(axis=0)).std()), 1e-12)
     placed = np.concatenate([features, POSITION * (means - means.mean(axis=0)) / spread], axis=1)
-    coarse = kmeans(placed.astype(np.float32), num_coarse, KMEANS_STEPS, random)
+    _, coarse = kmeans(placed.astype(np.float32), num_coarse, seed, KMEANS_STEPS)
     leaf = coarse * num_fine
     for group in range(num_coarse):
         inside = np.flatnonzero(coarse == group)
-        leaf[inside] += kmeans(features[inside], num_fine, KMEANS_STEPS, random)
+        leaf[inside] += kmeans(features[inside], num_fine, seed + group, KMEANS_STEPS)[1]
     return leaf
 
 

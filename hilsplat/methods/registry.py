@@ -13,12 +13,15 @@ METHODS: Plugins["Method"] = Plugins(
     {
         "dr_splat": "hilsplat.methods.dr_splat:METHOD",
         "gaussian_grouping": "hilsplat.methods.gaussian_grouping:METHOD",
+        "laga": "hilsplat.methods.laga:METHOD",
         "langsplat": "hilsplat.methods.langsplat:METHOD",
         "langsplat_v2": "hilsplat.methods.langsplat_v2:METHOD",
+        "legaussians": "hilsplat.methods.legaussians:METHOD",
         "lifted": "hilsplat.methods.lifted:METHOD",
         "occam": "hilsplat.methods.occam:METHOD",
         "omniseg3d": "hilsplat.methods.omniseg3d:METHOD",
         "opengaussian": "hilsplat.methods.opengaussian:METHOD",
+        "saga": "hilsplat.methods.saga:METHOD",
         "vch": "hilsplat.methods.vch:METHOD",
     }
 )

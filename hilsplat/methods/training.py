@@ -96,6 +96,15 @@ def product(matrix: sp.csr_matrix, features: Float[Tensor, "N D"]) -> Float[Tens
     return _Product.apply(features, matrix)
 
 
+def of_seen(matrix: sp.csr_matrix) -> tuple[sp.csr_matrix, Int64[Tensor, " s"]]:
+    """The columns that are not empty, and their numbers: most Gaussians are not seen in a few pixels."""
+    columns, place = np.unique(matrix.indices, return_inverse=True)
+    parts = matrix.data, place.reshape(-1), matrix.indptr
+    return sp.csr_matrix(parts, shape=(matrix.shape[0], len(columns))), torch.from_numpy(
+        columns.astype(np.int64)
+    )
+
+
 def unit(rows: Float[Tensor, "*n D"]) -> Float[Tensor, "*n D"]:
     """Rows of length 1; a row of zeros stays."""
     return rows / rows.norm(dim=-1, keepdim=True).clamp(min=1e-9)

@@ -27,6 +27,8 @@ from hilsplat.settings import EvaluateSettings, FiguresSettings
 logger = logging.getLogger(__name__)
 
 WIDTH_IN = 13.0
+MOST_COLUMNS = 8
+"""With more methods than this, each is a row of the figure of queries."""
 VIEWS = 4
 """Number of views in the figure of one query."""
 
@@ -148,19 +150,31 @@ def over_views(
 
 
 def draw_methods(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: EvaluateSettings) -> Figure:
-    """One row per query, one column per method; the truth is outlined, IoU in the title."""
+    """One row per query, one column per method, or the other way round if there are many methods.
+
+    The truth is outlined, and the IoU in the title.
+    """
     first = methods[0].scene
     scene = first.scene
-    figure, grid = _grid(scene, max(len(rows), 1), len(methods) + 1, f"{scene.name}: queries by method")
-    for axes, row in zip(grid, track(list(rows), "queries compared"), strict=False):
+    many = len(methods) > MOST_COLUMNS
+    shape = max(len(rows), 1), len(methods) + 1
+    figure, grid = _grid(scene, *(shape[::-1] if many else shape), f"{scene.name}: queries by method")
+    by_query = grid.T if many else grid
+    for axes, row in zip(by_query, track(list(rows), "queries compared"), strict=False):
         image = first.image(row.view)
         title = f"truth, {row.view}" if row.truth is not None else row.view
-        show(axes[0], paint_answer(image, None, row.truth), title)
-        label_left(axes[0], row.text, row.level)
+        asked = f"“{row.text}” ({row.level.label})\n" if many and row.level else ""
+        show(axes[0], paint_answer(image, None, row.truth), asked + title)
+        if not many:
+            label_left(axes[0], row.text, row.level)
         for place, method in zip(axes[1:], methods, strict=True):
             mask = method.mask(row, evaluate)
-            score = f"\nIoU {iou(mask, row.truth):.2f}" if row.truth is not None else ""
-            show(place, paint_answer(image, mask, row.truth), method.title + score)
+            score = f"IoU {iou(mask, row.truth):.2f}" if row.truth is not None else ""
+            named = score if many else f"{method.title}\n{score}".rstrip()
+            show(place, paint_answer(image, mask, row.truth), named)
+    if many:
+        for axes, method in zip(grid[1:, 0], methods, strict=True):
+            label_left(axes, method.title)
     return figure
 
 

@@ -12,11 +12,17 @@ import torch
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.methods import gaussian_grouping, omniseg3d, opengaussian, vch
+from hilsplat.field.linear_code import LinearCode
+from hilsplat.methods import gaussian_grouping, laga, legaussians, omniseg3d, opengaussian, saga, vch
 from hilsplat.methods.gaussian_grouping import mask_identities, neighbour_loss
-from hilsplat.methods.groups import features_of_groups, group_latents, kmeans, thresholds_of
+from hilsplat.methods.groups import (
+    clusters,
+    features_of_groups,
+    group_latents,
+    thresholds_of,
+)
 from hilsplat.methods.method import MethodInputs
-from hilsplat.methods.omniseg3d import clusters, hierarchical_loss, patches
+from hilsplat.methods.omniseg3d import hierarchical_loss, patches
 from hilsplat.methods.opengaussian import contrast_loss, instances, smoothing_loss
 from hilsplat.methods.training import LabelledView, labelled_views, product, train, unit
 from hilsplat.methods.vch import components, neighbouring_pixels, triplets, ultrametric
@@ -33,6 +39,9 @@ FITS = {
         gaussian_grouping,
         MethodSettings(name="gaussian_grouping", steps=100, rate=0.05, pixel_step=1),
     ),
+    "laga": (laga, MethodSettings(name="laga", steps=150, rate=0.05, pixel_step=1)),
+    "legaussians": (legaussians, MethodSettings(name="legaussians", steps=150, rate=0.02, pixel_step=1)),
+    "saga": (saga, MethodSettings(name="saga", steps=150, rate=0.05, pixel_step=1)),
     "omniseg3d": (
         omniseg3d,
         MethodSettings(name="omniseg3d", steps=150, rate=0.05, pixel_step=1, thresholds=(0.05, 0.4, 0.7)),
@@ -52,6 +61,9 @@ class BoxesInputs(MethodInputs):
         views = range(len(self.world.views))
         names = [row for shift in views for row in range(len(REGIONS)) if row != shift + 3]
         return np.eye(len(REGIONS), dtype=np.float32)[names]
+
+    def linear_code(self, method):
+        return LinearCode(np.full(len(REGIONS), 0.1, np.float32), np.eye(len(REGIONS), dtype=np.float32))
 
     def view_weights(self, view):
         return normalised_weights(two_boxes_weights(self.world.views.index(view)))
@@ -78,7 +90,7 @@ def answered(features, level, row):
     return np.mean((own.argmax(axis=1) == row) & (own.max(axis=1) > 0.5))
 
 
-@pytest.mark.parametrize("name", ["opengaussian", "gaussian_grouping"])
+@pytest.mark.parametrize("name", ["opengaussian", "gaussian_grouping", "legaussians"])
 def test_methods_that_group_a_level_give_every_region_its_own_code(two_boxes_contributions, name):
     features = fit_of(name, two_boxes_inputs(*two_boxes_contributions))
     for row, (_, level, *_) in enumerate(REGIONS):
@@ -91,6 +103,19 @@ def test_methods_with_thresholds_find_the_hierarchy_from_masks_of_single_views(t
     for row in (0, 1, 2, 3, 5, 6):  # part "B top" covers its box too little to be told from the rest
         level = Level(REGIONS[row][1])
         assert answered(features, level, row) > 0.6, REGIONS[row][0]  # a third of "A top" is a subpart
+
+
+def test_laga_finds_the_objects_of_every_level(two_boxes_contributions, monkeypatch):
+    monkeypatch.setattr(laga, "LEAST_MASKS", 3)  # four views show a region, or three
+    features = fit_of("laga", two_boxes_inputs(*two_boxes_contributions))
+    for row, (name, level, *_) in enumerate(REGIONS):
+        assert answered(features, Level(level), row) > 0.8, name
+
+
+def test_saga_tells_wholes_from_parts_by_scale(two_boxes_contributions):
+    features = fit_of("saga", two_boxes_inputs(*two_boxes_contributions))
+    for row in (0, 1, 2, 3):
+        assert answered(features, Level(REGIONS[row][1]), row) > 0.6, REGIONS[row][0]
 
 
 @pytest.mark.parametrize("name", sorted(FITS))
@@ -198,16 +223,6 @@ def test_codebooks_split_by_position_first_and_by_feature_then():
     kinds = leaf.reshape(2, 10, 2)
     assert all(len(np.unique(kinds[side, :, turn])) == 1 for side in (0, 1) for turn in (0, 1))
     assert len(np.unique(leaf)) == 4
-
-
-def test_kmeans_finds_well_separated_groups_and_survives_few_distinct_rows():
-    rows = np.repeat(np.float32([[0, 0], [5, 0], [0, 5]]), 10, axis=0)
-    rows += 0.01 * RNG.random(rows.shape).astype(np.float32)
-    found = kmeans(rows, 3, 5, np.random.default_rng(0)).reshape(3, 10)
-    assert (found == found[:, :1]).all() and len(np.unique(found)) == 3
-    same = kmeans(np.ones((4, 2), np.float32), 3, 5, np.random.default_rng(0))
-    assert len(np.unique(same)) == 1
-    assert len(kmeans(np.zeros((0, 2), np.float32), 3, 5, np.random.default_rng(0))) == 0
 
 
 def association(S, mass, view):

@@ -18,7 +18,7 @@ from hilsplat.methods.descent import Adam
 from hilsplat.methods.langsplat import LevelPixels
 from hilsplat.methods.langsplat_v2 import as_vectors, cosine_loss, largest_shares, step
 from hilsplat.methods.method import MethodInputs
-from hilsplat.methods.quantise import ProductQuantiser, centroids
+from hilsplat.methods.quantise import ProductQuantiser
 from hilsplat.methods.registry import method_of
 from hilsplat.scene.cameras import Camera
 from hilsplat.settings import MethodSettings
@@ -203,13 +203,6 @@ def test_few_vectors_are_quantised_without_loss_and_many_to_less_than_their_spre
     many = rng.normal(size=(3000, 6)).astype(np.float32)
     quantiser = ProductQuantiser.fit(many, 4, seed=0)
     assert np.square(quantiser.decode(quantiser.encode(many), 6) - many).mean() < 0.15
-
-
-def test_centroids_are_the_means_of_groups_and_repeat_if_there_are_fewer():
-    groups = np.float32([[0, 0], [0, 0.2], [9, 0], [9, 0.2]])
-    found = centroids(groups, 2, seed=0)
-    assert found[np.argsort(found[:, 0])] == pytest.approx(np.float32([[0, 0.1], [9, 0.1]]))
-    assert centroids(groups[:1], 3, seed=0).tolist() == [[0, 0]] * 3
 
 
 # ---- Occam's LGS ----------------------------------------------------------------------------------------

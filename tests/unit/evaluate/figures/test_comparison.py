@@ -45,6 +45,18 @@ def test_titles_name_the_method_and_its_iou(block_world, rows):
     assert len(titles) == 2 * len(rows[1])
 
 
+def test_many_methods_are_rows_and_queries_columns(block_world, rows):
+    methods = [
+        Answerer(f"method {n}", "tree", block_world.answers) for n in range(comparison.MOST_COLUMNS + 1)
+    ]
+    figure = draw_methods(methods, rows[1], EVALUATE)
+    grid = np.array(figure.get_axes()).reshape(len(methods) + 1, len(rows[1]))
+    assert [axes.get_ylabel() for axes in grid[:, 0]] == ["", *(method.title for method in methods)]
+    assert all("IoU" in axes.get_title() for axes in grid[1:].ravel())
+    for axes, row in zip(grid[0], rows[1], strict=True):
+        assert axes.get_title().startswith(f"“{row.text}” ({row.level.label})\ntruth")
+
+
 def test_one_part_is_shown_over_views_and_views_without_truth_fill_up(block_world, rows):
     shown = over_views(block_world.scene, rows[1], rows[0])
     assert {(row.text, row.level) for row in shown} == {("head", Level.PART)}

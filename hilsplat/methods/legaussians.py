@@ -1,0 +1,164 @@
+"""LEGaussians: a code of few numbers and an uncertainty per Gaussian, decoded to an entry of a codebook.
+
+1. The CLIP vectors of the masks are quantised to 128 entries, so every pixel has an index.
+2. Every Gaussian learns 8 numbers and an uncertainty; a small network names the entry of each rendered pixel
+   (cross-entropy, less where the uncertainty is high, and -log(1 - uncertainty)).
+3. A network of the position predicts the 8 numbers, and they follow it, more so where they are uncertain.
+
+Source: Shi et al., Language Embedded 3D Gaussians, CVPR 2024; buaavrcg/LEGaussians `train.py`,
+`scene/index_decoder.py`, `arguments/__init__.py`. Authors' values are in the constants, and `steps` 30,000,
+`rate` 0.001 for codes and networks.
+
+Departs:
+    - indices of the masks' CLIP vectors, a codebook by k-means, and all of it in each of our levels; the
+      authors quantise a pyramid of CLIP crops together with DINO, which masks do not have, and train the
+      codebook with balanced loads;
+    - geometry is frozen, it is not trained together with the codes;
+    - fewer steps, on 1024 pixels of a view; almost equal first codes; networks learn at a
+      fifth of the rate; no weight decay (1e-5);
+    - the smoothing is taken at every step on 1000 Gaussians with a tenth of its weight, not at every tenth on
+      all; positions are scaled to a standard deviation of 1;
+    - each Gaussian takes the entry of its largest logit, which is then rendered; the authors decode rendered
+      codes at each pixel, to the largest or to a mixture by softmax.
+"""
+
+import itertools
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int64
+from torch import Tensor, nn
+from torch.nn.functional import cross_entropy
+
+from hilsplat.base.device import one_torch_thread
+from hilsplat.base.levels import LEVELS
+from hilsplat.methods.method import Method, MethodInputs
+from hilsplat.methods.quantise import kmeans
+from hilsplat.methods.training import LabelledView, alike, labelled_views, of_seen, product, train, unit
+from hilsplat.settings import MethodSettings
+
+ENTRIES = 128
+CHANNELS = 8
+DECODER_WIDTHS = (128, 256)
+POSITION_WIDTHS = (128,) * 4
+FIRST_UNCERTAINTY = 0.01
+UNCERTAINTY_RATE = 50
+"""Times the rate of the codes (0.05 to 0.001)."""
+NETWORK_RATE = 0.2
+"""Times the rate of the codes; the authors' is 1."""
+LEAST_SMOOTHING = 0.1
+"""Weight of the smoothing of a certain Gaussian; an uncertain one has 1."""
+SMOOTHING = 0.1
+SAMPLES = 1000
+PIXELS = 1024
+
+
+def network(sizes: tuple[int, ...]) -> nn.Sequential:
+    """Linear layers with ReLU between them."""
+    layers: list[nn.Module] = []
+    for inward, outward in itertools.pairwise(sizes):
+        layers += [nn.Linear(inward, outward), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])
+
+
+def index_loss(
+    logits: Float[Tensor, "p E"], index: Int64[Tensor, " p"], uncertainty: Float[Tensor, " p"]
+) -> Float[Tensor, ""]:
+    """Mean cross-entropy, less where the uncertainty is high, and the price -log(1 - u) of uncertainty."""
+    certain = 1 - uncertainty
+    return (cross_entropy(logits, index, reduction="none") * certain).mean() - certain.log().mean()
+
+
+def smoothing_loss(
+    codes: Float[Tensor, "s 8"], predicted: Float[Tensor, "s 8"], uncertainty: Float[Tensor, " s"]
+) -> Float[Tensor, ""]:
+    """Squared distance of codes and predictions: predictions follow codes, uncertain codes predictions."""
+    weight = LEAST_SMOOTHING + (1 - LEAST_SMOOTHING) * uncertainty.detach()
+    follow = (predicted - codes.detach()).square().mean(1).mean()
+    return follow + ((predicted.detach() - codes).square().mean(1) * weight).mean()
+
+
+def entries_of_gaussians(
+    views: list[LabelledView],
+    entry: Int64[np.ndarray, " M"],
+    of_view: list[Int64[np.ndarray, " m"]],
+    means: Float32[np.ndarray, "N 3"],
+    settings: MethodSettings,
+    seed: int,
+) -> Int64[np.ndarray, "N 3"]:
+    """Train codes, uncertainties and networks of all levels; returns the entry of each Gaussian.
+
+    Args:
+        views: pixels.
+        entry: index in its level's codebook of every mask of the scene.
+        of_view: rows of the masks of each view.
+        means: centres of the Gaussians, scene units.
+        settings: steps and rate.
+        seed: for the first codes and networks, and all samples.
+    """
+    num, levels = len(means), len(LEVELS)
+    codes = alike(num, levels * CHANNELS, seed)
+    doubt = torch.full((num, levels), float(np.log(FIRST_UNCERTAINTY / (1 - FIRST_UNCERTAINTY))))
+    doubt.requires_grad_()
+    with torch.random.fork_rng(devices=()):
+        torch.manual_seed(seed)
+        decoders = [network((CHANNELS, *DECODER_WIDTHS, ENTRIES)) for _ in LEVELS]
+        position = network((3, *POSITION_WIDTHS, levels * CHANNELS))
+    spread = max(float((means - means.mean(axis=0)).std()), 1e-12)
+    places = torch.from_numpy(((means - means.mean(axis=0)) / spread).astype(np.float32))
+
+    def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
+        view = view.chosen(np.arange(min(len(view), PIXELS)))
+        weights, seen = of_seen(view.weights)
+        rendered = product(weights, codes[seen]).reshape(-1, levels, CHANNELS)
+        uncertainty = product(weights, doubt[seen].sigmoid())
+        chosen = torch.from_numpy(random.integers(num, size=min(SAMPLES, num)))
+        total = SMOOTHING * smoothing_loss(
+            codes[chosen].reshape(-1, CHANNELS),
+            position(places[chosen]).reshape(-1, CHANNELS),
+            doubt[chosen].sigmoid().reshape(-1),
+        )
+        for level in LEVELS:
+            label = view.labels[:, level.index]
+            inside = np.flatnonzero(label >= 0)
+            if len(inside):
+                wanted = torch.from_numpy(entry[of_view[view.number][label[inside]]])
+                logits = decoders[level.index](unit(rendered[inside, level.index]))
+                total = total + index_loss(logits, wanted, uncertainty[inside, level.index])
+        return total
+
+    networks = [weight for each in (*decoders, position) for weight in each.parameters()]
+    groups = [
+        {"params": [codes], "lr": settings.rate},
+        {"params": networks, "lr": NETWORK_RATE * settings.rate},
+        {"params": [doubt], "lr": UNCERTAINTY_RATE * settings.rate},
+    ]
+    train(views, groups, loss, settings, seed)
+    with one_torch_thread(), torch.no_grad():
+        own = unit(codes.reshape(num, levels, CHANNELS))
+        return torch.stack([decoders[k](own[:, k]).argmax(1) for k in range(levels)], 1).numpy()
+
+
+def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+    """Quantise, train, and look the entries up; Gaussians in no mask of a level get zeros there."""
+    contributions, latents = inputs.contributions, inputs.latents
+    codebooks, entry = [], np.zeros(len(latents), np.int64)
+    for level in LEVELS:
+        rows = contributions.rows_of(level)
+        codebook, entry[rows] = kmeans(latents[rows], ENTRIES, seed + level.index)
+        codebooks.append(codebook)
+    of_view = [np.flatnonzero(contributions.view == number) for number in range(len(contributions.views))]
+    views = labelled_views(inputs, settings.pixel_step)
+    found = entries_of_gaussians(views, entry, of_view, contributions.means(), settings, seed)
+    features = np.stack([codebook[own] for codebook, own in zip(codebooks, found.T, strict=True)], axis=1)
+    return np.where(inputs.seen()[..., None], features, np.float32(0))
+
+
+METHOD = Method(
+    "legaussians",
+    "LEGaussians",
+    "buaavrcg/LEGaussians train.py; departs: indices of the masks' CLIP vectors in place of dense CLIP and "
+    "DINO, once per level, k-means codebook, frozen geometry, fewer steps on 1024 pixels, entries decoded "
+    "at each Gaussian in place of each pixel",
+    fit,
+)
