@@ -25,7 +25,7 @@ from hilsplat.splat.ply import load_ply
 from hilsplat.viewer import payload
 from hilsplat.viewer.frames import Paint
 from hilsplat.viewer.wire import Style
-from hilsplat.viewer.witness import StaleSceneError, Witness
+from hilsplat.viewer.witness import Witness
 
 VIEWS_MIB = 256.0
 """Memory for what is kept of views, such as their compositing weights."""
@@ -94,16 +94,8 @@ class ShownScene:
         Raises:
             StaleSceneError: a part was written anew before or meanwhile.
         """
-        self._require_unchanged()
-        yield
-        self._require_unchanged()
-
-    def _require_unchanged(self) -> None:
-        if changed := self.changed():
-            raise StaleSceneError(
-                f"{', '.join(changed)} of {self.scene.name} changed on the disk since the page was loaded",
-                fix="reload the page",
-            )
+        with self.witness.unchanged(self.scene.name):
+            yield
 
     def opened_again(self) -> "ShownScene":
         """The scene as it is on the disk now.
