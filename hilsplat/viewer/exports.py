@@ -3,7 +3,7 @@
 import io
 import json
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -33,6 +33,12 @@ LEAST_ALPHA = 0.1
 DIMMED = 0.3
 """Brightness of a crop outside the node."""
 
+Steps = Generator[tuple[int, int], None, bytes]
+"""A file that is made step by step: how many of how many are done, first 0, and at the end the file.
+
+Between two steps the thread of the scene draws what a person waits for.
+"""
+
 
 def selection_ply(gaussians_ply: Path, rows: np.ndarray) -> bytes:
     """Some Gaussians as a 3DGS PLY."""
@@ -45,8 +51,9 @@ def selection_ply(gaussians_ply: Path, rows: np.ndarray) -> bytes:
 # -- masks ----------------------------------------------------------------------------------------
 
 
-def masks_zip(scene: LanguageScene, nodes: Sequence[int]) -> bytes:
+def masks_zip(scene: LanguageScene, nodes: Sequence[int]) -> Steps:
     """Masks of nodes in all views: a PNG per node and view that shows it, and one COCO file."""
+    yield 0, len(scene.views)
     held = io.BytesIO()
     coco: dict[str, Any] = {
         "info": {"description": f"{scene.scene.name}: masks of nodes, by hilsplat"},
@@ -80,6 +87,7 @@ def masks_zip(scene: LanguageScene, nodes: Sequence[int]) -> bytes:
                         "segmentation": {"size": [height, width], "counts": coco_counts(mask)},
                     }
                 )
+            yield number + 1, len(scene.views)
         archive.writestr("coco.json", json.dumps(coco, ensure_ascii=False))
     return held.getvalue()
 

@@ -28,32 +28,38 @@ POLICY = (
 )
 
 
-def html_page(shown: "ShownScene", asked: "Page", static: dict[str, bytes]) -> bytes:
-    """The page of a scene, 8 MB for 60,000 Gaussians.
+def html_page(shown: "ShownScene", asked: "Page", static: dict[str, bytes]) -> exports.Steps:
+    """The page of a scene, crop by crop; 8 MB for 60,000 Gaussians.
 
     Args:
         shown: the scene.
-        asked: variant, and the texts whose answers the page holds.
+        asked: variant, the texts whose answers the page holds, and where its camera begins.
         static: files of the page by name.
 
     Raises:
         SettingsError: a text is empty, or the variant cannot answer.
+        StaleSceneError: a part of the scene was written anew before or meanwhile.
     """
     scene = shown.answering(asked.variant)
+    with shown.unchanged():
+        photos = [encoded(resize_to_fit(scene.image(view), PHOTO_PX), quality=75) for view in scene.views]
     described: dict[str, Any] = {
         "scene": {**shown.described(), "variants": [asked.variant]},
         "variant": shown.described_variant(asked.variant),
         "answers": [answers.answer(scene, text) for text in asked.texts],
-        "photos": [
-            _text(encoded(resize_to_fit(scene.image(view), PHOTO_PX), quality=75)) for view in scene.views
-        ],
+        "photos": [_text(photo) for photo in photos],
+        "opening": asked.start,
+        "crops": {},
     }
     nodes = list(range(len(scene.tree)))
     if len(nodes) > MAX_CROPS:
         wholes = {int(node) for node in nodes if scene.tree.level[node] == 1}
         nodes = sorted(wholes | {hit["node"] for answer in described["answers"] for hit in answer["hits"]})
-    crops = {node: _text(encoded(exports.crop(scene, node, shown.threads))) for node in nodes}
-    described["crops"] = crops
+    yield 0, len(nodes)
+    for made, node in enumerate(nodes):
+        with shown.unchanged():
+            described["crops"][node] = _text(encoded(exports.crop(scene, node, shown.threads)))
+        yield made + 1, len(nodes)
     scripts = {name: text.decode() for name, text in static.items() if name.endswith(".js")}
     scripts["api.js"] = scripts.pop("offline.js")
     sorter = scripts.pop("sorter.js")

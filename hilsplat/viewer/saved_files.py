@@ -1,6 +1,8 @@
 """Files that the page lets people keep.
 
-Films take long and read only arrays, so they have a thread of their own.
+Films take long and read only arrays, so they have a thread of their own. What takes long on the thread of
+the scene is made in steps, and the page can be used meanwhile. All are sent as lines of JSON, then the file:
+`{"made": 3, "of": 120}` after each step, `{"bytes": 12345}` before the file, or `{"error": "..."}`.
 """
 
 import asyncio
@@ -14,12 +16,12 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
-from hilsplat.base.errors import SettingsError
+from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.viewer import answers, exports, wire
 from hilsplat.viewer.html_page import html_page
 from hilsplat.viewer.scene_thread import SceneThread
-from hilsplat.viewer.server import BYTES, TYPES, answer_json, as_json, plain, read
+from hilsplat.viewer.server import BYTES, answer_json, as_json, plain, read
 from hilsplat.viewer.shown import ShownScene
 
 
@@ -66,17 +68,14 @@ class SavedFiles:
         """Masks of nodes in all views."""
         asked = await read(request, wire.Selection)
 
-        def make(shown: ShownScene) -> bytes:
+        def begin(shown: ShownScene) -> exports.Steps:
             scene = shown.answering(asked.variant)
             return exports.masks_zip(scene, nodes_of(scene, asked.nodes))
 
-        return plain(await self.thread.do(request, make), "application/zip")
+        return await self._in_steps(request, begin)
 
     async def film(self, request: Request) -> Response:
-        """A fly-around in the colours of the page: lines of JSON that tell how far it is, then the file.
-
-        The lines are `{"made": 3, "of": 120}` after each picture and `{"bytes": 12345}` before the file.
-        """
+        """A fly-around in the colours of the page."""
         asked = await read(request, wire.Film)
 
         def prepared(shown: ShownScene) -> Callable[..., bytes]:
@@ -92,9 +91,7 @@ class SavedFiles:
             )
 
         of = -(-asked.frames // exports.STEP[asked.format])
-        return StreamingResponse(
-            self._filmed(await self.thread.do(request, prepared), of), headers={"cache-control": "no-store"}
-        )
+        return _streamed(self._filmed(await self.thread.do(request, prepared), of))
 
     async def _filmed(self, film: Callable[..., bytes], of: int) -> AsyncIterator[bytes]:
         loop, made, left = asyncio.get_running_loop(), asyncio.Queue[int | None](), Event()
@@ -120,15 +117,42 @@ class SavedFiles:
     async def page(self, request: Request) -> Response:
         """The scene as one HTML file, with its answers to some texts."""
         asked = await read(request, wire.Page)
+        return await self._in_steps(request, lambda shown: html_page(shown, asked, self.static))
 
-        def make(shown: ShownScene) -> bytes:
-            with shown.unchanged():
-                return html_page(shown, asked, self.static)
+    async def _in_steps(self, request: Request, begin: Callable[[ShownScene], exports.Steps]) -> Response:
+        def first(shown: ShownScene) -> tuple[exports.Steps, tuple[int, int]]:
+            steps = begin(shown)
+            return steps, next(steps)  # refuses before the answer begins
 
-        return plain(await self.thread.do(request, make), TYPES["html"])
+        return _streamed(self._stepped(*await self.thread.do(request, first)))
+
+    async def _stepped(self, steps: exports.Steps, told: tuple[int, int]) -> AsyncIterator[bytes]:
+        found: tuple[int, int] | bytes = told
+        while isinstance(found, tuple):
+            yield _line(made=found[0], of=found[1])
+            try:
+                found = await self.thread.run(partial(_step, steps))
+            except HilsplatError as error:
+                yield _line(error=str(error))
+                return
+        yield _line(bytes=len(found))
+        yield found
 
 
-def _line(**told: int) -> bytes:
+def _step(steps: exports.Steps) -> tuple[int, int] | bytes:
+    """How far a file is after its next step, or the file."""
+    try:
+        return next(steps)
+    except StopIteration as made:
+        data: bytes = made.value
+        return data
+
+
+def _streamed(parts: AsyncIterator[bytes]) -> Response:
+    return StreamingResponse(parts, headers={"cache-control": "no-store"})
+
+
+def _line(**told: int | str) -> bytes:
     return as_json(told) + b"\n"
 
 

@@ -49,7 +49,7 @@ class SceneThread:
                 raise StaleSceneError("the scene was made anew since this page was loaded", fix="reload it")
             return work(self.shown)
 
-        return await self._run(run)
+        return await self.run(run)
 
     async def opened_anew(self) -> dict[str, Any]:
         """The scene's description, for a page that begins; what was written anew is opened again."""
@@ -59,7 +59,7 @@ class SceneThread:
                 self.shown = self.shown.opened_again()
             return self.shown.described()
 
-        return await self._run(run)
+        return await self.run(run)
 
     async def changes(self) -> dict[str, Any]:
         """What is here, which parts of it were written anew meanwhile, and who answers by now."""
@@ -68,7 +68,8 @@ class SceneThread:
             shown = self.shown
             return {"of": shown.state, "changed": shown.changed(), "variants": shown.variants}
 
-        return await self._run(run)
+        return await self.run(run)
 
-    async def _run(self, work: Callable[[], Made]) -> Made:
+    async def run(self, work: Callable[[], Made]) -> Made:
+        """Run on the thread of the scene, whatever state the scene is in."""
         return await asyncio.get_running_loop().run_in_executor(self.worker, work)

@@ -25,7 +25,7 @@ from hilsplat.splat.ply import load_ply
 from hilsplat.viewer import payload
 from hilsplat.viewer.frames import Paint
 from hilsplat.viewer.wire import Style
-from hilsplat.viewer.witness import StaleSceneError, Witness
+from hilsplat.viewer.witness import Witness
 
 VIEWS_MIB = 256.0
 """Memory for what is kept of views, such as their compositing weights."""
@@ -94,16 +94,8 @@ class ShownScene:
         Raises:
             StaleSceneError: a part was written anew before or meanwhile.
         """
-        self._require_unchanged()
-        yield
-        self._require_unchanged()
-
-    def _require_unchanged(self) -> None:
-        if changed := self.changed():
-            raise StaleSceneError(
-                f"{', '.join(changed)} of {self.scene.name} changed on the disk since the page was loaded",
-                fix="reload the page",
-            )
+        with self.witness.unchanged(self.scene.name):
+            yield
 
     def opened_again(self) -> "ShownScene":
         """The scene as it is on the disk now.
@@ -228,13 +220,19 @@ class ShownScene:
         return self._painted[1]
 
     def warm_up(self) -> None:
-        """Compile the loops of drawing and picking, so that the first frame does not wait for them."""
+        """Compile the loops of drawing, picking and masks: nobody waits for them once the page is open."""
+        from hilsplat.contributions.compositing import normalised_weights
+        from hilsplat.query.view_nodes import ViewNodes
+        from hilsplat.splat.rasterise.api import pixel_weights
         from hilsplat.viewer.frames import painted
         from hilsplat.viewer.picking import pick
 
         camera = self.scene.cameras[self.scene.cameras.names[0]].scaled((8, 8))
         painted(self.gaussians, camera, None, self.threads)
         pick(self.gaussians, None, camera, 4.0, 4.0, self.threads)
+        weights = pixel_weights(self.gaussians, camera, min_weight=0.0, threads=self.threads)
+        node = np.zeros(len(self.gaussians), np.int32)  # all of one, as the tree may not be there yet
+        ViewNodes.of(normalised_weights(weights), node).mask(np.ones(1, np.bool_))
         if self.first in self.variants:
             try:
                 self.answering(self.first)

@@ -163,4 +163,5 @@ class Page(Asked):
     """A scene as one HTML file with the answers to some texts."""
 
     texts: Annotated[list[Text], Field(max_length=40)]
-    start: WireCamera | None = None
+    start: Annotated[str, Field(max_length=400, pattern=r"^(v\d+|[-+.,e\d]*)$")] = ""
+    """The camera that the page begins with, as in its address; empty: that of the first photograph."""

@@ -1,6 +1,7 @@
 """Whether what was opened is still what lies on the disk."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from hilsplat.base.artifacts import INDEX
@@ -31,6 +32,28 @@ class Witness:
     def changed(self) -> list[Path]:
         """Those that are no longer what they were, or gone."""
         return [path for path, seen in self._seen.items() if _state(path) != seen]
+
+    @contextmanager
+    def unchanged(self, scene: str, *parts: Path) -> Iterator[None]:
+        """Around whatever reads the disk: it must read what belongs to what was opened before.
+
+        Args:
+            scene: its name, for the error.
+            parts: those that must be unchanged; without any, all that were noted.
+
+        Raises:
+            StaleSceneError: a part was written anew before or meanwhile.
+        """
+        self._require_unchanged(scene, parts)
+        yield
+        self._require_unchanged(scene, parts)
+
+    def _require_unchanged(self, scene: str, parts: tuple[Path, ...]) -> None:
+        if changed := sorted(path.name for path in self.changed() if not parts or path in parts):
+            raise StaleSceneError(
+                f"{', '.join(changed)} of {scene} changed on the disk since the page was loaded",
+                fix="reload the page",
+            )
 
 
 def _state(path: Path) -> State:

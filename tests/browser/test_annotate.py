@@ -1,6 +1,7 @@
 """Annotating by hand in a real browser, by role and label as people find things."""
 
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from hilsplat.annotate.labels import Label, label_path, read_labels, version_of, write_labels
+from hilsplat.base.artifacts import atomic_folder
 from hilsplat.datasets.registry import open_labelled
 from tests.browser.conftest import serving
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, WIDTH, region_mask
@@ -94,6 +96,7 @@ def test_a_brush_adds_and_an_eraser_takes_away(page, root):
         page.mouse.move(*place(page, 18, 22 if key == "b" else 10), steps=3)
         page.mouse.up()
         saved(page)
+        assert page.evaluate("getSelection().type") != "Range"  # or the photograph turns blue
         after = kept(root)[0].mask(SIZE)
         more, less = (after & ~before).any(), (before & ~after).any()
         assert (more, less) == changes
@@ -154,6 +157,40 @@ def test_a_node_is_proposed_stays_a_proposal_and_is_accepted(page, root):
     assert kept(root)[0].origin == "accepted"
     polygon(page, (1, 1), (4, 1), (4, 4))  # adds to the chosen thing
     assert kept(root)[0].origin == "edited"
+
+
+def test_the_next_thing_does_not_inherit_a_name(page, root):
+    draw_mug(page)
+    page.locator("#view").press("Escape")
+    assert page.locator("#text").input_value() == "" and page.locator("#title").inner_text() == "New thing"
+    page.locator("#view").press("x")
+    page.mouse.click(*place(page, 26, 6))
+    page.get_by_role("region", name="Proposals at this pixel").get_by_role("button").first.click()
+    saved(page)
+    assert [label.text for label in kept(root)] == ["mug", "unnamed"]
+    page.locator("#view").press("a")
+    page.get_by_role("status").get_by_text("Accepted.").wait_for()
+    page.locator("#view").press("Control+z")
+    assert page.get_by_role("status").inner_text() == ""
+
+
+def test_a_scene_that_was_made_anew_is_told(opened, desk, root, tmp_path_factory):
+    project = tmp_path_factory.mktemp("changing")
+    shutil.copytree(desk.parents[2], project, dirs_exist_ok=True)
+    folder = project / desk.relative_to(desk.parents[2])
+    with serving(folder, "annotate", "--data-root", str(root)) as address:
+        page = opened(address)
+        assert not page.get_by_role("alert").is_visible()
+        with atomic_folder(folder / "default/semantic_tree") as new:
+            shutil.copytree(folder / "default/semantic_tree", new, dirs_exist_ok=True)
+        page.get_by_role("alert").get_by_text("The scene has changed (semantic_tree).").wait_for()
+        name(page, "rim")  # the photographs are the same
+        polygon(page, (1, 1), (15, 1), (15, 5), (1, 5))
+        assert [label.text for label in kept(root)] == ["rim"]
+        page.get_by_role("button", name="Reload").click()
+        page.get_by_role("alert").wait_for(state="hidden")
+        items(page).first.wait_for()
+        page.close()
 
 
 def test_things_are_carried_into_the_next_photograph(page, root):

@@ -1,8 +1,8 @@
 // The annotation page: which photograph, tool and thing; the server computes every region.
 
+import { ask, exportUrl, scene as described, watch } from "./api.js";
 import { $, make } from "./elements.js";
 import { attachHands } from "./hands.js";
-import { get, send } from "./http.js";
 import { Sheet } from "./sheet.js";
 import { Store } from "./store.js";
 import { attachThings, fillForm, level, LEVEL, makeStrip, markStrip, setLevel, showTexts, showThings, under } from "./things.js";
@@ -18,7 +18,6 @@ const labels = () => store.labels(number);
 const own = () => labels().find((label) => label.id === chosen) ?? null;
 const tool = () => document.querySelector("[name=tool]:checked").value;
 const radius = () => Number($("radius").value);
-const ask = async (path, value) => (await send(path, value)).json();
 // One after the other: a region is made from the one before.
 const soon = (work) => { working = working.then(work).catch((error) => tell(error.message, true)); return working; };
 
@@ -90,6 +89,7 @@ function idFor(thing) {
 function add(thing) {
   const label = { ...thing, id: idFor(thing) };
   chosen = label.id;
+  next = { ...next, text: "" };   // the next thing is another one
   store.change([[number, [...labels(), label]]]);
   if (label.text === UNNAMED) { $("text").focus(); $("text").select(); }
 }
@@ -127,6 +127,7 @@ function take(each) {
   const above = own(), parent = above?.level === each.level - 1 ? above.id : null;
   drop();
   add({ text: each.text || next.text || UNNAMED, level: each.level, parent, polygons: each.polygons, origin: "proposed" });
+  tell("Proposed: accept (A), correct or delete it.");
 }
 
 async function carry() {
@@ -164,7 +165,10 @@ function accept() {
   const right = new Set();
   for (let label = own(); label; label = labels().find((each) => each.id === label.parent)) right.add(label.id);
   store.change([[number, labels().map((label) => right.has(label.id) && label.origin === "proposed" ? { ...label, origin: "accepted" } : label)]]);
+  tell(right.size > 1 ? "Accepted, with what it is part of." : "Accepted.");
 }
+
+function step(way) { tell(""); store[way](); }   // what was told is no longer so
 
 function remove() {
   const gone = new Set([chosen, ...under(labels(), chosen)]);
@@ -236,7 +240,7 @@ document.addEventListener("keydown", (event) => {
   const typing = event.target.closest("input:not([type=radio]):not([type=range]), select");
   if (typing) { if (event.key === "Enter" && event.target.id === "text") { event.target.blur(); $("view").focus(); event.preventDefault(); } return; }
   const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-  if ((event.ctrlKey || event.metaKey) && key === "z") { if (event.shiftKey) store.redo(); else store.undo(); event.preventDefault(); return; }
+  if ((event.ctrlKey || event.metaKey) && key === "z") { step(event.shiftKey ? "redo" : "undo"); event.preventDefault(); return; }
   if (event.ctrlKey || event.metaKey || event.altKey) return;
   const arrow = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[key], onView = event.target === $("view") || event.target === document.body;
   const by = event.shiftKey ? 10 : 1;
@@ -265,14 +269,15 @@ $("text").addEventListener("change", setText);
 for (const radio of document.querySelectorAll("[name=level]")) radio.addEventListener("change", levelChanged);
 $("parent").addEventListener("change", () => edit({ parent: Number($("parent").value) || null }));
 for (const radio of document.querySelectorAll("[name=tool]")) radio.addEventListener("change", () => setTool(tool()));
-for (const [id, work] of Object.entries({ new: () => fresh(), child: () => fresh(true), accept, delete: remove, undo: () => store.undo(), redo: () => store.redo(),
-  carry: () => soon(carry), import: () => $("file").click(), "help-button": () => $("help").showModal() })) $(id).addEventListener("click", work);
+for (const [id, work] of Object.entries({ new: () => fresh(), child: () => fresh(true), accept, delete: remove, undo: () => step("undo"), redo: () => step("redo"),
+  carry: () => soon(carry), reload: () => location.reload(), import: () => $("file").click(), "help-button": () => $("help").showModal() })) $(id).addEventListener("click", work);
 $("file").addEventListener("change", () => { const files = [...$("file").files]; $("file").value = ""; $("save").open = false; soon(() => take_in(files)); });
 $("radius").addEventListener("input", draw);
 window.addEventListener("beforeunload", (event) => { if (store.unsaved) event.preventDefault(); });
 
 async function begin() {
-  scene = await (await get("/api/scene")).json();
+  scene = await described();
+  for (const link of document.querySelectorAll("[data-export]")) link.href = exportUrl(link.dataset.export);
   const name = scene.name.split("/").at(-1);
   document.title = `Annotate ${name} · hilsplat`;
   $("propose-label").hidden = !scene.proposes;
@@ -283,6 +288,7 @@ async function begin() {
   stand(Number(start.get("view") ?? Math.max(0, first)) || 0);
   setTool("choose");
   document.body.dataset.ready = "yes";
+  watch();
 }
 
 globalThis.hilsplat = { store, sheet };   // what tests read

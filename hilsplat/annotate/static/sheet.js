@@ -1,5 +1,6 @@
 // The photograph and what is drawn on it: zoom, places in its pixels, outlines.
 
+import { photoUrl } from "./api.js";
 import { $ } from "./elements.js";
 import { colourOf } from "./styles.js";
 
@@ -25,7 +26,7 @@ export class Sheet {
 
   show(number, [height, width]) {
     this.size = [width, height];
-    $("picture").src = `/api/photo/${number}`;
+    $("picture").src = photoUrl(number);
     for (const each of [$("picture"), $("drawing")]) { each.setAttribute("width", width); each.setAttribute("height", height); }
     $("drawing").setAttribute("viewBox", `0 0 ${width} ${height}`);
     this.fit();

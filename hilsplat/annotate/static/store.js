@@ -1,6 +1,6 @@
 // Annotations of all photographs: every change can be undone, and is saved at once under the version that was read.
 
-import { get, send } from "./http.js";
+import * as api from "./api.js";
 
 export class Store {
   constructor({ changed, told }) {
@@ -12,7 +12,7 @@ export class Store {
   }
 
   async load() {
-    this.views = await (await get("/api/labels")).json();
+    this.views = await api.labels();
     this.past = [];
     this.future = [];
     this.handlers.changed();
@@ -53,7 +53,7 @@ export class Store {
   async put(number) {
     const view = this.views[number], sent = view.labels;
     try {
-      const kept = await (await send(`/api/labels/${number}`, { labels: sent }, { method: "PUT", headers: { "if-match": `"${view.version}"` } })).json();
+      const kept = await api.save(number, sent, view.version);
       view.version = kept.version;
       if (view.labels === sent) view.labels = kept.labels;   // cut to their parents
     } catch (error) {

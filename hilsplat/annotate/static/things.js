@@ -1,5 +1,6 @@
 // The things of a photograph as a tree of the page, the form of the chosen one, and the strip of photographs.
 
+import { thumbUrl } from "./api.js";
 import { $, counted, LEVELS, make } from "./elements.js";
 import { colour, element } from "./sheet.js";
 
@@ -64,7 +65,7 @@ export function showTexts(things) {
 
 export function makeStrip(views, stand) {
   $("views").replaceChildren(...views.map((view, number) => make("button", { type: "button", role: "option", class: view.split, title: view.name, onclick: () => stand(number) },
-    make("img", { src: `/api/thumb/${number}`, alt: "", loading: "lazy" }))));
+    make("img", { src: thumbUrl(number), alt: "", loading: "lazy" }))));
   $("views").addEventListener("keydown", (event) => {
     const all = [...$("views").children], by = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
     if (!by) return;

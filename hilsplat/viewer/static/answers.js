@@ -2,12 +2,14 @@
 
 import * as api from "./api.js";
 import { $, counted, make, nameOf } from "./elements.js";
+import { shownHits } from "./styles.js";
 
 export function showAnswers(outline, answer, { choose, hover }) {
   const list = $("answers");
   $("answers-section").hidden = !answer?.hits.length;
-  $("caution").hidden = !(answer?.caution || outline?.caution);
-  $("caution").textContent = answer?.caution || outline?.caution || "";
+  const caution = (answer ?? outline)?.caution ?? "";   // an answer by name or by likeness has none
+  $("caution").hidden = !caution;
+  $("caution").textContent = caution;
   list.replaceChildren(...(answer?.hits ?? []).map((hit, rank) => make("li", { "data-node": hit.node },
     make("button", { type: "button", onclick: () => choose(hit.node), onpointerenter: () => hover(hit.node), onpointerleave: () => hover(-1), onfocus: () => hover(hit.node), onblur: () => hover(-1) },
       make("img", { src: api.cropUrl(outline.variant, hit.node), alt: "", width: 44, height: 44 }),
@@ -25,11 +27,12 @@ export function summary(answer) {
   if (!answer.hits.length) return `Nothing answers to “${answer.text}”.`;
   const best = answer.hits[0], alike = answer.route === "like";
   const lines = [alike
-    ? `${counted(answer.hits.length, "node")}, most alike first; the best ${best.score.toFixed(2)}`
+    ? `${counted(answer.hits.length, "node")}, most alike first; the best ${best.score.toFixed(2)}. The first ${shownHits(answer).length} are painted.`
     : `${counted(answer.total, "answer")}, best ${best.score.toFixed(2)}, ${answer.level}`];
-  if (!alike && best.score < 0.5) lines.push("Below 0.5: perhaps nothing of the kind.");
   if (answer.route === "fallback") lines.push("No answer is part of anything that answers to the first text.");
-  return [...lines, ...answer.doubts.map((doubt) => doubt[0].toUpperCase() + doubt.slice(1) + ".")].join("\n");
+  const doubts = answer.doubts.map((doubt) => `${doubt}.`);
+  if (!alike && (best.score < 0.5 || doubts.length)) doubts[0] = `Perhaps nothing of the kind: ${doubts[0] ?? "the best is below 0.5."}`;
+  return [...lines, ...doubts].map((line) => line[0].toUpperCase() + line.slice(1)).join("\n");
 }
 
 export function markChosen(node) {

@@ -3,7 +3,7 @@
 import { get, send, streamed } from "./http.js";
 
 export const offline = false;
-export const texts = [];   // what an exported page can answer
+export const texts = [], opening = "";   // what an exported page can answer, and where its camera begins
 
 // Every question names the state of the scene that this page was loaded with; another state's answers are refused.
 let state = "";
@@ -31,4 +31,4 @@ export const frame = async (asked, signal) => (await send(at("/api/frame"), aske
 export const names = async (asked, version) =>
   (await send(at("/api/names"), asked, { method: "PUT", headers: { "if-match": `"${version}"` } })).json();
 export const saved = async (kind, asked) => (await send(at(`/api/export/${kind}`), asked)).blob();
-export const film = async (asked, told, signal) => streamed(await send(at("/api/export/film"), asked, { signal }), told);
+export const savedInSteps = async (kind, asked, told, signal) => streamed(await send(at(`/api/export/${kind}`), asked, { signal }), told);

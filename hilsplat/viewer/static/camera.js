@@ -68,10 +68,10 @@ export class Camera {
     this.view = -1;
   }
 
-  // A camera that shows a box of this size around a point, from the same side.
+  // A camera that shows a ball of this diameter around a point, from the same side.
   lookingAt(point, size) {
     const next = this.copy(), { fx, fy, w, h } = this.lens;
-    const back = Math.max(1.1 * size * Math.max(fx / w, fy / h), 0.02 * this.reach);
+    const back = Math.max(size * (0.5 + Math.max(fx / w, fy / h)), 0.02 * this.reach);   // its front is nearer than its middle
     next.target = point.slice();
     next.c = add(point, this.R[2], -back);
     next.view = -1;

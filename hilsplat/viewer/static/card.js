@@ -29,7 +29,7 @@ export function showCard(outline, node, unit, { choose, fly, like, name, hover }
         above.length ? make("nav", { "aria-label": "Part of" }, ...above.flatMap((row) => [go(row), " › "])) : null,
         input,
         make("dl", {}, fact(LEVELS[own.level], `· node ${node}`), fact("seen in", counted(own.views, "photograph")),
-          fact("made of", counted(own.gaussians, "Gaussian")), fact("size", `${own.size.map((v) => v.toPrecision(2)).join(" × ")}${unit}`)))),
+          fact("Gaussians", own.gaussians.toLocaleString("en")), fact("size", `${own.size.map((v) => v.toPrecision(2)).join(" × ")}${unit}`)))),
     below.length ? make("div", { class: "kids", role: "group", "aria-label": "Made of" }, ...below.map((row) => make("button", { type: "button", title: nameOf(outline, row), onclick: () => choose(row), onpointerenter: () => hover(row), onpointerleave: () => hover(-1) },
       make("img", { src: api.cropUrl(outline.variant, row), alt: "", loading: "lazy" }), make("span", {}, outline.nodes[row].name || `${row}`)))) : "",
     make("div", { class: "actions" },

@@ -77,9 +77,9 @@ async function rename(node, name) {
       each.nodes.forEach((entry, row) => { entry.name = kept.names[row] ?? ""; });
     }
     page.outline.renamed(node);
-    choose(node);
-    if (panes[0].answer) showAnswers(own, panes[0].answer, acts);
     tell(name ? `Named “${name}”. Ask for it, here or with hilsplat query.` : "The name is taken away.");
+    choose(node);   // after the words, which take room from the outline
+    if (panes[0].answer) showAnswers(own, panes[0].answer, acts);
   } catch (error) {
     if (error.status === 412) { await loadVariant(own.variant, true); page.outline.show(main()); choose(node); tell("Somebody else changed the names meanwhile; they are here now. Name it again.", true); } else failed(error);
   }

@@ -4,7 +4,7 @@ import * as api from "./api.js";
 import { $, nameOf } from "./elements.js";
 import { drawOverlay } from "./overlay.js";
 import { host, level, levelIndex, main, options, outlines, page, panes, variantOf } from "./state.js";
-import { styleOf } from "./styles.js";
+import { shownHits, styleOf } from "./styles.js";
 
 const SLOW_MS = 60;
 let dirty = true, styles = [], lastFrame = 0, frames = 0;
@@ -39,7 +39,7 @@ function paint(now) {
 
 export function overlay() {
   const width = host.clientWidth, height = host.clientHeight;
-  drawOverlay($("overlay"), page.camera, panes.map((pane, k) => ({ boxes: boxes(pane, k), label: panes.length > 1 ? pane.by.replace("|", ", ") : "" })), width, height);
+  drawOverlay($("overlay"), page.camera, panes.map((pane, k) => ({ boxes: boxes(pane, k), label: panes.length > 1 ? pane.by.replace("|", ", ") : "" })), width, height, $("tools").offsetTop + $("tools").offsetHeight);
   page.photos.place(page.camera, width, height, panes.length);
   page.photos.mark(page.camera.view, page.asked?.shows ?? []);
 }
@@ -47,7 +47,7 @@ export function overlay() {
 function boxes(pane, k) {
   const own = outlines.get(variantOf(pane));
   if (!own || $("colour").value === "none") return [];
-  const found = (pane.answer?.route === "like" ? pane.answer.hits.slice(0, 5) : pane.answer?.hits ?? [])
+  const found = shownHits(pane.answer)
     .map((hit) => ({ node: hit.node, kind: "answer", label: `${own.nodes[hit.node].name || ""} ${hit.score.toFixed(2)}`.trim() }));
   if (!k || variantOf(pane) === variantOf(panes[0])) {
     if (page.chosen >= 0) found.push({ node: page.chosen, kind: "chosen", label: nameOf(own, page.chosen) });

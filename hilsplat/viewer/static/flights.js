@@ -38,8 +38,8 @@ export function stand(number) {
 
 export const flyTo = (node) => {
   if (node < 0 || !main()) return;
-  const { centroid, size } = main().nodes[node];
-  goTo(page.camera.lookingAt(centroid, Math.max(...size)));
+  const { corners, size } = main().nodes[node], middle = [0, 1, 2].map((axis) => corners.reduce((sum, corner) => sum + corner[axis], 0) / corners.length);
+  goTo(page.camera.lookingAt(middle, Math.hypot(...size)));
 };
 
 export const step = (by) => {

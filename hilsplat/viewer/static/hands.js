@@ -54,7 +54,7 @@ export function attachHands() {
   $("save").addEventListener("toggle", () => {
     const nodes = selected();
     $("save-what").textContent = page.chosen >= 0 ? `Of ${nameOf(main(), page.chosen)}` : nodes.length ? `Of ${counted(nodes.length, "answer")}` : "Ask or choose something to save its Gaussians, boxes and masks.";
-    for (const button of $("save").querySelectorAll("[data-nodes]")) button.disabled = !nodes.length;
+    for (const button of $("save").querySelectorAll("[data-nodes]")) button.disabled = !nodes.length || ("long" in button.dataset && !$("saving").hidden);
   });
   $("save").addEventListener("click", async (event) => {
     const kind = event.target.closest("[data-save]")?.dataset.save;
@@ -64,7 +64,7 @@ export function attachHands() {
       if (kind === "link") { await navigator.clipboard.writeText(location.href); tell("The link is copied. It opens this view while this viewer runs."); return; }
       const scale = devicePixelRatio, size = [Math.round(host.clientWidth * scale), Math.round(host.clientHeight * scale)];
       await save(kind, { variant: variantOf(panes[0]), nodes: selected(), style: currentStyles()[0], capture: () => page.painter.capture(page.camera, painted(), ...size),
-        texts: page.asked?.text ? [page.asked.text] : [], camera: page.camera.wire(host.clientWidth, host.clientHeight), name: page.scene.name.split("/").at(-1), told: tell });
+        texts: page.asked?.text ? [page.asked.text] : [], camera: page.camera.toText(), name: page.scene.name.split("/").at(-1), told: tell });
       redraw();
     } catch (error) { failed(error); }
   });

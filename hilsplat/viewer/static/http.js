@@ -16,7 +16,7 @@ export const send = async (path, value, { method = "POST", headers = {}, signal 
   method, signal, headers: { "content-type": "application/json", ...headers }, body: JSON.stringify(value),
 }));
 
-// A file after lines that tell how far it is: {"made", "of"} many times, then {"bytes"}, then as many bytes.
+// A file after lines that tell how far it is: {"made", "of"} many times, then {"bytes"}, then as many bytes; or {"error"}.
 export async function streamed(response, told) {
   const reader = response.body.getReader(), decoder = new TextDecoder(), parts = [];
   let head = new Uint8Array(0), wanted = -1, got = 0;
@@ -29,6 +29,7 @@ export async function streamed(response, told) {
       head = both;
       for (let end; wanted < 0 && (end = head.indexOf(10)) >= 0; head = head.subarray(end + 1)) {
         const said = JSON.parse(decoder.decode(head.subarray(0, end)));
+        if ("error" in said) throw new Refused(said.error, 409);
         if ("bytes" in said) wanted = said.bytes; else told(said.made, said.of);
       }
       if (wanted < 0) continue;

@@ -33,7 +33,7 @@ async function begin() {
   document.title = `${page.scene.name} · hilsplat`;
   $("title").textContent = `Ask ${page.scene.name.split("/").at(-1)}`;
   page.camera = new Camera(page.scene);
-  if (start.get("c")) page.camera.fromText(start.get("c"), page.scene.views);
+  page.camera.fromText(start.get("c") ?? api.opening, page.scene.views);
   page.photos = new Photos(page.scene.views, stand);
   page.outline = new Outline(acts);
   for (const [id, key] of [["colour", "colour"], ["mode", "mode"]]) if ([...$(id).options].some((o) => o.value === start.get(key))) $(id).value = start.get(key);
@@ -71,7 +71,7 @@ function onlyWhatIsHere() {
   $("levels").hidden = true;
   $("text").setAttribute("list", "texts");
   document.body.append(make("datalist", { id: "texts" }, ...api.texts.map((text) => make("option", { value: text }))));
-  if (api.texts.length) tell(`This page answers: ${api.texts.join(", ")}.`);
+  $("text").placeholder = api.texts[0] ?? "";
 }
 // What tests and benchmarks read.
 globalThis.hilsplat = {

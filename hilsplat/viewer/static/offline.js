@@ -6,7 +6,7 @@ export class Refused extends Error {}
 
 const held = (id) => document.getElementById(id).textContent.trim();
 const data = JSON.parse(held("data"));
-export const texts = data.answers.map((answer) => answer.text);
+export const texts = data.answers.map((answer) => answer.text), opening = data.opening;
 
 async function unpacked(id) {
   const bytes = Uint8Array.from(atob(held(id)), (c) => c.charCodeAt(0));
@@ -32,4 +32,4 @@ export async function query({ text }) {
   return found;
 }
 
-export const changes = none, like = none, field = none, pick = none, frame = none, names = none, saved = none, film = none;
+export const changes = none, like = none, field = none, pick = none, frame = none, names = none, saved = none, savedInSteps = none;

@@ -13,35 +13,37 @@ export function download(blob, name) {
 }
 
 const KINDS = { ply: "selection.ply", boxes: "boxes.json", masks: "masks.zip", still: "picture.png", mp4: "flight.mp4", gif: "flight.gif", page: "page.html" };
+const IN_STEPS = { masks: ["Masks", "photographs"], mp4: ["Film", "pictures"], gif: ["Film", "pictures"], page: ["Page", "crops"] };
+const sized = (bytes) => bytes < 1e6 ? `${Math.ceil(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
 
 export async function save(kind, { variant, nodes, style, capture, texts, camera, name, told }) {
-  const filmed = kind === "mp4" || kind === "gif";
-  told(filmed ? "Filming: you can go on meanwhile." : kind === "masks" ? "Drawing the masks of all photographs…" : "Saving…");
-  let blob;
-  if (kind === "still") blob = await capture();
-  else if (filmed) blob = await filming({ variant, style: wireStyle(style), format: kind, ...(kind === "gif" ? { side_px: Number($("gif-side").value) } : {}) }, told);
-  else if (kind === "page") blob = await api.saved("page", { variant, texts, start: camera });
-  else blob = await api.saved(kind, { variant, nodes });
+  const asked = {
+    masks: { variant, nodes }, page: { variant, texts, start: camera },
+    mp4: { variant, style: wireStyle(style), format: "mp4" }, gif: { variant, style: wireStyle(style), format: "gif", side_px: Number($("gif-side").value) },
+  }[kind];
+  told(asked ? "Saving: you can go on meanwhile." : "Saving…");
+  const blob = kind === "still" ? await capture() : asked ? await inSteps(kind, asked, told) : await api.saved(kind, { variant, nodes });
   if (!blob) return;
   download(blob, `${name}-${KINDS[kind]}`);
-  told(`Saved ${name}-${KINDS[kind]}, ${(blob.size / 1e6).toFixed(blob.size < 1e6 ? 2 : 1)} MB.`);
+  told(`Saved ${name}-${KINDS[kind]}, ${sized(blob.size)}.`);
 }
 
-// One film at a time: how far it is, and a button that ends it. Nothing if it was ended.
-async function filming(asked, told) {
-  const ending = new AbortController(), buttons = $("save").querySelectorAll("[data-film]");
-  const progress = (made, of) => { Object.assign($("film-made"), { value: made, max: of }); $("film-told").textContent = made < of ? `Film: ${made} of ${of} pictures` : "Film: packing"; };
-  $("film-made").removeAttribute("value");
-  $("film-told").textContent = "Film";
-  $("film-end").onclick = () => ending.abort();
-  $("film").hidden = false;
+// One at a time: how far it is, and a button that ends it. Nothing if it was ended.
+async function inSteps(kind, asked, told) {
+  const ending = new AbortController(), buttons = $("save").querySelectorAll("[data-long]"), [what, things] = IN_STEPS[kind];
+  const progress = (made, of) => { Object.assign($("saving-made"), { value: made, max: of }); $("saving-told").textContent = made < of ? `${what}: ${made} of ${of} ${things}` : `${what}: packing`; };
+  $("saving-made").removeAttribute("value");
+  $("saving-made").setAttribute("aria-label", what);
+  $("saving-told").textContent = what;
+  $("saving-end").onclick = () => ending.abort();
+  $("saving").hidden = false;
   for (const button of buttons) button.disabled = true;
-  try { return await api.film(asked, progress, ending.signal); } catch (error) {
+  try { return await api.savedInSteps(asked.format ? "film" : kind, asked, progress, ending.signal); } catch (error) {
     if (error.name !== "AbortError") throw error;
-    told("The film was cancelled.");
+    told("Cancelled: nothing was saved.");
     return null;
   } finally {
-    $("film").hidden = true;
+    $("saving").hidden = true;
     for (const button of buttons) button.disabled = false;
   }
 }

@@ -21,6 +21,10 @@ export function colourOf(node) {
   return [value(0), value(8), value(4)];
 }
 
+// Hits that are painted and boxed. What is alike is a ranking of all nodes: painted whole, it would leave nothing unpainted.
+const PAINTED_ALIKE = 5;
+export const shownHits = (answer) => answer?.route === "like" ? answer.hits.slice(0, PAINTED_ALIKE) : answer?.hits ?? [];
+
 /*
  * outline: the nodes of a variant; answer: what was found, or null; colour, mode: the choices of the page;
  * level: 0, 1, 2 for what is painted by level; chosen, hover: nodes, or -1.
@@ -40,7 +44,8 @@ export function styleOf({ outline, answer, colour, mode, level, chosen, hover, h
     });
     mode = "plain";
   } else if (colour === "answers" && answer) {
-    answer.hits.forEach((hit, rank) => set(hit.node, ANSWER, 0.72 - 0.42 * rank / Math.max(answer.hits.length, 4)));
+    const hits = shownHits(answer);
+    hits.forEach((hit, rank) => set(hit.node, ANSWER, 0.72 - 0.42 * rank / Math.max(hits.length, 4)));
     if (!answer.hits.length) mode = "plain";
   } else if (chosen < 0 || colour === "none") mode = "plain";
   if (chosen >= 0 && colour !== "none") {

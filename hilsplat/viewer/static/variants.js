@@ -29,7 +29,8 @@ export async function useVariants() {
   for (const pane of panes) await loadVariant(variantOf(pane));
   fillVariants();
   showOutline();
-  if (start.get("q")) { $("text").value = start.get("q"); await ask(); }
+  const text = start.get("q") ?? api.texts[0];   // an exported page begins with its answer
+  if (text) { $("text").value = text; await ask(); }
   const [node, tree] = (start.get("node") ?? "").split(".");   // a row of another tree is another node
   if (tree === main().tree && main().nodes[node]) choose(Number(node));
 }

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from pycocotools import mask as coco_masks
 
-from hilsplat.annotate.exchange import exported, imported, unpacked_counts
+from hilsplat.annotate.exporting import exported
+from hilsplat.annotate.importing import imported, unpacked_counts
 from hilsplat.annotate.labels import Label
 from hilsplat.base.errors import SceneError
 from hilsplat.scene.cameras import Cameras

@@ -9,6 +9,7 @@ from starlette.testclient import TestClient
 
 from hilsplat.annotate.app import Annotator
 from hilsplat.annotate.labels import Label
+from hilsplat.base.artifacts import atomic_folder
 from hilsplat.base.errors import ArtifactError
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.segment.masks import HierarchicalMasks
@@ -232,3 +233,59 @@ def test_things_are_carried_by_their_gaussians_with_their_parts_inside(client):
 def test_a_scene_without_poses_says_what_to_run(tmp_path):
     with pytest.raises(ArtifactError, match="has no photographs to annotate yet"):
         Annotator(tmp_path, tmp_path / "labels", "default", 1)
+
+
+# -- a scene that is written anew meanwhile ---------------------------------------------------------
+
+
+def made_again(artifact: Path) -> None:
+    """As a stage that was rerun leaves it."""
+    with atomic_folder(artifact) as new:
+        shutil.copytree(artifact, new, dirs_exist_ok=True)
+
+
+@pytest.fixture
+def copied(desk, tmp_path) -> Path:
+    """A copy of the scene, to be written to."""
+    return shutil.copytree(desk, tmp_path / "results/photos/desk")
+
+
+def test_a_tree_that_was_made_anew_is_told_and_proposes_nothing_until_a_reload(copied, labels):
+    client = opened(copied, labels)
+    of = {"of": client.get("/api/scene").json()["of"]}
+    assert client.get("/api/changes").json() == {**of, "changed": []}
+    pixel = {"view": 0, "x": 6, "y": 6}
+    assert client.post("/api/at", json=pixel, params=of).status_code == 200
+    made_again(copied / "default/semantic_tree")
+    assert client.get("/api/changes").json() == {**of, "changed": ["semantic_tree"]}
+    for path, sent in (("at", pixel), ("carry", {"ids": [1], "view": 1})):
+        refused = client.post(f"/api/{path}", json=sent, params=of)
+        assert refused.status_code == 409
+        assert "semantic_tree of photos/desk changed on the disk" in refused.json()["error"]
+    assert put(client, 0, [MUG], "none").status_code == 200  # what is drawn on the same photographs is kept
+    again = client.get("/api/scene").json()["of"]
+    assert again != of["of"]
+    assert client.post("/api/at", json=pixel, params={"of": again}).status_code == 200
+    for path in ("photo/0", "thumb/0", "labels", "export/coco"):
+        assert client.get(f"/api/{path}", params=of).status_code == 409
+        assert client.get(f"/api/{path}", params={"of": again}).status_code == 200
+
+
+def test_nothing_is_drawn_on_photographs_of_before(copied, labels):
+    client = opened(copied, labels)
+    made_again(copied / "scene")
+    assert put(client, 0, [MUG], "none").status_code == 409
+    assert client.get("/api/photo/0").status_code == 409
+    assert not labels.exists() or not list(labels.glob("*.json"))
+    client.get("/api/scene")
+    assert put(client, 0, [MUG], "none").status_code == 200
+
+
+def test_a_run_that_goes_on_brings_proposals_after_a_reload(copied, labels):
+    tree = copied / "default/semantic_tree"
+    shutil.move(tree, copied / "later")
+    client = opened(copied, labels)
+    assert client.get("/api/scene").json()["proposes"] == "masks"
+    shutil.move(copied / "later", tree)
+    assert client.get("/api/changes").json()["changed"] == ["semantic_tree"]
+    assert client.get("/api/scene").json()["proposes"] == "nodes"

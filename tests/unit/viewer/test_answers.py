@@ -145,7 +145,8 @@ def test_a_saved_selection_is_the_nodes_gaussians(client, scene, shown, tmp_path
 
 def test_saved_masks_are_those_of_the_hits_in_every_view(client, scene):
     (hit,) = scene.query("mug > handle")
-    data = client.post("/api/export/masks", json={"nodes": [hit.node]}).content
+    told, data = in_steps(client, "masks", nodes=[hit.node])
+    assert told == [(made, len(scene.views)) for made in range(len(scene.views) + 1)]
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         coco = json.loads(archive.read("coco.json"))
         assert [image["file_name"] for image in coco["images"]] == list(scene.views)
@@ -166,9 +167,9 @@ def test_coco_runs_begin_with_zeros(mask):
     np.testing.assert_array_equal(coco_masks.decode(runs).astype(bool), mask)
 
 
-def filmed(client, **sent) -> tuple[list[tuple[int, int]], bytes]:
-    """How far the film was, line by line, and the film."""
-    told, rest = [], client.post("/api/export/film", json=sent).content
+def in_steps(client, kind: str, **sent) -> tuple[list[tuple[int, int]], bytes]:
+    """How far a file was, line by line, and the file."""
+    told, rest = [], client.post(f"/api/export/{kind}", json=sent).content
     while True:
         line, _, rest = rest.partition(b"\n")
         said = json.loads(line)
@@ -178,8 +179,32 @@ def filmed(client, **sent) -> tuple[list[tuple[int, int]], bytes]:
         told.append((said["made"], said["of"]))
 
 
+def test_a_person_is_answered_between_the_steps_of_a_file(shown):
+    """What takes long never has the thread of the scene for longer than a step."""
+    thread = SceneThread(shown)
+    order: list[str] = []
+
+    def steps():
+        for made in range(3):
+            yield made, 3
+            order.append(f"step {made}")
+        return b"file"
+
+    async def both() -> None:
+        parts = SavedFiles(thread, {})._stepped(file := steps(), next(file))
+        assert await anext(parts) == b'{"made":0,"of":3}\n'
+        first = asyncio.ensure_future(anext(parts))
+        await asyncio.sleep(0)
+        await thread.run(lambda: order.append("click"))
+        assert await first == b'{"made":1,"of":3}\n'
+        assert [part async for part in parts] == [b'{"made":2,"of":3}\n', b'{"bytes":4}\n', b"file"]
+
+    asyncio.run(both())
+    assert order == ["step 0", "click", "step 1", "step 2"]
+
+
 def test_films_have_the_frames_that_were_asked_for(client, tmp_path):
-    told, data = filmed(client, frames=6, side_px=64)
+    told, data = in_steps(client, "film", frames=6, side_px=64)
     assert told == [(made, 6) for made in range(7)]
     (tmp_path / "film.mp4").write_bytes(data)
     with av.open(str(tmp_path / "film.mp4")) as film:
@@ -189,7 +214,7 @@ def test_films_have_the_frames_that_were_asked_for(client, tmp_path):
 
 @pytest.mark.parametrize("side_px", [64, 96])
 def test_a_gif_has_every_other_frame_in_the_size_that_was_asked_for(client, side_px):
-    told, data = filmed(client, frames=7, side_px=side_px, format="gif")
+    told, data = in_steps(client, "film", frames=7, side_px=side_px, format="gif")
     assert told == [(made, 4) for made in range(5)]
     gif = Image.open(io.BytesIO(data))
     durations = []
@@ -267,14 +292,17 @@ def test_gaussians_are_sent_once(client, shown):
 
 def test_an_exported_page_holds_all_that_it_needs(client, shown):
     evil = "mug </script><script>alert(1)</script>".replace(">", "")
-    page = client.post("/api/export/page", json={"texts": ["mug > handle", evil]}).text
+    told, data = in_steps(client, "page", texts=["mug > handle", evil], start="v3")
+    nodes = len(shown.answering("default").tree)
+    assert told == [(made, nodes) for made in range(nodes + 1)]
+    page = data.decode()
     assert not re.search(r"""(src|href)=["'](?!data:)""", page) and "http://127" not in page
     held = dict(re.findall(r'<script type="text/plain" id="(\w+)">(.*?)</script>', page, re.S))
     assert set(held) == {"data", "sorter", "splats", "nodes"}
     assert zlib.decompress(base64.b64decode(held["splats"])) == packed_gaussians(shown.gaussians)
     data = json.loads(held["data"])
     assert [answer["text"] for answer in data["answers"]] == ["mug > handle", evil]
-    assert len(data["photos"]) == len(data["scene"]["views"])
+    assert len(data["photos"]) == len(data["scene"]["views"]) and data["opening"] == "v3"
     imports = json.loads(re.search(r'<script type="importmap">(.*?)</script>', page, re.S)[1])["imports"]
     for name, address in imports.items():
         script = base64.b64decode(address.partition(",")[2]).decode()

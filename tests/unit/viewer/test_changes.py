@@ -11,6 +11,7 @@ from starlette.testclient import TestClient
 
 from hilsplat.base.artifacts import atomic_folder
 from hilsplat.splat.ply import load_ply, save_ply
+from hilsplat.viewer import exports
 from hilsplat.viewer.app import Viewer
 from hilsplat.viewer.shown import ShownScene
 from hilsplat.viewer.witness import Witness
@@ -96,6 +97,19 @@ def test_nothing_is_read_beside_what_was_opened_before(page, desk):
         assert answer.status_code == 409, answer.request.url
         assert "gaussians.ply of photos/desk changed on the disk" in answer.json()["error"]
     assert not (desk / "names.json").exists()
+
+
+def test_a_page_that_is_saved_while_the_scene_changes_is_refused(page, desk, monkeypatch):
+    draw = exports.crop
+
+    def crop(*of):
+        made_again(desk / "default/semantic_tree")
+        return draw(*of)
+
+    monkeypatch.setattr(exports, "crop", crop)
+    lines = page.post("/api/export/page", json={"texts": []}).text.splitlines()
+    assert lines[0].startswith('{"made":0')
+    assert len(lines) == 2 and "semantic_tree of photos/desk changed on the disk" in lines[1]
 
 
 def test_a_variant_that_comes_later_is_not_opened_beside_old_parts(page, desk):

@@ -1,0 +1,24 @@
+"""Regions as hands draw them: polygons and brush strokes."""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool
+
+from hilsplat.annotate.labels import fill_rings
+from hilsplat.annotate.wire import Shape
+
+
+def shaped(asked: Shape, size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    """Union of polygons, plus or minus a stroke, cut to the region that it must stay inside."""
+    mask = fill_rings(asked.add, size_hw)
+    if asked.stroke is not None:
+        painted = np.zeros(size_hw, np.uint8)
+        points = np.array(asked.stroke.points, np.int32)
+        radius = asked.stroke.radius
+        cv2.polylines(painted, [points], False, 1, max(1, round(2 * radius)))
+        for x, y in points:  # round ends, and dots
+            cv2.circle(painted, (int(x), int(y)), round(radius), 1, cv2.FILLED)
+        mask = mask & (painted == 0) if asked.stroke.erase else mask | (painted > 0)
+    if asked.inside is not None:
+        mask &= fill_rings(asked.inside, size_hw)
+    return mask

@@ -1,0 +1,35 @@
+// The server's answers. Every question names the state of the scene that this page was loaded with; another state's answers are refused.
+
+import { $ } from "./elements.js";
+import { get, send } from "./http.js";
+
+const POLL_MS = 4000;
+let state = "";
+const at = (path) => `${path}?of=${state}`;
+
+export async function scene() {
+  const described = await (await get("/api/scene")).json();
+  state = described.of;
+  return described;
+}
+export const labels = async () => (await get(at("/api/labels"))).json();
+export const save = async (number, labels, version) =>
+  (await send(at(`/api/labels/${number}`), { labels }, { method: "PUT", headers: { "if-match": `"${version}"` } })).json();
+export const ask = async (path, value) => (await send(at(path), value)).json();
+export const photoUrl = (number) => at(`/api/photo/${number}`);
+export const thumbUrl = (number) => at(`/api/thumb/${number}`);
+export const exportUrl = (kind) => at(`/api/export/${kind}`);
+
+// While the page is open: is what it shows still what lies on the disk? Another state comes with a reload and never in parts.
+export async function watch() {
+  while ($("changed").hidden) {
+    await new Promise((done) => setTimeout(done, POLL_MS));
+    if (document.hidden) continue;
+    try {
+      const now = await (await get("/api/changes")).json();
+      if (now.of === state && !now.changed.length) continue;
+      $("changed-what").textContent = `The scene has changed${now.changed.length ? ` (${now.changed.join(", ")})` : ""}. Reload to draw on it and for its proposals.`;
+      $("changed").hidden = false;
+    } catch { /* the server has ended, which the next change tells */ }
+  }
+}

@@ -1,0 +1,53 @@
+"""What the annotation page sends: strokes, shapes, pixels, labels."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from hilsplat.annotate.labels import Label, Place, Rings
+from hilsplat.viewer.wire import Message
+
+
+class Stroke(Message):
+    """A brush stroke: discs of a radius along points, px."""
+
+    points: Annotated[list[tuple[Place, Place]], Field(min_length=1, max_length=20_000)]
+    radius: Annotated[float, Field(ge=0.5, le=500)]
+    erase: bool = False
+
+
+class Shape(Message):
+    """A region to be made from polygons and a stroke, inside its parent."""
+
+    view: int
+    add: Rings
+    stroke: Stroke | None = None
+    inside: Rings | None = None
+
+
+class At(Message):
+    """A pixel of a photograph."""
+
+    view: int
+    x: int
+    y: int
+
+
+class Carry(Message):
+    """Things, and the view to carry them into."""
+
+    ids: Annotated[list[int], Field(min_length=1, max_length=2000)]
+    view: int
+
+
+class Labels(Message):
+    """All annotations of a view."""
+
+    labels: Annotated[list[Label], Field(max_length=2000)]
+
+
+class Given(Message):
+    """A file of annotations."""
+
+    name: Annotated[str, Field(max_length=300)]
+    text: str

@@ -1,0 +1,108 @@
+"""What a person sees: labels, colours and words that say no more than is there."""
+
+import re
+
+import numpy as np
+import pytest
+
+import hilsplat
+from hilsplat.base.images import write_png
+from tests.browser.conftest import wire_camera
+from tests.browser.test_ask import answers, ask
+
+
+@pytest.fixture
+def scene(desk):
+    return hilsplat.open(desk)
+
+
+def painted_nodes(page) -> set[int]:
+    table = page.evaluate("Array.from(hilsplat.painted()[0].style.table)")
+    return {row - 1 for row, share in enumerate(table[3::4]) if share}
+
+
+def test_a_box_beside_the_picture_has_no_label_and_labels_stay_clear_of_the_tools(opened, desk_address):
+    page = opened(desk_address, "server")
+    page.locator("#view").focus()
+    ask(page, "mug > handle")
+    label = page.locator("#overlay text")
+    label.first.wait_for(state="attached")
+    tools = page.locator("#tools").bounding_box()
+    for _ in range(40):
+        page.evaluate(
+            "hilsplat.camera.move(0, 3, 0); hilsplat.redraw()"
+        )  # until the box has left the picture
+        page.wait_for_timeout(100)
+        top = label.first.bounding_box() if label.count() else None
+        if top is None:
+            break
+        assert top["y"] + top["height"] > tools["y"] + tools["height"]
+    assert label.count() == 0
+
+
+def test_what_is_flown_to_is_seen_whole(opened, desk_address, scene):
+    page = opened(desk_address, "server")
+    for text in ("mug", "mug > handle"):
+        page.locator(f"[role=treeitem][data-node='{scene.query(text)[0].node}'] > .row .label").click()
+        page.locator("#view").press("f")
+        page.wait_for_timeout(1500)
+        box = page.locator("#overlay path.chosen")
+        box.wait_for(state="attached")
+        places = np.array(re.findall(r"[-\d.]+", box.get_attribute("d")), float).reshape(-1, 2)
+        wire = wire_camera(page)
+        middle, half = np.array(wire["K"])[:2, 2], np.array(wire["size_hw"])[::-1] / 2
+        assert (np.abs(places - middle) < half).all() and np.ptp(places, axis=0).max() > 0.3 * half.min()
+
+
+def test_of_what_is_alike_the_first_five_are_painted(opened, desk_address, scene, tmp_path):
+    page = opened(desk_address, "server")
+    write_png(tmp_path / "blue.png", np.full((40, 30, 3), (0, 0, 250), np.uint8))
+    page.get_by_label("Picture to look for").set_input_files(tmp_path / "blue.png")
+    answers(page).first.wait_for()
+    listed = {int(item.get_attribute("data-node")) for item in page.locator("#answers li").all()}
+    assert len(listed) == 5 and painted_nodes(page) == listed
+    assert "The first 5 are painted." in page.get_by_role("status").inner_text()
+    answer = "{ route: ROUTE, hits: [9, 8, 7, 6, 5, 4, 3] }"
+    shown = f"import('/static/styles.js').then((own) => own.shownHits({answer}))"
+    assert page.evaluate(shown.replace("ROUTE", "'like'")) == [9, 8, 7, 6, 5]
+    assert len(page.evaluate(shown.replace("ROUTE", "'tree'"))) == 7
+
+
+def test_a_caution_about_words_is_not_told_of_names_and_likeness(opened, desk_address):
+    page = opened(desk_address, "server")
+    shown = "own.showAnswers({ caution: 'no word means anything' }, ANSWER, {})"
+    said = "document.getElementById('caution').hidden || document.getElementById('caution').textContent"
+    code = f"import('/static/answers.js').then((own) => {{ {shown}; return {said}; }})"
+    answers_and_cautions = {
+        "null": "no word means anything",  # nothing is asked yet
+        "{ hits: [], caution: 'not this one' }": "not this one",
+        "{ hits: [], caution: '' }": True,  # by name or by likeness: the server gives it none
+    }
+    for answer, expected in answers_and_cautions.items():
+        assert page.evaluate(code.replace("ANSWER", answer)) == expected
+
+
+def test_the_present_photograph_is_marked_also_where_it_shows_the_answer(opened, desk_address, scene):
+    page = opened(desk_address, "server")
+    page.locator("#view").focus()
+    ask(page, "mug > handle")
+    answers(page).first.wait_for()
+    best = scene.views.index(scene.query("mug > handle")[0].best_views[0])
+    page.locator("#views button").nth(best).click()
+    button = page.locator("#views button[aria-selected=true].shows")
+    button.wait_for()
+    marks = "[getComputedStyle(each).borderTopColor, getComputedStyle(each, '::before').borderTopColor]"
+    assert button.evaluate(f"(each) => {marks}") == ["rgb(255, 138, 31)", "rgb(255, 255, 255)"]
+
+
+def test_masks_are_saved_step_by_step_and_the_size_is_told(opened, desk_address):
+    page = opened(desk_address, "server")
+    page.locator("#view").focus()
+    ask(page, "mug > handle")
+    answers(page).first.wait_for()
+    page.locator("#save summary").click()
+    with page.expect_download() as started:
+        page.get_by_role("button", name=re.compile("Masks in all photographs")).click()
+    size = started.value.path().stat().st_size
+    page.get_by_role("status").get_by_text(f"Saved desk-masks.zip, {-(-size // 1000)} kB.").wait_for()
+    assert page.locator("#saving").is_hidden()
