@@ -62,8 +62,8 @@ def answer(
     hits = hits_of(scene, nodes, LISTED)
     label = masks_label(found.parts.masks)
     note = f"; a diagnostic, masks made from the true labels: {label}" if made_from_truth(label) else ""
-    caution = f"\n{scene.caution}" if scene.caution else ""
-    yield f"{report(scene, text, nodes, view)}{note}{caution}"
+    caution = scene.caution_about(text)
+    yield "\n".join([report(scene, text, nodes, view) + note, *([caution] if caution else [])])
 
     from hilsplat.query.query_panel import query_panel
 

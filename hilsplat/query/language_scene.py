@@ -348,6 +348,10 @@ class LanguageScene:
             row[self.names.nodes_of(text)] = NAMED
         return found
 
+    def caution_about(self, text: str) -> str:
+        """`caution`, unless a person named nodes by every text of a query, so that no CLIP answers it."""
+        return "" if all(self.names.nodes_of(part) for part in path_of(text)) else self.caution
+
     def node_relevancy(self, texts: Sequence[str], answerer: Answerer = "tree") -> Float32[np.ndarray, "T n"]:
         """Relevancy of every node to every text."""
         return relevancy_of_margins(self.node_margins(texts, answerer), self.settings.relevancy_scale)

@@ -27,7 +27,6 @@ def answer(
     found = scene.find(text, level, answerer=answerer, view=view, threshold=threshold)
     hits, path = hits_of(scene, found, LISTED), path_of(text)
     relevancy = scene.node_relevancy([path[-1]], "field" if answerer == "field" else "tree")[0]
-    named = all(scene.names.nodes_of(part) for part in path)
     return {
         "text": text,
         "level": found.level.label,
@@ -35,7 +34,7 @@ def answer(
         "total": len(found.ids),
         "relevancy": np.round(relevancy, 4).tolist(),
         "doubts": [str(doubt) for doubt in doubts_of(scene, found)],
-        "caution": "" if named else scene.caution,
+        "caution": scene.caution_about(text),
         "route": found.route,
         "ms": round(1e3 * (time.perf_counter() - begin), 2),
     }

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from hilsplat.evaluate.figures.comparison import open_variants
 from hilsplat.evaluate.figures.panel import run_figures
 from hilsplat.field.code import autoencoder_file
 from hilsplat.models.folder import open_model_folder
+from hilsplat.query.names import NodeNames
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, build_finished_desk, region_mask
@@ -148,6 +150,9 @@ def test_answers_about_photographs_by_the_embedded_clip_are_called_meaningless(
     assert f"photos/desk: {caution}" in caplog.text
     told = run_command(project, "query", str(Path("copy") / SCENE), "mug")
     assert told.returncode == 0 and caution in told.stdout and "hilsplat models get" in caution
+    # a name that a person gave is no answer of CLIP
+    named = replace(hilsplat.open(Path("copy") / SCENE), names=NodeNames({0: "the frog"}))
+    assert named.caution_about("The frog") == "" and named.caution_about("the frog > nose") == caution
     # a synthetic scene is what the embedded models know
     write_provenance(
         elsewhere / "copy" / SCENE / "scene",
