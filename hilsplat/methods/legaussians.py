@@ -42,8 +42,8 @@ CHANNELS = 8
 DECODER_WIDTHS = (128, 256)
 POSITION_WIDTHS = (128,) * 4
 FIRST_UNCERTAINTY = 0.01
-UNCERTAINTY_RATE = 50
-"""Times the rate of the codes (0.05 to 0.001)."""
+UNCERTAINTY_RATE = 0.05
+"""Of Adam, whatever the rate of the codes is."""
 NETWORK_RATE = 0.2
 """Times the rate of the codes; the authors' is 1."""
 LEAST_SMOOTHING = 0.1
@@ -131,7 +131,7 @@ def entries_of_gaussians(
     groups = [
         {"params": [codes], "lr": settings.rate},
         {"params": networks, "lr": NETWORK_RATE * settings.rate},
-        {"params": [doubt], "lr": UNCERTAINTY_RATE * settings.rate},
+        {"params": [doubt], "lr": UNCERTAINTY_RATE},
     ]
     train(views, groups, loss, settings, seed)
     with one_torch_thread(), torch.no_grad():

@@ -158,7 +158,9 @@ def draw_methods(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: E
     scene = first.scene
     many = len(methods) > MOST_COLUMNS
     shape = max(len(rows), 1), len(methods) + 1
-    figure, grid = _grid(scene, *(shape[::-1] if many else shape), f"{scene.name}: queries by method")
+    width_in = WIDTH_IN * min(shape[0] / MOST_COLUMNS, 1) if many else WIDTH_IN
+    title = f"{scene.name}: queries by method"
+    figure, grid = _grid(scene, *(shape[::-1] if many else shape), title, width_in)
     by_query = grid.T if many else grid
     for axes, row in zip(by_query, track(list(rows), "queries compared"), strict=False):
         image = first.image(row.view)
@@ -234,11 +236,13 @@ def node_image(scene: LanguageScene, view: str, level: Level) -> np.ndarray:
     return (255 * np.clip(weights @ of_gaussian, 0, 1)).astype(np.uint8).reshape(height, width, 3)
 
 
-def _grid(scene: Scene, rows: int, columns: int, title: str) -> tuple[Figure, np.ndarray]:
+def _grid(
+    scene: Scene, rows: int, columns: int, title: str, width_in: float = WIDTH_IN
+) -> tuple[Figure, np.ndarray]:
     """An empty grid for pictures of the scene's shape, without ticks."""
     height, width = scene.cameras[scene.cameras.names[0]].size_hw
-    row_in = WIDTH_IN / columns * height / width + 0.18
-    figure = Figure(figsize=(WIDTH_IN, rows * row_in + 0.4), layout="constrained")
+    row_in = width_in / columns * height / width + 0.18
+    figure = Figure(figsize=(width_in, rows * row_in + 0.4), layout="constrained")
     figure.suptitle(title, fontsize=12, fontweight="bold", parse_math=False)
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.ravel():
