@@ -10,11 +10,11 @@ from jaxtyping import Float32, Int64, UInt8
 from hilsplat.base.device import ComputeDevice
 from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, Level
+from hilsplat.contributions.rendered_latents import rendered_latents
 from hilsplat.field.code import Code
 from hilsplat.field.language_field import LanguageField
 from hilsplat.query.latent_relevancy import LatentRelevancy
 from hilsplat.query.look_up_kernels import fill_maps
-from hilsplat.query.rendered_latents import rendered_latents
 from hilsplat.query.scene_views import SceneViews
 from hilsplat.semantic_tree.nodes import node_means
 from hilsplat.settings import EvaluateSettings
