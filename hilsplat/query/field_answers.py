@@ -10,6 +10,7 @@ from jaxtyping import Float32, Int64, UInt8
 from hilsplat.base.device import ComputeDevice
 from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, Level
+from hilsplat.contributions.rendered_latents import rendered_latents
 from hilsplat.field.code import Code
 from hilsplat.field.language_field import LanguageField
 from hilsplat.query.latent_relevancy import LatentRelevancy
@@ -17,9 +18,6 @@ from hilsplat.query.look_up_kernels import fill_maps
 from hilsplat.query.scene_views import SceneViews
 from hilsplat.semantic_tree.nodes import node_means
 from hilsplat.settings import EvaluateSettings
-
-MIN_LATENT_SHARE = 0.5
-"""A pixel has a latent at a level if Gaussians with one make up more than this share of it."""
 
 
 @dataclass(frozen=True)
@@ -106,21 +104,10 @@ class FieldAnswers:
 
     def latents(self, view: str) -> list[tuple[np.ndarray, Float32[np.ndarray, "P D"]]]:
         """Per level, the pixels that show mostly Gaussians with a latent, and their rendered latents."""
-
-        def render() -> list[tuple[np.ndarray, np.ndarray]]:
-            weights, features = self.views.weights(view), self.language.features
-            shares = weights @ (features != 0).any(axis=2).astype(np.float32)
-            rendered = (weights @ features.reshape(len(features), -1)).reshape(-1, *features.shape[1:])
-            shown = []
-            for index in range(len(LEVELS)):
-                pixels = np.flatnonzero(shares[:, index] > MIN_LATENT_SHARE)
-                # Gaussians without a latent hold zeros, which a code would decode like any other: leave them
-                # out.
-                shown.append((pixels, rendered[pixels, index] / shares[pixels, index, None]))
-            return shown
-
         return self.views.store.get(
-            ("latents", view), render, lambda kept: sum(a.nbytes + b.nbytes for a, b in kept)
+            ("latents", view),
+            lambda: rendered_latents(self.views.weights(view), self.language.features),
+            lambda kept: sum(a.nbytes + b.nbytes for a, b in kept),
         )
 
     def _placed_latents(self, view: str) -> list:

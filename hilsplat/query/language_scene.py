@@ -326,6 +326,10 @@ class LanguageScene:
         """The undistorted photograph of a view; read-only because it is cached, so copy it to draw on it."""
         return self._shown.image(view)
 
+    def forget(self, view: str) -> None:
+        """Free what is kept of a view: later answers in it are the same, and take longer again."""
+        self._views.forget(view)
+
     # -- relevancy --------------------------------------------------------------------------------
 
     def text_vectors(self, texts: Sequence[str]) -> Float32[np.ndarray, "T C"]:

@@ -93,19 +93,20 @@ class LatentRelevancy:
             texts: unit vectors.
         """
         out = np.empty((len(texts), len(placed.generic)), np.float32)
-        for text, row in zip(texts, out, strict=True):
-            if not isinstance(placed, PlacedLinear | PlacedProjected):
+        if not isinstance(placed, PlacedLinear | PlacedProjected):
+            for text, row in zip(texts, out, strict=True):
                 row[:] = placed.relevancy(*self._text_weights(placed, text), self._scale)
-                continue
+            return out
 
-            def answer(span: slice, text: np.ndarray = text, row: np.ndarray = row) -> None:
-                if isinstance(self._look_up, LinearLookUp):
-                    assert isinstance(placed, PlacedLinear)  # `prepare` made it
-                    self._look_up.look_up(placed, span, text, row[span])
-                else:
-                    assert isinstance(placed, PlacedProjected)
-                    self._look_up.look_up(placed, span, text, row[span])
+        def answer(span: slice) -> None:
+            if isinstance(self._look_up, LinearLookUp):
+                assert isinstance(placed, PlacedLinear)  # `prepare` made it
+                self._look_up.look_up(placed, span, texts, out[:, span])
+            else:
+                assert isinstance(placed, PlacedProjected)
+                self._look_up.look_up(placed, span, texts, out[:, span])
 
+        if len(texts):
             self._in_parts(answer, len(placed.generic))
         return out
 

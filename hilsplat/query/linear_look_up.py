@@ -61,13 +61,20 @@ class LinearLookUp:
         self,
         placed: PlacedLinear,
         span: slice,
-        text: Float32[np.ndarray, " C"],
-        out: Float32[np.ndarray, " p"],
+        texts: Float32[np.ndarray, "T C"],
+        out: Float32[np.ndarray, "T p"],
     ) -> None:
-        """Write the relevancy of a text for a span of latents."""
-        offset, slope = self.text_weights(text)
+        """Write the relevancy of texts for a span of latents."""
+        weights = [self.text_weights(text) for text in texts]
         linear_relevancy(
-            placed.channels, placed.length, placed.generic, span.start, offset, slope, self._scale, out
+            placed.channels,
+            placed.length,
+            placed.generic,
+            span.start,
+            np.array([offset for offset, _ in weights], np.float32),
+            np.array([slope for _, slope in weights], np.float32),
+            self._scale,
+            out,
         )
 
     def text_weights(self, text: Float32[np.ndarray, " C"]) -> tuple[np.float32, Float32[np.ndarray, " D"]]:

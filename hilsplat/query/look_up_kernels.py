@@ -59,34 +59,58 @@ def lengths_and_generic(channels, cross, mean_square, offsets, slopes, length, g
 
 
 @compiled
-def linear_relevancy(channels, length, generic, first, offset, slope, scale, out):
-    """Relevancy of pixels from `first` on; channels (D, P), cosine = (offset + slope.channels) / length."""
+def linear_relevancy(channels, length, generic, first, offsets, slopes, scale, out):
+    """Relevancy of texts (T, p) at pixels from `first` on; channels (D, P).
+
+    The cosine of a text is (offset + slope . channels) / length. A block of pixels answers all texts while it
+    is in the cache.
+    """
     dots = np.empty(BLOCK, np.float32)
-    for begin in range(first, first + len(out), BLOCK):
-        end = min(begin + BLOCK, first + len(out))
-        _dots_of_block(channels, begin, end, offset, slope, dots)
-        for p in range(end - begin):
-            dots[p] /= length[begin + p]
-        _write_relevancy(dots, generic[begin:end], scale, out[begin - first : end - first])
+    last = first + out.shape[1]
+    for begin in range(first, last, BLOCK):
+        end = min(begin + BLOCK, last)
+        for text in range(len(out)):
+            _dots_of_block(channels, begin, end, offsets[text], slopes[text], dots)
+            for p in range(end - begin):
+                dots[p] /= length[begin + p]
+            _write_relevancy(dots, generic[begin:end], scale, out[text, begin - first : end - first])
 
 
 @compiled
 def projected_relevancy(coordinates, generic, first, weights, scale, out):
-    """Relevancy of pixels from `first` on; coordinates (R, P) of 16 bits, cosine = weights.coordinates."""
+    """Relevancy of texts (T, p) at pixels from `first` on; coordinates (R, P) of 16 bits.
+
+    The cosine of a text is weights . coordinates. A block of pixels answers all texts while it is in the
+    cache.
+    """
     dots = np.empty(BLOCK, np.float32)
-    for begin in range(first, first + len(out), BLOCK):
-        end = min(begin + BLOCK, first + len(out))
-        _dots_of_block(coordinates, begin, end, np.float32(0), weights, dots)
-        _write_relevancy(dots, generic[begin:end], scale, out[begin - first : end - first])
+    last = first + out.shape[1]
+    for begin in range(first, last, BLOCK):
+        end = min(begin + BLOCK, last)
+        for text in range(len(out)):
+            _dots_of_block(coordinates, begin, end, np.float32(0), weights[text], dots)
+            _write_relevancy(dots, generic[begin:end], scale, out[text, begin - first : end - first])
 
 
 @compiled
 def fill_maps(found, least, pixels, level, maps):
-    """Write the values of a level's pixels to its maps (T, 3, P), and each text's least value elsewhere."""
+    """Write the values of a level's pixels to its maps (T, 3, P), and each text's least value elsewhere.
+
+    Pixels that follow each other are copied together.
+    """
+    starts = np.empty(len(pixels) + 1, np.int64)
+    runs = 0
+    for place in range(len(pixels)):
+        if place == 0 or pixels[place] != pixels[place - 1] + 1:
+            starts[runs] = place
+            runs += 1
+    starts[runs] = len(pixels)
     for text in range(len(found)):
-        maps[text, level, :] = least[text]
-        for place in range(len(pixels)):
-            maps[text, level, pixels[place]] = found[text, place]
+        row = maps[text, level]
+        row[:] = least[text]
+        for run in range(runs):
+            begin, end = starts[run], starts[run + 1]
+            row[pixels[begin] : pixels[begin] + end - begin] = found[text, begin:end]
 
 
 @compiled

@@ -90,11 +90,11 @@ class ProjectedLookUp:
         self,
         placed: PlacedProjected,
         span: slice,
-        text: Float32[np.ndarray, " C"],
-        out: Float32[np.ndarray, " p"],
+        texts: Float32[np.ndarray, "T C"],
+        out: Float32[np.ndarray, "T p"],
     ) -> None:
-        """Write the relevancy of a text for a span of latents."""
-        _, weights = self.text_weights(placed.directions, text)
+        """Write the relevancy of texts for a span of latents."""
+        weights = np.stack([self.text_weights(placed.directions, text)[1] for text in texts])
         projected_relevancy(placed.coordinates, placed.generic, span.start, weights, self._scale, out)
 
     def text_weights(

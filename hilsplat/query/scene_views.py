@@ -118,7 +118,7 @@ class SceneViews:
                 continue
             shown = self.nodes(view, level)
             for row, values in enumerate(scores):
-                maps[row, level.index] = shown.blend(values, float(values[nodes].min()))
+                shown.blend(values, float(values[nodes].min()), maps[row, level.index])
         return maps.reshape(len(scores), len(LEVELS), height, width)
 
 

@@ -47,14 +47,18 @@ class ViewNodes:
         """Number of pixels of which each node makes up more than half."""
         return np.bincount(self.nodes[self.shares > 0.5], minlength=num_nodes)
 
-    def blend(self, values: Float32[np.ndarray, " n"], without: float) -> Float32[np.ndarray, " P"]:
+    def blend(
+        self,
+        values: Float32[np.ndarray, " n"],
+        without: float,
+        out: Float32[np.ndarray, " P"] | None = None,
+    ) -> Float32[np.ndarray, " P"]:
         """Blend one value per node; Gaussians without a node have the value `without`.
 
-        Uncovered pixels get the least value of the covered ones.
+        Uncovered pixels get the least value of the covered ones. Writes into `out` if there is one.
         """
-        out = np.empty(len(self.covered), np.float32)
-        least = _blend(self.indptr, self.nodes, self.shares, self.covered, values, np.float32(without), out)
-        out[~self.covered] = least
+        out = np.empty(len(self.covered), np.float32) if out is None else out
+        _blend(self.indptr, self.nodes, self.shares, self.covered, values, np.float32(without), out)
         return out
 
     def mask(self, chosen: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " P"]:
@@ -107,7 +111,11 @@ def _blend(indptr, nodes, shares, covered, values, without, out):
         total += max(left, np.float32(0)) * without
         out[p] = total
         least = min(least, total)
-    return least if least < np.inf else np.float32(0)
+    if not least < np.inf:
+        least = np.float32(0)
+    for p in range(len(covered)):
+        if not covered[p]:
+            out[p] = least
 
 
 @compiled

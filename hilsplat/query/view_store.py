@@ -24,3 +24,8 @@ class ViewStore:
         while len(self._kept) > 1 and sum(bytes_ for _, bytes_ in self._kept.values()) > self._most_bytes:
             self._kept.pop(next(iter(self._kept)))
         return value
+
+    def forget(self, view: str) -> None:
+        """Drop the results of a view; the second part of a key is the view."""
+        for key in [key for key in self._kept if key[1] == view]:
+            del self._kept[key]

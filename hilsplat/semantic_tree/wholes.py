@@ -10,7 +10,6 @@ import heapq
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float32, Float64, Int32, Int64
-from scipy.spatial import cKDTree
 
 from hilsplat.base.levels import NONE
 
@@ -59,6 +58,8 @@ def touching(
     region: Int32[np.ndarray, " n"], num_regions: int, means: Float32[np.ndarray, "n 3"]
 ) -> sp.csr_matrix:
     """Number of pairs (Gaussian, one of its `NEIGHBOURS` nearest) in every two regions; symmetric."""
+    from scipy.spatial import cKDTree  # takes a fifth of a second, and all who open a tree import this module
+
     near = min(NEIGHBOURS, len(means))  # the nearest of all is the Gaussian itself
     nearest = cKDTree(means).query(means, k=np.arange(1, near + 1))[1] if near else np.zeros((0, 0), np.int64)
     first, second = np.repeat(region, near), region[nearest.ravel()]

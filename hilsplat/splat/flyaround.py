@@ -8,9 +8,9 @@ from jaxtyping import Float64, UInt8
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.distance import cdist
 
-from hilsplat.base.film import write_film
 from hilsplat.base.images import write_png
 from hilsplat.scene.cameras import Camera
+from hilsplat.splat.film import write_film
 from hilsplat.splat.sheets import contact_sheet
 
 FRAMES = 120

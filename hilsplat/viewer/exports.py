@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from PIL import Image
 
-from hilsplat.base.film import write_film
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.export import write_selection_ply
+from hilsplat.splat.film import write_film
 from hilsplat.splat.flyaround import closed_path
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.rasterise.cpu import blend_forward, project_gaussians

@@ -53,10 +53,9 @@ def measure_world_consistency(
     mesh = TrueMesh.load(Path(truth) / "mesh.ply")
     views = [view for view in answers.scene.cameras.names if view in set(true.names)]
     nearest = dict(neighbours(true, views, 1))
-    for view in truths:
-        if view not in nearest:
-            continue
-        pair = (view, nearest[view])
+    pairs = [(view, nearest[view]) for view in truths if view in nearest]
+    for number, pair in enumerate(pairs):
+        view = pair[0]
         points = thinned(
             shared_points(true[pair[0]], mesh.depth(true[pair[0]]), true[pair[1]], mesh.depth(true[pair[1]]))
         )
@@ -64,6 +63,8 @@ def measure_world_consistency(
         mask_of = answers_of(answers, selections, answered, pair, queries, settings)
         for row in consistency_rows(pair, points, queries, mask_of, settings):
             yield view, row
+        for each in set(pair) - {each for later in pairs[number + 1 :] for each in later}:
+            answers.forget(each)
 
 
 def spread(queries: Sequence[Query], per_level: int) -> list[Query]:

@@ -16,8 +16,8 @@ def peak_points(
     if level is None:
         level = max(LEVELS, key=lambda each: (filtered[each.index].max(), each.index))
     chosen = filtered[level.index]
-    rows, columns = np.nonzero(chosen == chosen.max())
-    return np.stack([columns, rows], axis=1), level
+    pixels = np.flatnonzero(chosen == chosen.max())  # nonzero in two dimensions is six times slower
+    return np.stack([pixels % chosen.shape[1], pixels // chosen.shape[1]], axis=1), level
 
 
 def hits_a_box(points_xy: Int[np.ndarray, "P 2"], boxes_xyxy: Int[np.ndarray, "B 4"]) -> bool:

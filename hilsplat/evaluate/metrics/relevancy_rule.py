@@ -90,7 +90,7 @@ def mean_filter(
     """
     import cv2
 
-    values, side_hw = relevancy.astype(np.float32), (side_px, side_px)
+    values, side_hw = np.asarray(relevancy, np.float32), (side_px, side_px)
     if border == "langsplat":
         return cv2.boxFilter(values, cv2.CV_32F, side_hw, borderType=cv2.BORDER_DEFAULT)
     summed, count = (
@@ -148,9 +148,15 @@ class SmoothedRelevancy:
     def of(relevancy: Float[np.ndarray, "3 H W"], rule: RelevancyRule) -> "SmoothedRelevancy":
         """Filter all three levels."""
         side_px = filter_side_px(rule.filter_px, relevancy.shape[1])
-        raw = relevancy.astype(np.float32)
-        filtered = np.stack([mean_filter(raw[level.index], side_px, rule.border) for level in LEVELS])
-        return SmoothedRelevancy(filtered, 0.5 * (filtered + raw) if rule.mix else raw)
+        raw = np.asarray(relevancy, np.float32)
+        filtered = np.empty_like(raw)
+        for level in LEVELS:
+            filtered[level.index] = mean_filter(raw[level.index], side_px, rule.border)
+        if not rule.mix:
+            return SmoothedRelevancy(filtered, raw)
+        mixed = filtered + raw
+        mixed *= np.float32(0.5)
+        return SmoothedRelevancy(filtered, mixed)
 
 
 def relevancy_mask(

@@ -185,3 +185,14 @@ def test_a_device_that_is_missing_is_told(vectors, texts, monkeypatch):
     with pytest.raises(DeviceError, match="no device here"):
         LatentRelevancy(LinearCode.fit(vectors, 4), texts[:3], 10.0, device="cuda")
     compute_device.cache_clear()
+
+
+def test_texts_looked_up_together_have_the_bytes_of_each_alone(vectors, texts):
+    latents = blends(np.random.default_rng(3).normal(size=(60, 9)).astype(np.float32), 5000)
+    for code in (LinearCode.fit(vectors, 9), pass_through(9, 32)):
+        fast = LatentRelevancy(code, texts[:4], 10.0)
+        placed = fast.prepare(latents)
+        together = fast.fast(placed, texts)
+        alone = [fast.fast(placed, texts[row : row + 1])[0] for row in range(len(texts))]
+        assert together.tobytes() == np.stack(alone).tobytes()
+        assert fast.fast(placed, texts[:0]).shape == (0, len(latents))

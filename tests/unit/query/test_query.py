@@ -502,6 +502,25 @@ def test_latents_rendered_at_once_have_the_bytes_of_each_level_alone(scene):
         assert latents.tobytes() == ((weights[pixels] @ own) / share[pixels, None]).tobytes()
 
 
+def test_a_view_that_is_forgotten_is_computed_anew_with_the_same_answers(scene):
+    asked = []
+    weights = lambda view: asked.append(view) or scene.pixel_weights(view)  # noqa: E731
+    own = replace(scene, pixel_weights=weights, _views=ViewStore())
+    first = own.field_relevancy(["cup"], "000.png")
+    own.nodes_shown("001.png")
+    own.forget("000.png")
+    assert np.array_equal(own.field_relevancy(["cup"], "000.png"), first)
+    own.nodes_shown("001.png")
+    assert asked == ["000.png", "001.png", "000.png"]
+
+
+def test_runs_of_pixels_are_copied_to_their_places():
+    maps = np.zeros((1, 1, 9), np.float32)
+    found = np.arange(1, 7, dtype=np.float32)[None]
+    fill_maps(found, np.float32([9]), np.array([0, 1, 3, 4, 5, 8]), 0, maps)
+    assert maps[0, 0].tolist() == [1, 2, 9, 3, 4, 5, 9, 9, 6]
+
+
 def test_pixels_of_a_map_without_a_latent_get_the_least_value_of_its_text():
     maps = np.full((2, 3, 4), 7, np.float32)
     found = np.array([[0.5, 0.25], [0.125, 1]], np.float32)
