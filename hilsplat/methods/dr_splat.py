@@ -22,8 +22,8 @@ from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import track
 from hilsplat.contributions.stage import painted_indicator
+from hilsplat.methods.common.quantise import ProductQuantiser
 from hilsplat.methods.method import Method, MethodInputs
-from hilsplat.methods.quantise import ProductQuantiser
 from hilsplat.settings import MethodSettings
 
 PART = 4

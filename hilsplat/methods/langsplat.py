@@ -27,8 +27,8 @@ from jaxtyping import Float32, Int32, Int64
 from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
+from hilsplat.methods.common.quads import WIDTH, load, plus, signs_of_difference, store, zeros
 from hilsplat.methods.method import Method, MethodInputs
-from hilsplat.methods.quads import WIDTH, load, plus, signs_of_difference, store, zeros
 from hilsplat.settings import MethodSettings
 
 BETAS = (0.9, 0.999)

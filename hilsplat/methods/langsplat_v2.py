@@ -21,10 +21,10 @@ from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
 from hilsplat.field.linear_code import LinearCode
-from hilsplat.methods.descent import Adam
+from hilsplat.methods.common.descent import Adam
+from hilsplat.methods.common.quantise import kmeans
 from hilsplat.methods.langsplat import LevelPixels, ViewPixels, ViewQueue, views_of
 from hilsplat.methods.method import Method, MethodInputs
-from hilsplat.methods.quantise import kmeans
 from hilsplat.settings import MethodSettings
 
 ENTRIES = 64

@@ -26,9 +26,17 @@ from torch import Tensor
 from torch.nn.functional import log_softmax
 
 from hilsplat.base.levels import LEVELS
-from hilsplat.methods.groups import cluster_field, clusters, thresholds_of
+from hilsplat.methods.common.groups import cluster_field, clusters, thresholds_of
+from hilsplat.methods.common.training import (
+    LabelledView,
+    alike,
+    labelled_views,
+    product,
+    segment_means,
+    train,
+    unit,
+)
 from hilsplat.methods.method import Method, MethodInputs
-from hilsplat.methods.training import LabelledView, alike, labelled_views, product, segment_means, train, unit
 from hilsplat.settings import MethodSettings
 
 CHANNELS = 16

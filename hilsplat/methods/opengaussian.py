@@ -27,10 +27,10 @@ from torch import Tensor
 
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.rows import Contributions
-from hilsplat.methods.groups import features_of_groups, group_latents
+from hilsplat.methods.common.groups import features_of_groups, group_latents
+from hilsplat.methods.common.quantise import kmeans
+from hilsplat.methods.common.training import LabelledView, labelled_views, product, segment_means, train, unit
 from hilsplat.methods.method import Method, MethodInputs
-from hilsplat.methods.quantise import kmeans
-from hilsplat.methods.training import LabelledView, labelled_views, product, segment_means, train, unit
 from hilsplat.settings import MethodSettings
 
 CHANNELS = 6

@@ -29,9 +29,17 @@ from torch import Tensor
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.contributions.rows import Contributions
-from hilsplat.methods.groups import cluster_field, clusters
+from hilsplat.methods.common.groups import cluster_field, clusters
+from hilsplat.methods.common.training import (
+    LabelledView,
+    alike,
+    labelled_views,
+    of_seen,
+    product,
+    train,
+    unit,
+)
 from hilsplat.methods.method import Method, MethodInputs
-from hilsplat.methods.training import LabelledView, alike, labelled_views, of_seen, product, train, unit
 from hilsplat.settings import MethodSettings
 
 CHANNELS = 32

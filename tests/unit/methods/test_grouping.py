@@ -14,17 +14,17 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.field.linear_code import LinearCode
 from hilsplat.methods import gaussian_grouping, laga, legaussians, omniseg3d, opengaussian, saga, vch
-from hilsplat.methods.gaussian_grouping import mask_identities, neighbour_loss
-from hilsplat.methods.groups import (
+from hilsplat.methods.common.groups import (
     clusters,
     features_of_groups,
     group_latents,
     thresholds_of,
 )
+from hilsplat.methods.common.training import LabelledView, labelled_views, product, train, unit
+from hilsplat.methods.gaussian_grouping import mask_identities, neighbour_loss
 from hilsplat.methods.method import MethodInputs
 from hilsplat.methods.omniseg3d import hierarchical_loss, patches
 from hilsplat.methods.opengaussian import contrast_loss, instances, smoothing_loss
-from hilsplat.methods.training import LabelledView, labelled_views, product, train, unit
 from hilsplat.methods.vch import components, neighbouring_pixels, triplets, ultrametric
 from hilsplat.settings import MethodSettings
 from tests.unit.two_boxes_world import HEIGHT, REGIONS, WIDTH, TwoBoxes, region_mask, two_boxes_weights

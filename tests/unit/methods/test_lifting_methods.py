@@ -14,11 +14,11 @@ from hilsplat.contributions.stage import mask_means, painted_indicator
 from hilsplat.field.linear_code import LinearCode
 from hilsplat.field.network_code import Autoencoder
 from hilsplat.methods import dr_splat, occam
-from hilsplat.methods.descent import Adam
+from hilsplat.methods.common.descent import Adam
+from hilsplat.methods.common.quantise import ProductQuantiser
 from hilsplat.methods.langsplat import LevelPixels
 from hilsplat.methods.langsplat_v2 import as_vectors, cosine_loss, largest_shares, step
 from hilsplat.methods.method import MethodInputs
-from hilsplat.methods.quantise import ProductQuantiser
 from hilsplat.methods.registry import method_of
 from hilsplat.scene.cameras import Camera
 from hilsplat.settings import MethodSettings

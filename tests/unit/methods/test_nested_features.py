@@ -10,8 +10,8 @@ from torch.nn.functional import cross_entropy
 
 from hilsplat.field.linear_code import LinearCode
 from hilsplat.methods import laga, legaussians, saga
-from hilsplat.methods.groups import density_clusters
-from hilsplat.methods.training import of_seen, product, unit
+from hilsplat.methods.common.groups import density_clusters
+from hilsplat.methods.common.training import of_seen, product, unit
 
 RNG = np.random.default_rng(0)
 

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from hilsplat.methods.quantise import kmeans
+from hilsplat.methods.common.quantise import kmeans
 
 
 def test_centroids_are_the_means_of_groups_and_every_row_knows_its_own():
@@ -40,7 +40,7 @@ def test_no_rows_have_no_groups():
 
 def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads():
     code = (
-        "import numpy as np; from hilsplat.methods.quantise import kmeans;"
+        "import numpy as np; from hilsplat.methods.common.quantise import kmeans;"
         "rows = np.random.default_rng(0).normal(size=(5000, 16)).astype(np.float32);"
         "centroids, nearest = kmeans(rows, 100, 3, 5);"
         "import hashlib; print(hashlib.sha256(centroids.tobytes() + nearest.tobytes()).hexdigest())"

@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import NONE
 from hilsplat.contributions.rows import Contributions
+from hilsplat.methods.common.quantise import kmeans
 from hilsplat.methods.method import MethodInputs
-from hilsplat.methods.quantise import kmeans
 from hilsplat.settings import MethodSettings
 
 CENTRES = 256

@@ -1,0 +1,1 @@
+"""What several methods share: optimiser, clusters, codebooks, training on rendered pixels."""
