@@ -199,7 +199,7 @@ def test_a_person_is_answered_between_the_steps_of_a_file(shown):
         assert await first == b'{"made":1,"of":3}\n'
         assert [part async for part in parts] == [b'{"made":2,"of":3}\n', b'{"bytes":4}\n', b"file"]
 
-    asyncio.run(both())
+    run_apart(both)
     assert order == ["step 0", "click", "step 1", "step 2"]
 
 
