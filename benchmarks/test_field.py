@@ -20,7 +20,7 @@ from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.quadratic import StackedWeights
 from hilsplat.field.language_field import LanguageField
 from hilsplat.field.linear_code import LinearCode
-from hilsplat.field.network_code import train_autoencoder
+from hilsplat.field.network_training import train_autoencoder
 from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Cameras

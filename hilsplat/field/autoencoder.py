@@ -62,7 +62,7 @@ def run_autoencoder(
         if settings.code == "pca":
             model = LinearCode.fit(train, settings.latent)
         else:
-            from hilsplat.field.network_code import train_autoencoder
+            from hilsplat.field.network_training import train_autoencoder
 
             model = train_autoencoder(train, settings, seed)
         latents = model.encode_array(target)

@@ -1,143 +1,143 @@
 """The scene autoencoder of LangSplat: a trained network from CLIP vectors to a few numbers and back."""
 
 import json
+from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-import safetensors.torch
-import torch
-from jaxtyping import Float, Float32
-from torch import Tensor, nn
+import safetensors.numpy
+from jaxtyping import Float32
 
 from hilsplat.base.artifacts import atomic_path
-from hilsplat.base.device import one_torch_thread
 from hilsplat.field.code import CHUNK_ROWS
 from hilsplat.field.linear_code import METADATA_KEY
-from hilsplat.settings import AutoencoderSettings
 
 ENCODER_WIDTHS = (256, 128, 64, 32)
 DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
+NORM_EPS = 1e-5
+"""Added to the variances of BatchNorm, as by torch."""
 
 
-class Autoencoder(nn.Module):
+class Layer(NamedTuple):
+    """A linear layer, and what comes before it.
+
+    Attributes:
+        name: of its weights in the file.
+        norm: name of the BatchNorm before it; empty for none.
+        relu: whether its inputs are made positive, after the BatchNorm.
+        inputs: their number.
+        outputs: their number.
+    """
+
+    name: str
+    norm: str
+    relu: bool
+    inputs: int
+    outputs: int
+
+
+def layers_of(channels: int, latent: int) -> tuple[list[Layer], list[Layer]]:
+    """Encoder and decoder; no layer is wider than the vectors."""
+    sides = []
+    for side, widths, norm in (("encoder", ENCODER_WIDTHS, True), ("decoder", DECODER_WIDTHS, False)):
+        between = [min(width, channels) for width in widths]
+        ends = [channels, *between, latent] if norm else [latent, *between, channels]
+        every = 3 if norm else 2  # numbers of torch's nn.Sequential, where norm and ReLU count
+        sides.append(
+            [
+                Layer(f"{side}.{every * k}", f"{side}.{every * k - 2}" if norm and k else "", k > 0, *sizes)
+                for k, sizes in enumerate(pairwise(ends))
+            ]
+        )
+    return sides[0], sides[1]
+
+
+def unit(vectors: Float32[np.ndarray, "B C"]) -> Float32[np.ndarray, "B C"]:
+    """Rows divided by their lengths."""
+    return vectors / np.maximum(np.sqrt(np.square(vectors).sum(axis=1, keepdims=True)), np.float32(1e-12))
+
+
+class Autoencoder:
     """LangSplat's scene autoencoder, C -> 256 -> 128 -> 64 -> 32 -> d and back, unit length at both ends.
 
     Departs: layer widths never exceed C. The encoder's BatchNorm (better than LayerNorm or none when
-    measured) sees full batches only, and ends with the statistics of all vectors: see `train_autoencoder`.
+    measured) sees full batches only, and ends with the statistics of all vectors: see
+    `network_training.train_autoencoder`. Arrays are named and laid out as in torch's modules.
 
     Args:
         channels: width C of the CLIP vectors.
         latent: size d of a latent.
+        arrays: of the layers, float32.
     """
 
-    def __init__(self, channels: int, latent: int) -> None:
-        super().__init__()
+    def __init__(self, channels: int, latent: int, arrays: Mapping[str, np.ndarray]) -> None:
         self.channels, self.latent = channels, latent
-        widths = [min(width, channels) for width in ENCODER_WIDTHS]
-        layers: list[nn.Module] = [nn.Linear(channels, widths[0])]
-        for before, after in zip(widths, [*widths[1:], latent], strict=True):
-            layers += [nn.BatchNorm1d(before), nn.ReLU(), nn.Linear(before, after)]
-        self.encoder = nn.Sequential(*layers)
-        widths = [min(width, channels) for width in DECODER_WIDTHS]
-        layers = [nn.Linear(latent, widths[0])]
-        for before, after in zip(widths, [*widths[1:], channels], strict=True):
-            layers += [nn.ReLU(), nn.Linear(before, after)]
-        self.decoder = nn.Sequential(*layers)
+        self.arrays = dict(arrays)
+        self._encoder, self._decoder = layers_of(channels, latent)
 
-    def encode(self, vectors: Float[Tensor, "B C"]) -> Float[Tensor, "B D"]:
-        """Latents of unit length."""
-        return nn.functional.normalize(self.encoder(vectors), dim=-1)
-
-    def decode(self, latents: Float[Tensor, "B D"]) -> Float[Tensor, "B C"]:
-        """Vectors of unit length, from latents of any length."""
-        return nn.functional.normalize(self.decoder(latents), dim=-1)
-
-    @torch.no_grad()
     def encode_array(self, vectors: Float32[np.ndarray, "B C"]) -> Float32[np.ndarray, "B D"]:
-        """`encode` for arrays."""
-        with one_torch_thread():
-            return self.encode(torch.from_numpy(np.ascontiguousarray(vectors))).numpy()
+        """Latents of unit length."""
+        return self._through(self._encoder, vectors)
 
-    @torch.no_grad()
     def decode_array(self, latents: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:
-        """`decode` for arrays, in chunks."""
-        out = np.empty((len(latents), self.channels), np.float32)
-        with one_torch_thread():
-            for start in range(0, len(latents), CHUNK_ROWS):
-                part = torch.from_numpy(np.ascontiguousarray(latents[start : start + CHUNK_ROWS]))
-                out[start : start + len(part)] = self.decode(part).numpy()
+        """Vectors of unit length, from latents of any length."""
+        return self._through(self._decoder, latents)
+
+    def _through(self, layers: list[Layer], values: np.ndarray) -> np.ndarray:
+        out = np.empty((len(values), layers[-1].outputs), np.float32)
+        for start in range(0, len(values), CHUNK_ROWS):
+            part = values[start : start + CHUNK_ROWS]
+            for layer in layers:
+                if layer.norm:
+                    weight, bias, mean, var = (
+                        self.arrays[f"{layer.norm}.{name}"]
+                        for name in ("weight", "bias", "running_mean", "running_var")
+                    )
+                    factor = weight / np.sqrt(var + np.float32(NORM_EPS))
+                    part = part * factor + (bias - mean * factor)
+                if layer.relu:
+                    np.maximum(part, 0, out=part)
+                part = part @ self.arrays[f"{layer.name}.weight"].T
+                part += self.arrays[f"{layer.name}.bias"]
+            out[start : start + len(part)] = unit(part)
         return out
 
     @staticmethod
+    def drawn(channels: int, latent: int, seed: int) -> "Autoencoder":
+        """The weights that torch draws after `torch.manual_seed(seed)`, bit by bit; BatchNorm has no effect."""
+        twister = np.random.RandomState(seed % 2**32)  # noqa: NPY002 - torch seeds the same generator in the same way
+        arrays: dict[str, np.ndarray] = {}
+        for layer in (layer for side in layers_of(channels, latent) for layer in side):
+            if layer.norm:
+                values = {"weight": 1, "bias": 0, "running_mean": 0, "running_var": 1}
+                arrays |= {
+                    f"{layer.norm}.{name}": np.full(layer.inputs, value, np.float32)
+                    for name, value in values.items()
+                }
+            reach = float(np.float32(layer.inputs**-0.5))
+            for name, shape in (("weight", (layer.outputs, layer.inputs)), ("bias", (layer.outputs,))):
+                share = (twister.randint(0, 2**32, shape, np.uint32) % 2**24) * 2.0**-24
+                arrays[f"{layer.name}.{name}"] = (2 * reach * share - reach).astype(np.float32)
+        return Autoencoder(channels, latent, arrays)
+
+    @staticmethod
     def from_arrays(channels: int, latent: int, arrays: dict[str, np.ndarray]) -> "Autoencoder":
-        """A trained network from its saved weights."""
-        model = Autoencoder(channels, latent)
-        model.load_state_dict({name: torch.from_numpy(values) for name, values in arrays.items()})
-        return model.eval()
+        """A trained network from its saved weights.
+
+        Raises:
+            ValueError: an array is missing or has another shape.
+        """
+        model = Autoencoder.drawn(channels, latent, 0)
+        for name, values in model.arrays.items():
+            if name not in arrays or arrays[name].shape != values.shape:
+                raise ValueError(f"{name} of shape {values.shape} is missing")
+            model.arrays[name] = arrays[name]
+        return model
 
     def save(self, path: Path) -> None:
         """Write a .safetensors file; the same weights give the same bytes."""
         about = json.dumps({"channels": self.channels, "latent": self.latent}, sort_keys=True)
-        tensors = {name: value.detach().contiguous() for name, value in self.state_dict().items()}
         with atomic_path(path) as temporary:
-            safetensors.torch.save_file(tensors, temporary, metadata={METADATA_KEY: about})
-
-
-def reconstruction_loss(
-    decoded: Float[Tensor, "B C"], vectors: Float[Tensor, "B C"], cosine_weight: float
-) -> Float[Tensor, ""]:
-    """Mean squared error plus `cosine_weight` times the mean over vectors of 1 - cosine.
-
-    Departs: LangSplat takes the cosine along the batch axis, which compares channels, not vectors.
-    """
-    cosine = nn.functional.cosine_similarity(decoded, vectors, dim=1)
-    return (decoded - vectors).square().mean() + cosine_weight * (1 - cosine).mean()
-
-
-def train_autoencoder(
-    vectors: Float32[np.ndarray, "B C"], settings: AutoencoderSettings, seed: int
-) -> Autoencoder:
-    """Train on one scene's vectors: Adam with cosine decay, full batches drawn without replacement.
-
-    Args:
-        vectors: unit CLIP vectors, at least one.
-        settings: latent size, steps and weights.
-        seed: for the initial weights and the order of vectors.
-
-    Returns:
-        the trained model; the same bytes for the same input and seed on any number of threads.
-    """
-    with one_torch_thread(), torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        data = torch.from_numpy(np.ascontiguousarray(vectors))
-        model = Autoencoder(data.shape[1], settings.latent)
-        if len(data) == 1:
-            data = data.repeat(2, 1)  # BatchNorm needs two rows
-        batch = min(settings.batch, len(data))
-        per_epoch = len(data) // batch
-        steps = max(settings.epochs * per_epoch, settings.min_steps)
-        optimiser = torch.optim.Adam(model.parameters(), lr=settings.learning_rate)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
-        for step in range(steps):
-            place = step % per_epoch
-            if place == 0:
-                order = torch.randperm(len(data))
-            chosen = data[order[place * batch : (place + 1) * batch]]
-            loss = reconstruction_loss(model.decode(model.encode(chosen)), chosen, settings.cosine_weight)
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-            schedule.step()
-        settle_batch_norm(model, data)
-        return model.eval()
-
-
-@torch.no_grad()
-def settle_batch_norm(model: Autoencoder, data: Float[Tensor, "B C"]) -> None:
-    """Replace the running statistics, which favour the last batches, by those of all vectors."""
-    for module in model.modules():
-        if isinstance(module, nn.BatchNorm1d):
-            module.reset_running_stats()
-            module.momentum = None  # a plain average over what follows: one pass over everything
-    model.train()
-    model.encoder(data)
+            safetensors.numpy.save_file(self.arrays, temporary, metadata={METADATA_KEY: about})

@@ -149,7 +149,7 @@ def block_world(tmp_path_factory) -> BlockWorld:
         gaussians,
         tree,
         LanguageField(features, "0", "0"),
-        Uncoded(8, 8),
+        Uncoded(8, 8, {}),
         encode_texts,
         lambda view: weights,
     )

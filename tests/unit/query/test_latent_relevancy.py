@@ -7,7 +7,8 @@ import torch
 from hilsplat.base.device import compute_device
 from hilsplat.base.errors import DeviceError
 from hilsplat.field.linear_code import LinearCode
-from hilsplat.field.network_code import Autoencoder, train_autoencoder
+from hilsplat.field.network_code import Autoencoder
+from hilsplat.field.network_training import train_autoencoder
 from hilsplat.query import projected_look_up
 from hilsplat.query.device_look_up import PlacedOnDevice
 from hilsplat.query.latent_relevancy import LatentRelevancy
@@ -43,14 +44,12 @@ def blends(features, count):
     )
 
 
-@torch.no_grad()
 def pass_through(latent, channels):
     """A network that decodes to the positive part of a latent, then zeros, at unit length."""
-    code = Autoencoder(channels, latent)
-    for layer in code.decoder:
-        if isinstance(layer, torch.nn.Linear):
-            layer.weight.copy_(torch.eye(*layer.weight.shape))
-            layer.bias.zero_()
+    code = Autoencoder.drawn(channels, latent, 0)
+    for name, values in code.arrays.items():
+        if name.startswith("decoder"):
+            values[:] = np.eye(*values.shape) if values.ndim == 2 else 0
     return code
 
 

@@ -107,7 +107,7 @@ def three_mugs() -> LanguageScene:
         round_gaussians(np.zeros((1, 3))),
         replace(tree, clip=vectors),
         LanguageField(np.zeros((1, 3, 2), np.float32), "", ""),
-        Autoencoder(6, 2),
+        Autoencoder.drawn(6, 2, 0),
         encode,
         lambda view: sp.csr_matrix((4, 1), dtype=np.float32),
         settings,

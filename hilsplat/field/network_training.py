@@ -1,0 +1,215 @@
+"""Training of the scene autoencoder: closed-form gradients on BLAS, without torch.
+
+The matrices are so small (64 x 128) that torch spends most of a step between them.
+"""
+
+import math
+from itertools import pairwise
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+from jaxtyping import Float32
+
+from hilsplat.base.compiled import compiled
+from hilsplat.field.network_code import NORM_EPS, Autoencoder, Layer, layers_of, unit
+from hilsplat.settings import AutoencoderSettings
+
+BETA1, BETA2, ADAM_EPS = 0.9, 0.999, 1e-8
+"""Of Adam, as in torch."""
+
+Arrays = dict[str, np.ndarray]
+
+
+class Passed(NamedTuple):
+    """What the way back through a layer needs from the way there.
+
+    Attributes:
+        values: inputs of the linear layer, after BatchNorm and ReLU, (B, inputs).
+        scaled: inputs of the BatchNorm with mean 0 and variance 1, (B, inputs); empty without one.
+        spread: 1 over their standard deviation, (inputs).
+    """
+
+    values: np.ndarray
+    scaled: np.ndarray
+    spread: np.ndarray
+
+
+def train_autoencoder(
+    vectors: Float32[np.ndarray, "B C"], settings: AutoencoderSettings, seed: int
+) -> Autoencoder:
+    """Train on one scene's vectors: Adam with cosine decay, full batches drawn without replacement.
+
+    Args:
+        vectors: unit CLIP vectors, at least one.
+        settings: latent size, steps and weights.
+        seed: for the initial weights and the order of vectors.
+
+    Returns:
+        the trained model; the same bytes for the same input and seed on any number of threads of the stage
+        (the command line gives BLAS one).
+    """
+    rng = np.random.default_rng(seed)
+    channels, latent = vectors.shape[1], settings.latent
+    data = np.ascontiguousarray(vectors)
+    if len(data) == 1:
+        data = np.repeat(data, 2, axis=0)  # BatchNorm needs two rows
+    batch = min(settings.batch, len(data))
+    per_epoch = len(data) // batch
+    steps = max(settings.epochs * per_epoch, settings.min_steps)
+    drawn = Autoencoder.drawn(channels, latent, seed).arrays
+    drawn = {name: values for name, values in drawn.items() if "running" not in name}
+    flat = np.zeros((4, sum(values.size for values in drawn.values())), np.float32)
+    flat[0] = np.concatenate([values.reshape(-1) for values in drawn.values()])
+    parameters, gradients = (_as_arrays(row, drawn) for row in flat[:2])
+    for step in range(steps):
+        place = step % per_epoch
+        if place == 0:
+            order = rng.permutation(len(data))
+        chosen = data[order[place * batch : (place + 1) * batch]]
+        loss_gradients(parameters, chosen, latent, settings.cosine_weight, gradients)
+        rate = settings.learning_rate * (1 + math.cos(math.pi * step / steps)) / 2
+        _adam(
+            *flat,
+            np.float32(rate / (1 - BETA1 ** (step + 1))),
+            np.float32(1 / math.sqrt(1 - BETA2 ** (step + 1))),
+        )
+    return Autoencoder(channels, latent, parameters | statistics(parameters, data, latent))
+
+
+def _as_arrays(flat: Float32[np.ndarray, " P"], like: Arrays) -> Arrays:
+    """Arrays of the same names and shapes, one after another in the memory of `flat`."""
+    parts = np.split(flat, np.cumsum([values.size for values in like.values()])[:-1])
+    return {name: part.reshape(like[name].shape) for name, part in zip(like, parts, strict=True)}
+
+
+def loss_gradients(
+    parameters: Arrays,
+    vectors: Float32[np.ndarray, "B C"],
+    latent: int,
+    cosine_weight: float,
+    gradients: Arrays,
+) -> None:
+    """Gradients of the mean squared error plus `cosine_weight` times the mean over vectors of 1 - cosine.
+
+    Both ends have unit length, so the squared error of a vector is 2 (1 - cosine), over C channels.
+
+    Departs: LangSplat takes the cosine along the batch axis, which compares channels, not vectors.
+
+    Args:
+        parameters: of the network, by name.
+        vectors: a batch of unit vectors.
+        latent: size d of a latent.
+        cosine_weight: see above.
+        gradients: written, under the same names.
+    """
+    channels = vectors.shape[1]
+    encoder, decoder = layers_of(channels, latent)
+    codes, to_codes = _there(parameters, encoder, vectors)
+    latents = unit(codes)
+    outputs, to_outputs = _there(parameters, decoder, latents)
+    slope = -vectors * np.float32((2 / channels + cosine_weight) / len(vectors))
+    slope = _back(parameters, decoder, to_outputs, _slope_before_unit(outputs, slope), gradients)
+    _back(parameters, encoder, to_codes, _slope_before_unit(codes, slope), gradients)
+
+
+def statistics(parameters: Arrays, data: Float32[np.ndarray, "B C"], latent: int) -> Arrays:
+    """Mean and (unbiased) variance of all vectors at each BatchNorm, which takes them from then on."""
+    found: Arrays = {}
+    encoder, _ = layers_of(data.shape[1], latent)
+    values = data
+    for layer, after in pairwise(encoder):
+        values = _there(parameters, [layer], values)[0]
+        found[f"{after.norm}.running_mean"] = values.mean(axis=0)
+        found[f"{after.norm}.running_var"] = values.var(axis=0, ddof=1)
+    return found
+
+
+def _there(parameters: Arrays, layers: list[Layer], values: np.ndarray) -> tuple[np.ndarray, list[Passed]]:
+    """What layers make of a batch, with the batch's own statistics, and what the way back needs."""
+    passed = []
+    for layer in layers:
+        scaled, spread = values[:0], values[:0, 0]
+        if layer.norm:
+            norm = parameters[f"{layer.norm}.weight"], parameters[f"{layer.norm}.bias"]
+            scaled, spread, values = _normalised(values, *norm)
+        elif layer.relu:
+            values = np.maximum(values, 0)
+        passed.append(Passed(values, scaled, spread))
+        values = values @ parameters[f"{layer.name}.weight"].T
+        values += parameters[f"{layer.name}.bias"]
+    return values, passed
+
+
+def _back(
+    parameters: Arrays, layers: list[Layer], passed: list[Passed], slope: np.ndarray, gradients: Arrays
+) -> np.ndarray:
+    """Gradients of the layers' parameters from that of their outputs; returns that of their inputs."""
+    for layer, (values, scaled, spread) in zip(layers[::-1], passed[::-1], strict=True):
+        np.matmul(slope.T, values, out=gradients[f"{layer.name}.weight"])
+        np.sum(slope, axis=0, out=gradients[f"{layer.name}.bias"])
+        slope = slope @ parameters[f"{layer.name}.weight"]
+        if layer.relu:
+            slope *= values > 0
+        if layer.norm:
+            names = f"{layer.norm}.weight", f"{layer.norm}.bias"
+            of_norm = (gradients[name] for name in names)
+            _normalised_back(slope, scaled, spread, parameters[names[0]], *of_norm)
+    return slope
+
+
+def _slope_before_unit(values: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Gradient of vectors from that of `unit` of them: what points along them does nothing."""
+    length = np.sqrt(np.square(values).sum(axis=1, keepdims=True))
+    units = values / length
+    return (slope - units * (units * slope).sum(axis=1, keepdims=True)) / length
+
+
+@compiled(error_model="numpy")
+@no_type_check  # the shape checks of the test-suite cannot be compiled
+def _normalised(values, weight, bias):
+    """BatchNorm with the batch's own statistics, then ReLU: scaled inputs, 1 / deviation, outputs."""
+    rows, columns = values.shape
+    mean, var = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
+    scaled, out = np.empty_like(values), np.empty_like(values)
+    share = np.float32(1.0 / rows)
+    for row in range(rows):
+        for c in range(columns):
+            mean[c] += share * values[row, c]
+    for row in range(rows):
+        for c in range(columns):
+            var[c] += share * (values[row, c] - mean[c]) ** 2
+    spread = np.float32(1.0) / np.sqrt(var + np.float32(NORM_EPS))
+    for row in range(rows):
+        for c in range(columns):
+            scaled[row, c] = (values[row, c] - mean[c]) * spread[c]
+            out[row, c] = max(scaled[row, c] * weight[c] + bias[c], np.float32(0.0))
+    return scaled, spread, out
+
+
+@compiled(error_model="numpy")
+@no_type_check  # the shape checks of the test-suite cannot be compiled
+def _normalised_back(slope, scaled, spread, weight, of_weight, of_bias):
+    """`slope` of a BatchNorm's outputs becomes that of its inputs; writes those of weight and bias."""
+    rows, columns = slope.shape
+    of_weight[:] = 0
+    of_bias[:] = 0
+    for row in range(rows):
+        for c in range(columns):
+            of_weight[c] += slope[row, c] * scaled[row, c]
+            of_bias[c] += slope[row, c]
+    share = np.float32(1.0 / rows)
+    for row in range(rows):
+        for c in range(columns):
+            common = share * (of_bias[c] + scaled[row, c] * of_weight[c])
+            slope[row, c] = weight[c] * spread[c] * (slope[row, c] - common)
+
+
+@compiled(error_model="numpy")
+@no_type_check  # the shape checks of the test-suite cannot be compiled
+def _adam(values, gradient, first, second, rate, scale):
+    """One step in place; `rate` is over 1 - beta1^t, `scale` is 1 / sqrt(1 - beta2^t)."""
+    for k in range(len(values)):
+        g = gradient[k]
+        first[k] = np.float32(BETA1) * first[k] + np.float32(1 - BETA1) * g
+        second[k] = np.float32(BETA2) * second[k] + np.float32(1 - BETA2) * g * g
+        values[k] -= rate * first[k] / (np.sqrt(second[k]) * scale + np.float32(ADAM_EPS))
