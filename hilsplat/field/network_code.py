@@ -106,8 +106,8 @@ class Autoencoder:
 
     @staticmethod
     def drawn(channels: int, latent: int, seed: int) -> "Autoencoder":
-        """The weights that torch draws after `torch.manual_seed(seed)`, bit by bit; BatchNorm has no effect."""
-        twister = np.random.RandomState(seed % 2**32)  # noqa: NPY002 - torch seeds the same generator in the same way
+        """The weights that torch draws after `manual_seed(seed)`, bit for bit; BatchNorm has no effect."""
+        twister = np.random.RandomState(seed % 2**32)  # torch seeds the same generator in the same way
         arrays: dict[str, np.ndarray] = {}
         for layer in (layer for side in layers_of(channels, latent) for layer in side):
             if layer.norm:
