@@ -81,7 +81,7 @@ _SPAN = np.float32(3.0)
 
 @compiled(inline="always")
 @no_type_check
-def _start_tile(tile, tiles_x, height, width, transmittance):
+def start_tile(tile, tiles_x, height, width, transmittance):
     """Full transmittance in the pixels inside the image; returns the tile's corner."""
     x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
     right, bottom = lanes(np.float32(width - x0)), lanes(np.float32(height - y0))
@@ -93,7 +93,7 @@ def _start_tile(tile, tiles_x, height, width, transmittance):
 
 @compiled(inline="always")
 @no_type_check
-def _alive(transmittance):
+def unfinished(transmittance):
     """Bits of the blocks that are unfinished."""
     bits = 0
     for block in range(BLOCKS):
@@ -132,7 +132,7 @@ def _reach(mean_x, mean_y, a, b, c, top):
 
 @compiled(inline="always")
 @no_type_check
-def _gather(first, count, x0, y0, gaussian, geometry, records, reach):
+def gather(first, count, x0, y0, gaussian, geometry, records, reach):
     """Copy the Gaussians of entries first..first + count of the band, and the blocks that they reach."""
     for k in range(count):
         i = gaussian[first + k]
@@ -168,7 +168,7 @@ def _shine(exponent, light):
 
 @compiled(inline="always")
 @no_type_check
-def _list_block(block, count, reach, entries):
+def list_block(block, count, reach, entries):
     """Which Gaussians of a chunk reach a block, front to back; returns how many."""
     size = 0
     for k in range(count):  # without a branch, which the processor could not foresee
@@ -179,7 +179,7 @@ def _list_block(block, count, reach, entries):
 
 @compiled(inline="always")
 @no_type_check
-def _weigh(block, size, records, entries, shades, width, transmittance, weights):
+def weigh(block, size, records, entries, shades, width, transmittance, weights):
     """Weights of a block's Gaussians, front to back, and its transmittance behind them.
 
     Args:
@@ -232,14 +232,14 @@ def blend(begin, end, base, tiles_x, tile_start, gaussian, geometry, colours, im
     shades[::per_gaussian] = 1.0
     entries, weights = np.empty(CHUNK, np.int64), np.empty(CHUNK * LANES, np.float32)
     for tile in range(begin, end):
-        x0, y0 = _start_tile(tile, tiles_x, height, width, transmittance)
+        x0, y0 = start_tile(tile, tiles_x, height, width, transmittance)
         sums[:] = 0.0
         for chunk in range(tile_start[tile], tile_start[tile + 1], CHUNK):
-            alive = _alive(transmittance)
+            alive = unfinished(transmittance)
             if alive == 0:
                 break
             count = min(tile_start[tile + 1] - chunk, CHUNK)
-            _gather(chunk - base, count, x0, y0, gaussian, geometry, records, reach)
+            gather(chunk - base, count, x0, y0, gaussian, geometry, records, reach)
             for k in range(count):
                 i = gaussian[chunk - base + k]
                 for channel in range(channels):
@@ -247,8 +247,8 @@ def blend(begin, end, base, tiles_x, tile_start, gaussian, geometry, colours, im
             for block in range(BLOCKS):
                 if not (alive >> block) & 1:
                     continue
-                size = _list_block(block, count, reach, entries)
-                done, one, two, three, four = _weigh(
+                size = list_block(block, count, reach, entries)
+                done, one, two, three, four = weigh(
                     block, size, records, entries, shades, per_gaussian, transmittance, weights
                 )
                 _add_group(sums, block * stride, one, two, three, four)
@@ -328,19 +328,19 @@ def blend_backward(
     flat_slots, columns = slots.reshape(-1), slots.shape[1]
     zero = lanes(_ZERO)
     for tile in range(begin, end):
-        x0, y0 = _start_tile(tile, tiles_x, height, width, transmittance)
+        x0, y0 = start_tile(tile, tiles_x, height, width, transmittance)
         _load_gradients(x0, y0, stride, image, alpha, grad_image, grad_alpha, grads, to_come)
-        alive = _alive(transmittance)
+        alive = unfinished(transmittance)
         for chunk in range(tile_start[tile], tile_start[tile + 1], CHUNK):
             count = min(tile_start[tile + 1] - chunk, CHUNK)
             if alive == 0:
                 slots[chunk - base : chunk - base + count, :] = 0.0
                 continue
-            _gather(chunk - base, count, x0, y0, gaussian, geometry, records, reach)
+            gather(chunk - base, count, x0, y0, gaussian, geometry, records, reach)
             for k in range(count):
                 slot = chunk - base + k
                 if k % CHECK_EVERY == 0:
-                    alive = _alive(transmittance)
+                    alive = unfinished(transmittance)
                 bits = reach[k] & alive
                 if bits == 0:
                     for column in range(columns):
@@ -405,60 +405,3 @@ def add_slots(begin, end, gaussian, slots, sums):
         if begin <= i < end:
             for k in range(slots.shape[1]):
                 sums[i, k] += slots[entry, k]
-
-
-@compiled
-@no_type_check
-def blend_weights(
-    begin, end, base, tiles_x, size_hw, tile_start, gaussian, geometry, least, cursor, columns, weights
-):
-    """Weights of tiles as sparse rows, one row per pixel (row-major).
-
-    Called twice. With empty `columns` it counts: cursor[pixel] grows by one per weight >= least.
-    Then, with cursor at the beginning of each row, it fills columns and weights front to back.
-    """
-    height, width = size_hw
-    count_only = len(columns) == 0
-    transmittance = np.empty(PIXELS, np.float32)
-    records, reach = np.empty(CHUNK * RECORD, np.float32), np.empty(CHUNK, np.int64)
-    entries = np.empty(CHUNK, np.int64)
-    by_lane = np.empty(CHUNK * LANES, np.float32)
-    for tile in range(begin, end):
-        x0, y0 = _start_tile(tile, tiles_x, height, width, transmittance)
-        for chunk in range(tile_start[tile], tile_start[tile + 1], CHUNK):
-            alive = _alive(transmittance)
-            if alive == 0:
-                break
-            count = min(tile_start[tile + 1] - chunk, CHUNK)
-            _gather(chunk - base, count, x0, y0, gaussian, geometry, records, reach)
-            for block in range(BLOCKS):
-                size = _list_block(block, count, reach, entries)
-                done = _weigh(block, size, records, entries, records, 0, transmittance, by_lane)[0]
-                for lane in range(LANES if done else 0):
-                    x = x0 + (block & 3) * 4 + (lane & 3)
-                    y = y0 + (block >> 2) * 4 + (lane >> 2)
-                    if x >= width or y >= height:
-                        continue
-                    at = cursor[y * width + x]
-                    for n in range(done):
-                        weight = by_lane[n * LANES + lane]
-                        if weight > _ZERO and weight >= least:
-                            if not count_only:
-                                columns[at] = gaussian[chunk - base + entries[n]]
-                                weights[at] = weight
-                            at += 1
-                    cursor[y * width + x] = at
-
-
-@compiled
-@no_type_check
-def sort_rows(begin, end, row_start, columns, weights):
-    """Sort the entries of sparse rows begin..end by column (insertion sort; rows are short)."""
-    for row in range(begin, end):
-        for k in range(row_start[row] + 1, row_start[row + 1]):
-            column, weight = columns[k], weights[k]
-            at = k
-            while at > row_start[row] and columns[at - 1] > column:
-                columns[at], weights[at] = columns[at - 1], weights[at - 1]
-                at -= 1
-            columns[at], weights[at] = column, weight

@@ -18,8 +18,9 @@ from hilsplat.base.errors import HilsplatError
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise.binning import Tiles, bin_gaussians, fill_lists
-from hilsplat.splat.rasterise.blend import add_slots, blend, blend_backward, blend_weights, sort_rows
+from hilsplat.splat.rasterise.blend import add_slots, blend, blend_backward
 from hilsplat.splat.rasterise.project import GEOMETRY, MOMENTS, pack_camera, project, project_backward
+from hilsplat.splat.rasterise.weights import count_weights, write_weights
 
 RANGES_PER_THREAD = 4
 """Ranges of work per thread, so that threads finish together."""
@@ -254,19 +255,16 @@ def sparse_weights(
     Rows are row-major pixels; columns ascend within a row. Row starts are int64.
     """
     t = view.tiles
-    pixels = view.size_hw[0] * view.size_hw[1]
-    count = np.zeros(pixels, np.int64)
+    counts = np.zeros(view.size_hw[0] * view.size_hw[1], np.int64)
 
-    def walk(cursor: np.ndarray, columns: np.ndarray, weights: np.ndarray) -> None:
-        rows = (np.float32(min_weight), cursor, columns, weights)
+    def over_bands(work: Callable[..., Any], *arguments: Any) -> None:
         for band in tile_lists(view, threads):
             lists = (band.base, t.tiles_x, view.size_hw, t.tile_start, band.gaussian, view.geometry)
-            band.over_tiles(blend_weights, threads, *lists, *rows)
+            band.over_tiles(work, threads, *lists, np.float32(min_weight), *arguments)
 
-    walk(count, np.empty(0, np.int32), np.empty(0, np.float32))
-    row_start = np.concatenate([[0], np.cumsum(count)])
+    over_bands(count_weights, counts)
+    row_start = np.concatenate([[0], np.cumsum(counts)])
     columns, weights = np.empty(row_start[-1], np.int32), np.empty(row_start[-1], np.float32)
     if len(columns):
-        walk(row_start[:-1].copy(), columns, weights)
-        over_ranges(sort_rows, pixels, threads, row_start, columns, weights)
+        over_bands(write_weights, int(counts.max()), row_start, columns, weights)
     return row_start, columns, weights
