@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -11,7 +12,7 @@ import safetensors.numpy
 from jaxtyping import Float32
 
 from hilsplat.base.artifacts import atomic_path
-from hilsplat.field.code import CHUNK_ROWS
+from hilsplat.field.decoder_kernel import PackedLayers
 from hilsplat.field.linear_code import METADATA_KEY
 
 ENCODER_WIDTHS = (256, 128, 64, 32)
@@ -79,30 +80,27 @@ class Autoencoder:
 
     def encode_array(self, vectors: Float32[np.ndarray, "B C"]) -> Float32[np.ndarray, "B D"]:
         """Latents of unit length."""
-        return self._through(self._encoder, vectors)
+        values = vectors
+        for layer in self._encoder:
+            weight, bias = self._affine(layer.name)
+            if layer.norm:
+                scale, shift = self._affine(layer.norm)
+                mean, var = (self.arrays[f"{layer.norm}.running_{name}"] for name in ("mean", "var"))
+                factor = scale / np.sqrt(var + np.float32(NORM_EPS))
+                values = np.maximum(values * factor + (shift - mean * factor), 0)
+            values = values @ weight.T + bias
+        return unit(values)
 
     def decode_array(self, latents: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:
         """Vectors of unit length, from latents of any length."""
-        return self._through(self._decoder, latents)
+        return self._packed_decoder.through(latents)
 
-    def _through(self, layers: list[Layer], values: np.ndarray) -> np.ndarray:
-        out = np.empty((len(values), layers[-1].outputs), np.float32)
-        for start in range(0, len(values), CHUNK_ROWS):
-            part = values[start : start + CHUNK_ROWS]
-            for layer in layers:
-                if layer.norm:
-                    weight, bias, mean, var = (
-                        self.arrays[f"{layer.norm}.{name}"]
-                        for name in ("weight", "bias", "running_mean", "running_var")
-                    )
-                    factor = weight / np.sqrt(var + np.float32(NORM_EPS))
-                    part = part * factor + (bias - mean * factor)
-                if layer.relu:
-                    np.maximum(part, 0, out=part)
-                part = part @ self.arrays[f"{layer.name}.weight"].T
-                part += self.arrays[f"{layer.name}.bias"]
-            out[start : start + len(part)] = unit(part)
-        return out
+    def _affine(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        return self.arrays[f"{name}.weight"], self.arrays[f"{name}.bias"]
+
+    @cached_property
+    def _packed_decoder(self) -> PackedLayers:
+        return PackedLayers.of([self._affine(layer.name) for layer in self._decoder])
 
     @staticmethod
     def drawn(channels: int, latent: int, seed: int) -> "Autoencoder":

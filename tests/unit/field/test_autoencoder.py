@@ -12,6 +12,7 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.autoencoder import mask_targets, run_autoencoder
 from hilsplat.field.code import autoencoder_file, load_code, load_latents
+from hilsplat.field.decoder_kernel import PackedLayers
 from hilsplat.field.network_code import Autoencoder
 from hilsplat.field.network_training import loss_gradients, statistics, train_autoencoder
 from hilsplat.semantic_tree.tree import SemanticTree, run_semantic_tree
@@ -111,6 +112,23 @@ def test_a_trained_network_answers_as_torch_does_with_the_statistics_of_all_vect
     with torch.no_grad():
         expected = reference.eval()(given).numpy()
     assert model.decode_array(model.encode_array(vectors)) == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize(("rows", "widths"), [(1, (3, 1)), (130, (2, 5, 16, 7)), (64, (16, 64))])
+def test_the_compiled_layers_are_products_with_relu_between_them(rows, widths):
+    random = np.random.default_rng(0)
+    layers = [
+        (random.normal(size=(out, into)).astype(np.float32), random.normal(size=out).astype(np.float32))
+        for into, out in pairwise(widths)
+    ]
+    values = given = random.normal(size=(rows, widths[0])).astype(np.float32)
+    for weight, bias in layers:
+        before = values @ weight.T.astype(np.float64) + bias
+        values = np.maximum(before, 0)
+    expected = before / np.linalg.norm(before, axis=1, keepdims=True)
+    packed = PackedLayers.of(layers)
+    assert packed.through(given) == pytest.approx(expected, abs=2e-6)
+    assert np.array_equal(packed.through(given)[rows // 2 :], packed.through(given[rows // 2 :]))
 
 
 def test_weights_that_are_missing_are_told(tmp_path):
