@@ -5,10 +5,11 @@ Source: minghanqin/LangSplat `eval/evaluate_iou_loc.py`; every departure is a fi
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from hilsplat.base.levels import LEVELS, Level
 
@@ -118,18 +119,27 @@ def majority_smooth(mask: Bool[np.ndarray, "H W"], border: Border = "langsplat")
     code slices it: the last row and column are never looked at, so the filter is not symmetric near
     the lower and right edges. `inside`: the part of the window that lies in the image.
     """
-    import cv2
+    seen, count = _majority_windows(mask.shape, border)
+    return 2 * _ones_in_windows(mask.view(np.uint8) & seen) > count
 
-    seen = np.ones(mask.shape, np.uint8)
+
+@cache
+def _majority_windows(
+    shape: tuple[int, int], border: Border
+) -> tuple[UInt8[np.ndarray, "H W"], UInt8[np.ndarray, "H W"]]:
+    """Pixels that are looked at, and how many of them each window has."""
+    seen = np.ones(shape, np.uint8)
     if border == "langsplat":
         seen[-1, :] = seen[:, -1] = 0
+    return seen, _ones_in_windows(seen)
+
+
+def _ones_in_windows(ones: UInt8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
+    """How many of the at most 49 pixels of a majority window are 1."""
+    import cv2
+
     side_hw = (2 * MAJORITY_REACH_PX + 1,) * 2
-    # At most 49 ones in a window, so that 8 bits hold every sum.
-    ones, count = (
-        cv2.boxFilter(each, cv2.CV_8U, side_hw, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        for each in ((mask & (seen > 0)).view(np.uint8), seen)
-    )
-    return 2 * ones > count
+    return cv2.boxFilter(ones, cv2.CV_8U, side_hw, normalize=False, borderType=cv2.BORDER_CONSTANT)
 
 
 @dataclass(frozen=True)
