@@ -28,6 +28,9 @@ CHUNK_WEIGHTS = 2**25
 MAX_WEIGHTS = 2**28
 """W of all views is held in memory up to this many non-zeros, 2 GiB."""
 
+CLEARLY_MORE = 2
+"""W is dropped once it has this many times the non-zeros of G: more views add to W as before, less to G."""
+
 CHECKPOINT_SECONDS = 300.0
 """Time between checkpoints of a long pass; short passes write none."""
 
@@ -123,11 +126,57 @@ def _empty_block(rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.zeros(rows + 1, np.int64), np.zeros(0, np.int32), np.zeros((0, len(LEVELS)))
 
 
+class _Waiting:
+    """Parts of W, one below the other, in memory that is used again: fresh memory takes longer to fill."""
+
+    def __init__(self, num_gaussians: int) -> None:
+        self._num_gaussians = num_gaussians
+        self._indices, self._data = np.empty(0, np.int32), np.empty(0, np.float32)
+        self._clear()
+
+    def _clear(self) -> None:
+        self.nonzeros = 0
+        self._indptr = [np.zeros(1, np.int64)]
+        self._valid = [np.zeros((0, len(LEVELS)), np.bool_)]
+
+    def append(self, part: StackedWeights) -> None:
+        """Copy a part below the others."""
+        before, after = self.nonzeros, self.nonzeros + part.nonzeros
+        if after > len(self._data):
+            room = max(after, CHUNK_WEIGHTS * 9 // 8)
+            self._indices, self._data = (_enlarged(old, before, room) for old in (self._indices, self._data))
+        self._indices[before:after] = part.weights.indices
+        self._data[before:after] = part.weights.data
+        self._indptr.append(part.weights.indptr[1:].astype(np.int64) + before)
+        self._valid.append(part.valid)
+        self.nonzeros = after
+
+    def held(self) -> StackedWeights:
+        """All that waits, until something is appended."""
+        indptr = np.concatenate(self._indptr)
+        arrays = (self._data[: self.nonzeros], self._indices[: self.nonzeros], indptr)
+        matrix = sp.csr_matrix(arrays, shape=(len(indptr) - 1, self._num_gaussians), copy=False)
+        return StackedWeights(matrix, np.concatenate(self._valid))
+
+    def take(self) -> StackedWeights:
+        """The same; then nothing waits any more."""
+        held = self.held()
+        self._clear()
+        return held
+
+
+def _enlarged(array: np.ndarray, kept: int, room: int) -> np.ndarray:
+    """Room for more entries, with the first `kept` of an array."""
+    larger = np.empty(room, array.dtype)
+    larger[:kept] = array[:kept]
+    return larger
+
+
 class QuadraticBuilder:
     """Collects W part by part and keeps whichever of G and W has fewer non-zeros.
 
     A product reads each non-zero of either equally often. W is dropped, and G kept, as soon as W has more
-    than `MAX_WEIGHTS` non-zeros.
+    than `MAX_WEIGHTS` non-zeros, or `CLEARLY_MORE` times those of G so far.
 
     Args:
         num_gaussians: N.
@@ -141,34 +190,35 @@ class QuadraticBuilder:
         self._keeps_weights = keep != "gram"
         self._may_drop = keep == "auto"
         self._parts: list[StackedWeights] = []
-        self._waiting: list[StackedWeights] = []
+        self._waiting = _Waiting(num_gaussians)
         self.weights_nonzeros = 0
 
     def add(self, part: StackedWeights) -> None:
         """Add the labelled pixels of a view."""
         self.weights_nonzeros += part.nonzeros
-        if self._may_drop and self.weights_nonzeros > MAX_WEIGHTS:
-            self._parts, self._keeps_weights = [], False
         if self._keeps_weights:
             self._parts.append(part)
+        most = MAX_WEIGHTS
         if self._gram is not None:
             self._waiting.append(part)
-            if sum(each.nonzeros for each in self._waiting) >= CHUNK_WEIGHTS:
-                self._gram.add(stack_weights(self._waiting))
-                self._waiting = []
+            if self._waiting.nonzeros >= CHUNK_WEIGHTS:
+                self._gram.add(self._waiting.take())
+                most = min(most, CLEARLY_MORE * self._gram.nonzeros)
+        if self._may_drop and self.weights_nonzeros > most:
+            self._parts, self._keeps_weights = [], False
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything added so far, as arrays."""
         out = {"nonzeros": np.array([self.weights_nonzeros, self._keeps_weights], np.int64)}
         if self._gram is not None:
             out |= {f"gram_{name}": array for name, array in self._gram.state().items()}
-        for name, parts in (("parts", self._parts), ("waiting", self._waiting)):
-            if parts:
-                stacked = stack_weights(parts)
-                out |= {f"{name}_valid": stacked.valid}
-                out |= {
-                    f"{name}_{what}": getattr(stacked.weights, what) for what in ("data", "indices", "indptr")
-                }
+        held = {"parts": stack_weights(self._parts)} if self._parts else {}
+        if self._waiting.nonzeros:
+            held["waiting"] = self._waiting.held()
+        for name, stacked in held.items():
+            out[f"{name}_valid"] = stacked.valid
+            for what in ("data", "indices", "indptr"):
+                out[f"{name}_{what}"] = getattr(stacked.weights, what)
         return out
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
@@ -189,9 +239,8 @@ class QuadraticBuilder:
         """G or W of everything added."""
         if self._gram is None:
             return stack_weights(self._parts)
-        if self._waiting:
-            self._gram.add(stack_weights(self._waiting))
-            self._waiting = []
+        if self._waiting.nonzeros:
+            self._gram.add(self._waiting.take())
         if self._keeps_weights and self.weights_nonzeros < self._gram.nonzeros:
             return stack_weights(self._parts)
         return self._gram.finish()
