@@ -27,13 +27,10 @@ from jaxtyping import Float32, Int32, Int64
 from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
+from hilsplat.methods.common.descent import Adam
 from hilsplat.methods.common.quads import WIDTH, load, plus, signs_of_difference, store, zeros
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.settings import MethodSettings
-
-BETAS = (0.9, 0.999)
-EPS = 1e-15
-"""As in the published optimiser."""
 
 
 @dataclass(frozen=True)
@@ -124,22 +121,21 @@ def train_level(
     """
     channels = views[0].latents.shape[1]
     wide = channels + -channels % WIDTH
-    features, gradient, first, second = np.zeros((4, num_gaussians * wide), np.float32)
+    features, gradient = np.zeros((2, num_gaussians * wide), np.float32)
     codes = {id(view): np.pad(view.latents, ((0, 0), (0, wide - channels))).reshape(-1) for view in views}
-    queue = ViewQueue(views, seed)
-    for step in range(1, settings.steps + 1):
+    queue, adam = ViewQueue(views, seed), Adam(features, settings.rate)
+    for _ in range(settings.steps):
         view = queue.next()
         weights, labels = view.weights, view.labels[:, level.index]
         rows = weights.indptr, weights.indices, weights.data
         l1_gradient(*rows, labels, codes[id(view)], channels, wide, features, gradient)
-        unbiased = (np.float32(1 - beta**step) for beta in BETAS)
-        adam_step(gradient, first, second, features, np.float32(settings.rate), *unbiased)
+        adam.step(gradient)
     return features.reshape(num_gaussians, wide)[:, :channels].copy()
 
 
 @compiled
 def l1_gradient(indptr, indices, data, labels, codes, channels, wide, features, gradient):
-    """Add the gradient of the mean absolute difference of rendered and painted codes by the features.
+    """Write the gradient of the mean absolute difference of rendered and painted codes by the features.
 
     A row of weights is read once for its sum and, while it is in the fastest cache, once for what it passes
     back. Sums have the order of the products with the matrix and its transpose; there is one thread.
@@ -151,8 +147,9 @@ def l1_gradient(indptr, indices, data, labels, codes, channels, wide, features, 
         channels: of a code; the numbers after them are 0.
         wide: numbers of a Gaussian, a multiple of `WIDTH`.
         features: float32, flat, `wide` numbers a Gaussian.
-        gradient: of the same shape; added to.
+        gradient: of the same shape; written.
     """
+    gradient[:] = 0
     labelled = 0
     for p in range(len(labels)):
         labelled += labels[p] >= 0
@@ -169,18 +166,6 @@ def l1_gradient(indptr, indices, data, labels, codes, channels, wide, features, 
             for k in range(begin, end):
                 there = np.int64(indices[k]) * wide + c
                 store(gradient, there, plus(load(gradient, there), data[k], pull))
-
-
-@compiled(error_model="numpy")
-def adam_step(gradient, first, second, features, rate, unbiased1, unbiased2):
-    """One step of Adam on flat arrays in place; the gradient becomes 0 for the next."""
-    rest1, rest2 = np.float32(1 - BETAS[0]), np.float32(1 - BETAS[1])
-    for k in range(len(features)):
-        g = gradient[k]
-        gradient[k] = 0
-        first[k] += rest1 * (g - first[k])
-        second[k] += rest2 * (g * g - second[k])
-        features[k] -= rate * (first[k] / unbiased1) / (np.sqrt(second[k] / unbiased2) + np.float32(EPS))
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:

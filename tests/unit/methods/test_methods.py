@@ -13,7 +13,14 @@ import scipy.sparse as sp
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.methods import langsplat, lifted, registry, stage
-from hilsplat.methods.langsplat import LevelPixels, ViewPixels, ViewQueue, grid_pixels, train_level
+from hilsplat.methods.common.descent import Adam
+from hilsplat.methods.langsplat import (
+    LevelPixels,
+    ViewPixels,
+    ViewQueue,
+    grid_pixels,
+    train_level,
+)
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.methods.registry import METHODS, OURS, method_of, require_method
 from hilsplat.settings import MethodSettings
@@ -66,6 +73,28 @@ def test_l1_gradient_matches_finite_differences():
         assert gradient[place] == pytest.approx(slope, abs=2e-3)
 
 
+def adam_in_numpy(values, gradients, rate):
+    """Adam in place, a step for each gradient, which may be computed from the values of that step."""
+    first, second = np.zeros_like(values), np.zeros_like(values)
+    for step, gradient in enumerate(gradients, 1):
+        first += (1 - 0.9) * (gradient - first)
+        second += (1 - 0.999) * (gradient * gradient - second)
+        mean, spread = first / (1 - 0.9**step), second / (1 - 0.999**step)
+        values -= rate * mean / (np.sqrt(spread) + 1e-15)
+
+
+def test_adam_has_the_bytes_of_its_formula_in_numpy():
+    rng = np.random.default_rng(6)
+    gradients = rng.normal(size=(40, 7, 3)).astype(np.float32)
+    gradients[:, 0] = 0
+    expected, found = np.ones((2, 7, 3), np.float32)
+    adam_in_numpy(expected, gradients, 0.01)
+    adam = Adam(found, 0.01)
+    for gradient in gradients:
+        adam.step(gradient)
+    assert np.array_equal(found, expected) and (found[0] == 1).all() and (found[1:] != 1).all()
+
+
 @pytest.mark.parametrize("channels", [1, 3, 4, 6])
 def test_training_has_the_bytes_of_products_with_the_matrix_and_of_adam_in_numpy(channels):
     rng = np.random.default_rng(channels)
@@ -75,15 +104,9 @@ def test_training_has_the_bytes_of_products_with_the_matrix_and_of_adam_in_numpy
         labels = rng.integers(-1, 5, (40, 3)).astype(np.int32)
         views.append(ViewPixels(weights, labels, rng.normal(size=(5, channels)).astype(np.float32)))
     settings = MethodSettings(name="langsplat", steps=50)
-    features = np.zeros((9, channels), np.float32)
-    first, second = np.zeros_like(features), np.zeros_like(features)
-    queue = ViewQueue(views, 4)
-    for step in range(1, settings.steps + 1):
-        _, gradient = l1_step(features, queue.next().at(Level.PART))
-        first += (1 - 0.9) * (gradient - first)
-        second += (1 - 0.999) * (gradient * gradient - second)
-        mean, spread = first / (1 - 0.9**step), second / (1 - 0.999**step)
-        features -= settings.rate * mean / (np.sqrt(spread) + 1e-15)
+    features, queue = np.zeros((9, channels), np.float32), ViewQueue(views, 4)
+    steps = range(settings.steps)
+    adam_in_numpy(features, (l1_step(features, queue.next().at(Level.PART))[1] for _ in steps), settings.rate)
     assert np.array_equal(train_level(views, Level.PART, 9, settings, seed=4), features)
 
 
