@@ -124,12 +124,11 @@ def train_features(
     features = alike(num_gaussians, sum(SLICES), seed)
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
-        view = view.chosen(np.arange(min(len(view), PIXELS)))
         weights, seen = of_seen(view.weights)
         rendered = product(weights, unit_slices(features[seen]))
         return nested_loss(rendered, masks_of_pixels(view.labels), random)
 
-    train(views, [{"params": [features], "lr": settings.rate}], loss, settings, seed)
+    train(views, [{"params": [features], "lr": settings.rate}], loss, settings, seed, PIXELS)
     return unit_slices(features.detach()).numpy()
 
 

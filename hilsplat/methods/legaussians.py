@@ -116,7 +116,6 @@ def entries_of_gaussians(
     places = torch.from_numpy(((means - means.mean(axis=0)) / spread).astype(np.float32))
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
-        view = view.chosen(np.arange(min(len(view), PIXELS)))
         weights, seen = of_seen(view.weights)
         rendered = product(weights, codes[seen]).reshape(-1, levels, CHANNELS)
         uncertainty = product(weights, doubt[seen].sigmoid())
@@ -141,7 +140,7 @@ def entries_of_gaussians(
         {"params": networks, "lr": NETWORK_RATE * settings.rate},
         {"params": [doubt], "lr": UNCERTAINTY_RATE},
     ]
-    train(views, groups, loss, settings, seed)
+    train(views, groups, loss, settings, seed, PIXELS)
     with one_torch_thread(), torch.no_grad():
         own = unit(codes.reshape(num, levels, CHANNELS))
         return torch.stack([decoders[k](own[:, k]).argmax(1) for k in range(levels)], 1).numpy()

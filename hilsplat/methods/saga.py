@@ -171,7 +171,6 @@ def train_features(
         return (share[:, None] * gate[0] + gate[1]).sigmoid()
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
-        view = view.chosen(np.arange(min(len(view), PIXELS)))
         own, has = of_view[view.number], view.labels >= 0
         scale = np.where(has, scales[own][view.labels], 0)
         area = np.where(has, contributions.area_px[own][view.labels], 0).sum(axis=1) / has.sum(axis=1)
@@ -181,7 +180,7 @@ def train_features(
         rendered = product(weights, unit(features[seen]))
         return affinity_loss(rendered, gates(at), same, pixel_weights(area), random)
 
-    train(views, [{"params": [features, gate], "lr": settings.rate}], loss, settings, seed)
+    train(views, [{"params": [features, gate], "lr": settings.rate}], loss, settings, seed, PIXELS)
     with torch.no_grad():
         return unit(product(smooth, unit(features))[None] * gates(asked)[:, None]).numpy()
 

@@ -22,8 +22,7 @@ from hilsplat.methods.method import MethodInputs
 from hilsplat.settings import MethodSettings
 
 PIXELS = 4096
-"""Pixels that a step renders, at most; VCH takes as many, OmniSeg3D 32,768, the others whole views."""
-
+"""Pixels that a step renders, at most; published: VCH as many, OmniSeg3D 32,768, others whole views."""
 
 START_NOISE = 0.1
 """Standard deviation of the first features about their common value."""
@@ -126,16 +125,22 @@ Loss = Callable[[LabelledView, np.random.Generator, float], Tensor]
 
 
 def train(
-    views: list[LabelledView], groups: list[dict[str, Any]], loss: Loss, settings: MethodSettings, seed: int
+    views: list[LabelledView],
+    groups: list[dict[str, Any]],
+    loss: Loss,
+    settings: MethodSettings,
+    seed: int,
+    pixels: int = PIXELS,
 ) -> None:
     """Minimise in place by Adam: each step one view, each view once before any is repeated.
 
     Args:
         views: where pixels are drawn from.
         groups: parameter groups of `torch.optim.Adam`, each with its rate.
-        loss: of up to `PIXELS` random pixels.
+        loss: of some random pixels of a view.
         settings: number of steps.
         seed: for the order of views and the pixels.
+        pixels: of a step, at most.
     """
     random = np.random.default_rng(seed)
     with one_torch_thread():
@@ -145,9 +150,9 @@ def train(
             if not queue:
                 queue = list(random.permutation(len(views)))
             view = views[queue.pop()]
-            pixels = random.permutation(len(view))[:PIXELS]
+            chosen = random.permutation(len(view))[:pixels]
             optimiser.zero_grad()
-            loss(view.chosen(pixels), random, step / settings.steps).backward()
+            loss(view.chosen(chosen), random, step / settings.steps).backward()
             optimiser.step()
 
 

@@ -194,6 +194,22 @@ def test_training_finds_the_mean_of_what_a_gaussian_shows_and_visits_all_views()
     assert {number for number, _ in seen[:3]} == {0, 1, 2} and seen[150][1] == 0.5
 
 
+@pytest.mark.parametrize(("most", "expected"), [(3, 3), (5, 5), (9, 5)])
+def test_a_step_sees_some_pixels_of_a_view_each_once(most, expected):
+    matrix = sp.csr_matrix(np.eye(5, dtype=np.float32))
+    view = LabelledView(0, matrix, np.zeros((5, 3), np.int32), np.stack([np.arange(5)] * 2, axis=1))
+    feature, seen = torch.zeros(5, 1, requires_grad=True), []
+
+    def loss(view, random, done):
+        seen.append(view.xy[:, 0].tolist())
+        return product(view.weights, feature).sum()
+
+    settings = MethodSettings(name="saga", steps=20)
+    train([view], [{"params": [feature], "lr": 0.1}], loss, settings, 0, most)
+    assert {len(set(pixels)) for pixels in seen} == {len(pixels) for pixels in seen} == {expected}
+    assert {pixel for pixels in seen for pixel in pixels} == set(range(5))
+
+
 def test_smoothing_is_the_mean_distance_to_the_mean_of_the_mask():
     # mask 0: distances 1 and 3 from its mean, mask 1: 2; mask 2 has no pixel and does not count
     rendered = torch.tensor([[1.0, 0], [3.0, 0], [0.0, 2]])
