@@ -86,9 +86,7 @@ def identity_of_gaussians(
     means = contributions.means()
     count = min(NEIGHBOURS + 1, len(means))
     neighbours = cKDTree(means).query(means, count)[1].reshape(len(means), count)[:, 1:]
-    of_view = [
-        np.append(identity[contributions.view == number], NONE) for number in range(len(contributions.views))
-    ]
+    of_view = [np.append(identity[rows], NONE) for rows in contributions.rows_of_views()]
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
         wanted = torch.from_numpy(of_view[view.number][view.labels[:, level.index]])

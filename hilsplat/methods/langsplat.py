@@ -100,10 +100,11 @@ class ViewQueue:
 def views_of(inputs: MethodInputs, pixel_step: int) -> list[ViewPixels]:
     """Labelled pixels of every train view, on a grid."""
     contributions, views = inputs.contributions, []
-    for number, view in enumerate(track(list(contributions.views), "weights of views")):
+    rows_of_views = contributions.rows_of_views()
+    for view, rows in zip(track(list(contributions.views), "weights of views"), rows_of_views, strict=True):
         grid = grid_pixels(inputs.view_size_hw(view), pixel_step)
-        own = inputs.latents[contributions.view == number]
-        views.append(ViewPixels.of(inputs.view_weights(view), inputs.view_labels(view), own, grid))
+        weights, labels = inputs.view_weights(view), inputs.view_labels(view)
+        views.append(ViewPixels.of(weights, labels, inputs.latents[rows], grid))
     return views
 
 

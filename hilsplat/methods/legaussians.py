@@ -154,7 +154,7 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
         rows = contributions.rows_of(level)
         codebook, entry[rows] = kmeans(latents[rows], ENTRIES, seed + level.index)
         codebooks.append(codebook)
-    of_view = [np.flatnonzero(contributions.view == number) for number in range(len(contributions.views))]
+    of_view = contributions.rows_of_views()
     views = labelled_views(inputs, settings.pixel_step)
     found = entries_of_gaussians(views, entry, of_view, contributions.means(), settings, seed)
     features = np.stack([codebook[own] for codebook, own in zip(codebooks, found.T, strict=True)], axis=1)

@@ -80,7 +80,7 @@ def instance_features(
     start = np.random.default_rng(seed).random((num, levels, CHANNELS), dtype=np.float32)
     features = torch.from_numpy(start * 2 - 1).requires_grad_()
     A = contributions.matrix("A")
-    rows = [np.flatnonzero(contributions.view == number) for number in range(len(contributions.views))]
+    rows = contributions.rows_of_views()
     means_of = {view.number: A[rows[view.number]] for view in views}
 
     def loss(view: LabelledView, _: np.random.Generator, done: float) -> Tensor:

@@ -164,7 +164,7 @@ def train_features(
     gate = (2 * torch.rand(2, CHANNELS, generator=draw) - 1).requires_grad_()  # slope and offset
     smooth = neighbour_mean(contributions.means())
     quantile = np.linspace(0, 1, len(scales)), np.sort(scales)
-    of_view = [np.flatnonzero(contributions.view == number) for number in range(len(contributions.views))]
+    of_view = contributions.rows_of_views()
 
     def gates(at: Float64[np.ndarray, " s"]) -> Tensor:
         share = torch.from_numpy(np.interp(at, quantile[1], quantile[0]).astype(np.float32))

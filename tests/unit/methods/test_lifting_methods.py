@@ -52,7 +52,7 @@ class OneRowOfPixels(MethodInputs):
         own["contributions"] = types.SimpleNamespace(
             views=views,
             num_gaussians=weights.shape[1],
-            view=np.repeat(np.arange(len(views)), 2),
+            rows_of_views=lambda: list(np.arange(2 * len(views)).reshape(-1, 2)),
             level=level,
             pixels=np.tile(pixels, len(views)),
             rows_of=lambda wanted: np.flatnonzero(level == int(wanted)),

@@ -179,7 +179,9 @@ def test_langsplat_trains_every_level_on_the_pixels_of_the_grid():
     labels = np.array([[0, 2, -1], [1, 2, -1], [0, -1, -1], [1, 2, 1], [1, 1, 1]], np.int32)
     inputs = MethodInputs(*[Path("none")] * 5)
     inputs.__dict__.update(
-        contributions=types.SimpleNamespace(views=("a", "b"), num_gaussians=2, view=np.array([0, 1, 1, 1])),
+        contributions=types.SimpleNamespace(
+            views=("a", "b"), num_gaussians=2, rows_of_views=lambda: [np.array([0]), np.array([1, 2, 3])]
+        ),
         latents=np.array([[9.0], [0.3], [5.0], [0.6]], np.float32),  # view b has the last three
         view_weights=lambda view: weights,
         view_labels=lambda view: labels if view == "b" else np.full((5, 3), -1, np.int32),
