@@ -86,7 +86,7 @@ def together(
     return ((kept[:, None] == kept[None]) & (kept >= 0)[None]).any(axis=2)
 
 
-def pixel_weights(area_px: Float64[np.ndarray, " p"]) -> Float32[np.ndarray, "p p"]:
+def pair_weights(area_px: Float64[np.ndarray, " p"]) -> Float32[np.ndarray, "p p"]:
     """Weight of each pair of pixels, from 1 to 10: pixels of small masks count more."""
     pairs = np.outer(area_px, area_px)
     weight = pairs.max() / np.maximum(pairs, 1e-12)
@@ -178,7 +178,7 @@ def train_features(
         same = np.stack([together(view.labels, scale, each) for each in at])
         weights, seen = of_seen(view.weights @ smooth)
         rendered = product(weights, unit(features[seen]))
-        return affinity_loss(rendered, gates(at), same, pixel_weights(area), random)
+        return affinity_loss(rendered, gates(at), same, pair_weights(area), random)
 
     train(views, [{"params": [features, gate], "lr": settings.rate}], loss, settings, seed, PIXELS)
     with torch.no_grad():
