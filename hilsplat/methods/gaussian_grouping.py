@@ -50,6 +50,7 @@ def mask_identities(contributions: Contributions, level: Level, threads: int) ->
     weights, view = contributions.matrix("S")[rows], contributions.view[rows]
     total = mass.sum(axis=0, dtype=np.float64)
     settings = SemanticTreeSettings()
+    settings = settings.model_copy(update={"min_views": min(settings.min_views, len(mass))})
     return level_nodes(weights, view, mass, visible, importance, total, settings, threads).of_mask
 
 

@@ -54,6 +54,7 @@ HARD_COSINE = 0.5
 RADIUS = (0.3, 0.2, 0.1)
 """Of density clusters of whole, part, subpart."""
 LEAST_MASKS = 5
+"""Within the radius of a dense mask; a scene of fewer views asks for as many as it has views."""
 MOST_DESCRIPTORS = 20
 PIXELS = 2048
 
@@ -133,7 +134,7 @@ def train_features(
 
 
 def objects(
-    features: Float32[np.ndarray, "N C"], prototypes: Float32[np.ndarray, "m C"], radius: float
+    features: Float32[np.ndarray, "N C"], prototypes: Float32[np.ndarray, "m C"], radius: float, least: int
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " m"]]:
     """Object of each Gaussian and of each mask, -1 for none.
 
@@ -141,8 +142,9 @@ def objects(
         features: of the Gaussians, of unit length.
         prototypes: of the masks, of unit length.
         radius: of density clusters of prototypes.
+        least: masks within the radius of a dense one, itself among them.
     """
-    of_mask = density_clusters(prototypes, radius, LEAST_MASKS)
+    of_mask = density_clusters(prototypes, radius, least)
     num = int(of_mask.max(initial=NONE)) + 1
     if not num:
         return np.full(len(features), NONE, np.int64), of_mask
@@ -219,7 +221,7 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     views = labelled_views(inputs, settings.pixel_step)
     features = train_features(views, contributions.num_gaussians, settings, seed)
     A, large = contributions.matrix("A"), large_masks(inputs, contributions)
-    fields = []
+    fields, least = [], min(LEAST_MASKS, len(contributions.views))
     for level in LEVELS:
         rows = contributions.rows_of(level)
         rows = rows[large[rows]]
@@ -227,7 +229,7 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
         own = own / np.maximum(np.linalg.norm(own, axis=1, keepdims=True), 1e-12)
         shown = unit_slices(torch.from_numpy(A[rows] @ features)).numpy()[:, : PREFIX[level.index]]
         prototypes = shown / np.maximum(np.linalg.norm(shown, axis=1, keepdims=True), 1e-12)
-        group, of_mask = objects(own, prototypes, RADIUS[level.index])
+        group, of_mask = objects(own, prototypes, RADIUS[level.index], least)
         latents = object_latents(of_mask, inputs.latents[rows], code, seed)
         fields.append(features_of_groups(group, latents))
     return np.stack(fields, axis=1)

@@ -141,6 +141,8 @@ def level_field(
     rows = contributions.rows_of(level)
     A = contributions.matrix("A")[rows]
     shown = np.flatnonzero(np.bincount(A.indices, A.data, contributions.num_gaussians) > 0)
+    if not len(shown):
+        return np.zeros((contributions.num_gaussians, inputs.latents.shape[1]), np.float32)
     leaf = np.full(contributions.num_gaussians, NONE, np.int64)
     leaf[shown] = instances(features[shown], contributions.means()[shown], codebook, seed)
     num = codebook[0] * codebook[1]

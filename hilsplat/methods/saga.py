@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int32
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from hilsplat.base.levels import LEVELS
+from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.contributions.rows import Contributions
 from hilsplat.methods.common.groups import cluster_field, clusters
 from hilsplat.methods.common.training import (
@@ -145,17 +145,17 @@ def train_features(
     views: list[LabelledView],
     contributions: Contributions,
     scales: Float64[np.ndarray, " M"],
-    asked: Float64[np.ndarray, " 3"],
+    asked: Float64[np.ndarray, " s"],
     settings: MethodSettings,
     seed: int,
-) -> Float32[np.ndarray, "3 N 32"]:
-    """Train features and gate; returns the features gated for each level, of unit length.
+) -> Float32[np.ndarray, "s N 32"]:
+    """Train features and gate; returns the features gated for each scale, of unit length.
 
     Args:
         views: pixels.
         contributions: of the scene.
         scales: of all masks.
-        asked: scale of whole, part, subpart.
+        asked: scales.
         settings: steps and rate.
         seed: for the first features and gate, and all samples.
     """
@@ -189,11 +189,14 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     """Train features, cluster them at the median scale of each level, give clusters the codes of masks."""
     contributions = inputs.contributions
     scales = mask_scales(contributions)
-    medians = [np.median(scales[contributions.rows_of(level)]) for level in LEVELS]
+    found = [level for level in LEVELS if len(contributions.rows_of(level))]
+    medians = [np.median(scales[contributions.rows_of(level)]) for level in found]
     views = labelled_views(inputs, settings.pixel_step)
     gated = train_features(views, contributions, scales, np.array(medians), settings, seed)
-    group = [clusters(own, (COSINE,), seed) for own in gated]
-    return cluster_field(inputs, np.concatenate(group, axis=1))
+    group = np.full((contributions.num_gaussians, len(LEVELS)), NONE, np.int64)
+    for level, own in zip(found, gated, strict=True):
+        group[:, level.index] = clusters(own, (COSINE,), seed)[:, 0]
+    return cluster_field(inputs, group)
 
 
 METHOD = Method(

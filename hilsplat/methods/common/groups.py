@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.base.levels import NONE
+from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.contributions.rows import Contributions
 from hilsplat.methods.common.quantise import kmeans
 from hilsplat.methods.method import MethodInputs
@@ -48,7 +48,7 @@ def group_latents(
         rows: masks that may be chosen.
         latents: code of every mask of the scene.
         min_score: a mask is chosen if its score is above this.
-        min_views: groups with masks in fewer views get none.
+        min_views: groups with masks in fewer views get none; a scene of fewer views asks for all of them.
         closeness: factor of the score for pairs of a mask (place in `rows`) and a group; 1 if missing.
 
     Returns:
@@ -73,7 +73,7 @@ def group_latents(
     counts = np.bincount(of[best], minlength=num_groups)
     sums = np.zeros((num_groups, latents.shape[1]))
     np.add.at(sums, of[best], latents[rows[mask[best]]])
-    found = counts >= max(min_views, 1)
+    found = counts >= max(min(min_views, len(size)), 1)
     means = np.where(found[:, None], sums / np.maximum(counts, 1)[:, None], 0)
     return means.astype(np.float32), found
 
@@ -103,11 +103,16 @@ def clusters(
 
 
 def cluster_field(inputs: MethodInputs, group: Int64[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3 D"]:
-    """Code of its cluster at each level for every Gaussian; masks of all levels compete."""
+    """Code of its cluster at each level for every Gaussian; masks of all levels compete.
+
+    A level without masks gets 0, as from methods that learn each level from its own masks.
+    """
     every = np.arange(len(inputs.contributions))
     features = []
-    for own in group.T:
-        num = int(own.max(initial=-1)) + 1
+    for level, own in zip(LEVELS, group.T, strict=True):
+        if not len(inputs.contributions.rows_of(level)):
+            own = np.full_like(own, NONE)
+        num = int(own.max(initial=NONE)) + 1
         latents, _ = group_latents(
             own,
             num,

@@ -2,7 +2,6 @@
 
 import inspect
 import types
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -11,8 +10,6 @@ import torch
 
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.field.linear_code import LinearCode
 from hilsplat.methods import gaussian_grouping, laga, legaussians, omniseg3d, opengaussian, saga, vch
 from hilsplat.methods.common.groups import (
     clusters,
@@ -22,12 +19,12 @@ from hilsplat.methods.common.groups import (
 )
 from hilsplat.methods.common.training import LabelledView, labelled_views, product, train, unit
 from hilsplat.methods.gaussian_grouping import mask_identities, neighbour_loss
-from hilsplat.methods.method import MethodInputs
 from hilsplat.methods.omniseg3d import hierarchical_loss, patches
 from hilsplat.methods.opengaussian import contrast_loss, instances, smoothing_loss
 from hilsplat.methods.vch import components, neighbouring_pixels, triplets, ultrametric
 from hilsplat.settings import MethodSettings
-from tests.unit.two_boxes_world import HEIGHT, REGIONS, WIDTH, TwoBoxes, region_mask, two_boxes_weights
+from tests.unit.methods.two_boxes_inputs import two_boxes_inputs
+from tests.unit.two_boxes_world import HEIGHT, REGIONS, WIDTH, region_mask
 
 RNG = np.random.default_rng(0)
 FITS = {
@@ -48,33 +45,6 @@ FITS = {
     ),
     "vch": (vch, MethodSettings(name="vch", steps=100, rate=0.05, pixel_step=1, thresholds=(0.8, 0.5, 0.3))),
 }
-
-
-@dataclass(frozen=True)
-class BoxesInputs(MethodInputs):
-    """Inputs of the world with two boxes; codes are the one-hot names of regions."""
-
-    world: TwoBoxes | None = None
-
-    @property
-    def latents(self):
-        views = range(len(self.world.views))
-        names = [row for shift in views for row in range(len(REGIONS)) if row != shift + 3]
-        return np.eye(len(REGIONS), dtype=np.float32)[names]
-
-    def linear_code(self, method):
-        return LinearCode(np.full(len(REGIONS), 0.1, np.float32), np.eye(len(REGIONS), dtype=np.float32))
-
-    def view_weights(self, view):
-        return normalised_weights(two_boxes_weights(self.world.views.index(view)))
-
-    def view_size_hw(self, view):
-        return (HEIGHT, WIDTH)
-
-
-def two_boxes_inputs(world, contributions, threads=1):
-    """Inputs of methods; a mask of the world misses one region per view."""
-    return BoxesInputs(world.scene, world.ply, world.masks, contributions, world.folder, threads, world)
 
 
 def fit_of(name, inputs, settings=None):
@@ -106,7 +76,7 @@ def test_methods_with_thresholds_find_the_hierarchy_from_masks_of_single_views(t
 
 
 def test_laga_finds_the_objects_of_every_level(two_boxes_contributions, monkeypatch):
-    monkeypatch.setattr(laga, "LEAST_MASKS", 3)  # four views show a region, or three
+    monkeypatch.setattr(laga, "LEAST_MASKS", 3)  # some regions have masks in three of the four views
     features = fit_of("laga", two_boxes_inputs(*two_boxes_contributions))
     for row, (name, level, *_) in enumerate(REGIONS):
         assert answered(features, Level(level), row) > 0.8, name
@@ -266,7 +236,10 @@ def test_a_group_takes_the_best_mask_of_each_view():
     far = lambda mask, group: np.where(mask == 0, 0.1, 1.0)  # noqa: E731
     assert associated(contributions, [0, 0, -1], 2, [[1.0], [5.0], [2.0]], closeness=far)[0][0] == 3.5
     assert associated(contributions, [0, 0, -1], 2, [[1.0], [5.0], [2.0]], min_score=0.7)[0][0] == 1.0
-    assert not associated(contributions, [0, 0, -1], 2, [[1.0], [5.0], [2.0]], min_views=3)[1].any()
+    # three views are as good as all of two, but not as two of three
+    three = association(S, np.ones((3, 3)), [0, 0, 1])
+    for scene, expected in ((contributions, [True, False]), (three, [False, False])):
+        assert associated(scene, [0, 0, -1], 2, [[1.0], [5.0], [2.0]], min_views=3)[1].tolist() == expected
 
 
 def test_gaussians_without_a_group_get_nothing():

@@ -92,9 +92,9 @@ def test_nested_loss_matches_a_plain_loop_over_pixels_and_masks():
 def test_a_gaussian_belongs_to_the_nearest_object_and_an_object_has_five_masks():
     prototypes = np.float32([[1, 0, 0]] * 5 + [[0, 1, 0]] * 6 + [[0, 0, 1]] * 4)
     features = np.float32([[0.6, 0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
-    group, of_mask = laga.objects(features, prototypes, 0.1)
+    group, of_mask = laga.objects(features, prototypes, 0.1, 5)
     assert of_mask.tolist() == [0] * 5 + [1] * 6 + [-1] * 4 and group.tolist() == [1, 0, 0]
-    group, _ = laga.objects(features, prototypes[:4], 0.1)
+    group, _ = laga.objects(features, prototypes[:4], 0.1, 5)
     assert group.tolist() == [-1, -1, -1]
 
 
