@@ -1,12 +1,13 @@
-"""Every method on scenes with little in them: a level without masks, one view, one mask of a level."""
+"""Every method on scenes with little in them (a level without masks, one view), and the knobs it reads."""
 
+import re
 from functools import cache
 
 import numpy as np
 import pytest
 
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.methods.registry import METHODS, method_of
+from hilsplat.methods.registry import METHODS, OURS, method_of
 from hilsplat.settings import MethodSettings
 from tests.unit.methods.two_boxes_inputs import two_boxes_inputs
 from tests.unit.two_boxes_world import REGIONS, build_contributions, build_two_boxes
@@ -25,8 +26,8 @@ def fit(tmp_path_factory):
             world = build_two_boxes(tmp_path_factory.mktemp("thin"), monkeypatch, regions)
             return two_boxes_inputs(world, build_contributions(world))
 
-    def fit(name, regions):
-        settings = MethodSettings(name=name, steps=30, rate=0.05, pixel_step=1, codebook=(2, 2))
+    def fit(name, regions, kind=MethodSettings):
+        settings = kind(name=name, steps=30, rate=0.05, pixel_step=1, codebook=(2, 2))
         features = method_of(name).fit(inputs_of(regions), settings, 0)
         assert np.isfinite(features).all()
         return features
@@ -55,3 +56,27 @@ def test_a_single_mask_of_each_level_is_enough(fit, name):
 @pytest.mark.parametrize("name", sorted(METHODS))
 def test_a_single_mask_of_a_single_view_is_enough(fit, name):
     assert fit(name, ((0,),)).any(axis=(0, 2)).tolist() == [level == Level.WHOLE for level in LEVELS]
+
+
+def readers(description):
+    """Methods that the text of a knob names, or all but those before its colon."""
+    if description.startswith("all but "):
+        spared = description.removeprefix("all but ").partition(":")[0].split(", ")
+        assert set(spared) <= {OURS, *METHODS}
+        return set(METHODS) - set(spared)
+    return {name for name in METHODS if re.search(rf"\b{name}\b", description)}
+
+
+@pytest.mark.parametrize("name", sorted(METHODS))
+def test_knobs_name_the_methods_that_read_them(fit, name):
+    read = set()
+
+    class Watched(MethodSettings):
+        def __getattribute__(self, key):
+            read.add(key)
+            return super().__getattribute__(key)
+
+    fit(name, (EVERY,) * 6, Watched)
+    knobs = MethodSettings.model_fields.items()
+    own = {knob for knob, field in knobs if knob != "name" and name in readers(field.description)}
+    assert (read & MethodSettings.model_fields.keys()) - {"name"} == own
