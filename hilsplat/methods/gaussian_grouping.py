@@ -29,7 +29,8 @@ from hilsplat.base.device import one_torch_thread
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.rows import Contributions
 from hilsplat.methods.common.groups import features_of_groups
-from hilsplat.methods.common.training import LabelledView, labelled_views, product, train
+from hilsplat.methods.common.pixels import LabelledView, labelled_views
+from hilsplat.methods.common.training import product, train
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.semantic_tree.level_nodes import level_nodes
 from hilsplat.semantic_tree.tree import MIN_VISIBLE_PX

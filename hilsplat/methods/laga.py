@@ -31,16 +31,9 @@ from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.linear_code import LinearCode
 from hilsplat.methods.common.groups import density_clusters, features_of_groups
+from hilsplat.methods.common.pixels import LabelledView, labelled_views
 from hilsplat.methods.common.quantise import kmeans
-from hilsplat.methods.common.training import (
-    LabelledView,
-    alike,
-    labelled_views,
-    of_seen,
-    product,
-    train,
-    unit,
-)
+from hilsplat.methods.common.training import alike, of_seen, product, train, unit
 from hilsplat.methods.langsplat_v2 import as_vectors
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.settings import MethodSettings

@@ -22,12 +22,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float32, Int32, Int64
+from jaxtyping import Float32, Int32
 
 from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
 from hilsplat.methods.common.descent import Adam
+from hilsplat.methods.common.pixels import labelled_views
 from hilsplat.methods.common.quads import WIDTH, load, plus, signs_of_difference, store, zeros
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.settings import MethodSettings
@@ -62,18 +63,6 @@ class ViewPixels:
     labels: Int32[np.ndarray, "p 3"]
     latents: Float32[np.ndarray, "m D"]
 
-    @staticmethod
-    def of(
-        weights: sp.csr_matrix,
-        labels: Int32[np.ndarray, "P 3"],
-        latents: Float32[np.ndarray, "m D"],
-        grid: Int64[np.ndarray, " p"],
-    ) -> "ViewPixels":
-        """Choose the pixels of a grid from all P of a view."""
-        covered = np.diff(weights.indptr)[grid] > 0
-        pixels = grid[covered & (labels[grid] >= 0).any(axis=1)]
-        return ViewPixels(weights[pixels], labels[pixels], latents)
-
     def is_labelled(self, level: Level) -> bool:
         """Whether any pixel shows a mask of the level."""
         return bool((self.labels[:, level.index] >= 0).any())
@@ -98,14 +87,14 @@ class ViewQueue:
 
 
 def views_of(inputs: MethodInputs, pixel_step: int) -> list[ViewPixels]:
-    """Labelled pixels of every train view, on a grid."""
-    contributions, views = inputs.contributions, []
-    rows_of_views = contributions.rows_of_views()
-    for view, rows in zip(track(list(contributions.views), "weights of views"), rows_of_views, strict=True):
-        grid = grid_pixels(inputs.view_size_hw(view), pixel_step)
-        weights, labels = inputs.view_weights(view), inputs.view_labels(view)
-        views.append(ViewPixels.of(weights, labels, inputs.latents[rows], grid))
-    return views
+    """Labelled pixels of the train views that have any, on a grid, and the codes of their masks.
+
+    Raises:
+        ArtifactError: no view has a labelled pixel.
+    """
+    rows = inputs.contributions.rows_of_views()
+    views = labelled_views(inputs, pixel_step)
+    return [ViewPixels(view.weights, view.labels, inputs.latents[rows[view.number]]) for view in views]
 
 
 def train_level(
@@ -180,12 +169,6 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
                 labelled, level, num_gaussians, settings, seed + level.index
             )
     return features
-
-
-def grid_pixels(size_hw: tuple[int, int], step: int) -> Int64[np.ndarray, " p"]:
-    """Row-major indices of every `step`-th pixel of every `step`-th row."""
-    rows, columns = np.arange(0, size_hw[0], step), np.arange(0, size_hw[1], step)
-    return (rows[:, None] * size_hw[1] + columns[None]).ravel()
 
 
 METHOD = Method(

@@ -32,16 +32,9 @@ from torch.nn.functional import cross_entropy
 
 from hilsplat.base.device import one_torch_thread
 from hilsplat.base.levels import LEVELS
+from hilsplat.methods.common.pixels import LabelledView, labelled_views
 from hilsplat.methods.common.quantise import kmeans
-from hilsplat.methods.common.training import (
-    LabelledView,
-    alike,
-    labelled_views,
-    of_seen,
-    product,
-    train,
-    unit,
-)
+from hilsplat.methods.common.training import alike, of_seen, product, train, unit
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.settings import MethodSettings
 

@@ -28,8 +28,9 @@ from torch import Tensor
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.rows import Contributions
 from hilsplat.methods.common.groups import features_of_groups, group_latents
+from hilsplat.methods.common.pixels import LabelledView, labelled_views
 from hilsplat.methods.common.quantise import kmeans
-from hilsplat.methods.common.training import LabelledView, labelled_views, product, segment_means, train, unit
+from hilsplat.methods.common.training import product, segment_means, train, unit
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.settings import MethodSettings
 

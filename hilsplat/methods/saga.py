@@ -30,15 +30,8 @@ from torch import Tensor
 from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.contributions.rows import Contributions
 from hilsplat.methods.common.groups import cluster_field, clusters
-from hilsplat.methods.common.training import (
-    LabelledView,
-    alike,
-    labelled_views,
-    of_seen,
-    product,
-    train,
-    unit,
-)
+from hilsplat.methods.common.pixels import LabelledView, labelled_views
+from hilsplat.methods.common.training import alike, of_seen, product, train, unit
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.settings import MethodSettings
 

@@ -5,20 +5,17 @@ weights, which are computed once per view; losses are written in torch and diffe
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 import torch
-from jaxtyping import Float, Int32, Int64
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from hilsplat.base.device import one_torch_thread
-from hilsplat.base.errors import ArtifactError
 from hilsplat.base.progress import track
-from hilsplat.methods.langsplat import grid_pixels
-from hilsplat.methods.method import MethodInputs
+from hilsplat.methods.common.pixels import LabelledView
 from hilsplat.settings import MethodSettings
 
 PIXELS = 4096
@@ -26,55 +23,6 @@ PIXELS = 4096
 
 START_NOISE = 0.1
 """Standard deviation of the first features about their common value."""
-
-
-@dataclass(frozen=True)
-class LabelledView:
-    """Covered pixels of one view that are labelled at any level, on the grid of `method.pixel_step`.
-
-    Attributes:
-        number: index of the view in the contributions.
-        weights: compositing weights (pixels x Gaussians), rows summing to 1.
-        labels: row of the mask painted there at each level among the view's masks, -1 for none.
-        xy: column and row of each pixel, px.
-    """
-
-    number: int
-    weights: sp.csr_matrix
-    labels: Int32[np.ndarray, "p 3"]
-    xy: Int64[np.ndarray, "p 2"]
-
-    def __len__(self) -> int:
-        return len(self.labels)
-
-    def chosen(self, pixels: Int64[np.ndarray, " q"]) -> "LabelledView":
-        """Some of the pixels, in the given order."""
-        return LabelledView(self.number, self.weights[pixels], self.labels[pixels], self.xy[pixels])
-
-
-def labelled_views(inputs: MethodInputs, pixel_step: int) -> list[LabelledView]:
-    """Pixels of all train views that have any.
-
-    Raises:
-        ArtifactError: no view has a labelled pixel.
-    """
-    found = []
-    for number, name in enumerate(track(list(inputs.contributions.views), "weights of views")):
-        weights, labels = inputs.view_weights(name), inputs.view_labels(name)
-        size_hw = inputs.view_size_hw(name)
-        grid = grid_pixels(size_hw, pixel_step)
-        covered = np.diff(weights.indptr)[grid] > 0
-        pixels = grid[covered & (labels[grid] >= 0).any(axis=1)]
-        row, column = np.divmod(pixels, size_hw[1])
-        if len(pixels):
-            xy = np.stack([column, row], axis=1)
-            found.append(LabelledView(number, weights[pixels], labels[pixels], xy))
-    if not found:
-        raise ArtifactError(
-            f"no train view has a pixel on a grid of {pixel_step} px that a mask labels",
-            fix="reduce method.pixel_step, or loosen masks.predicted_iou_min and run the masks stage again",
-        )
-    return found
 
 
 class _Product(torch.autograd.Function):

@@ -17,7 +17,8 @@ from hilsplat.methods.common.groups import (
     group_latents,
     thresholds_of,
 )
-from hilsplat.methods.common.training import LabelledView, labelled_views, product, train, unit
+from hilsplat.methods.common.pixels import LabelledView, labelled_views
+from hilsplat.methods.common.training import product, train, unit
 from hilsplat.methods.gaussian_grouping import mask_identities, neighbour_loss
 from hilsplat.methods.omniseg3d import hierarchical_loss, patches
 from hilsplat.methods.opengaussian import contrast_loss, instances, smoothing_loss
@@ -134,6 +135,8 @@ def test_labelled_pixels_know_their_place_and_are_covered():
         view_labels=lambda view: labels,
         view_size_hw=lambda view: (2, 3),
     )
+    (view,) = inspect.unwrap(labelled_views)(inputs, 2)  # columns 0 and 2 of row 0
+    assert view.xy.tolist() == [[2, 0]]
     (view,) = inspect.unwrap(labelled_views)(inputs, 1)
     assert view.xy.tolist() == [[1, 0], [2, 0], [0, 1], [2, 1]]
     assert view.chosen(np.array([3, 0])).xy.tolist() == [[2, 1], [1, 0]]

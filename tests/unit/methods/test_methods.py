@@ -14,10 +14,10 @@ from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.methods import langsplat, lifted, registry, stage
 from hilsplat.methods.common.descent import Adam
+from hilsplat.methods.common.pixels import grid_pixels
 from hilsplat.methods.langsplat import (
     ViewPixels,
     ViewQueue,
-    grid_pixels,
     l1_gradient,
     train_level,
 )
@@ -146,15 +146,6 @@ def test_training_is_the_same_for_the_same_seed_and_another_for_another():
     first, again, other = (train_level(views, Level.WHOLE, 3, settings, seed) for seed in (0, 0, 3))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
-
-
-def test_a_view_keeps_covered_pixels_of_the_grid_that_any_level_labels():
-    weights = sp.csr_matrix(np.float32([[1, 0], [2, 0], [0, 3], [0, 4], [0, 0]]))
-    labels = np.array([[-1, 0, -1], [0, 0, 0], [-1, -1, -1], [-1, -1, 0], [0, 0, 0]], np.int32)
-    view = ViewPixels.of(weights, labels, np.zeros((1, 1), np.float32), np.array([0, 2, 3, 4]))
-    # pixel 1 is not on the grid, 2 not labelled, 4 not covered
-    assert view.weights.toarray().tolist() == [[1, 0], [0, 4]]
-    assert view.labels.tolist() == [[-1, 0, -1], [-1, -1, 0]]
 
 
 def test_a_level_takes_the_pixels_that_it_labels():

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.methods.registry import METHODS, OURS, method_of
 from hilsplat.settings import MethodSettings
@@ -32,6 +33,7 @@ def fit(tmp_path_factory):
         assert np.isfinite(features).all()
         return features
 
+    fit.inputs_of = inputs_of
     return fit
 
 
@@ -56,6 +58,14 @@ def test_a_single_mask_of_each_level_is_enough(fit, name):
 @pytest.mark.parametrize("name", sorted(METHODS))
 def test_a_single_mask_of_a_single_view_is_enough(fit, name):
     assert fit(name, ((0,),)).any(axis=(0, 2)).tolist() == [level == Level.WHOLE for level in LEVELS]
+
+
+@pytest.mark.parametrize("name", ["langsplat", "langsplat_v2"])
+def test_a_grid_without_labelled_pixels_is_no_silent_field_of_zeros(name, fit):
+    settings = MethodSettings(name=name, pixel_step=100)
+    inputs = fit.inputs_of(((6,),))  # a mask that the one pixel of the grid is not in
+    with pytest.raises(ArtifactError, match="no train view has a pixel on a grid of 100 px"):
+        method_of(name).fit(inputs, settings, 0)
 
 
 def readers(description):
