@@ -12,6 +12,7 @@ Departs:
     - identities come from masks linked by the Gaussians they share, as our tree links them, not from a
       tracker of videos (DEVA): a row shows what codes and classifier add to that;
     - all in each of our levels separately; the authors use one set of masks;
+    - pixels without an identity are left out; the authors train them to a class of their own;
     - geometry is frozen, it is not trained together with the codes;
     - fewer steps, on 4096 pixels of a view; the rate of the classifier is that of the codes;
     - the KL is taken at every step, not every fifth, with 1000 samples as there;
