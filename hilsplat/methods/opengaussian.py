@@ -56,10 +56,10 @@ def smoothing_loss(
 
 
 def contrast_loss(means: Float[Tensor, "m D"], done: float) -> Float[Tensor, ""]:
-    """Mean of w / (squared distance + 1) over pairs of masks; w falls from 1 to 0.1 with the rank.
+    """Mean of w / (squared distance + 1) over pairs of masks, w = 0.1 + 0.9 rank / (masks - 1).
 
-    Ranks are those of the other masks by distance from each; after half of the steps, weights below 0.9
-    become 0.1.
+    Ranks are those of the other masks by distance from each, from 1 for the farthest to masks - 1, and w = 1,
+    for the closest; after half of the steps, weights below 0.9 become 0.1.
     """
     num = len(means)
     if num < 2:
@@ -67,7 +67,7 @@ def contrast_loss(means: Float[Tensor, "m D"], done: float) -> Float[Tensor, ""]
     inverse = 1 / ((means[:, None] - means[None]).square().sum(2) + 1)
     others = inverse.masked_fill(torch.eye(num, dtype=torch.bool), -1.0)
     rank = others.detach().argsort(dim=1, stable=True).argsort(dim=1)  # own 0, farthest 1, closest num - 1
-    weight = LEAST_WEIGHT + (1 - LEAST_WEIGHT) * (rank - 1) / max(num - 2, 1)
+    weight = LEAST_WEIGHT + (1 - LEAST_WEIGHT) * rank / (num - 1)
     if done >= HARD_FROM:
         weight = torch.where(weight < HARD_WEIGHT, LEAST_WEIGHT, weight)
     return (weight * others)[rank > 0].mean()

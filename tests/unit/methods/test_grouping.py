@@ -191,15 +191,18 @@ def test_smoothing_is_the_mean_distance_to_the_mean_of_the_mask():
 
 
 def test_contrast_weighs_the_closest_masks_most():
-    # on a line at 0, 1, 3: squares 1, 9, 4; from each mask the closest weighs 1, the farthest 0.1
+    # on a line at 0, 1, 3: squares 1, 9, 4; from each mask the closest weighs 1, the farthest 0.55, later 0.1
     means = torch.tensor([[0.0], [1.0], [3.0]])
-    early = (1 / 2 + 0.1 / 10) + (1 / 2 + 0.1 / 5) + (1 / 5 + 0.1 / 10)
-    assert contrast_loss(means, 0.0).item() == pytest.approx(early / 6)
-    # with a fourth mask the middle rank weighs 0.55 at first, 0.1 later
+    for done, far in ((0.0, 0.55), (0.5, 0.1)):
+        every = (1 / 2 + far / 10) + (1 / 2 + far / 5) + (1 / 5 + far / 10)
+        assert contrast_loss(means, done).item() == pytest.approx(every / 6)
+    assert contrast_loss(means[:2], 0.5).item() == pytest.approx(1 / 2)  # of two masks each is the closest
+    # with a fourth mask the ranks weigh 0.4, 0.7 and 1 at first, then 0.1, 0.1 and 1
     means = torch.tensor([[0.0], [1.0], [3.0], [100.0]])
     first, later = contrast_loss(means, 0.0).item(), contrast_loss(means, 0.5).item()
     middle = 1 / 10 + 1 / 5 + 1 / 10 + 1 / (99**2 + 1)
-    assert first - later == pytest.approx(0.45 * middle / 12, rel=1e-3)
+    farthest = 1 / (100**2 + 1) + 1 / (99**2 + 1) + 1 / (97**2 + 1) + 1 / (100**2 + 1)
+    assert first - later == pytest.approx((0.6 * middle + 0.3 * farthest) / 12, rel=1e-3)
     assert contrast_loss(means[:1], 0.0).item() == 0
 
 
