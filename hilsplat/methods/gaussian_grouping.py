@@ -29,7 +29,7 @@ from torch.nn.functional import cross_entropy, log_softmax
 from hilsplat.base.device import one_torch_thread
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.rows import Contributions
-from hilsplat.methods.common.groups import features_of_groups
+from hilsplat.methods.common.groups import features_of_groups, group_means
 from hilsplat.methods.common.pixels import LabelledView, labelled_views
 from hilsplat.methods.common.training import product, train
 from hilsplat.methods.method import Method, MethodInputs
@@ -128,10 +128,7 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
         identity = np.full(len(contributions), NONE, np.int64)
         identity[rows] = of_row
         group = identity_of_gaussians(views, contributions, identity, level, settings, seed + level.index)
-        num = int(of_row.max()) + 1
-        sums = np.zeros((num, latents.shape[1]))
-        np.add.at(sums, of_row[has], latents[rows[has]])
-        means = sums / np.maximum(np.bincount(of_row[has], minlength=num), 1)[:, None]
+        means, _ = group_means(latents[rows[has]], of_row[has], int(of_row.max()) + 1)
         features[:, level.index] = features_of_groups(group, means.astype(np.float32))
     return features
 

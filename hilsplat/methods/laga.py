@@ -30,7 +30,7 @@ from torch import Tensor
 from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.linear_code import LinearCode
-from hilsplat.methods.common.groups import density_clusters, features_of_groups
+from hilsplat.methods.common.groups import density_clusters, features_of_groups, group_means
 from hilsplat.methods.common.pixels import LabelledView, labelled_views
 from hilsplat.methods.common.quantise import kmeans
 from hilsplat.methods.common.training import alike, of_seen, product, train, unit
@@ -177,8 +177,7 @@ def descriptor_weights(vectors: Float32[np.ndarray, "n C"], seed: int) -> Float[
         _, tried = kmeans(vectors, count, seed)
         if len(np.unique(tried)) == count and (score := silhouette(distance, tried)) > best:
             group, best = tried, score
-    size = np.bincount(group)
-    centroids = np.stack([np.bincount(group, column) for column in vectors.T], axis=1) / size[:, None]
+    centroids, size = group_means(vectors, group, int(group.max()) + 1)
     average = vectors.mean(axis=0) / np.maximum(np.linalg.norm(vectors.mean(axis=0)), 1e-12)
     weight = centroids @ average / np.maximum(np.linalg.norm(centroids, axis=1), 1e-12)
     return (weight / size)[group]

@@ -32,6 +32,7 @@ from torch.nn.functional import cross_entropy
 
 from hilsplat.base.device import one_torch_thread
 from hilsplat.base.levels import LEVELS
+from hilsplat.methods.common.groups import standardised
 from hilsplat.methods.common.pixels import LabelledView, labelled_views
 from hilsplat.methods.common.quantise import kmeans
 from hilsplat.methods.common.training import alike, of_seen, product, train, unit
@@ -105,8 +106,7 @@ def entries_of_gaussians(
         torch.manual_seed(seed)
         decoders = [network((CHANNELS, *DECODER_WIDTHS, ENTRIES)) for _ in LEVELS]
         position = network((3, *POSITION_WIDTHS, levels * CHANNELS))
-    spread = max(float((means - means.mean(axis=0)).std()), 1e-12)
-    places = torch.from_numpy(((means - means.mean(axis=0)) / spread).astype(np.float32))
+    places = torch.from_numpy(standardised(means))
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
         weights, seen = of_seen(view.weights)

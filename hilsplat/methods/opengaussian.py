@@ -27,7 +27,7 @@ from torch import Tensor
 
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.rows import Contributions
-from hilsplat.methods.common.groups import features_of_groups, group_latents
+from hilsplat.methods.common.groups import features_of_groups, group_latents, group_means, standardised
 from hilsplat.methods.common.pixels import LabelledView, labelled_views
 from hilsplat.methods.common.quantise import kmeans
 from hilsplat.methods.common.training import product, segment_means, train, unit
@@ -120,9 +120,8 @@ def instances(
         seed: for the first centres.
     """
     num_coarse, num_fine = codebook
-    spread = max(float((means - means.mean(axis=0)).std()), 1e-12)
-    placed = np.concatenate([features, POSITION * (means - means.mean(axis=0)) / spread], axis=1)
-    _, coarse = kmeans(placed.astype(np.float32), num_coarse, seed, KMEANS_STEPS)
+    placed = np.concatenate([features, np.float32(POSITION) * standardised(means)], axis=1)
+    _, coarse = kmeans(placed, num_coarse, seed, KMEANS_STEPS)
     leaf = coarse * num_fine
     for group in range(num_coarse):
         inside = np.flatnonzero(coarse == group)
@@ -147,9 +146,7 @@ def level_field(
     leaf = np.full(contributions.num_gaussians, NONE, np.int64)
     leaf[shown] = instances(features[shown], contributions.means()[shown], codebook, seed)
     num = codebook[0] * codebook[1]
-    counts = np.maximum(np.bincount(leaf[shown], minlength=num), 1)
-    sums = np.stack([np.bincount(leaf[shown], column, num) for column in features[shown].T], axis=1)
-    of_leaf = sums / counts[:, None]
+    of_leaf, _ = group_means(features[shown], leaf[shown], num)
     of_mask = A @ features
 
     def closeness(mask: np.ndarray, group: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import scipy.cluster.hierarchy
 import scipy.sparse as sp
-from jaxtyping import Bool, Float, Float32, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int32, Int64
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -23,6 +23,21 @@ MIN_VIEWS = 2
 """Least score of a mask, and least views, for a code of a cluster (OpenGaussian, for ScanNet)."""
 
 Closeness = Callable[[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]], Float[np.ndarray, " k"]]
+
+
+def standardised(means: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
+    """Centres of Gaussians about their mean, with a standard deviation of 1 over all three axes."""
+    apart = means - means.mean(axis=0)
+    return apart / max(float(apart.std()), 1e-12)
+
+
+def group_means(
+    rows: Float[np.ndarray, "n D"], group: Int[np.ndarray, " n"], num: int
+) -> tuple[Float64[np.ndarray, "T D"], Int64[np.ndarray, " T"]]:
+    """Mean of the rows of each of `num` groups, 0 for an empty one, and how many they have."""
+    counts = np.bincount(group, minlength=num)
+    sums = np.stack([np.bincount(group, column, num) for column in rows.T], axis=1)
+    return sums / np.maximum(counts, 1)[:, None], counts
 
 
 def group_latents(
@@ -70,12 +85,9 @@ def group_latents(
     key = view[order].astype(np.int64) * num_groups + of[order]
     first = order[np.flatnonzero(np.diff(key, prepend=-1))]
     best = first[score[first] > min_score]
-    counts = np.bincount(of[best], minlength=num_groups)
-    sums = np.zeros((num_groups, latents.shape[1]))
-    np.add.at(sums, of[best], latents[rows[mask[best]]])
+    means, counts = group_means(latents[rows[mask[best]]], of[best], num_groups)
     found = counts >= max(min(min_views, len(size)), 1)
-    means = np.where(found[:, None], sums / np.maximum(counts, 1)[:, None], 0)
-    return means.astype(np.float32), found
+    return np.where(found[:, None], means, 0).astype(np.float32), found
 
 
 def features_of_groups(
@@ -92,8 +104,7 @@ def clusters(
     """Cluster of each Gaussian at every threshold of the cosine; a higher threshold splits clusters only."""
     _, centre = kmeans(features, CENTRES, seed, KMEANS_ROUNDS)
     used, centre = np.unique(centre, return_inverse=True)
-    counts = np.bincount(centre)
-    means = np.stack([np.bincount(centre, column) / counts for column in features.T], axis=1)
+    means, _ = group_means(features, centre, len(used))
     means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12)
     if len(used) < 2:
         return np.zeros((len(features), len(thresholds)), np.int64)

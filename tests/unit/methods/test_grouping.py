@@ -15,6 +15,7 @@ from hilsplat.methods.common.groups import (
     clusters,
     features_of_groups,
     group_latents,
+    group_means,
     thresholds_of,
 )
 from hilsplat.methods.common.pixels import LabelledView, labelled_views
@@ -246,6 +247,11 @@ def test_a_group_takes_the_best_mask_of_each_view():
     three = association(S, np.ones((3, 3)), [0, 0, 1])
     for scene, expected in ((contributions, [True, False]), (three, [False, False])):
         assert associated(scene, [0, 0, -1], 2, [[1.0], [5.0], [2.0]], min_views=3)[1].tolist() == expected
+
+
+def test_means_of_groups_are_zero_where_a_group_is_empty():
+    means, counts = group_means(np.float32([[1, 2], [3, 4], [5, 7]]), np.array([2, 0, 2]), 4)
+    assert means.tolist() == [[3, 4], [0, 0], [3, 4.5], [0, 0]] and counts.tolist() == [1, 0, 2, 0]
 
 
 def test_gaussians_without_a_group_get_nothing():
