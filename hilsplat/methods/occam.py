@@ -41,6 +41,8 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     for view, rows in zip(track(list(contributions.views), "views"), rows_of_views, strict=True):
         pixel = centre_pixels(means, inputs.view_camera(view))
         gaussians = np.flatnonzero(pixel >= 0)
+        if not len(gaussians):
+            continue
         weights = np.asarray(inputs.view_weights(view)[pixel[gaussians], gaussians], np.float32).ravel()
         labels, own = inputs.view_labels(view)[pixel], latents[rows]
         for level in LEVELS:
