@@ -458,21 +458,23 @@ class MethodSettings(Section):
     name: str = knob("hilsplat", "hilsplat, or a baseline in hilsplat/methods/registry.py")
     steps: int = knob(
         1800,
-        "langsplat, langsplat_v2: steps per level, each on one view",
+        "all but hilsplat, lifted, occam, dr_splat: training steps, each on one view; langsplat, "
+        "langsplat_v2 and gaussian_grouping take them for each level, the others for all together",
         ge=1,
         origin="LangSplat, LangSplatV2: 30000",
     )
-    rate: float = knob(0.0025, "langsplat, langsplat_v2: Adam step size", gt=0, origin="LangSplat")
+    rate: float = knob(
+        0.0025, "all but hilsplat, lifted, occam, dr_splat: Adam step size", gt=0, origin="LangSplat"
+    )
     pixel_step: int = knob(
         2,
-        "langsplat, langsplat_v2: every n-th pixel of every n-th row is compared",
+        "all but hilsplat, lifted, occam, dr_splat: every n-th pixel of every n-th row is used",
         ge=1,
         origin="LangSplat: 1",
     )
     top_gaussians: int = knob(
         45, "dr_splat: heaviest Gaussians of a pixel that take its vector", ge=1, origin="Dr. Splat"
     )
-
     codebook: tuple[Size, Size] = knob(
         (64, 10),
         "opengaussian: groups by feature and position, and groups by feature of each of them",

@@ -53,6 +53,10 @@ class Contributions:
         """Rows of a level, in order."""
         return np.flatnonzero(self.level == int(level))
 
+    def rows_of_views(self) -> list[Int64[np.ndarray, " m"]]:
+        """Rows of each view, in the order of `views` and of the view's masks."""
+        return [np.flatnonzero(self.view == number) for number in range(len(self.views))]
+
     def matrix(self, name: str) -> sp.csr_matrix:
         """`A`, `A_half` or `S` (M x N), mapped from its file rather than held in memory."""
         parts = (mapped(self.folder / name / f"{part}.npy") for part in ("data", "indices", "indptr"))

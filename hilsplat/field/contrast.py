@@ -54,8 +54,7 @@ def view_relations(
         means: mean lifted feature of each mask, to prune masks that look alike; None keeps all.
     """
     relations = []
-    for number, view in enumerate(contributions.views):
-        rows = np.flatnonzero(contributions.view == number)
+    for view, rows in zip(contributions.views, contributions.rows_of_views(), strict=True):
         pixels = contributions.pixels[rows]
         half = contributions.half_pixels[rows]
         parent = parents[view]

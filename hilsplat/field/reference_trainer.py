@@ -125,7 +125,7 @@ def run_reference(
     latents = load_latents(autoencoder_folder, contributions)
     views = contributions.views
     labels = [label_maps(HierarchicalMasks.load(Path(masks_folder) / f"{view}.npz")) for view in views]
-    own_latents = [latents[contributions.view == number] for number in range(len(views))]
+    own_latents = [latents[rows] for rows in contributions.rows_of_views()]
     chosen = choose_device(device)
     shape = (len(gaussians), len(LEVELS) * latents.shape[1])
     features = torch.zeros(shape, requires_grad=True)

@@ -54,8 +54,8 @@ def register(
     """
     contributions = inputs.contributions
     sums = np.zeros((contributions.num_gaussians, len(LEVELS), vectors.shape[1]), np.float32)
-    for number, view in enumerate(track(list(contributions.views), "views")):
-        rows = np.flatnonzero(contributions.view == number)
+    rows_of_views = contributions.rows_of_views()
+    for view, rows in zip(track(list(contributions.views), "views"), rows_of_views, strict=True):
         weights = heaviest(inputs.view_weights(view), count)
         covered = np.diff(weights.indptr) > 0
         shown = painted_indicator(inputs.view_labels(view), len(rows), covered) @ weights  # masks x Gaussians

@@ -12,6 +12,7 @@ Departs:
     - identities come from masks linked by the Gaussians they share, as our tree links them, not from a
       tracker of videos (DEVA): a row shows what codes and classifier add to that;
     - all in each of our levels separately; the authors use one set of masks;
+    - pixels without an identity are left out; the authors train them to a class of their own;
     - geometry is frozen, it is not trained together with the codes;
     - fewer steps, on 4096 pixels of a view; the rate of the classifier is that of the codes;
     - the KL is taken at every step, not every fifth, with 1000 samples as there;
@@ -28,8 +29,9 @@ from torch.nn.functional import cross_entropy, log_softmax
 from hilsplat.base.device import one_torch_thread
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.rows import Contributions
-from hilsplat.methods.common.groups import features_of_groups
-from hilsplat.methods.common.training import LabelledView, labelled_views, product, train
+from hilsplat.methods.common.groups import features_of_groups, group_means
+from hilsplat.methods.common.pixels import LabelledView, labelled_views
+from hilsplat.methods.common.training import product, train
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.semantic_tree.level_nodes import level_nodes
 from hilsplat.semantic_tree.tree import MIN_VISIBLE_PX
@@ -50,6 +52,7 @@ def mask_identities(contributions: Contributions, level: Level, threads: int) ->
     weights, view = contributions.matrix("S")[rows], contributions.view[rows]
     total = mass.sum(axis=0, dtype=np.float64)
     settings = SemanticTreeSettings()
+    settings = settings.model_copy(update={"min_views": min(settings.min_views, len(mass))})
     return level_nodes(weights, view, mass, visible, importance, total, settings, threads).of_mask
 
 
@@ -86,9 +89,7 @@ def identity_of_gaussians(
     means = contributions.means()
     count = min(NEIGHBOURS + 1, len(means))
     neighbours = cKDTree(means).query(means, count)[1].reshape(len(means), count)[:, 1:]
-    of_view = [
-        np.append(identity[contributions.view == number], NONE) for number in range(len(contributions.views))
-    ]
+    of_view = [np.append(identity[rows], NONE) for rows in contributions.rows_of_views()]
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
         wanted = torch.from_numpy(of_view[view.number][view.labels[:, level.index]])
@@ -127,10 +128,7 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
         identity = np.full(len(contributions), NONE, np.int64)
         identity[rows] = of_row
         group = identity_of_gaussians(views, contributions, identity, level, settings, seed + level.index)
-        num = int(of_row.max()) + 1
-        sums = np.zeros((num, latents.shape[1]))
-        np.add.at(sums, of_row[has], latents[rows[has]])
-        means = sums / np.maximum(np.bincount(of_row[has], minlength=num), 1)[:, None]
+        means, _ = group_means(latents[rows[has]], of_row[has], int(of_row.max()) + 1)
         features[:, level.index] = features_of_groups(group, means.astype(np.float32))
     return features
 

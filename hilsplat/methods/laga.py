@@ -30,17 +30,10 @@ from torch import Tensor
 from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.linear_code import LinearCode
-from hilsplat.methods.common.groups import density_clusters, features_of_groups
+from hilsplat.methods.common.groups import density_clusters, features_of_groups, group_means
+from hilsplat.methods.common.pixels import LabelledView, labelled_views
 from hilsplat.methods.common.quantise import kmeans
-from hilsplat.methods.common.training import (
-    LabelledView,
-    alike,
-    labelled_views,
-    of_seen,
-    product,
-    train,
-    unit,
-)
+from hilsplat.methods.common.training import alike, of_seen, product, train, unit
 from hilsplat.methods.langsplat_v2 import as_vectors
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.settings import MethodSettings
@@ -54,6 +47,7 @@ HARD_COSINE = 0.5
 RADIUS = (0.3, 0.2, 0.1)
 """Of density clusters of whole, part, subpart."""
 LEAST_MASKS = 5
+"""Within the radius of a dense mask; a scene of fewer views asks for as many as it has views."""
 MOST_DESCRIPTORS = 20
 PIXELS = 2048
 
@@ -124,17 +118,16 @@ def train_features(
     features = alike(num_gaussians, sum(SLICES), seed)
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
-        view = view.chosen(np.arange(min(len(view), PIXELS)))
         weights, seen = of_seen(view.weights)
         rendered = product(weights, unit_slices(features[seen]))
         return nested_loss(rendered, masks_of_pixels(view.labels), random)
 
-    train(views, [{"params": [features], "lr": settings.rate}], loss, settings, seed)
+    train(views, [{"params": [features], "lr": settings.rate}], loss, settings, seed, PIXELS)
     return unit_slices(features.detach()).numpy()
 
 
 def objects(
-    features: Float32[np.ndarray, "N C"], prototypes: Float32[np.ndarray, "m C"], radius: float
+    features: Float32[np.ndarray, "N C"], prototypes: Float32[np.ndarray, "m C"], radius: float, least: int
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " m"]]:
     """Object of each Gaussian and of each mask, -1 for none.
 
@@ -142,8 +135,9 @@ def objects(
         features: of the Gaussians, of unit length.
         prototypes: of the masks, of unit length.
         radius: of density clusters of prototypes.
+        least: masks within the radius of a dense one, itself among them.
     """
-    of_mask = density_clusters(prototypes, radius, LEAST_MASKS)
+    of_mask = density_clusters(prototypes, radius, least)
     num = int(of_mask.max(initial=NONE)) + 1
     if not num:
         return np.full(len(features), NONE, np.int64), of_mask
@@ -183,8 +177,7 @@ def descriptor_weights(vectors: Float32[np.ndarray, "n C"], seed: int) -> Float[
         _, tried = kmeans(vectors, count, seed)
         if len(np.unique(tried)) == count and (score := silhouette(distance, tried)) > best:
             group, best = tried, score
-    size = np.bincount(group)
-    centroids = np.stack([np.bincount(group, column) for column in vectors.T], axis=1) / size[:, None]
+    centroids, size = group_means(vectors, group, int(group.max()) + 1)
     average = vectors.mean(axis=0) / np.maximum(np.linalg.norm(vectors.mean(axis=0)), 1e-12)
     weight = centroids @ average / np.maximum(np.linalg.norm(centroids, axis=1), 1e-12)
     return (weight / size)[group]
@@ -220,7 +213,7 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     views = labelled_views(inputs, settings.pixel_step)
     features = train_features(views, contributions.num_gaussians, settings, seed)
     A, large = contributions.matrix("A"), large_masks(inputs, contributions)
-    fields = []
+    fields, least = [], min(LEAST_MASKS, len(contributions.views))
     for level in LEVELS:
         rows = contributions.rows_of(level)
         rows = rows[large[rows]]
@@ -228,7 +221,7 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
         own = own / np.maximum(np.linalg.norm(own, axis=1, keepdims=True), 1e-12)
         shown = unit_slices(torch.from_numpy(A[rows] @ features)).numpy()[:, : PREFIX[level.index]]
         prototypes = shown / np.maximum(np.linalg.norm(shown, axis=1, keepdims=True), 1e-12)
-        group, of_mask = objects(own, prototypes, RADIUS[level.index])
+        group, of_mask = objects(own, prototypes, RADIUS[level.index], least)
         latents = object_latents(of_mask, inputs.latents[rows], code, seed)
         fields.append(features_of_groups(group, latents))
     return np.stack(fields, axis=1)

@@ -22,18 +22,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float32, Int32, Int64
+from jaxtyping import Float32, Int32
 
 from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
+from hilsplat.methods.common.descent import Adam
+from hilsplat.methods.common.pixels import labelled_views
 from hilsplat.methods.common.quads import WIDTH, load, plus, signs_of_difference, store, zeros
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.settings import MethodSettings
-
-BETAS = (0.9, 0.999)
-EPS = 1e-15
-"""As in the published optimiser."""
 
 
 @dataclass(frozen=True)
@@ -65,18 +63,6 @@ class ViewPixels:
     labels: Int32[np.ndarray, "p 3"]
     latents: Float32[np.ndarray, "m D"]
 
-    @staticmethod
-    def of(
-        weights: sp.csr_matrix,
-        labels: Int32[np.ndarray, "P 3"],
-        latents: Float32[np.ndarray, "m D"],
-        grid: Int64[np.ndarray, " p"],
-    ) -> "ViewPixels":
-        """Choose the pixels of a grid from all P of a view."""
-        covered = np.diff(weights.indptr)[grid] > 0
-        pixels = grid[covered & (labels[grid] >= 0).any(axis=1)]
-        return ViewPixels(weights[pixels], labels[pixels], latents)
-
     def is_labelled(self, level: Level) -> bool:
         """Whether any pixel shows a mask of the level."""
         return bool((self.labels[:, level.index] >= 0).any())
@@ -101,13 +87,14 @@ class ViewQueue:
 
 
 def views_of(inputs: MethodInputs, pixel_step: int) -> list[ViewPixels]:
-    """Labelled pixels of every train view, on a grid."""
-    contributions, views = inputs.contributions, []
-    for number, view in enumerate(track(list(contributions.views), "weights of views")):
-        grid = grid_pixels(inputs.view_size_hw(view), pixel_step)
-        own = inputs.latents[contributions.view == number]
-        views.append(ViewPixels.of(inputs.view_weights(view), inputs.view_labels(view), own, grid))
-    return views
+    """Labelled pixels of the train views that have any, on a grid, and the codes of their masks.
+
+    Raises:
+        ArtifactError: no view has a labelled pixel.
+    """
+    rows = inputs.contributions.rows_of_views()
+    views = labelled_views(inputs, pixel_step)
+    return [ViewPixels(view.weights, view.labels, inputs.latents[rows[view.number]]) for view in views]
 
 
 def train_level(
@@ -124,22 +111,21 @@ def train_level(
     """
     channels = views[0].latents.shape[1]
     wide = channels + -channels % WIDTH
-    features, gradient, first, second = np.zeros((4, num_gaussians * wide), np.float32)
+    features, gradient = np.zeros((2, num_gaussians * wide), np.float32)
     codes = {id(view): np.pad(view.latents, ((0, 0), (0, wide - channels))).reshape(-1) for view in views}
-    queue = ViewQueue(views, seed)
-    for step in range(1, settings.steps + 1):
+    queue, adam = ViewQueue(views, seed), Adam(features, settings.rate)
+    for _ in range(settings.steps):
         view = queue.next()
         weights, labels = view.weights, view.labels[:, level.index]
         rows = weights.indptr, weights.indices, weights.data
         l1_gradient(*rows, labels, codes[id(view)], channels, wide, features, gradient)
-        unbiased = (np.float32(1 - beta**step) for beta in BETAS)
-        adam_step(gradient, first, second, features, np.float32(settings.rate), *unbiased)
+        adam.step(gradient)
     return features.reshape(num_gaussians, wide)[:, :channels].copy()
 
 
 @compiled
 def l1_gradient(indptr, indices, data, labels, codes, channels, wide, features, gradient):
-    """Add the gradient of the mean absolute difference of rendered and painted codes by the features.
+    """Write the gradient of the mean absolute difference of rendered and painted codes by the features.
 
     A row of weights is read once for its sum and, while it is in the fastest cache, once for what it passes
     back. Sums have the order of the products with the matrix and its transpose; there is one thread.
@@ -151,8 +137,9 @@ def l1_gradient(indptr, indices, data, labels, codes, channels, wide, features, 
         channels: of a code; the numbers after them are 0.
         wide: numbers of a Gaussian, a multiple of `WIDTH`.
         features: float32, flat, `wide` numbers a Gaussian.
-        gradient: of the same shape; added to.
+        gradient: of the same shape; written.
     """
+    gradient[:] = 0
     labelled = 0
     for p in range(len(labels)):
         labelled += labels[p] >= 0
@@ -171,18 +158,6 @@ def l1_gradient(indptr, indices, data, labels, codes, channels, wide, features, 
                 store(gradient, there, plus(load(gradient, there), data[k], pull))
 
 
-@compiled(error_model="numpy")
-def adam_step(gradient, first, second, features, rate, unbiased1, unbiased2):
-    """One step of Adam on flat arrays in place; the gradient becomes 0 for the next."""
-    rest1, rest2 = np.float32(1 - BETAS[0]), np.float32(1 - BETAS[1])
-    for k in range(len(features)):
-        g = gradient[k]
-        gradient[k] = 0
-        first[k] += rest1 * (g - first[k])
-        second[k] += rest2 * (g * g - second[k])
-        features[k] -= rate * (first[k] / unbiased1) / (np.sqrt(second[k] / unbiased2) + np.float32(EPS))
-
-
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train the three levels one after the other, each with its own seed."""
     views = views_of(inputs, settings.pixel_step)
@@ -194,12 +169,6 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
                 labelled, level, num_gaussians, settings, seed + level.index
             )
     return features
-
-
-def grid_pixels(size_hw: tuple[int, int], step: int) -> Int64[np.ndarray, " p"]:
-    """Row-major indices of every `step`-th pixel of every `step`-th row."""
-    rows, columns = np.arange(0, size_hw[0], step), np.arange(0, size_hw[1], step)
-    return (rows[:, None] * size_hw[1] + columns[None]).ravel()
 
 
 METHOD = Method(

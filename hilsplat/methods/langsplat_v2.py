@@ -11,7 +11,7 @@ Departs from the published code:
       d = 64 keeps the masks' vectors to a mean cosine of 0.9998 on the development scenes;
     - the loss is averaged over the labelled pixels of the grid, rendered mixtures are divided by alpha,
       thinly covered pixels are left out and small weights dropped, as in `langsplat`;
-    - k-means on all vectors instead of mini-batches.
+    - k-means on all vectors of the level's masks at once instead of mini-batches.
 """
 
 import numpy as np

@@ -32,16 +32,10 @@ from torch.nn.functional import cross_entropy
 
 from hilsplat.base.device import one_torch_thread
 from hilsplat.base.levels import LEVELS
+from hilsplat.methods.common.groups import standardised
+from hilsplat.methods.common.pixels import LabelledView, labelled_views
 from hilsplat.methods.common.quantise import kmeans
-from hilsplat.methods.common.training import (
-    LabelledView,
-    alike,
-    labelled_views,
-    of_seen,
-    product,
-    train,
-    unit,
-)
+from hilsplat.methods.common.training import alike, of_seen, product, train, unit
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.settings import MethodSettings
 
@@ -112,11 +106,9 @@ def entries_of_gaussians(
         torch.manual_seed(seed)
         decoders = [network((CHANNELS, *DECODER_WIDTHS, ENTRIES)) for _ in LEVELS]
         position = network((3, *POSITION_WIDTHS, levels * CHANNELS))
-    spread = max(float((means - means.mean(axis=0)).std()), 1e-12)
-    places = torch.from_numpy(((means - means.mean(axis=0)) / spread).astype(np.float32))
+    places = torch.from_numpy(standardised(means))
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
-        view = view.chosen(np.arange(min(len(view), PIXELS)))
         weights, seen = of_seen(view.weights)
         rendered = product(weights, codes[seen]).reshape(-1, levels, CHANNELS)
         uncertainty = product(weights, doubt[seen].sigmoid())
@@ -141,7 +133,7 @@ def entries_of_gaussians(
         {"params": networks, "lr": NETWORK_RATE * settings.rate},
         {"params": [doubt], "lr": UNCERTAINTY_RATE},
     ]
-    train(views, groups, loss, settings, seed)
+    train(views, groups, loss, settings, seed, PIXELS)
     with one_torch_thread(), torch.no_grad():
         own = unit(codes.reshape(num, levels, CHANNELS))
         return torch.stack([decoders[k](own[:, k]).argmax(1) for k in range(levels)], 1).numpy()
@@ -155,7 +147,7 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
         rows = contributions.rows_of(level)
         codebook, entry[rows] = kmeans(latents[rows], ENTRIES, seed + level.index)
         codebooks.append(codebook)
-    of_view = [np.flatnonzero(contributions.view == number) for number in range(len(contributions.views))]
+    of_view = contributions.rows_of_views()
     views = labelled_views(inputs, settings.pixel_step)
     found = entries_of_gaussians(views, entry, of_view, contributions.means(), settings, seed)
     features = np.stack([codebook[own] for codebook, own in zip(codebooks, found.T, strict=True)], axis=1)

@@ -37,11 +37,14 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     means = contributions.means().astype(np.float64)
     sums = np.zeros((len(means), len(LEVELS), latents.shape[1]), np.float32)
     total = np.zeros((len(means), len(LEVELS)), np.float32)
-    for number, view in enumerate(track(list(contributions.views), "views")):
+    rows_of_views = contributions.rows_of_views()
+    for view, rows in zip(track(list(contributions.views), "views"), rows_of_views, strict=True):
         pixel = centre_pixels(means, inputs.view_camera(view))
         gaussians = np.flatnonzero(pixel >= 0)
+        if not len(gaussians):
+            continue
         weights = np.asarray(inputs.view_weights(view)[pixel[gaussians], gaussians], np.float32).ravel()
-        labels, own = inputs.view_labels(view)[pixel], latents[contributions.view == number]
+        labels, own = inputs.view_labels(view)[pixel], latents[rows]
         for level in LEVELS:
             label = labels[gaussians, level.index]
             shown = (label >= 0) & (weights > 0)

@@ -27,15 +27,8 @@ from torch.nn.functional import log_softmax
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.methods.common.groups import cluster_field, clusters, thresholds_of
-from hilsplat.methods.common.training import (
-    LabelledView,
-    alike,
-    labelled_views,
-    product,
-    segment_means,
-    train,
-    unit,
-)
+from hilsplat.methods.common.pixels import LabelledView, labelled_views
+from hilsplat.methods.common.training import alike, product, segment_means, train, unit
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.settings import MethodSettings
 

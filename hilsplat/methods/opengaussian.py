@@ -27,9 +27,10 @@ from torch import Tensor
 
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.rows import Contributions
-from hilsplat.methods.common.groups import features_of_groups, group_latents
+from hilsplat.methods.common.groups import features_of_groups, group_latents, group_means, standardised
+from hilsplat.methods.common.pixels import LabelledView, labelled_views
 from hilsplat.methods.common.quantise import kmeans
-from hilsplat.methods.common.training import LabelledView, labelled_views, product, segment_means, train, unit
+from hilsplat.methods.common.training import product, segment_means, train, unit
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.settings import MethodSettings
 
@@ -55,10 +56,10 @@ def smoothing_loss(
 
 
 def contrast_loss(means: Float[Tensor, "m D"], done: float) -> Float[Tensor, ""]:
-    """Mean of w / (squared distance + 1) over pairs of masks; w falls from 1 to 0.1 with the rank.
+    """Mean of w / (squared distance + 1) over pairs of masks, w = 0.1 + 0.9 rank / (masks - 1).
 
-    Ranks are those of the other masks by distance from each; after half of the steps, weights below 0.9
-    become 0.1.
+    Ranks are those of the other masks by distance from each, from 1 for the farthest to masks - 1, and w = 1,
+    for the closest; after half of the steps, weights below 0.9 become 0.1.
     """
     num = len(means)
     if num < 2:
@@ -66,7 +67,7 @@ def contrast_loss(means: Float[Tensor, "m D"], done: float) -> Float[Tensor, ""]
     inverse = 1 / ((means[:, None] - means[None]).square().sum(2) + 1)
     others = inverse.masked_fill(torch.eye(num, dtype=torch.bool), -1.0)
     rank = others.detach().argsort(dim=1, stable=True).argsort(dim=1)  # own 0, farthest 1, closest num - 1
-    weight = LEAST_WEIGHT + (1 - LEAST_WEIGHT) * (rank - 1) / max(num - 2, 1)
+    weight = LEAST_WEIGHT + (1 - LEAST_WEIGHT) * rank / (num - 1)
     if done >= HARD_FROM:
         weight = torch.where(weight < HARD_WEIGHT, LEAST_WEIGHT, weight)
     return (weight * others)[rank > 0].mean()
@@ -80,7 +81,7 @@ def instance_features(
     start = np.random.default_rng(seed).random((num, levels, CHANNELS), dtype=np.float32)
     features = torch.from_numpy(start * 2 - 1).requires_grad_()
     A = contributions.matrix("A")
-    rows = [np.flatnonzero(contributions.view == number) for number in range(len(contributions.views))]
+    rows = contributions.rows_of_views()
     means_of = {view.number: A[rows[view.number]] for view in views}
 
     def loss(view: LabelledView, _: np.random.Generator, done: float) -> Tensor:
@@ -119,9 +120,8 @@ def instances(
         seed: for the first centres.
     """
     num_coarse, num_fine = codebook
-    spread = max(float((means - means.mean(axis=0)).std()), 1e-12)
-    placed = np.concatenate([features, POSITION * (means - means.mean(axis=0)) / spread], axis=1)
-    _, coarse = kmeans(placed.astype(np.float32), num_coarse, seed, KMEANS_STEPS)
+    placed = np.concatenate([features, np.float32(POSITION) * standardised(means)], axis=1)
+    _, coarse = kmeans(placed, num_coarse, seed, KMEANS_STEPS)
     leaf = coarse * num_fine
     for group in range(num_coarse):
         inside = np.flatnonzero(coarse == group)
@@ -141,12 +141,12 @@ def level_field(
     rows = contributions.rows_of(level)
     A = contributions.matrix("A")[rows]
     shown = np.flatnonzero(np.bincount(A.indices, A.data, contributions.num_gaussians) > 0)
+    if not len(shown):
+        return np.zeros((contributions.num_gaussians, inputs.latents.shape[1]), np.float32)
     leaf = np.full(contributions.num_gaussians, NONE, np.int64)
     leaf[shown] = instances(features[shown], contributions.means()[shown], codebook, seed)
     num = codebook[0] * codebook[1]
-    counts = np.maximum(np.bincount(leaf[shown], minlength=num), 1)
-    sums = np.stack([np.bincount(leaf[shown], column, num) for column in features[shown].T], axis=1)
-    of_leaf = sums / counts[:, None]
+    of_leaf, _ = group_means(features[shown], leaf[shown], num)
     of_mask = A @ features
 
     def closeness(mask: np.ndarray, group: np.ndarray) -> np.ndarray:

@@ -27,18 +27,11 @@ from jaxtyping import Bool, Float, Float32, Float64, Int32
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from hilsplat.base.levels import LEVELS
+from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.contributions.rows import Contributions
 from hilsplat.methods.common.groups import cluster_field, clusters
-from hilsplat.methods.common.training import (
-    LabelledView,
-    alike,
-    labelled_views,
-    of_seen,
-    product,
-    train,
-    unit,
-)
+from hilsplat.methods.common.pixels import LabelledView, labelled_views
+from hilsplat.methods.common.training import alike, of_seen, product, train, unit
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.settings import MethodSettings
 
@@ -86,7 +79,7 @@ def together(
     return ((kept[:, None] == kept[None]) & (kept >= 0)[None]).any(axis=2)
 
 
-def pixel_weights(area_px: Float64[np.ndarray, " p"]) -> Float32[np.ndarray, "p p"]:
+def pair_weights(area_px: Float64[np.ndarray, " p"]) -> Float32[np.ndarray, "p p"]:
     """Weight of each pair of pixels, from 1 to 10: pixels of small masks count more."""
     pairs = np.outer(area_px, area_px)
     weight = pairs.max() / np.maximum(pairs, 1e-12)
@@ -145,17 +138,17 @@ def train_features(
     views: list[LabelledView],
     contributions: Contributions,
     scales: Float64[np.ndarray, " M"],
-    asked: Float64[np.ndarray, " 3"],
+    asked: Float64[np.ndarray, " s"],
     settings: MethodSettings,
     seed: int,
-) -> Float32[np.ndarray, "3 N 32"]:
-    """Train features and gate; returns the features gated for each level, of unit length.
+) -> Float32[np.ndarray, "s N 32"]:
+    """Train features and gate; returns the features gated for each scale, of unit length.
 
     Args:
         views: pixels.
         contributions: of the scene.
         scales: of all masks.
-        asked: scale of whole, part, subpart.
+        asked: scales.
         settings: steps and rate.
         seed: for the first features and gate, and all samples.
     """
@@ -164,14 +157,13 @@ def train_features(
     gate = (2 * torch.rand(2, CHANNELS, generator=draw) - 1).requires_grad_()  # slope and offset
     smooth = neighbour_mean(contributions.means())
     quantile = np.linspace(0, 1, len(scales)), np.sort(scales)
-    of_view = [np.flatnonzero(contributions.view == number) for number in range(len(contributions.views))]
+    of_view = contributions.rows_of_views()
 
     def gates(at: Float64[np.ndarray, " s"]) -> Tensor:
         share = torch.from_numpy(np.interp(at, quantile[1], quantile[0]).astype(np.float32))
         return (share[:, None] * gate[0] + gate[1]).sigmoid()
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
-        view = view.chosen(np.arange(min(len(view), PIXELS)))
         own, has = of_view[view.number], view.labels >= 0
         scale = np.where(has, scales[own][view.labels], 0)
         area = np.where(has, contributions.area_px[own][view.labels], 0).sum(axis=1) / has.sum(axis=1)
@@ -179,9 +171,9 @@ def train_features(
         same = np.stack([together(view.labels, scale, each) for each in at])
         weights, seen = of_seen(view.weights @ smooth)
         rendered = product(weights, unit(features[seen]))
-        return affinity_loss(rendered, gates(at), same, pixel_weights(area), random)
+        return affinity_loss(rendered, gates(at), same, pair_weights(area), random)
 
-    train(views, [{"params": [features, gate], "lr": settings.rate}], loss, settings, seed)
+    train(views, [{"params": [features, gate], "lr": settings.rate}], loss, settings, seed, PIXELS)
     with torch.no_grad():
         return unit(product(smooth, unit(features))[None] * gates(asked)[:, None]).numpy()
 
@@ -190,11 +182,14 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     """Train features, cluster them at the median scale of each level, give clusters the codes of masks."""
     contributions = inputs.contributions
     scales = mask_scales(contributions)
-    medians = [np.median(scales[contributions.rows_of(level)]) for level in LEVELS]
+    found = [level for level in LEVELS if len(contributions.rows_of(level))]
+    medians = [np.median(scales[contributions.rows_of(level)]) for level in found]
     views = labelled_views(inputs, settings.pixel_step)
     gated = train_features(views, contributions, scales, np.array(medians), settings, seed)
-    group = [clusters(own, (COSINE,), seed) for own in gated]
-    return cluster_field(inputs, np.concatenate(group, axis=1))
+    group = np.full((contributions.num_gaussians, len(LEVELS)), NONE, np.int64)
+    for level, own in zip(found, gated, strict=True):
+        group[:, level.index] = clusters(own, (COSINE,), seed)[:, 0]
+    return cluster_field(inputs, group)
 
 
 METHOD = Method(

@@ -31,10 +31,10 @@ from torch.nn.functional import softplus
 
 from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import NONE
-from hilsplat.methods.common.groups import thresholds_of
-from hilsplat.methods.common.training import LabelledView, alike, labelled_views, product, train, unit
+from hilsplat.methods.common.groups import cluster_field, thresholds_of
+from hilsplat.methods.common.pixels import LabelledView, labelled_views
+from hilsplat.methods.common.training import alike, product, train, unit
 from hilsplat.methods.method import Method, MethodInputs
-from hilsplat.methods.omniseg3d import cluster_field
 from hilsplat.segment.coverage import coverage_tree
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import CoverageTreeSettings, MethodSettings

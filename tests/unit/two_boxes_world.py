@@ -35,15 +35,19 @@ REGIONS = (
 
 @dataclass(frozen=True)
 class TwoBoxes:
-    """Folders of the world, and what only a test may know.
+    """Folders of the world, the regions of the masks of each train view, and what only a test may know.
 
     Gaussian g is seen at pixel (row, column) = divmod(g, WIDTH), moved right by one column (and
     around) per view. Weights are 0.9 there and 0.09 at the left neighbour's Gaussian.
     """
 
     folder: Path
-    views: tuple[str, ...]
+    regions: dict[str, list[int]]
     region_vectors: np.ndarray
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        return tuple(self.regions)
 
     @property
     def scene(self) -> Path:
@@ -97,28 +101,33 @@ def two_boxes_contributions(two_boxes) -> tuple[TwoBoxes, Path]:
     return two_boxes, build_contributions(two_boxes)
 
 
-def build_two_boxes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TwoBoxes:
-    """Four train views and a test view, masks of every region but one dropped per view."""
+ONE_DROPPED = tuple(tuple(row for row in range(len(REGIONS)) if row != view + 3) for view in range(4))
+"""Regions with a mask in each of four views: one is missed in each."""
+
+
+def build_two_boxes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, regions: tuple[tuple[int, ...], ...] = ONE_DROPPED
+) -> TwoBoxes:
+    """A train view with masks of the given regions for each item, and a test view."""
     rng = np.random.default_rng(0)
-    names = tuple(f"{view:03d}.png" for view in range(5))
+    names = tuple(f"{view:03d}.png" for view in range(len(regions) + 1))
     scene = tmp_path / "scene"
     (scene / "images").mkdir(parents=True)
     for name in names:
         write_png(scene / "images" / name, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     cameras = Cameras(
         names,
-        np.tile(np.eye(4), (5, 1, 1)),
-        np.tile(np.array([[10.0, 0, 6], [0, 10, 4], [0, 0, 1]]), (5, 1, 1)),
-        np.full((5, 2), (HEIGHT, WIDTH), np.int32),
+        np.tile(np.eye(4), (len(names), 1, 1)),
+        np.tile(np.array([[10.0, 0, 6], [0, 10, 4], [0, 0, 1]]), (len(names), 1, 1)),
+        np.full((len(names), 2), (HEIGHT, WIDTH), np.int32),
     )
-    split = {name: "test" if name == names[4] else "train" for name in names}
+    split = {name: "test" if name == names[-1] else "train" for name in names}
     points = np.zeros((0, 3), np.float32)
     Scene(scene, "toy/boxes", "metre", cameras, split, points, points.astype(np.uint8), np.eye(4)).save()
-    world = TwoBoxes(tmp_path, names[:4], rng.normal(size=(len(REGIONS), CHANNELS)))
+    own = {name: list(rows) for name, rows in zip(names, regions, strict=False)}
+    world = TwoBoxes(tmp_path, own, rng.normal(size=(len(REGIONS), CHANNELS)))
     world.region_vectors[:] /= np.linalg.norm(world.region_vectors, axis=1, keepdims=True)
-    for shift, view in enumerate(world.views):
-        dropped = shift + 3  # one region is missed in each view
-        rows = [row for row in range(len(REGIONS)) if row != dropped]
+    for shift, (view, rows) in enumerate(world.regions.items()):
         dense = np.stack([np.roll(region_mask(row), shift, axis=1) for row in rows])
         level = np.array([REGIONS[row][1] for row in rows], np.uint8)
         ones = np.ones(len(rows), np.float32)

@@ -1,4 +1,4 @@
-"""Adam for the methods that train on mask means, in one pass over the numbers."""
+"""Adam for the methods whose gradients are written out by hand, in one pass over the numbers."""
 
 from dataclasses import dataclass, field
 
@@ -31,21 +31,16 @@ class Adam:
     def step(self, gradient: np.ndarray) -> None:
         """One step; the same bytes on any number of threads, for there is one."""
         self.steps += 1
-        _adam(
-            self.values.reshape(-1),
-            np.ascontiguousarray(gradient, np.float32).reshape(-1),
-            *self._moments,
-            np.float32(self.rate / (1 - BETAS[0] ** self.steps)),
-            np.float32(1 / np.sqrt(1 - BETAS[1] ** self.steps)),
-        )
+        unbiased = (np.float32(1 - beta**self.steps) for beta in BETAS)
+        flat = np.ascontiguousarray(gradient, np.float32).reshape(-1)
+        _adam(flat, *self._moments, self.values.reshape(-1), np.float32(self.rate), *unbiased)
 
 
-@compiled
-def _adam(values, gradient, first, second, rate, scale):
-    keep1, rest1 = np.float32(BETAS[0]), np.float32(1 - BETAS[0])
-    keep2, rest2 = np.float32(BETAS[1]), np.float32(1 - BETAS[1])
+@compiled(error_model="numpy")
+def _adam(gradient, first, second, values, rate, unbiased1, unbiased2):
+    rest1, rest2 = np.float32(1 - BETAS[0]), np.float32(1 - BETAS[1])
     for k in range(len(values)):
         g = gradient[k]
-        first[k] = keep1 * first[k] + rest1 * g
-        second[k] = keep2 * second[k] + rest2 * g * g
-        values[k] -= rate * first[k] / (np.sqrt(second[k]) * scale + np.float32(EPS))
+        first[k] += rest1 * (g - first[k])
+        second[k] += rest2 * (g * g - second[k])
+        values[k] -= rate * (first[k] / unbiased1) / (np.sqrt(second[k] / unbiased2) + np.float32(EPS))

@@ -5,12 +5,12 @@ from collections.abc import Callable
 import numpy as np
 import scipy.cluster.hierarchy
 import scipy.sparse as sp
-from jaxtyping import Bool, Float, Float32, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int32, Int64
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.base.levels import NONE
+from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.contributions.rows import Contributions
 from hilsplat.methods.common.quantise import kmeans
 from hilsplat.methods.method import MethodInputs
@@ -23,6 +23,21 @@ MIN_VIEWS = 2
 """Least score of a mask, and least views, for a code of a cluster (OpenGaussian, for ScanNet)."""
 
 Closeness = Callable[[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]], Float[np.ndarray, " k"]]
+
+
+def standardised(means: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
+    """Centres of Gaussians about their mean, with a standard deviation of 1 over all three axes."""
+    apart = means - means.mean(axis=0)
+    return apart / max(float(apart.std()), 1e-12)
+
+
+def group_means(
+    rows: Float[np.ndarray, "n D"], group: Int[np.ndarray, " n"], num: int
+) -> tuple[Float64[np.ndarray, "T D"], Int64[np.ndarray, " T"]]:
+    """Mean of the rows of each of `num` groups, 0 for an empty one, and how many they have."""
+    counts = np.bincount(group, minlength=num)
+    sums = np.stack([np.bincount(group, column, num) for column in rows.T], axis=1)
+    return sums / np.maximum(counts, 1)[:, None], counts
 
 
 def group_latents(
@@ -48,7 +63,7 @@ def group_latents(
         rows: masks that may be chosen.
         latents: code of every mask of the scene.
         min_score: a mask is chosen if its score is above this.
-        min_views: groups with masks in fewer views get none.
+        min_views: groups with masks in fewer views get none; a scene of fewer views asks for all of them.
         closeness: factor of the score for pairs of a mask (place in `rows`) and a group; 1 if missing.
 
     Returns:
@@ -70,12 +85,9 @@ def group_latents(
     key = view[order].astype(np.int64) * num_groups + of[order]
     first = order[np.flatnonzero(np.diff(key, prepend=-1))]
     best = first[score[first] > min_score]
-    counts = np.bincount(of[best], minlength=num_groups)
-    sums = np.zeros((num_groups, latents.shape[1]))
-    np.add.at(sums, of[best], latents[rows[mask[best]]])
-    found = counts >= max(min_views, 1)
-    means = np.where(found[:, None], sums / np.maximum(counts, 1)[:, None], 0)
-    return means.astype(np.float32), found
+    means, counts = group_means(latents[rows[mask[best]]], of[best], num_groups)
+    found = counts >= max(min(min_views, len(size)), 1)
+    return np.where(found[:, None], means, 0).astype(np.float32), found
 
 
 def features_of_groups(
@@ -92,8 +104,7 @@ def clusters(
     """Cluster of each Gaussian at every threshold of the cosine; a higher threshold splits clusters only."""
     _, centre = kmeans(features, CENTRES, seed, KMEANS_ROUNDS)
     used, centre = np.unique(centre, return_inverse=True)
-    counts = np.bincount(centre)
-    means = np.stack([np.bincount(centre, column) / counts for column in features.T], axis=1)
+    means, _ = group_means(features, centre, len(used))
     means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12)
     if len(used) < 2:
         return np.zeros((len(features), len(thresholds)), np.int64)
@@ -103,11 +114,16 @@ def clusters(
 
 
 def cluster_field(inputs: MethodInputs, group: Int64[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3 D"]:
-    """Code of its cluster at each level for every Gaussian; masks of all levels compete."""
+    """Code of its cluster at each level for every Gaussian; masks of all levels compete.
+
+    A level without masks gets 0, as from methods that learn each level from its own masks.
+    """
     every = np.arange(len(inputs.contributions))
     features = []
-    for own in group.T:
-        num = int(own.max(initial=-1)) + 1
+    for level, own in zip(LEVELS, group.T, strict=True):
+        if not len(inputs.contributions.rows_of(level)):
+            own = np.full_like(own, NONE)
+        num = int(own.max(initial=NONE)) + 1
         latents, _ = group_latents(
             own,
             num,

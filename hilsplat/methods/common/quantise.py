@@ -26,7 +26,7 @@ def kmeans(
         rounds: of Lloyd's iteration; a centroid that loses its last vector stays where it is.
 
     Returns:
-        E centroids, of which missing ones repeat the first vector, and the row of the nearest.
+        E centroids, of which missing ones repeat the first, and the row of the nearest for every vector.
     """
     if not len(vectors):
         return np.zeros((count, vectors.shape[1]), np.float32), np.zeros(0, np.int64)

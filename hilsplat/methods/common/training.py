@@ -5,77 +5,24 @@ weights, which are computed once per view; losses are written in torch and diffe
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 import torch
-from jaxtyping import Float, Int32, Int64
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from hilsplat.base.device import one_torch_thread
-from hilsplat.base.errors import ArtifactError
 from hilsplat.base.progress import track
-from hilsplat.methods.langsplat import grid_pixels
-from hilsplat.methods.method import MethodInputs
+from hilsplat.methods.common.pixels import LabelledView
 from hilsplat.settings import MethodSettings
 
 PIXELS = 4096
-"""Pixels that a step renders, at most; VCH takes as many, OmniSeg3D 32,768, the others whole views."""
-
+"""Pixels that a step renders, at most; published: VCH as many, OmniSeg3D 32,768, others whole views."""
 
 START_NOISE = 0.1
 """Standard deviation of the first features about their common value."""
-
-
-@dataclass(frozen=True)
-class LabelledView:
-    """Covered pixels of one view that are labelled at any level, on the grid of `method.pixel_step`.
-
-    Attributes:
-        number: index of the view in the contributions.
-        weights: compositing weights (pixels x Gaussians), rows summing to 1.
-        labels: row of the mask painted there at each level among the view's masks, -1 for none.
-        xy: column and row of each pixel, px.
-    """
-
-    number: int
-    weights: sp.csr_matrix
-    labels: Int32[np.ndarray, "p 3"]
-    xy: Int64[np.ndarray, "p 2"]
-
-    def __len__(self) -> int:
-        return len(self.labels)
-
-    def chosen(self, pixels: Int64[np.ndarray, " q"]) -> "LabelledView":
-        """Some of the pixels, in the given order."""
-        return LabelledView(self.number, self.weights[pixels], self.labels[pixels], self.xy[pixels])
-
-
-def labelled_views(inputs: MethodInputs, pixel_step: int) -> list[LabelledView]:
-    """Pixels of all train views that have any.
-
-    Raises:
-        ArtifactError: no view has a labelled pixel.
-    """
-    found = []
-    for number, name in enumerate(track(list(inputs.contributions.views), "weights of views")):
-        weights, labels = inputs.view_weights(name), inputs.view_labels(name)
-        size_hw = inputs.view_size_hw(name)
-        grid = grid_pixels(size_hw, pixel_step)
-        covered = np.diff(weights.indptr)[grid] > 0
-        pixels = grid[covered & (labels[grid] >= 0).any(axis=1)]
-        row, column = np.divmod(pixels, size_hw[1])
-        if len(pixels):
-            xy = np.stack([column, row], axis=1)
-            found.append(LabelledView(number, weights[pixels], labels[pixels], xy))
-    if not found:
-        raise ArtifactError(
-            f"no train view has a pixel on a grid of {pixel_step} px that a mask labels",
-            fix="reduce method.pixel_step, or loosen masks.predicted_iou_min and run the masks stage again",
-        )
-    return found
 
 
 class _Product(torch.autograd.Function):
@@ -126,16 +73,22 @@ Loss = Callable[[LabelledView, np.random.Generator, float], Tensor]
 
 
 def train(
-    views: list[LabelledView], groups: list[dict[str, Any]], loss: Loss, settings: MethodSettings, seed: int
+    views: list[LabelledView],
+    groups: list[dict[str, Any]],
+    loss: Loss,
+    settings: MethodSettings,
+    seed: int,
+    pixels: int = PIXELS,
 ) -> None:
     """Minimise in place by Adam: each step one view, each view once before any is repeated.
 
     Args:
         views: where pixels are drawn from.
         groups: parameter groups of `torch.optim.Adam`, each with its rate.
-        loss: of up to `PIXELS` random pixels.
+        loss: of some random pixels of a view.
         settings: number of steps.
         seed: for the order of views and the pixels.
+        pixels: of a step, at most.
     """
     random = np.random.default_rng(seed)
     with one_torch_thread():
@@ -145,9 +98,9 @@ def train(
             if not queue:
                 queue = list(random.permutation(len(views)))
             view = views[queue.pop()]
-            pixels = random.permutation(len(view))[:PIXELS]
+            chosen = random.permutation(len(view))[:pixels]
             optimiser.zero_grad()
-            loss(view.chosen(pixels), random, step / settings.steps).backward()
+            loss(view.chosen(chosen), random, step / settings.steps).backward()
             optimiser.step()
 
 

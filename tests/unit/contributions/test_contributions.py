@@ -187,6 +187,7 @@ def test_stage_writes_rows_in_view_order_and_masses(two_boxes_contributions):
     assert found.level[:6].tolist() == [1, 1, 2, 2, 3, 3]
     assert found.pixels[:6].tolist() == [48, 48, 24, 24, 8, 6]
     assert found.rows_of(Level.SUBPART)[:2].tolist() == [4, 5]
+    assert [rows.tolist() for rows in found.rows_of_views()] == np.arange(24).reshape(4, 6).tolist()
     assert found.mass().sum(axis=1) == pytest.approx([HEIGHT * WIDTH] * 4, rel=1e-5)
     A = found.matrix("A").toarray()
     assert A.sum(axis=1) == pytest.approx(np.ones(len(found)), abs=1e-5)

@@ -2,7 +2,6 @@
 
 import inspect
 import types
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -11,23 +10,23 @@ import torch
 
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.field.linear_code import LinearCode
 from hilsplat.methods import gaussian_grouping, laga, legaussians, omniseg3d, opengaussian, saga, vch
 from hilsplat.methods.common.groups import (
     clusters,
     features_of_groups,
     group_latents,
+    group_means,
     thresholds_of,
 )
-from hilsplat.methods.common.training import LabelledView, labelled_views, product, train, unit
+from hilsplat.methods.common.pixels import LabelledView, labelled_views
+from hilsplat.methods.common.training import product, train, unit
 from hilsplat.methods.gaussian_grouping import mask_identities, neighbour_loss
-from hilsplat.methods.method import MethodInputs
 from hilsplat.methods.omniseg3d import hierarchical_loss, patches
 from hilsplat.methods.opengaussian import contrast_loss, instances, smoothing_loss
 from hilsplat.methods.vch import components, neighbouring_pixels, triplets, ultrametric
 from hilsplat.settings import MethodSettings
-from tests.unit.two_boxes_world import HEIGHT, REGIONS, WIDTH, TwoBoxes, region_mask, two_boxes_weights
+from tests.unit.methods.two_boxes_inputs import two_boxes_inputs
+from tests.unit.two_boxes_world import HEIGHT, REGIONS, WIDTH, region_mask
 
 RNG = np.random.default_rng(0)
 FITS = {
@@ -48,33 +47,6 @@ FITS = {
     ),
     "vch": (vch, MethodSettings(name="vch", steps=100, rate=0.05, pixel_step=1, thresholds=(0.8, 0.5, 0.3))),
 }
-
-
-@dataclass(frozen=True)
-class BoxesInputs(MethodInputs):
-    """Inputs of the world with two boxes; codes are the one-hot names of regions."""
-
-    world: TwoBoxes | None = None
-
-    @property
-    def latents(self):
-        views = range(len(self.world.views))
-        names = [row for shift in views for row in range(len(REGIONS)) if row != shift + 3]
-        return np.eye(len(REGIONS), dtype=np.float32)[names]
-
-    def linear_code(self, method):
-        return LinearCode(np.full(len(REGIONS), 0.1, np.float32), np.eye(len(REGIONS), dtype=np.float32))
-
-    def view_weights(self, view):
-        return normalised_weights(two_boxes_weights(self.world.views.index(view)))
-
-    def view_size_hw(self, view):
-        return (HEIGHT, WIDTH)
-
-
-def two_boxes_inputs(world, contributions, threads=1):
-    """Inputs of methods; a mask of the world misses one region per view."""
-    return BoxesInputs(world.scene, world.ply, world.masks, contributions, world.folder, threads, world)
 
 
 def fit_of(name, inputs, settings=None):
@@ -106,7 +78,7 @@ def test_methods_with_thresholds_find_the_hierarchy_from_masks_of_single_views(t
 
 
 def test_laga_finds_the_objects_of_every_level(two_boxes_contributions, monkeypatch):
-    monkeypatch.setattr(laga, "LEAST_MASKS", 3)  # four views show a region, or three
+    monkeypatch.setattr(laga, "LEAST_MASKS", 3)  # some regions have masks in three of the four views
     features = fit_of("laga", two_boxes_inputs(*two_boxes_contributions))
     for row, (name, level, *_) in enumerate(REGIONS):
         assert answered(features, Level(level), row) > 0.8, name
@@ -164,6 +136,8 @@ def test_labelled_pixels_know_their_place_and_are_covered():
         view_labels=lambda view: labels,
         view_size_hw=lambda view: (2, 3),
     )
+    (view,) = inspect.unwrap(labelled_views)(inputs, 2)  # columns 0 and 2 of row 0
+    assert view.xy.tolist() == [[2, 0]]
     (view,) = inspect.unwrap(labelled_views)(inputs, 1)
     assert view.xy.tolist() == [[1, 0], [2, 0], [0, 1], [2, 1]]
     assert view.chosen(np.array([3, 0])).xy.tolist() == [[2, 1], [1, 0]]
@@ -194,6 +168,22 @@ def test_training_finds_the_mean_of_what_a_gaussian_shows_and_visits_all_views()
     assert {number for number, _ in seen[:3]} == {0, 1, 2} and seen[150][1] == 0.5
 
 
+@pytest.mark.parametrize(("most", "expected"), [(3, 3), (5, 5), (9, 5)])
+def test_a_step_sees_some_pixels_of_a_view_each_once(most, expected):
+    matrix = sp.csr_matrix(np.eye(5, dtype=np.float32))
+    view = LabelledView(0, matrix, np.zeros((5, 3), np.int32), np.stack([np.arange(5)] * 2, axis=1))
+    feature, seen = torch.zeros(5, 1, requires_grad=True), []
+
+    def loss(view, random, done):
+        seen.append(view.xy[:, 0].tolist())
+        return product(view.weights, feature).sum()
+
+    settings = MethodSettings(name="saga", steps=20)
+    train([view], [{"params": [feature], "lr": 0.1}], loss, settings, 0, most)
+    assert {len(set(pixels)) for pixels in seen} == {len(pixels) for pixels in seen} == {expected}
+    assert {pixel for pixels in seen for pixel in pixels} == set(range(5))
+
+
 def test_smoothing_is_the_mean_distance_to_the_mean_of_the_mask():
     # mask 0: distances 1 and 3 from its mean, mask 1: 2; mask 2 has no pixel and does not count
     rendered = torch.tensor([[1.0, 0], [3.0, 0], [0.0, 2]])
@@ -202,15 +192,18 @@ def test_smoothing_is_the_mean_distance_to_the_mean_of_the_mask():
 
 
 def test_contrast_weighs_the_closest_masks_most():
-    # on a line at 0, 1, 3: squares 1, 9, 4; from each mask the closest weighs 1, the farthest 0.1
+    # on a line at 0, 1, 3: squares 1, 9, 4; from each mask the closest weighs 1, the farthest 0.55, later 0.1
     means = torch.tensor([[0.0], [1.0], [3.0]])
-    early = (1 / 2 + 0.1 / 10) + (1 / 2 + 0.1 / 5) + (1 / 5 + 0.1 / 10)
-    assert contrast_loss(means, 0.0).item() == pytest.approx(early / 6)
-    # with a fourth mask the middle rank weighs 0.55 at first, 0.1 later
+    for done, far in ((0.0, 0.55), (0.5, 0.1)):
+        every = (1 / 2 + far / 10) + (1 / 2 + far / 5) + (1 / 5 + far / 10)
+        assert contrast_loss(means, done).item() == pytest.approx(every / 6)
+    assert contrast_loss(means[:2], 0.5).item() == pytest.approx(1 / 2)  # of two masks each is the closest
+    # with a fourth mask the ranks weigh 0.4, 0.7 and 1 at first, then 0.1, 0.1 and 1
     means = torch.tensor([[0.0], [1.0], [3.0], [100.0]])
     first, later = contrast_loss(means, 0.0).item(), contrast_loss(means, 0.5).item()
     middle = 1 / 10 + 1 / 5 + 1 / 10 + 1 / (99**2 + 1)
-    assert first - later == pytest.approx(0.45 * middle / 12, rel=1e-3)
+    farthest = 1 / (100**2 + 1) + 1 / (99**2 + 1) + 1 / (97**2 + 1) + 1 / (100**2 + 1)
+    assert first - later == pytest.approx((0.6 * middle + 0.3 * farthest) / 12, rel=1e-3)
     assert contrast_loss(means[:1], 0.0).item() == 0
 
 
@@ -250,7 +243,15 @@ def test_a_group_takes_the_best_mask_of_each_view():
     far = lambda mask, group: np.where(mask == 0, 0.1, 1.0)  # noqa: E731
     assert associated(contributions, [0, 0, -1], 2, [[1.0], [5.0], [2.0]], closeness=far)[0][0] == 3.5
     assert associated(contributions, [0, 0, -1], 2, [[1.0], [5.0], [2.0]], min_score=0.7)[0][0] == 1.0
-    assert not associated(contributions, [0, 0, -1], 2, [[1.0], [5.0], [2.0]], min_views=3)[1].any()
+    # three views are as good as all of two, but not as two of three
+    three = association(S, np.ones((3, 3)), [0, 0, 1])
+    for scene, expected in ((contributions, [True, False]), (three, [False, False])):
+        assert associated(scene, [0, 0, -1], 2, [[1.0], [5.0], [2.0]], min_views=3)[1].tolist() == expected
+
+
+def test_means_of_groups_are_zero_where_a_group_is_empty():
+    means, counts = group_means(np.float32([[1, 2], [3, 4], [5, 7]]), np.array([2, 0, 2]), 4)
+    assert means.tolist() == [[3, 4], [0, 0], [3, 4.5], [0, 0]] and counts.tolist() == [1, 0, 2, 0]
 
 
 def test_gaussians_without_a_group_get_nothing():

@@ -1,6 +1,7 @@
 """Methods that lift language: worlds of a few pixels and Gaussians in which the right answer is known."""
 
 import types
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +53,7 @@ class OneRowOfPixels(MethodInputs):
         own["contributions"] = types.SimpleNamespace(
             views=views,
             num_gaussians=weights.shape[1],
-            view=np.repeat(np.arange(len(views)), 2),
+            rows_of_views=lambda: list(np.arange(2 * len(views)).reshape(-1, 2)),
             level=level,
             pixels=np.tile(pixels, len(views)),
             rows_of=lambda wanted: np.flatnonzero(level == int(wanted)),
@@ -227,6 +228,15 @@ def test_a_gaussian_across_a_border_takes_the_mask_at_its_centre_and_a_hidden_on
     assert (
         masks.spread(np.ones((4, 1), np.float32))[3] > 0
     ).any()  # which `lifted` would divide between both
+
+
+def test_a_view_in_which_no_centre_lies_adds_nothing():
+    class LooksAway(OneRowOfPixels):
+        def view_camera(self, view):
+            camera = super().view_camera(view)
+            return replace(camera, cam_from_world=np.diag([1.0, -1, -1, 1])) if view == "b" else camera
+
+    assert np.array_equal(fit_of("occam", LooksAway(TWO)), fit_of("occam", OneRowOfPixels(TWO, views=("a",))))
 
 
 # ---- what they need -------------------------------------------------------------------------------------

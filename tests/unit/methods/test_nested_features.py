@@ -92,9 +92,9 @@ def test_nested_loss_matches_a_plain_loop_over_pixels_and_masks():
 def test_a_gaussian_belongs_to_the_nearest_object_and_an_object_has_five_masks():
     prototypes = np.float32([[1, 0, 0]] * 5 + [[0, 1, 0]] * 6 + [[0, 0, 1]] * 4)
     features = np.float32([[0.6, 0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
-    group, of_mask = laga.objects(features, prototypes, 0.1)
+    group, of_mask = laga.objects(features, prototypes, 0.1, 5)
     assert of_mask.tolist() == [0] * 5 + [1] * 6 + [-1] * 4 and group.tolist() == [1, 0, 0]
-    group, _ = laga.objects(features, prototypes[:4], 0.1)
+    group, _ = laga.objects(features, prototypes[:4], 0.1, 5)
     assert group.tolist() == [-1, -1, -1]
 
 
@@ -155,7 +155,7 @@ def test_scales_lie_between_those_of_neighbouring_masks_and_beyond_both_ends():
 
 
 def test_pairs_of_pixels_in_small_masks_weigh_ten_times_those_in_large_ones():
-    assert saga.pixel_weights(np.array([1.0, 10.0])) == pytest.approx(
+    assert saga.pair_weights(np.array([1.0, 10.0])) == pytest.approx(
         np.float32([[10, 1 + 9 * 9 / 99], [1 + 9 * 9 / 99, 1]])
     )
 
@@ -166,7 +166,7 @@ def test_affinity_loss_matches_a_plain_loop_over_pairs_and_scales():
     same = RNG.random((3, 6, 6)) < 0.5
     same |= same.transpose(0, 2, 1)
     same[:, 0, 1], same[:, 0, 2] = True, False
-    weight = saga.pixel_weights(RNG.random(6) + 0.1)
+    weight = saga.pair_weights(RNG.random(6) + 0.1)
     found = saga.affinity_loss(rendered, gates, same, weight, np.random.default_rng(4)).item()
     draw = np.random.default_rng(4).random((6, 6), dtype=np.float32)
     gated = unit(rendered[None] * gates[:, None]).numpy()

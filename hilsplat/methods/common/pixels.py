@@ -1,0 +1,66 @@
+"""The labelled pixels of the train views, from which methods learn, with weights computed once per view."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Int32, Int64
+
+from hilsplat.base.errors import ArtifactError
+from hilsplat.base.progress import track
+from hilsplat.methods.method import MethodInputs
+
+
+@dataclass(frozen=True)
+class LabelledView:
+    """Covered pixels of one view that are labelled at any level, on the grid of `method.pixel_step`.
+
+    Attributes:
+        number: index of the view in the contributions.
+        weights: compositing weights (pixels x Gaussians), rows summing to 1.
+        labels: row of the mask painted there at each level among the view's masks, -1 for none.
+        xy: column and row of each pixel, px.
+    """
+
+    number: int
+    weights: sp.csr_matrix
+    labels: Int32[np.ndarray, "p 3"]
+    xy: Int64[np.ndarray, "p 2"]
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def chosen(self, pixels: Int64[np.ndarray, " q"]) -> "LabelledView":
+        """Some of the pixels, in the given order."""
+        return LabelledView(self.number, self.weights[pixels], self.labels[pixels], self.xy[pixels])
+
+
+def labelled_views(inputs: MethodInputs, pixel_step: int) -> list[LabelledView]:
+    """Pixels of all train views that have any.
+
+    Raises:
+        ArtifactError: no view has a labelled pixel.
+    """
+    found = []
+    for number, name in enumerate(track(list(inputs.contributions.views), "weights of views")):
+        weights, labels = inputs.view_weights(name), inputs.view_labels(name)
+        size_hw = inputs.view_size_hw(name)
+        grid = grid_pixels(size_hw, pixel_step)
+        covered = np.diff(weights.indptr)[grid] > 0
+        pixels = grid[covered & (labels[grid] >= 0).any(axis=1)]
+        row, column = np.divmod(pixels, size_hw[1])
+        if len(pixels):
+            xy = np.stack([column, row], axis=1)
+            found.append(LabelledView(number, weights[pixels], labels[pixels], xy))
+    if not found:
+        raise ArtifactError(
+            f"no train view has a pixel on a grid of {pixel_step} px that a mask labels",
+            fix="reduce method.pixel_step, or loosen masks.predicted_iou_min and run the masks stage again",
+        )
+    return found
+
+
+def grid_pixels(size_hw: tuple[int, int], step: int) -> Int64[np.ndarray, " p"]:
+    """Row-major indices of every `step`-th pixel of every `step`-th row."""
+    rows, columns = np.arange(0, size_hw[0], step), np.arange(0, size_hw[1], step)
+    return (rows[:, None] * size_hw[1] + columns[None]).ravel()
