@@ -55,6 +55,11 @@ def layers_of(channels: int, latent: int) -> tuple[list[Layer], list[Layer]]:
     return sides[0], sides[1]
 
 
+def torch_generator(seed: int) -> np.random.RandomState:
+    """The generator that `torch.manual_seed(seed)` begins, a Mersenne Twister."""
+    return np.random.RandomState(seed % 2**32)
+
+
 def unit(vectors: Float32[np.ndarray, "B C"]) -> Float32[np.ndarray, "B C"]:
     """Rows divided by their lengths."""
     return vectors / np.maximum(np.sqrt(np.square(vectors).sum(axis=1, keepdims=True)), np.float32(1e-12))
@@ -103,9 +108,8 @@ class Autoencoder:
         return PackedLayers.of([self._affine(layer.name) for layer in self._decoder])
 
     @staticmethod
-    def drawn(channels: int, latent: int, seed: int) -> "Autoencoder":
-        """The weights that torch draws after `manual_seed(seed)`, bit for bit; BatchNorm has no effect."""
-        twister = np.random.RandomState(seed % 2**32)  # torch seeds the same generator in the same way
+    def drawn(channels: int, latent: int, twister: np.random.RandomState) -> "Autoencoder":
+        """The weights that torch draws from this state of its generator; BatchNorm has no effect."""
         arrays: dict[str, np.ndarray] = {}
         for layer in (layer for side in layers_of(channels, latent) for layer in side):
             if layer.norm:
@@ -127,7 +131,7 @@ class Autoencoder:
         Raises:
             ValueError: an array is missing or has another shape.
         """
-        model = Autoencoder.drawn(channels, latent, 0)
+        model = Autoencoder.drawn(channels, latent, torch_generator(0))
         for name, values in model.arrays.items():
             if name not in arrays or arrays[name].shape != values.shape:
                 raise ValueError(f"{name} of shape {values.shape} is missing")

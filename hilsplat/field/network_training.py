@@ -8,10 +8,10 @@ from itertools import pairwise
 from typing import NamedTuple, no_type_check
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 
 from hilsplat.base.compiled import compiled
-from hilsplat.field.network_code import NORM_EPS, Autoencoder, Layer, layers_of, unit
+from hilsplat.field.network_code import NORM_EPS, Autoencoder, Layer, layers_of, torch_generator, unit
 from hilsplat.settings import AutoencoderSettings
 
 BETA1, BETA2, ADAM_EPS = 0.9, 0.999, 1e-8
@@ -48,7 +48,7 @@ def train_autoencoder(
         the trained model; the same bytes for the same input and seed on any number of threads of the stage
         (the command line gives BLAS one).
     """
-    rng = np.random.default_rng(seed)
+    twister = torch_generator(seed)
     channels, latent = vectors.shape[1], settings.latent
     data = np.ascontiguousarray(vectors)
     if len(data) == 1:
@@ -56,7 +56,7 @@ def train_autoencoder(
     batch = min(settings.batch, len(data))
     per_epoch = len(data) // batch
     steps = max(settings.epochs * per_epoch, settings.min_steps)
-    drawn = Autoencoder.drawn(channels, latent, seed).arrays
+    drawn = Autoencoder.drawn(channels, latent, twister).arrays
     drawn = {name: values for name, values in drawn.items() if "running" not in name}
     flat = np.zeros((4, sum(values.size for values in drawn.values())), np.float32)
     flat[0] = np.concatenate([values.reshape(-1) for values in drawn.values()])
@@ -64,7 +64,7 @@ def train_autoencoder(
     for step in range(steps):
         place = step % per_epoch
         if place == 0:
-            order = rng.permutation(len(data))
+            order = torch_order(len(data), twister)
         chosen = data[order[place * batch : (place + 1) * batch]]
         loss_gradients(parameters, chosen, latent, settings.cosine_weight, gradients)
         rate = settings.learning_rate * (1 + math.cos(math.pi * step / steps)) / 2
@@ -74,6 +74,22 @@ def train_autoencoder(
             np.float32(1 / math.sqrt(1 - BETA2 ** (step + 1))),
         )
     return Autoencoder(channels, latent, parameters | statistics(parameters, data, latent))
+
+
+def torch_order(count: int, twister: np.random.RandomState) -> Int64[np.ndarray, " n"]:
+    """The order that `torch.randperm(count)` draws from this state of its generator."""
+    order = np.arange(count)
+    _swap(order, twister.randint(0, 2**32, max(count - 1, 0), np.uint32))
+    return order
+
+
+@compiled
+@no_type_check  # the shape checks of the test-suite cannot be compiled
+def _swap(order, drawn):
+    """Swap each place with one of those from it on, as drawn."""
+    for place in range(len(drawn)):
+        other = place + np.int64(drawn[place]) % (len(order) - place)
+        order[place], order[other] = order[other], order[place]
 
 
 def _as_arrays(flat: Float32[np.ndarray, " P"], like: Arrays) -> Arrays:

@@ -13,8 +13,8 @@ from hilsplat.contributions.rows import Contributions
 from hilsplat.field.autoencoder import mask_targets, run_autoencoder
 from hilsplat.field.code import autoencoder_file, load_code, load_latents
 from hilsplat.field.decoder_kernel import PackedLayers
-from hilsplat.field.network_code import Autoencoder
-from hilsplat.field.network_training import loss_gradients, statistics, train_autoencoder
+from hilsplat.field.network_code import Autoencoder, torch_generator
+from hilsplat.field.network_training import loss_gradients, statistics, torch_order, train_autoencoder
 from hilsplat.semantic_tree.tree import SemanticTree, run_semantic_tree
 from hilsplat.settings import AutoencoderSettings, SemanticTreeSettings
 
@@ -27,7 +27,7 @@ def unit_vectors(rows: int, channels: int, seed: int = 0) -> np.ndarray:
 
 
 def test_both_ends_have_unit_length():
-    model = Autoencoder.drawn(16, 3, 0)
+    model = Autoencoder.drawn(16, 3, torch_generator(0))
     latents = model.encode_array(unit_vectors(5, 16))
     assert latents.shape == (5, 3)
     assert np.linalg.norm(latents, axis=1) == pytest.approx(np.ones(5), abs=1e-5)
@@ -36,7 +36,7 @@ def test_both_ends_have_unit_length():
 
 @pytest.mark.parametrize(("channels", "first", "last"), [(16, 16, 16), (512, 256, 256)])
 def test_layers_are_never_wider_than_the_input(channels, first, last):
-    arrays = Autoencoder.drawn(channels, 3, 0).arrays
+    arrays = Autoencoder.drawn(channels, 3, torch_generator(0)).arrays
     assert arrays["encoder.0.weight"].shape == (first, channels)
     assert arrays["decoder.12.weight"].shape == (channels, last)
 
@@ -64,12 +64,15 @@ class TorchAutoencoder(nn.Module):
 
 
 @pytest.mark.parametrize("seed", [0, 2**32 + 7])
-def test_first_weights_are_those_that_torch_draws(seed):
+def test_first_weights_and_orders_are_those_that_torch_draws(seed):
     torch.manual_seed(seed)
     expected = dict(TorchAutoencoder({}, 300, 3).named_parameters())
-    drawn = Autoencoder.drawn(300, 3, seed).arrays
+    twister = torch_generator(seed)
+    drawn = Autoencoder.drawn(300, 3, twister).arrays
     for name, values in expected.items():
         assert np.array_equal(drawn[name], values.detach().numpy()), name
+    for count in (1, 2, 1000):
+        assert torch_order(count, twister).tolist() == torch.randperm(count).tolist()
 
 
 def torch_loss(model: TorchAutoencoder, vectors: np.ndarray, cosine_weight: float) -> torch.Tensor:
@@ -86,7 +89,7 @@ def without_statistics(model: Autoencoder) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("channels", [16, 300])
 def test_gradients_are_those_of_autograd(channels):
     vectors, weight = unit_vectors(24, channels), 0.3
-    parameters = without_statistics(Autoencoder.drawn(channels, 3, 1))
+    parameters = without_statistics(Autoencoder.drawn(channels, 3, torch_generator(1)))
     found = {name: np.full_like(values, np.nan) for name, values in parameters.items()}
     loss_gradients(parameters, vectors, 3, weight, found)
     model = TorchAutoencoder(parameters, channels, 3)
@@ -100,7 +103,7 @@ def test_gradients_are_those_of_autograd(channels):
 
 def test_a_trained_network_answers_as_torch_does_with_the_statistics_of_all_vectors():
     vectors = unit_vectors(50, 16)
-    model = Autoencoder.drawn(16, 3, 2)
+    model = Autoencoder.drawn(16, 3, torch_generator(2))
     model.arrays |= statistics(without_statistics(model), vectors, 3)
     reference = TorchAutoencoder(model.arrays, 16, 3)
     for module in reference.modules():
@@ -132,7 +135,7 @@ def test_the_compiled_layers_are_products_with_relu_between_them(rows, widths):
 
 
 def test_weights_that_are_missing_are_told(tmp_path):
-    model = Autoencoder.drawn(16, 3, 0)
+    model = Autoencoder.drawn(16, 3, torch_generator(0))
     del model.arrays["encoder.4.running_var"]
     model.save(autoencoder_file(tmp_path))
     with pytest.raises(ArtifactError, match=r"encoder.4.running_var of shape \(16,\) is missing"):
@@ -153,16 +156,21 @@ def test_training_recovers_a_few_vectors():
 
 
 def test_training_takes_the_steps_of_torch():
-    vectors = unit_vectors(32, 16)  # one batch: their order does not matter
-    settings = AutoencoderSettings(code="network", latent=3, epochs=60, min_steps=1, learning_rate=2e-3)
-    reference = TorchAutoencoder(without_statistics(Autoencoder.drawn(16, 3, 5)), 16, 3)
+    vectors = unit_vectors(100, 16)
+    settings = AutoencoderSettings(
+        code="network", latent=3, epochs=20, min_steps=1, batch=32, learning_rate=2e-3
+    )
+    torch.manual_seed(5)
+    reference = TorchAutoencoder({}, 16, 3).double()
     optimiser = torch.optim.Adam(reference.parameters(), lr=2e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, 60)
-    for _ in range(60):
-        optimiser.zero_grad()
-        torch_loss(reference, vectors, settings.cosine_weight).backward()
-        optimiser.step()
-        schedule.step()
+    for _ in range(20):
+        order = torch.randperm(100).numpy()
+        for begin in (0, 32, 64):
+            optimiser.zero_grad()
+            torch_loss(reference, vectors[order[begin : begin + 32]], settings.cosine_weight).backward()
+            optimiser.step()
+            schedule.step()
     trained = train_autoencoder(vectors, settings, seed=5).arrays
     for name, values in reference.named_parameters():
         assert trained[name] == pytest.approx(values.detach().numpy(), abs=2e-4), name

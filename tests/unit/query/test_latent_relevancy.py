@@ -7,7 +7,7 @@ import torch
 from hilsplat.base.device import compute_device
 from hilsplat.base.errors import DeviceError
 from hilsplat.field.linear_code import LinearCode
-from hilsplat.field.network_code import Autoencoder
+from hilsplat.field.network_code import Autoencoder, torch_generator
 from hilsplat.field.network_training import train_autoencoder
 from hilsplat.query import projected_look_up
 from hilsplat.query.device_look_up import PlacedOnDevice
@@ -46,7 +46,7 @@ def blends(features, count):
 
 def pass_through(latent, channels):
     """A network that decodes to the positive part of a latent, then zeros, at unit length."""
-    code = Autoencoder.drawn(channels, latent, 0)
+    code = Autoencoder.drawn(channels, latent, torch_generator(0))
     for name, values in code.arrays.items():
         if name.startswith("decoder"):
             values[:] = np.eye(*values.shape) if values.ndim == 2 else 0

@@ -9,7 +9,7 @@ import scipy.sparse as sp
 
 from hilsplat.base.levels import Level
 from hilsplat.field.language_field import LanguageField
-from hilsplat.field.network_code import Autoencoder
+from hilsplat.field.network_code import Autoencoder, torch_generator
 from hilsplat.query.hits import doubts_of
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.node_search import margin_range, search
@@ -107,7 +107,7 @@ def three_mugs() -> LanguageScene:
         round_gaussians(np.zeros((1, 3))),
         replace(tree, clip=vectors),
         LanguageField(np.zeros((1, 3, 2), np.float32), "", ""),
-        Autoencoder.drawn(6, 2, 0),
+        Autoencoder.drawn(6, 2, torch_generator(0)),
         encode,
         lambda view: sp.csr_matrix((4, 1), dtype=np.float32),
         settings,
