@@ -11,9 +11,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from hilsplat.base.artifacts import INDEX, atomic_folder, read_index, read_npy, sha256_of_json, write_index
-from hilsplat.base.compiled import compiled
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
+from hilsplat.contributions.gram_kernels import grown_block, transpose
 from hilsplat.contributions.quadratic import Gram, Quadratic, StackedWeights
 
 logger = logging.getLogger(__name__)
@@ -68,7 +68,7 @@ class GramBuilder:
             begin, end = self._ranges[block]
             if columns[0][begin] == columns[0][end]:
                 return
-            self._blocks[block] = _grown_block(
+            self._blocks[block] = grown_block(
                 begin, end, *arrays, *columns, *self._blocks[block], len(LEVELS)
             )
 
@@ -86,7 +86,7 @@ class GramBuilder:
             self._pixels = np.empty(weights.nnz * 9 // 8, np.int32)
             self._places = np.empty(len(self._pixels), dtype)
         begins = np.zeros(weights.shape[1] + 1, np.int64)
-        _transpose(weights.indptr, weights.indices, begins, self._pixels, self._places)
+        transpose(weights.indptr, weights.indices, begins, self._pixels, self._places)
         return begins, self._pixels, self._places
 
     def state(self) -> dict[str, np.ndarray]:
@@ -300,86 +300,3 @@ def stack_weights(parts: list[StackedWeights]) -> StackedWeights:
         return parts[0]
     matrix = sp.vstack([part.weights for part in parts], format="csr")
     return StackedWeights(matrix, np.concatenate([part.valid for part in parts]))
-
-
-@compiled
-def _transpose(indptr, indices, begins, pixels, places):
-    """Start of each column's list, and the row and place of its values; `begins` must be zero."""
-    for k in range(indptr[-1]):
-        begins[indices[k] + 1] += 1
-    begins[:] = np.cumsum(begins)
-    filled = begins[:-1].copy()
-    for p in range(len(indptr) - 1):
-        for k in range(indptr[p], indptr[p + 1]):
-            at = filled[indices[k]]
-            pixels[at] = p
-            places[at] = k
-            filled[indices[k]] += 1
-
-
-@compiled
-def _grown_block(
-    begin,
-    end,
-    indptr,
-    indices,
-    data,
-    valid,
-    begins,
-    pixels,
-    places,
-    old_indptr,
-    old_indices,
-    old_values,
-    levels,
-):
-    """Rows begin..end of G: old values plus the new pixels; columns sorted."""
-    num = len(begins) - 1
-    seen = np.full(num, -1, np.int64)
-    sums = np.zeros((num, levels), np.float64)
-    found = np.empty(num, np.int32)
-    out_indptr = np.zeros(end - begin + 1, np.int64)
-    out_indices = np.empty(max(1024, 2 * len(old_indices)), np.int32)
-    out_values = np.empty((len(out_indices), levels), np.float64)
-    done = 0
-    for i in range(begin, end):
-        count = 0
-        for k in range(old_indptr[i - begin], old_indptr[i - begin + 1]):
-            j = old_indices[k]
-            seen[j] = i
-            found[count] = j
-            count += 1
-            for level in range(levels):
-                sums[j, level] = old_values[k, level]
-        known = count
-        for t in range(begins[i], begins[i + 1]):
-            p = pixels[t]
-            weight = np.float64(data[places[t]])
-            whole = weight if valid[p, 0] else 0.0
-            part = weight if valid[p, 1] else 0.0
-            subpart = weight if valid[p, 2] else 0.0
-            for k in range(places[t], indptr[p + 1]):
-                j = indices[k]
-                if seen[j] != i:
-                    seen[j] = i
-                    sums[j] = 0
-                    found[count] = j
-                    count += 1
-                value = np.float64(data[k])
-                sums[j, 0] += whole * value
-                sums[j, 1] += part * value
-                sums[j, 2] += subpart * value
-        if count > known:
-            found[:count] = np.sort(found[:count])
-        if done + count > len(out_indices):
-            room = 2 * (done + count)
-            more_indices, more_values = np.empty(room, np.int32), np.empty((room, levels), np.float64)
-            more_indices[:done], more_values[:done] = out_indices[:done], out_values[:done]
-            out_indices, out_values = more_indices, more_values
-        for place in range(count):
-            out_indices[done + place] = found[place]
-            for level in range(levels):
-                out_values[done + place, level] = sums[found[place], level]
-        done += count
-        out_indptr[i - begin + 1] = done
-    return out_indptr, out_indices[:done].copy(), out_values[:done].copy()
