@@ -16,7 +16,6 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
-from scipy.spatial import cKDTree
 
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.rotations import rotation_matrices
@@ -214,6 +213,8 @@ def _neighbours(
             found=f"{len(opacities)} Gaussians below",
             fix="look at gaussians.ply; the fit has probably failed",
         )
+    from scipy.spatial import cKDTree  # takes 0.2 s, and only points need it
+
     tree = cKDTree(means[opaque].astype(float))
     # The radius itself counts as within.
     bound = np.nextafter(radius, np.inf)
