@@ -224,7 +224,14 @@ class MasksSettings(Section):
         origin="SAM, LangSplat: official",
     )
     stability_offset: float = knob(1.0, "shift of the logits in the stability test", gt=0, origin="SAM")
-    box_nms_iou: float = knob(0.7, "box IoU above which the worse mask is dropped", gt=0, le=1, origin="SAM")
+    box_nms_iou: float = knob(
+        0.7,
+        "box IoU above which the worse mask is dropped; from 0.95 on, every prompt is decoded even where a "
+        "preview shows that it repeats another",
+        gt=0,
+        le=1,
+        origin="SAM",
+    )
     min_area_px: int = knob(
         16,
         "smaller masks are dropped, smaller islands and holes removed",

@@ -30,7 +30,7 @@ def check_model(folder: Path, variant: str = "") -> str:
     lines = [f"folder     {model.folder}", f"kind       {model.layout}", f"image      {side} x {side} px"]
     if model.kind == "sam":
         own = own_thresholds(model)
-        encoder, decoder = (model.network(name) for name in model.networks)
+        encoder, decoder, *_ = (model.network(name) for name in model.networks)
         start = time.perf_counter()
         features = dict(zip(encoder.spec.outputs, encoder(pixel_values=pixels), strict=True))
         encode_s = time.perf_counter() - start

@@ -39,7 +39,7 @@ class ModelFolder:
         layout: key of `LAYOUTS`.
         config: content of `config.json`.
         preprocessing: how a picture becomes an input, in the words of `preprocessor_config.json`.
-        networks: file of each network by name.
+        networks: file of each network by name, and of those that few models have if it is there.
         files: all files that count for the digest.
     """
 
@@ -73,7 +73,7 @@ class ModelFolder:
         Raises:
             ModelError: it cannot be read, or its inputs or outputs have other names or axes than expected.
         """
-        return Network(self.networks[name], LAYOUTS[self.layout].networks[name], threads)
+        return Network(self.networks[name], LAYOUTS[self.layout].usable[name], threads)
 
 
 def open_model_folder(
@@ -98,7 +98,7 @@ def open_model_folder(
     layout = LAYOUTS[name]
     networks = {
         network: found
-        for network, spec in layout.networks.items()
+        for network, spec in layout.usable.items()
         if (found := _network_file(folder, spec, variant)) is not None
     }
     missing = [

@@ -33,6 +33,7 @@ class Layout:
     Attributes:
         kind: what the model is for: "sam" segments, "clip" compares pictures with texts.
         networks: by the names that our code gives them.
+        further: networks that few models have; they are used if the folder has them.
         preprocessing: file that says how a picture becomes an input.
         tokenizer: file that turns texts into tokens; "" if the model reads none.
         beside: further files that count for the digest, if they exist.
@@ -40,9 +41,15 @@ class Layout:
 
     kind: str
     networks: Mapping[str, NetworkSpec]
+    further: Mapping[str, NetworkSpec] = field(default_factory=dict)
     preprocessing: str = "preprocessor_config.json"
     tokenizer: str = ""
     beside: tuple[str, ...] = ()
+
+    @property
+    def usable(self) -> dict[str, NetworkSpec]:
+        """`networks` and `further`."""
+        return {**self.networks, **self.further}
 
     @property
     def described(self) -> tuple[str, ...]:
@@ -55,6 +62,11 @@ _IMAGE: Axes = (None, 3, None, None)
 _POINTS: dict[str, Axes] = {"input_points": (None, None, None, 2), "input_labels": _ANY3}
 _MASKS: dict[str, Axes] = {"iou_scores": (None, None, 3), "pred_masks": (None, None, 3, None, None)}
 
+DECODER = "prompt_encoder_mask_decoder"
+PREVIEW = "prompt_encoder_mask_preview"
+"""A decoder with the same predicted IoUs, but only every second row and column of the masks: in a fraction of
+the decoder's time it says which prompts repeat others (`segment.candidates`). sam-tiny has one."""
+
 
 def _places(name: str) -> tuple[str, ...]:
     return name, f"onnx/{name}"
@@ -63,15 +75,15 @@ def _places(name: str) -> tuple[str, ...]:
 def _segmenter(features: Sequence[str], optional: tuple[str, ...] = ()) -> Layout:
     """A SAM whose encoder hands the named features to its decoder."""
     encoded = dict.fromkeys(features, _ANY4)
-    decoder = "prompt_encoder_mask_decoder"
     return Layout(
         "sam",
         {
             "vision_encoder": NetworkSpec(
                 {"pixel_values": _IMAGE}, encoded, places=_places("vision_encoder")
             ),
-            decoder: NetworkSpec(_POINTS | encoded, _MASKS, optional, _places(decoder)),
+            DECODER: NetworkSpec(_POINTS | encoded, _MASKS, optional, _places(DECODER)),
         },
+        {PREVIEW: NetworkSpec(_POINTS | encoded, _MASKS, optional, _places(PREVIEW))},
     )
 
 

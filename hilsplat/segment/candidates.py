@@ -1,10 +1,11 @@
 """What the networks predict for a view: the costly, cached half of automatic mask generation."""
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Int8, Int32, Int64, UInt8
+from jaxtyping import Float, Float32, Int8, Int32, Int64, UInt8
 
 from hilsplat.base.artifacts import sha256_of_json
 from hilsplat.base.identity import code_digest
@@ -12,6 +13,7 @@ from hilsplat.segment.logit_kernels import edge_windows
 from hilsplat.segment.masks import join_rows
 from hilsplat.segment.sam import (
     HEADS,
+    Encoded,
     Frame,
     SamModel,
     Thresholds,
@@ -19,6 +21,7 @@ from hilsplat.segment.sam import (
     point_grid,
     read_logits,
 )
+from hilsplat.segment.suppression import distinct_boxes
 from hilsplat.settings import MasksSettings
 
 LOOSE = 0.1
@@ -26,6 +29,12 @@ LOOSE = 0.1
 
 BAND_PX = 3
 """Low-resolution pixels on either side of a mask's edge whose logits are kept (see `Candidates`)."""
+
+REPEAT_IOU = 0.95
+"""A preview's mask whose box has a higher IoU with that of a better one repeats it (`distinct_prompts`)."""
+
+REPEAT_SLACK = 0.05
+"""Stability that a repeated mask may have above the better one, as a preview counts it: pixels are few."""
 
 CROP_OVERLAP = 512 / 1500
 """Overlap of the first layer's crops, as a share of the image's shorter side (SAM)."""
@@ -114,6 +123,7 @@ def candidates_key(image_sha256: str, model: SamModel, settings: MasksSettings) 
             "stability_offset": settings.stability_offset,
             "full_size": needs_full_size(settings),
             "official": settings.generator == "official",
+            "preview": uses_preview(model, settings),
             "floors": floors(thresholds),
             "code": code_digest(decode_candidates),
         }
@@ -134,7 +144,7 @@ def needs_full_size(settings: MasksSettings) -> bool:
 def decode_candidates(
     image: UInt8[np.ndarray, "H W 3"], model: SamModel, settings: MasksSettings
 ) -> Candidates:
-    """Prompt the network at every grid point of the image and of its crops."""
+    """Prompt the network at every grid point of the image and of its crops, or at those worth it."""
     boxes, _ = crop_boxes((image.shape[0], image.shape[1]), settings.crop_layers)
     grid = point_grid(settings.points_per_side)
     thresholds = model.thresholds(settings)
@@ -143,18 +153,60 @@ def decode_candidates(
     for crop, (left, top, right, bottom) in enumerate(boxes):
         encoded = model.encode(np.ascontiguousarray(image[top:bottom, left:right]))
         points = grid * (right - left, bottom - top)
-        for start in range(0, len(points), batch):
-            asked = points[start : start + batch]
-            # Every call has the same number of prompts: some networks fix it, and so results
-            # cannot depend on how a batch was cut.
-            padded = np.concatenate([asked, np.repeat(asked[-1:], batch - len(asked), axis=0)])
-            scores, logits = model.decode(encoded, padded)
-            parts.append(
-                keep_candidates(
-                    scores[: len(asked)], logits[: len(asked)], encoded.frame, crop, settings, thresholds
-                )
-            )
+        if uses_preview(model, settings):
+            points = points[distinct_prompts(encoded, points, model, settings, batch)]
+        for scores, logits in answers(model.decode, encoded, points, batch):
+            parts.append(keep_candidates(scores, logits, encoded.frame, crop, settings, thresholds))
     return Candidates.concatenate(parts)
+
+
+def answers(
+    ask: Callable[[Encoded, np.ndarray], tuple[np.ndarray, np.ndarray]],
+    encoded: Encoded,
+    points: Float[np.ndarray, "P 2"],
+    batch: int,
+) -> Iterator[tuple[Float32[np.ndarray, "p 3"], Float32[np.ndarray, "p 3 h w"]]]:
+    """What `SamModel.decode` or `SamModel.preview` answers to the points, call by call."""
+    for start in range(0, len(points), batch):
+        asked = points[start : start + batch]
+        # Every call has the same number of prompts: some networks fix it, and so results
+        # cannot depend on how a batch was cut.
+        padded = np.concatenate([asked, np.repeat(asked[-1:], batch - len(asked), axis=0)])
+        scores, logits = ask(encoded, padded)
+        yield scores[: len(asked)], logits[: len(asked)]
+
+
+def uses_preview(model: SamModel, settings: MasksSettings) -> bool:
+    """Whether prompts that repeat others are left out: if the model can tell, and if what they give would be
+    suppressed anyway."""
+    may_repeat = settings.generator == "official" or settings.box_nms_iou >= REPEAT_IOU
+    return model.previewer is not None and not may_repeat
+
+
+def distinct_prompts(
+    encoded: Encoded, points: Float[np.ndarray, "P 2"], model: SamModel, settings: MasksSettings, batch: int
+) -> Int64[np.ndarray, " p"]:
+    """Prompts of which some mask repeats no better one of its head, by the model's preview.
+
+    Masks are compared by their boxes in the preview, which has every second row and column of the decoder's
+    masks (`suppression.distinct_boxes`), before any threshold that a user may change. Of a thousand prompts
+    some two hundred stay (docs/segment.md), and at least one.
+    """
+    iou_floor, stability_floor = floors(model.thresholds(settings))
+    found = []
+    for scores, logits in answers(model.preview, encoded, points, batch):
+        flat = logits.reshape(-1, *logits.shape[2:])
+        _, stability, boxes = read_logits(flat, settings.stability_offset, encoded.frame)
+        found.append((scores, stability.reshape(scores.shape), boxes.reshape(*scores.shape, 4)))
+    predicted_iou, stability, boxes = (np.concatenate(each) for each in zip(*found, strict=True))
+    likely = (predicted_iou >= iou_floor) & (stability >= stability_floor) & boxes.any(axis=2)
+    wanted = np.zeros(len(points), bool)
+    for head in range(len(HEADS)):
+        rows = np.flatnonzero(likely[:, head])
+        at = rows, head
+        kept = distinct_boxes(boxes[at], predicted_iou[at], stability[at], REPEAT_IOU, REPEAT_SLACK)
+        wanted[rows[kept]] = True
+    return np.flatnonzero(wanted) if wanted.any() else np.zeros(1, np.int64)
 
 
 def keep_candidates(

@@ -18,7 +18,8 @@ from PIL import Image
 from hilsplat.base.errors import ModelError
 from hilsplat.base.levels import Level
 from hilsplat.models.folder import ModelFolder, open_model_folder, side_px
-from hilsplat.models.network import require_three_heads
+from hilsplat.models.layouts import DECODER, PREVIEW
+from hilsplat.models.network import Network, require_three_heads
 from hilsplat.segment.kernels import areas_and_boxes, upscaled_runs
 from hilsplat.segment.logit_kernels import quantise_logits
 from hilsplat.settings import MasksSettings
@@ -102,10 +103,12 @@ class SamModel:
     Attributes:
         own: thresholds that come with the model.
         stretches: whether pictures are stretched to a square, as for SAM 2, or padded, as for SAM.
+        previewer: the decoder at half the resolution (`layouts.PREVIEW`), if the model has one.
     """
 
     own: Thresholds = REAL_SAM
     stretches: bool = False
+    previewer: Network | None = None
 
     def __init__(self, model: ModelFolder) -> None:
         self.model = model
@@ -113,7 +116,9 @@ class SamModel:
         self.stretches = model.layout == "sam2"
         self.digest = model.digest
         self.encoder = model.network("vision_encoder")
-        self.decoder = model.network("prompt_encoder_mask_decoder")
+        self.decoder = model.network(DECODER)
+        if PREVIEW in model.networks:
+            self.previewer = model.network(PREVIEW)
         preprocessing = model.preprocessing
         self.longest_edge = side_px(preprocessing.get("size"), 1024)
         padded = preprocessing.get("pad_size")
@@ -183,6 +188,19 @@ class SamModel:
         Returns:
             predicted IoUs and low-resolution logits; heads as in `HEADS`.
         """
+        return self._answer(self.decoder, encoded, points_xy)
+
+    def preview(
+        self, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]
+    ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 half_h half_w"]]:
+        """`decode` with every second row and column of the logits; for models that have a `previewer`."""
+        assert self.previewer is not None
+        return self._answer(self.previewer, encoded, points_xy)
+
+    def _answer(
+        self, decoder: Network, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Predicted IoUs and logits of one of the two decoders."""
         frame = encoded.frame
         scale = np.array(
             [
@@ -190,13 +208,13 @@ class SamModel:
                 frame.resized_hw[0] / frame.original_hw[0],
             ]
         )
-        scores, logits = self.decoder(
+        scores, logits = decoder(
             input_points=(points_xy * scale)[None, :, None, :],
             input_labels=np.ones((1, len(points_xy), 1)),
             input_boxes=np.zeros((1, 0, 4)),
             **encoded.features,
         )
-        require_three_heads(self.decoder.path, scores, logits)
+        require_three_heads(decoder.path, scores, logits)
         return scores[0], logits[0]
 
 

@@ -73,12 +73,42 @@ def suppress_boxes_officially(
     return order[_greedy(last_inside(boxes_xyxy)[order], iou_max)]
 
 
-def _greedy(boxes: Int[np.ndarray, "M 4"], iou_max: float) -> Bool[np.ndarray, " M"]:
-    """Which boxes stay if each that stays drops the following ones whose IoU with it exceeds `iou_max`."""
+def distinct_boxes(
+    boxes_xyxy: Int[np.ndarray, "M 4"],
+    score: Float[np.ndarray, " M"],
+    stability: Float[np.ndarray, " M"],
+    iou_max: float,
+    slack: float,
+) -> Int64[np.ndarray, " k"]:
+    """Greedy suppression by boxes that holds for any thresholds of score and stability.
+
+    The box of highest score (of equal score: the lower row) stays and drops every other whose IoU with it
+    exceeds `iou_max` and whose stability is at most `slack` above its own; then the best of the rest, and so
+    on. What passes a threshold is then dropped by what passes it too, but for the slack.
+
+    Returns:
+        rows kept, the best first.
+    """
+    order = np.argsort(-score, kind="stable")
+    return order[_greedy(boxes_xyxy[order], iou_max, stability[order], slack)]
+
+
+def _greedy(
+    boxes: Int[np.ndarray, "M 4"],
+    iou_max: float,
+    stability: Float[np.ndarray, " M"] | None = None,
+    slack: float = 0.0,
+) -> Bool[np.ndarray, " M"]:
+    """Which boxes stay if each that stays drops the following ones whose IoU with it exceeds `iou_max`.
+
+    With stabilities, it drops only those whose own is at most `slack` above its own.
+    """
     alive = np.ones(len(boxes), dtype=bool)
     for start in range(0, len(boxes), BOXES_AT_ONCE):
         block = np.flatnonzero(alive[start : start + BOXES_AT_ONCE]) + start
         allowed = box_iou(boxes[block], boxes[start:]) <= iou_max
+        if stability is not None:
+            allowed |= stability[start:] > stability[block, None] + slack
         for place, row in zip(block, allowed, strict=True):
             if alive[place]:
                 alive[place + 1 :] &= row[place + 1 - start :]

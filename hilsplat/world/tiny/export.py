@@ -12,6 +12,7 @@ from tokenizers import Tokenizer
 from torch import Tensor, nn
 
 from hilsplat.base.artifacts import atomic_path, write_json
+from hilsplat.models.layouts import DECODER, PREVIEW
 from hilsplat.segment.sam import OWN, Thresholds
 from hilsplat.world.tiny.clip import CROP_PX, DIMENSIONS, ClipText, ClipVision
 from hilsplat.world.tiny.sam import (
@@ -54,14 +55,16 @@ class _VisionEncoder(nn.Module):
 
 
 class _MaskDecoder(nn.Module):
-    """The decoder of what `_VisionEncoder` returns."""
+    """The decoder of what `_VisionEncoder` returns, or its preview."""
 
-    def __init__(self, decoder: SamDecoder) -> None:
+    def __init__(self, decoder: SamDecoder, preview: bool) -> None:
         super().__init__()
         self.decoder = decoder
+        self.preview = preview
 
     def forward(self, points: Tensor, labels: Tensor, place: Tensor, shared: Tensor) -> tuple[Tensor, Tensor]:
-        return self.decoder.masks(points, labels, place, shared)
+        answer = self.decoder.preview if self.preview else self.decoder.masks
+        return answer(points, labels, place, shared)
 
 
 def store_as_half(model: onnx.ModelProto) -> onnx.ModelProto:
@@ -119,7 +122,7 @@ def export_onnx(
 
 
 def export_sam(encoder: SamEncoder, decoder: SamDecoder, folder: Path) -> None:
-    """Write `config.json`, `preprocessor_config.json` and the two networks of SAM's layout."""
+    """Write `config.json`, `preprocessor_config.json`, the two networks of SAM's layout and the preview."""
     folder = Path(folder)
     vision = _VisionEncoder(encoder).eval()
     pixels = torch.zeros(1, 3, FRAME_PX, FRAME_PX)
@@ -132,27 +135,28 @@ def export_sam(encoder: SamEncoder, decoder: SamDecoder, folder: Path) -> None:
     )
     with torch.no_grad():
         place, shared = vision(pixels)
-    export_onnx(
-        _MaskDecoder(decoder),
-        {
-            # Two points of a prompt and three prompts: axes of length one would be traced as constants.
-            "input_points": torch.full((2, 3, 2, 2), FRAME_PX / 2.0),
-            "input_labels": torch.ones((2, 3, 2), dtype=torch.int64),
-            "image_embeddings": place.repeat(2, 1, 1, 1),
-            "image_positional_embeddings": shared.repeat(2, 1, 1, 1),
-        },
-        {
-            "iou_scores": {0: "batch", 1: "prompts"},
-            "pred_masks": {0: "batch", 1: "prompts"},
-        },
-        {
-            "input_points": {0: "batch", 1: "prompts", 2: "points"},
-            "input_labels": {0: "batch", 1: "prompts", 2: "points"},
-            "image_embeddings": {0: "batch"},
-            "image_positional_embeddings": {0: "batch"},
-        },
-        folder / "onnx" / "prompt_encoder_mask_decoder.onnx",
-    )
+    for name in (DECODER, PREVIEW):
+        export_onnx(
+            _MaskDecoder(decoder, preview=name == PREVIEW),
+            {
+                # Two points of a prompt and three prompts: axes of length one would be traced as constants.
+                "input_points": torch.full((2, 3, 2, 2), FRAME_PX / 2.0),
+                "input_labels": torch.ones((2, 3, 2), dtype=torch.int64),
+                "image_embeddings": place.repeat(2, 1, 1, 1),
+                "image_positional_embeddings": shared.repeat(2, 1, 1, 1),
+            },
+            {
+                "iou_scores": {0: "batch", 1: "prompts"},
+                "pred_masks": {0: "batch", 1: "prompts"},
+            },
+            {
+                "input_points": {0: "batch", 1: "prompts", 2: "points"},
+                "input_labels": {0: "batch", 1: "prompts", 2: "points"},
+                "image_embeddings": {0: "batch"},
+                "image_positional_embeddings": {0: "batch"},
+            },
+            folder / "onnx" / f"{name}.onnx",
+        )
     write_json(
         folder / "config.json",
         {

@@ -10,6 +10,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from hilsplat.base.images import write_png
+from hilsplat.models.layouts import DECODER, PREVIEW
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 
@@ -34,29 +35,22 @@ def tensor(name: str, shape: list, kind: int = TensorProto.FLOAT) -> onnx.ValueI
     return helper.make_tensor_value_info(name, kind, shape)
 
 
-def write_disc_sam(folder: Path, points_name: str = "input_points", heads: int = 3) -> Path:
-    """A SAM whose answer to a point is three discs around it: logit = radius - distance, px of the frame."""
-    save_network(
-        folder / "onnx" / "vision_encoder.onnx",
-        [
-            helper.make_node(
-                "AveragePool", ["pixel_values"], ["image_embeddings"], kernel_shape=[2, 2], strides=[2, 2]
-            ),
-            helper.make_node("Identity", ["image_embeddings"], ["image_positional_embeddings"]),
-        ],
-        [tensor("pixel_values", ["batch", 3, FRAME, FRAME])],
-        [
-            tensor("image_embeddings", ["batch", 3, LOW, LOW]),
-            tensor("image_positional_embeddings", ["batch", 3, LOW, LOW]),
-        ],
-        {},
-    )
-    centres = (np.arange(LOW, dtype=np.float32) + 0.5) * FRAME / LOW
+def _write_disc_decoder(path: Path, every: slice, points_name: str, heads: int, cell_px: float) -> None:
+    """The decoder of `write_disc_sam`, with those rows and columns of the masks that `every` takes."""
+    centres = ((np.arange(LOW, dtype=np.float32) + 0.5) * FRAME / LOW)[every]
+    low = len(centres)
     x, y = np.meshgrid(centres, centres)
+    to_middle_of_cell = [
+        helper.make_node("Div", [points_name, "cell"], ["in_cells"]),
+        helper.make_node("Floor", ["in_cells"], ["corner"]),
+        helper.make_node("Add", ["corner", "half"], ["middle"]),
+        helper.make_node("Mul", ["middle", "cell"], ["centre"]),
+    ]
     save_network(
-        folder / "onnx" / "prompt_encoder_mask_decoder.onnx",
+        path,
         [
-            helper.make_node("Sub", [points_name, "grid"], ["offset"]),  # (1, P, 256, 2)
+            *(to_middle_of_cell if cell_px else [helper.make_node("Identity", [points_name], ["centre"])]),
+            helper.make_node("Sub", ["centre", "grid"], ["offset"]),  # (1, P, 256, 2)
             helper.make_node("Mul", ["offset", "offset"], ["squared"]),
             helper.make_node("ReduceSum", ["squared", "last"], ["sum"], keepdims=0),
             helper.make_node("Sqrt", ["sum"], ["distance"]),
@@ -73,17 +67,46 @@ def write_disc_sam(folder: Path, points_name: str = "input_points", heads: int =
             tensor("image_embeddings", [1, 3, LOW, LOW]),
             tensor("image_positional_embeddings", [1, 3, LOW, LOW]),
         ],
-        [tensor("iou_scores", [1, "P", heads]), tensor("pred_masks", [1, "P", heads, LOW, LOW])],
+        [tensor("iou_scores", [1, "P", heads]), tensor("pred_masks", [1, "P", heads, low, low])],
         {
+            "cell": np.array([cell_px], np.float32),
+            "half": np.array([0.5], np.float32),
             "grid": np.stack([x.reshape(-1), y.reshape(-1)], axis=1)[None, None],
             "last": np.array([3]),
             "two": np.array([2]),
             "radii": np.array((RADII + RADII)[:heads], np.float32)[None, None, :, None],
-            "shape": np.array([1, -1, heads, LOW, LOW]),
+            "shape": np.array([1, -1, heads, low, low]),
             "zero": np.zeros(1, np.float32),
             "scores": np.array((SCORES + SCORES)[:heads], np.float32),
         },
     )
+
+
+def write_disc_sam(
+    folder: Path, points_name: str = "input_points", heads: int = 3, cell_px: float = 0
+) -> Path:
+    """A SAM whose answer to a point is three discs around it: logit = radius - distance, px of the frame.
+
+    With `cell_px`, discs are around the middle of the point's cell of a grid, and the model has a preview.
+    """
+    save_network(
+        folder / "onnx" / "vision_encoder.onnx",
+        [
+            helper.make_node(
+                "AveragePool", ["pixel_values"], ["image_embeddings"], kernel_shape=[2, 2], strides=[2, 2]
+            ),
+            helper.make_node("Identity", ["image_embeddings"], ["image_positional_embeddings"]),
+        ],
+        [tensor("pixel_values", ["batch", 3, FRAME, FRAME])],
+        [
+            tensor("image_embeddings", ["batch", 3, LOW, LOW]),
+            tensor("image_positional_embeddings", ["batch", 3, LOW, LOW]),
+        ],
+        {},
+    )
+    networks = {DECODER: slice(None), PREVIEW: slice(None, None, 2)} if cell_px else {DECODER: slice(None)}
+    for name, every in networks.items():
+        _write_disc_decoder(folder / "onnx" / f"{name}.onnx", every, points_name, heads, cell_px)
     own = {"predicted_iou_min": 0.35, "stability_min": 0.5, "nms_score": 0.0, "points_per_batch": 64}
     (folder / "config.json").write_text(json.dumps({"model_type": "sam", "mask_generation": own}))
     (folder / "preprocessor_config.json").write_text(

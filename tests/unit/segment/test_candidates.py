@@ -5,9 +5,9 @@ import zlib
 import numpy as np
 import pytest
 
-from hilsplat.segment.candidates import Candidates, keep_candidates
+from hilsplat.segment.candidates import Candidates, distinct_prompts, keep_candidates
 from hilsplat.segment.generate import masks_from_candidates
-from hilsplat.segment.sam import Frame, SamModel, Thresholds, resized_size
+from hilsplat.segment.sam import Encoded, Frame, SamModel, Thresholds, resized_size
 from hilsplat.settings import MasksSettings
 from tests.unit.segment.plain import flatten_far, quantise, restore, smooth_logits, unpacked
 
@@ -63,3 +63,35 @@ def test_a_mask_over_the_whole_picture_has_no_edge() -> None:
 
 def test_a_mask_without_a_pixel_is_not_a_candidate() -> None:
     assert len(candidates_of(np.full((2, 3, 8, 8), -3, np.float32), Frame((8, 8), (8, 8), (8, 8)))) == 0
+
+
+class Previewed(SamModel):
+    """Answers previews with given scores and discs (centre x, radius) in 16 x 16 px."""
+
+    def __init__(self, scores: list[list[float]], discs: list[list[tuple[float, float]]]) -> None:
+        self.scores, self.discs = np.array(scores, np.float32), np.array(discs, np.float32)
+
+    def preview(self, encoded: Encoded, points_xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        rows = points_xy[:, 0].astype(int)
+        y, x = np.mgrid[:16, :16].astype(np.float32)
+        centre, radius = (self.discs[rows, :, number, None, None] for number in (0, 1))
+        return self.scores[rows], 4 * (radius - np.hypot(x - centre, y - 8))
+
+
+def prompts_of(model: Previewed) -> list[int]:
+    points = np.stack([np.arange(len(model.scores))] * 2, axis=1).astype(np.float64)
+    encoded = Encoded({}, Frame((64, 64), (64, 64), (64, 64)))
+    return distinct_prompts(encoded, points, model, MasksSettings(), batch=2).tolist()
+
+
+def test_prompts_stay_that_have_a_mask_which_repeats_no_better_one() -> None:
+    small, middle, large = (8, 2.2), (8, 4.2), (8, 6.2)
+    scores = [[0.5, 0.5, 0.5], [0.6, 0.5, 0.5], [0.5, 0.5, 0.4], [0.4, 0.4, 0.05]]
+    discs = [[small, middle, large]] * 2 + [[small, (4, 3.2), large], [small, middle, (9, 6.2)]]
+    # 0 is as good as 1 at two heads, and the earlier; 1 is better at the first; 2 shows another part; the
+    # other whole of 3 is below the floor of 0.1
+    assert prompts_of(Previewed(scores, discs)) == [0, 1, 2]
+
+
+def test_one_prompt_stays_where_the_preview_shows_nothing() -> None:
+    assert prompts_of(Previewed([[0.05] * 3] * 3, [[(8, 3)] * 3] * 3)) == [0]

@@ -9,6 +9,7 @@ from hilsplat.base.artifacts import read_index, read_npz, sha256_of_path
 from hilsplat.base.errors import ArtifactError, ModelError
 from hilsplat.base.images import read_image
 from hilsplat.models.folder import open_model_folder
+from hilsplat.models.layouts import DECODER, PREVIEW
 from hilsplat.models.network import Network
 from hilsplat.segment.coverage_stage import run_coverage_tree
 from hilsplat.segment.masks import HierarchicalMasks
@@ -52,6 +53,35 @@ def test_second_run_calls_no_network_and_writes_the_same_bytes(make_scene, tmp_p
     run_masks(scene, tmp_path / "third", tmp_path / "cache", stricter, threads=1)
     assert calls == []
     assert read_index(tmp_path / "third")["views"]["000.png"] == {"whole": 0, "part": 4, "subpart": 4}
+
+
+def test_prompts_that_repeat_others_in_the_preview_are_not_decoded(
+    make_disc_sam, make_scene, tmp_path, calls
+):
+    # 64 prompts, 16 to each quarter of the picture, all with the same three discs; calls of 4 prompts
+    folder = make_disc_sam(tmp_path / "sam", cell_px=16)
+    settings = MasksSettings(model=str(folder), points_per_side=8, points_per_batch=4, stability_min=0.0)
+    scene = make_scene(views=2)
+    run_masks(scene, tmp_path / "some", tmp_path / "cache", settings, threads=1)
+    assert (calls.count(PREVIEW), calls.count(DECODER)) == (16, 1)
+    (folder / "onnx" / f"{PREVIEW}.onnx").unlink()
+    calls.clear()
+    run_masks(scene, tmp_path / "all", tmp_path / "cache", settings, threads=1)
+    assert (calls.count(PREVIEW), calls.count(DECODER)) == (0, 16)
+    some, every = (HierarchicalMasks.load(tmp_path / name / "000.png.npz") for name in ("some", "all"))
+    assert len(every) == 12
+    for name, values in every.arrays().items():
+        np.testing.assert_array_equal(some.arrays()[name], values)
+
+
+@pytest.mark.parametrize("change", [{"box_nms_iou": 0.95}, {"generator": "official"}])
+def test_all_prompts_are_decoded_where_repeated_masks_could_stay(
+    make_disc_sam, make_scene, tmp_path, calls, change
+):
+    folder = make_disc_sam(tmp_path / "sam", cell_px=16)
+    settings = MasksSettings(model=str(folder), points_per_side=8, points_per_batch=4, **change)
+    run_masks(make_scene(views=2), tmp_path / "masks", tmp_path / "cache", settings, threads=1)
+    assert (calls.count(PREVIEW), calls.count(DECODER)) == (0, 16)
 
 
 def test_masks_do_not_depend_on_the_number_of_threads(make_scene, tmp_path, settings):

@@ -7,7 +7,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.segment.suppression import box_iou, keep_best_masks, suppress_boxes, suppress_masks
+from hilsplat.segment.suppression import (
+    box_iou,
+    distinct_boxes,
+    keep_best_masks,
+    suppress_boxes,
+    suppress_masks,
+)
 
 shapes = st.tuples(st.integers(1, 8), st.just(3), st.just(5))
 nonempty_masks = hnp.arrays(bool, shapes).filter(lambda masks: masks.any(axis=(1, 2)).all())
@@ -54,6 +60,28 @@ def test_a_dropped_box_drops_no_other():
     # 0-1 and 1-2 overlap by 0.6, 0-2 by a third: 0 drops 1, so 2 stays
     boxes = np.array([[0, 0, 8, 1], [2, 0, 10, 1], [4, 0, 12, 1]])
     assert suppress_boxes(boxes, np.array([0.9, 0.8, 0.7]), iou_max=0.5).tolist() == [0, 2]
+
+
+def test_a_box_repeats_a_better_one_unless_it_is_steadier():
+    box = [0, 0, 10, 10]
+    boxes = np.array([box, box, box, box, [0, 0, 10, 8]])
+    score, stability = np.array([0.5, 0.9, 0.8, 0.7, 0.6]), np.array([0.5, 0.6, 0.64, 0.66, 0.1])
+    # 1 is best; 0 and 2 repeat it, 3 is steadier by more than 0.05, and 4 has an IoU of 0.8 with all others
+    assert distinct_boxes(boxes, score, stability, iou_max=0.85, slack=0.05).tolist() == [1, 3, 4]
+
+
+@given(st.integers(0, 1000), st.sampled_from([0.2, 0.5, 0.8]), st.sampled_from([0.2, 0.5, 0.8]))
+def test_distinct_boxes_lead_to_the_same_suppression_at_any_threshold(seed, score_min, stability_min):
+    rng = np.random.default_rng(seed)
+    copies = rng.integers(0, 4, 40)  # four regions, each many times with the very same box
+    boxes = np.array([[0, 0, 10, 10], [20, 0, 30, 10], [0, 20, 10, 30], [20, 20, 30, 30]])[copies]
+    score, stability = rng.permutation(40) / 40, rng.random(40)
+
+    def best(rows: np.ndarray) -> list[int]:
+        rows = rows[(score[rows] > score_min) & (stability[rows] >= stability_min)]
+        return rows[suppress_boxes(boxes[rows], score[rows], iou_max=0.7)].tolist()
+
+    assert best(np.sort(distinct_boxes(boxes, score, stability, 0.9, slack=0.0))) == best(np.arange(40))
 
 
 def test_contained_mask_goes_even_with_the_better_score():

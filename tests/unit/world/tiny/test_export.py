@@ -8,6 +8,7 @@ import pytest
 import torch
 from tokenizers import Tokenizer
 
+from hilsplat.models.layouts import DECODER, PREVIEW
 from hilsplat.world.tiny.clip import CANONICAL, CROP_PX, ClipText, ClipVision, word_tokenizer
 from hilsplat.world.tiny.export import export_clip, export_sam
 from hilsplat.world.tiny.sam import (
@@ -77,6 +78,24 @@ def test_exported_sam_equals_torch(sam, batch, prompts, points):
     assert np.abs(scores - expected_scores.numpy()).max() < 1e-3
     spread = np.abs(expected_masks.numpy()).max()
     assert np.abs(masks - expected_masks.numpy()).max() / spread < 1e-3
+
+
+def test_the_preview_is_every_second_row_and_column_of_the_masks(sam):
+    generator = torch.Generator().manual_seed(5)
+    pixels = torch.randn(1, 3, FRAME_PX, FRAME_PX, generator=generator)
+    place, shared = session(sam[2] / "onnx" / "vision_encoder.onnx").run(
+        None, {"pixel_values": pixels.numpy()}
+    )
+    feeds = {
+        "input_points": (torch.rand(1, 5, 1, 2, generator=generator) * FRAME_PX).numpy(),
+        "input_labels": np.ones((1, 5, 1), np.int64),
+        "image_embeddings": place,
+        "image_positional_embeddings": shared,
+    }
+    scores, masks = session(sam[2] / "onnx" / f"{DECODER}.onnx").run(["iou_scores", "pred_masks"], feeds)
+    seen, few = session(sam[2] / "onnx" / f"{PREVIEW}.onnx").run(["iou_scores", "pred_masks"], feeds)
+    np.testing.assert_allclose(seen, scores, atol=1e-6)
+    np.testing.assert_allclose(few, masks[..., ::2, ::2], atol=1e-5 * np.abs(masks).max())
 
 
 @pytest.mark.parametrize("cells", [16, 23])

@@ -98,6 +98,16 @@ def test_the_committed_segmenter_predicts_from_fine_to_coarse(unseen):
     assert area[0] < area[1] < area[2]
 
 
+def test_the_committed_preview_is_that_of_the_committed_decoder(unseen):
+    model = SamModel.load(MODELS / "sam-tiny")
+    encoded = model.encode(unseen.images[0])
+    points = point_grid(6) * FRAME_PX
+    scores, logits = model.decode(encoded, points)
+    seen, few = model.preview(encoded, points)
+    np.testing.assert_allclose(seen, scores, atol=1e-6)
+    np.testing.assert_allclose(few, logits[..., ::2, ::2], atol=1e-3)  # logits of up to some hundreds
+
+
 def test_the_committed_clip_is_as_good_as_its_card_says(unseen):
     folder = MODELS / "clip-tiny"
     options = {"providers": ["CPUExecutionProvider"]}
