@@ -118,8 +118,8 @@ def in_processes(
 ) -> Iterator[Result]:
     """Results of `work(*item)` in the order of `items`.
 
-    For work that holds Python's lock, such as Embree's wrapper. Processes are spawned, since forking a
-    process that has threads may hang. With one worker or one item, no process is started.
+    For work that holds Python's lock. Processes are spawned, since forking a process that has threads may
+    hang. With one worker or one item, no process is started.
 
     Args:
         work: a function at the top level of a module, or a `functools.partial` of one.

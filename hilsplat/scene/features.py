@@ -14,6 +14,7 @@ from hilsplat.base.errors import ImageError, SceneError
 from hilsplat.base.images import open_image, read_image, resize_to_fit, write_png
 from hilsplat.base.progress import track
 from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.matching import match_pairs
 from hilsplat.settings import PosesSettings
 
 logger = logging.getLogger(__name__)
@@ -21,8 +22,8 @@ logger = logging.getLogger(__name__)
 EXHAUSTIVE_UP_TO = 200
 """matcher = "auto" tries every pair up to this many views; beyond, neighbours by name."""
 
-SEQUENTIAL_OVERLAP = 10
-"""Neighbours by name that sequential matching tries (and as many at distances 2, 4, 8, ...)."""
+SEQUENTIAL_STEPS = sorted({*range(1, 11), *(2**power for power in range(10))})
+"""Distances by name at which sequential matching tries views."""
 
 MIN_INLIERS = 12
 """Verified matches a pair needs (reference block for renders and photographs alike; COLMAP: 15)."""
@@ -282,24 +283,15 @@ def match_features(database: Path, num_views: int, settings: PosesSettings, seed
     matcher = settings.matcher
     if matcher == "auto":
         matcher = "exhaustive" if num_views <= EXHAUSTIVE_UP_TO else "sequential"
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads = threads
-    matching.use_gpu = False
     verification = pycolmap.TwoViewGeometryOptions()
     verification.min_num_inliers = MIN_INLIERS
     verification.ransac.random_seed = seed
     verification.ransac.num_threads = 1
     verification.ransac.max_num_trials = MAX_TRIALS
     verification.compute_relative_pose = settings.mapper == "global"
-    if matcher == "exhaustive":
-        pycolmap.match_exhaustive(
-            database, matching, verification_options=verification, device=pycolmap.Device.cpu
-        )
-    else:
-        pairing = pycolmap.SequentialPairingOptions()
-        pairing.overlap = SEQUENTIAL_OVERLAP
-        pairing.num_threads = threads
-        pycolmap.match_sequential(database, matching, pairing, verification, device=pycolmap.Device.cpu)
+    steps = range(1, num_views) if matcher == "exhaustive" else SEQUENTIAL_STEPS
+    partners = [[row + step for step in steps if row + step < num_views] for row in range(num_views)]
+    match_pairs(database, partners, verification, threads)
     return matcher
 
 

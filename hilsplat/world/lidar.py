@@ -99,9 +99,8 @@ def scan_street(
     beams = np.repeat(np.arange(BEAMS), azimuth_steps)
     rows = []
     for pose, origin in enumerate(origins):
-        starts = np.broadcast_to(origin, directions.shape).astype(np.float32)
-        hit = scene.embree.run(starts, directions.astype(np.float32), query="INTERSECT", output=True)
-        prim, away = hit["primID"], hit["tfar"].astype(np.float64)
+        hits = scene.caster.nearest(origin.astype(np.float32)[None], directions.astype(np.float32))
+        prim, away = hits.triangle, hits.distance.astype(np.float64)
         triangle = scene.triangles[prim].astype(np.float64)
         normal = np.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])
         facing = np.abs((normal * directions).sum(axis=1)) / np.linalg.norm(normal, axis=1)

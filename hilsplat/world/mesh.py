@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
@@ -11,16 +10,7 @@ from plyfile import PlyData, PlyParseError
 
 from hilsplat.base.errors import ArtifactError
 from hilsplat.scene.cameras import Camera
-
-
-def ray_caster(triangles: Float32[np.ndarray, "F 3 3"]) -> Any:
-    """Embree's structure for casting rays at triangles (embreex has no types)."""
-    from embreex.mesh_construction import TriangleMesh
-    from embreex.rtcore_scene import EmbreeScene
-
-    scene = EmbreeScene()
-    TriangleMesh(scene, triangles)
-    return scene
+from hilsplat.world.rays import RayCaster
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +44,9 @@ class TrueMesh:
         return TrueMesh(corners[faces])
 
     @cached_property
-    def embree(self) -> Any:
-        """Ray-casting structure, built on first use."""
-        return ray_caster(self.triangles)
+    def caster(self) -> RayCaster:
+        """Casts rays at the triangles; built on first use."""
+        return RayCaster(self.triangles)
 
     def depth(self, camera: Camera) -> Float32[np.ndarray, "H W"]:
         """Depth along the optical axis at each pixel's centre, scene units; inf where there is nothing."""
@@ -64,9 +54,7 @@ class TrueMesh:
         y, x = np.mgrid[:height, :width] + 0.5
         pixels = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
         rotation = camera.cam_from_world[:3, :3]
-        # directions of depth 1, so the distance that Embree returns is the depth
+        # directions of depth 1, so the distance is the depth
         directions = (pixels @ np.linalg.inv(camera.K).T @ rotation).astype(np.float32)
-        origins = np.ascontiguousarray(np.broadcast_to(camera.centre.astype(np.float32), directions.shape))
-        hit = self.embree.run(origins, directions, query="INTERSECT", output=True)
-        depth = np.where(hit["primID"] >= 0, hit["tfar"], np.inf)
-        return depth.reshape(height, width).astype(np.float32)
+        hits = self.caster.nearest(camera.centre.astype(np.float32)[None], directions)
+        return hits.distance.reshape(height, width)

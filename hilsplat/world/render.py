@@ -16,6 +16,7 @@ from jaxtyping import Float32, Int32, UInt8
 from hilsplat.base.compiled import compiled
 from hilsplat.scene.cameras import Camera
 from hilsplat.world.paints import srgb_from_linear
+from hilsplat.world.rays import Hits
 from hilsplat.world.scenes.scene import Style, WorldScene
 from hilsplat.world.textures import albedo, grains, hash01
 
@@ -38,7 +39,7 @@ def label_view(scene: WorldScene, camera: Camera) -> Int32[np.ndarray, "3 H W"]:
     Returns:
         Levels whole, part, subpart along the first axis; -1 where the level has no node.
     """
-    return _labels(scene, _cast(scene, *_rays(camera, 1))["primID"], camera.size_hw)
+    return _labels(scene, scene.caster.nearest(*_rays(camera, 1)).triangle, camera.size_hw)
 
 
 def render_view(
@@ -80,27 +81,27 @@ def _rendered(
     image, middle = np.empty((height * width, 3), np.float32), np.empty(height * width, np.int32)
     for top in range(0, height, band):
         rows = range(top, min(top + band, height))
-        origins, directions = _rays(camera, samples, rows)
-        hit = _cast(scene, origins, directions)
+        origin, directions = _rays(camera, samples, rows)
+        hits = scene.caster.nearest(origin, directions)
         pixels = slice(rows.start * width, rows.stop * width)
-        image[pixels] = _reflected(scene, hit, directions, samples, style)
-        middle[pixels] = hit["primID"][samples**2 // 2 :: samples**2]
+        image[pixels] = _reflected(scene, hits, directions, samples, style)
+        middle[pixels] = hits.triangle[samples**2 // 2 :: samples**2]
     srgb = srgb_from_linear(np.clip(image, 0, 1))
     return (srgb * 255 + 0.5).astype(np.uint8).reshape(height, width, 3), middle
 
 
 def _reflected(
-    scene: WorldScene, hit: dict[str, np.ndarray], directions: np.ndarray, samples: int, style: Style
+    scene: WorldScene, hits: Hits, directions: np.ndarray, samples: int, style: Style
 ) -> Float32[np.ndarray, "P 3"]:
     """Linear light of the pixels whose sub-samples hit something from some directions."""
-    prim = hit["primID"]
+    prim = hits.triangle
     count = len(prim)
     points, facets, shading, colours = (np.empty((count, 3), np.float32) for _ in range(4))
     gloss = np.empty((count, 2), np.float32)
     _surfaces(
         prim,
-        hit["u"],
-        hit["v"],
+        hits.u,
+        hits.v,
         directions,
         scene.triangles,
         scene.normals,
@@ -124,10 +125,10 @@ def _reflected(
         reach = np.empty(len(rows), np.float32)
         for ray in range(rays_each):
             rays(rows, points, facets, lift, samples, ray, rays_each, cells, *given, starts, toward, reach)
-            share[rows] += _cast(scene, starts, toward, reach) < 0
+            share[rows] += ~scene.caster.blocked(starts, toward, reach)
         return share / np.float32(rays_each)
 
-    under_sky, lit = _receivers(prim, points, facets, shading, gloss, light)
+    under_sky, lit = _receivers(prim, points, facets, shading, gloss, light, samples)
     image = np.zeros((count // samples**2, 3), np.float32)
     _shade(
         prim,
@@ -148,15 +149,8 @@ def _reflected(
     return image
 
 
-def _cast(scene: WorldScene, origins: np.ndarray, directions: np.ndarray, reach: np.ndarray | None = None):
-    """Nearest hits, or with `reach` whether something is nearer than that (-1 where free)."""
-    if reach is None:
-        return scene.embree.run(origins, directions, query="INTERSECT", output=True)
-    return scene.embree.run(origins, directions, dists=reach, query="OCCLUDED")
-
-
 def _rays(camera: Camera, samples: int, rows: range | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Rays of all sub-samples of some rows (None: all), pixel by pixel: origins and unit directions."""
+    """Rays of all sub-samples of some rows (None: all), pixel by pixel: their origin and unit directions."""
     height, width = camera.size_hw
     rows = rows or range(height)
     step = (np.arange(samples) + 0.5) / samples
@@ -170,8 +164,7 @@ def _rays(camera: Camera, samples: int, rows: range | None = None) -> tuple[np.n
         samples,
         directions,
     )
-    origins = np.broadcast_to(camera.centre.astype(np.float32), directions.shape)
-    return np.ascontiguousarray(origins), directions
+    return camera.centre.astype(np.float32)[None], directions
 
 
 @compiled
@@ -274,16 +267,21 @@ def _to_light(points, facets, shading, i, light):
 
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
-def _receivers(prim, points, facets, shading, gloss, light):
-    """Rows that the sky lights (not the void nor what shines by itself), and those that face the light."""
+def _receivers(prim, points, facets, shading, gloss, light, samples):
+    """Rows that the sky lights (not the void nor what shines by itself), and those that face the light.
+
+    The first are in the order of their sub-samples: the same one of neighbouring pixels looks the same way,
+    and rays cast together should.
+    """
     under_sky, lit = np.empty(len(prim), np.int64), np.empty(len(prim), np.int64)
     skies = lights = 0
+    for sample in range(samples * samples):
+        for i in range(sample, len(prim), samples * samples):
+            if prim[i] >= 0 and gloss[i, 1] > 0:
+                under_sky[skies] = i
+                skies += 1
     for i in range(len(prim)):
-        if prim[i] < 0 or gloss[i, 1] <= 0:
-            continue
-        under_sky[skies] = i
-        skies += 1
-        if _to_light(points, facets, shading, i, light)[4] > 0:
+        if prim[i] >= 0 and gloss[i, 1] > 0 and _to_light(points, facets, shading, i, light)[4] > 0:
             lit[lights] = i
             lights += 1
     return under_sky[:skies], lit[:lights]

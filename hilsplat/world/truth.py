@@ -159,10 +159,8 @@ def views_of_points(
         centre = camera.centre.astype(np.float32)
         ways = points[rows] - centre
         distance = np.linalg.norm(ways, axis=1).astype(np.float32)
-        origins = np.ascontiguousarray(np.broadcast_to(centre, ways.shape))
         reach = distance * np.float32(1 - HIDDEN_BY)
-        hit = scene.embree.run(origins, ways / distance[:, None], dists=reach, query="OCCLUDED")
-        seen[rows] += hit < 0
+        seen[rows] += ~scene.caster.blocked(centre[None], ways / distance[:, None], reach)
     return seen
 
 

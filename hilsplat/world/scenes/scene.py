@@ -3,16 +3,15 @@
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
 from hilsplat.base.levels import NONE
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
-from hilsplat.world.mesh import ray_caster
 from hilsplat.world.objects.builder import ObjectModel
 from hilsplat.world.paints import Paint
+from hilsplat.world.rays import RayCaster
 from hilsplat.world.shapes import Mesh, rotation_about
 
 
@@ -118,9 +117,9 @@ class WorldScene:
     style: Style
 
     @cached_property
-    def embree(self) -> Any:
-        """Ray-casting structure, built on first use."""
-        return ray_caster(self.triangles)
+    def caster(self) -> RayCaster:
+        """Casts rays at the triangles; built on first use."""
+        return RayCaster(self.triangles)
 
 
 class Assembly:

@@ -345,7 +345,6 @@ def _sees(
     chosen = corners[rng.integers(len(corners), size=40)]
     directions = chosen - centre
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origins = np.broadcast_to(centre, directions.shape)
-    hit = scene.embree.run(origins.astype(np.float32), directions.astype(np.float32), query="INTERSECT")
+    hit = scene.caster.nearest(centre.astype(np.float32)[None], directions.astype(np.float32)).triangle
     seen: Bool[np.ndarray, " R"] = (hit >= 0) & (scene.node_ids[hit, 0] == node)
     return bool(seen.mean() > 0.6)

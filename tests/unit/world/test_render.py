@@ -7,6 +7,7 @@ from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
 from hilsplat.scene.cameras import Camera
 from hilsplat.world import render
 from hilsplat.world.paints import Paint
+from hilsplat.world.rays import RayCaster
 from hilsplat.world.render import label_view, render_and_label, render_view
 from hilsplat.world.scenes.kinds import build_scene
 from hilsplat.world.scenes.scene import Style, WorldScene
@@ -162,14 +163,14 @@ def test_only_shadow_rays_that_cannot_matter_are_left_out(monkeypatch):
     scene = scene_of(joined(box((4, 4, 0.1), (0, 0, -0.05)), box((0.6, 0.6, 0.6), (0, 0, 0.8))))
     style = Style(light_position=(1.0, 0.0, 4.0))
     camera = Camera("a.png", looking_at(np.array([-2.0, 0, 0.9]), np.zeros(3)), pinhole(64, 50), (64, 64))
-    cast, rays = render._cast, []
+    blocked, rays = RayCaster.blocked, []
     monkeypatch.setattr(render, "BAND_RAYS", 10**9)
-    monkeypatch.setattr(render, "_cast", lambda scene, *of: (rays.append(len(of[0])), cast(scene, *of))[1])
+    monkeypatch.setattr(RayCaster, "blocked", lambda *of: (rays.append(len(of[1])), blocked(*of))[1])
     image = render_view(scene, camera, 3, style)
-    assert rays[1] < rays[2] < rays[0]  # to the light, to the sky, from the camera
+    assert rays[0] < rays[1] < (3 * 64) ** 2  # to the light, to the sky, from the camera
     # each receives light and sky, if it is there at all
     monkeypatch.setattr(render, "_receivers", lambda prim, *_: (np.flatnonzero(prim >= 0),) * 2)
-    assert np.array_equal(image, render_view(scene, camera, 3, style)) and rays[4] == rays[5] == rays[2]
+    assert np.array_equal(image, render_view(scene, camera, 3, style)) and rays[2] == rays[3] == rays[1]
 
 
 def test_bricks_have_joints_along_every_upright_wall():

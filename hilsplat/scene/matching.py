@@ -1,0 +1,190 @@
+"""Matches of SIFT features between views, and their check by two-view geometry.
+
+The measure and its limits are COLMAP's. Its matcher takes approximate neighbours (FAISS); here every product
+of two descriptors is taken, in whole numbers, in a third of the time.
+"""
+
+import copy
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import no_type_check
+
+import numpy as np
+import onnxruntime
+from jaxtyping import Float64, Int8, Int32, UInt8, UInt32
+
+from hilsplat.base.compiled import compiled
+from hilsplat.scene.colmap import pycolmap
+
+MAX_ANGLE = 0.7
+"""Largest angle between matching descriptors, radians (COLMAP's)."""
+
+MAX_RATIO = 0.8
+"""Largest ratio of the angles to the nearest and to the second nearest descriptor (COLMAP's)."""
+
+MIN_MATCHES = 15
+"""A pair with fewer matches has none (COLMAP's)."""
+
+_CHANNELS = 128
+_LENGTH = 512.0  # of a descriptor, as COLMAP stores it
+_BLOCK = 256  # descriptors whose products are taken at once: they stay in the processor's cache
+
+
+@dataclass(frozen=True, eq=False)
+class ViewFeatures:
+    """The N features of one view.
+
+    Attributes:
+        image_id: of the view in COLMAP's database.
+        camera: its lens.
+        points: positions, px.
+        descriptors: SIFT, of length 512.
+        columns: the same less 128, a feature per column.
+    """
+
+    image_id: int
+    camera: pycolmap.Camera
+    points: Float64[np.ndarray, "N 2"]
+    descriptors: UInt8[np.ndarray, "N 128"]
+    columns: Int8[np.ndarray, "128 N"]
+
+
+def read_features(database: pycolmap.Database) -> list[ViewFeatures]:
+    """Features of all views of a database, by view name."""
+    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+    views = []
+    for image in sorted(database.read_all_images(), key=lambda image: image.name):
+        descriptors = np.ascontiguousarray(database.read_descriptors(image.image_id).data, np.uint8)
+        columns = np.ascontiguousarray(descriptors.T ^ np.uint8(128)).view(np.int8)
+        points = np.ascontiguousarray(database.read_keypoints(image.image_id)[:, :2], np.float64)
+        views.append(ViewFeatures(image.image_id, cameras[image.camera_id], points, descriptors, columns))
+    return views
+
+
+def match_pairs(
+    database: Path,
+    partners: Sequence[Sequence[int]],
+    options: pycolmap.TwoViewGeometryOptions,
+    threads: int,
+) -> None:
+    """Match pairs of views, check them, and enter what was found into COLMAP's database.
+
+    Args:
+        database: with features, without matches.
+        partners: for each view by name, the rows of the later views that it is matched with.
+        options: of the check; its RANSAC takes fewer trials where few matches leave no other way to pass.
+        threads: the result does not depend on them.
+    """
+    with pycolmap.Database.open(database) as opened, ThreadPoolExecutor(threads) as pool:
+        views = read_features(opened)
+        for one, rows in zip(views, partners, strict=True):
+            others = [views[row] for row in rows]
+            found = list(pool.map(lambda other, one=one: _matched(one, other, options), others))
+            with pycolmap.DatabaseTransaction(opened):
+                for other, (matches, geometry) in zip(others, found, strict=True):
+                    opened.write_matches(one.image_id, other.image_id, matches)
+                    opened.write_two_view_geometry(one.image_id, other.image_id, geometry)
+
+
+def _matched(
+    one: ViewFeatures, other: ViewFeatures, options: pycolmap.TwoViewGeometryOptions
+) -> tuple[UInt32[np.ndarray, "M 2"], pycolmap.TwoViewGeometry]:
+    """Matches of a pair of views, and the geometry that they agree on, if any."""
+    matches = mutual_matches(one, other)
+    if len(matches) < MIN_MATCHES:
+        return matches[:0], pycolmap.TwoViewGeometry()
+    options = copy.deepcopy(options)
+    # The fewer the matches, the larger a share of them must agree, and the sooner RANSAC has found it.
+    options.ransac.min_inlier_ratio = max(
+        options.ransac.min_inlier_ratio, options.min_num_inliers / len(matches)
+    )
+    geometry = pycolmap.estimate_two_view_geometry(
+        one.camera, one.points, other.camera, other.points, matches, options
+    )
+    return matches, geometry
+
+
+def mutual_matches(one: ViewFeatures, other: ViewFeatures) -> UInt32[np.ndarray, "M 2"]:
+    """Rows of features that are each other's nearest, near enough, and clearly nearer than the second."""
+    rows, columns = len(one.descriptors), len(other.descriptors)
+    if not rows or not columns:
+        return np.zeros((0, 2), np.uint32)
+    best, second, column = (np.empty(rows, np.int32) for _ in range(3))
+    best_of_column, second_of_column, row_of_column = (np.full(columns, -1, np.int32) for _ in range(3))
+    for first in range(0, rows, _BLOCK):
+        products = _products(one.descriptors[first : first + _BLOCK], other.columns)
+        _nearest(products, first, best, second, column, best_of_column, second_of_column, row_of_column)
+    clear = _is_clear(best, second)
+    clear &= _is_clear(best_of_column, second_of_column)[column]
+    clear &= row_of_column[column] == np.arange(rows)
+    matched = np.flatnonzero(clear)
+    return np.stack([matched, column[matched]], axis=1).astype(np.uint32)
+
+
+def _is_clear(best: Int32[np.ndarray, " N"], second: Int32[np.ndarray, " N"]) -> np.ndarray:
+    nearest, next_nearest = (np.arccos(np.clip(products / _LENGTH**2, 0, 1)) for products in (best, second))
+    return (nearest <= MAX_ANGLE) & (nearest < MAX_RATIO * next_nearest)
+
+
+def _products(
+    rows: UInt8[np.ndarray, "R 128"], columns: Int8[np.ndarray, "128 N"]
+) -> Int32[np.ndarray, "R N"]:
+    """Inner products of descriptors, exactly."""
+    session, is_exact = _multiplier()
+    if is_exact:
+        return session.run(None, {"rows": rows, "columns": columns})[0]
+    whole = columns.astype(np.float32) + 128
+    return (rows.astype(np.float32) @ whole).astype(np.int32)  # below 2**24, so exact
+
+
+@cache
+def _multiplier() -> tuple[onnxruntime.InferenceSession, bool]:
+    """A product of 8-bit matrices, and whether it is exact: without VNNI, x86 saturates sums of two."""
+    from onnx import TensorProto, helper
+
+    graph = helper.make_graph(
+        [helper.make_node("MatMulInteger", ["rows", "columns", "", "zero"], ["products"])],
+        "products",
+        [
+            helper.make_tensor_value_info("rows", TensorProto.UINT8, ["R", _CHANNELS]),
+            helper.make_tensor_value_info("columns", TensorProto.INT8, [_CHANNELS, "N"]),
+        ],
+        [helper.make_tensor_value_info("products", TensorProto.INT32, ["R", "N"])],
+        [helper.make_tensor("zero", TensorProto.INT8, [], [-128])],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    session = onnxruntime.InferenceSession(
+        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+    )
+    rows = np.full((_BLOCK, _CHANNELS), 255, np.uint8)
+    columns = np.repeat(np.array([[-128, 127]], np.int8), _CHANNELS, axis=0)
+    found = session.run(None, {"rows": rows, "columns": columns})[0]
+    return session, bool((found == [0, 255 * 255 * _CHANNELS]).all())
+
+
+@compiled
+@no_type_check  # the shape checks of the test-suite cannot be compiled
+def _nearest(products, first, best, second, column, best_of_column, second_of_column, row_of_column):
+    """Take in products of rows from `first` on: the largest two of each row and, so far, of each column."""
+    columns = products.shape[1]
+    for r in range(len(products)):
+        row, i = products[r], np.int32(first + r)
+        largest = np.int32(-1)
+        for j in range(columns):
+            value, before = row[j], best_of_column[j]
+            second_of_column[j] = max(second_of_column[j], min(before, value))
+            row_of_column[j] = i if value > before else row_of_column[j]
+            best_of_column[j] = max(before, value)
+            largest = max(largest, value)
+        below, place, ties = np.int32(-1), np.int32(columns), np.int32(0)
+        for j in range(columns):
+            is_largest = row[j] == largest
+            below = max(below, np.int32(-1) if is_largest else row[j])
+            place = min(place, np.int32(j) if is_largest else np.int32(columns))
+            ties = np.int32(ties + (np.int32(1) if is_largest else np.int32(0)))
+        best[i], second[i], column[i] = largest, largest if ties > 1 else below, place
