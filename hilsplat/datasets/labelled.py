@@ -1,7 +1,7 @@
 """Scenes with labelled images: what every reader of such a data set returns.
 
 Labels, images and poses of a view are keyed by its name in the scene ("frame_00041.png", see
-`scene.features.view_name`), so that a label finds its image and its camera whatever else is missing.
+`scene.view_names.view_name`), so that a label finds its image and its camera whatever else is missing.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -17,9 +17,9 @@ from hilsplat.base.files import list_images
 from hilsplat.base.images import open_image
 from hilsplat.base.levels import Level
 from hilsplat.datasets.dataset import SceneReport
-from hilsplat.scene.features import view_name
 from hilsplat.scene.known_poses import KnownView, find_known_poses
 from hilsplat.scene.known_views import known_views
+from hilsplat.scene.view_names import view_name
 
 ROUNDING_PX = 1.0
 """A label counts as a scaled copy of its image if their sides differ by no more than rounding."""

@@ -10,7 +10,7 @@ code; those of blue_sofa, snacks and office_desk from figure captions of the Lan
 incomplete; covered_desk and table: none.
 """
 
-from hilsplat.scene.features import view_name
+from hilsplat.scene.view_names import view_name
 
 
 def _lerf(*numbers: int) -> tuple[str, ...]:

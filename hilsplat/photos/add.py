@@ -14,7 +14,7 @@ from hilsplat.base.names import NAME_RULE, name_problem
 from hilsplat.base.progress import track
 from hilsplat.photos.check import CHECK_SIDE_PX, CheckedPhoto, photo_doubts
 from hilsplat.photos.intake import brought_photographs
-from hilsplat.scene.features import EXIF_ORIENTATION, exif_focal_px, require_usable_name
+from hilsplat.scene.features import EXIF_ORIENTATION, exif_focal_px
 from hilsplat.scene.layouts import has_known_poses, photo_folder
 from hilsplat.scene.sheet import (
     COLUMNS,
@@ -26,6 +26,7 @@ from hilsplat.scene.sheet import (
     project_root,
     read_sheet,
 )
+from hilsplat.scene.view_names import require_usable_name
 
 OTHER_PHOTO_SUFFIXES = frozenset({".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".gif", ".jxl"})
 """Photographs in formats that are not read; a folder of them deserves a better message than "no images"."""

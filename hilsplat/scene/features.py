@@ -1,8 +1,7 @@
 """From photographs to verified matches: upright work images, cameras to estimate, SIFT, pairs."""
 
 import logging
-import os
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from hilsplat.base.images import open_image, read_image, resize_to_fit, write_pn
 from hilsplat.base.progress import track
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.matching import match_pairs
+from hilsplat.scene.view_names import view_names
 from hilsplat.settings import PosesSettings
 
 logger = logging.getLogger(__name__)
@@ -65,66 +65,6 @@ class WorkImage:
     source: Path
     size_hw: tuple[int, int]
     focal_px: float | None
-
-
-def view_name(stem: str) -> str:
-    """Name of the view made from an image file of this stem ("DSC_1" -> "DSC_1.png")."""
-    return f"{stem}.png"
-
-
-LONGEST_NAME = 200
-"""Most bytes of a photograph's name: names of further files are made from it, and a disk takes 255."""
-
-
-def require_usable_name(photo: Path) -> None:
-    """Refuse a photograph after which files of later stages could not be named.
-
-    Raises:
-        SceneError: its name is too long, has braces, which are wildcards to Snakemake, or cannot be shown.
-    """
-    if "{" in photo.name or "}" in photo.name or not photo.name.isprintable():
-        raise SceneError(
-            f"the name of photograph {str(photo)!r} has a brace or a sign that cannot be shown",
-            fix="rename it",
-        )
-    if (num_bytes := len(os.fsencode(photo.name))) > LONGEST_NAME:
-        raise SceneError(
-            f"the name of photograph {photo} is too long",
-            expected=f"at most {LONGEST_NAME} bytes",
-            found=f"{num_bytes}",
-            fix="rename it",
-        )
-
-
-def view_names(sources: Sequence[Path]) -> list[str]:
-    """View names of image files: the file name with the suffix .png ("DSC_1.jpg" -> "DSC_1.png").
-
-    Files of the same name in different folders ("train/r_0.png", "test/r_0.png") get their folder
-    as a prefix: "train_r_0.png".
-
-    Raises:
-        SceneError: two files would get the same view name.
-    """
-    for source in sources:
-        require_usable_name(source)
-    stems = Counter(source.stem for source in sources)
-    by_folder = {stem for stem, count in stems.items() if count > 1}
-    same_folder = Counter((source.parent, source.stem) for source in sources)
-    names = []
-    owners: dict[str, list[Path]] = defaultdict(list)
-    for source in sources:
-        apart = source.stem in by_folder and same_folder[source.parent, source.stem] == 1
-        name = view_name(f"{source.parent.name}_{source.stem}" if apart else source.stem)
-        owners[name].append(source)
-        names.append(name)
-    for name, files in owners.items():
-        if len(files) > 1:
-            raise SceneError(
-                f"{len(files)} images would become the same view {name}",
-                found=", ".join(str(file) for file in files),
-                fix="rename or remove all but one: views are named after the file without its suffix",
-            )
-    return names
 
 
 def exif_focal_px(path: Path, size_hw: tuple[int, int]) -> float | None:

@@ -15,13 +15,11 @@ from hilsplat.base.images import open_image, read_image, resize_to_fit, write_pn
 from hilsplat.base.progress import track
 from hilsplat.scene.assemble import PosedView, split_views, undistort, write_scene
 from hilsplat.scene.colmap import pycolmap
-from hilsplat.scene.features import (
-    EXIF_ORIENTATION,
-    view_names,
-)
+from hilsplat.scene.features import EXIF_ORIENTATION
 from hilsplat.scene.first_points import MIN_TRIANGULATED, NUM_RANDOM_POINTS, random_points, triangulate
 from hilsplat.scene.known_poses import KnownPoses, KnownView
 from hilsplat.scene.known_views import known_views, read_colmap, read_transforms
+from hilsplat.scene.view_names import view_names
 from hilsplat.settings import PosesSettings
 
 logger = logging.getLogger(__name__)

@@ -25,7 +25,7 @@ from hilsplat.datasets.labelled import (
     unlisted_texts,
 )
 from hilsplat.datasets.published import FRAMES, PAIRS, PROMPTS
-from hilsplat.scene.features import view_name
+from hilsplat.scene.view_names import view_name
 
 LAYOUT = """\
 lerf_ovs/

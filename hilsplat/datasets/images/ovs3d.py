@@ -21,8 +21,8 @@ from hilsplat.datasets.labelled import (
     unlisted_texts,
 )
 from hilsplat.datasets.published import FRAMES, PROMPTS
-from hilsplat.scene.features import view_name
 from hilsplat.scene.llff import POSES_BOUNDS
+from hilsplat.scene.view_names import view_name
 
 FOREGROUND = 255
 """The original loader computes int8(value / 255)."""

@@ -13,11 +13,10 @@ from hilsplat.scene.features import (
     WorkImage,
     camera_groups,
     prepare_images,
-    view_name,
-    view_names,
 )
 from hilsplat.scene.poses import check_registration, run_poses
 from hilsplat.scene.scene import Scene
+from hilsplat.scene.view_names import view_name, view_names
 from hilsplat.settings import PosesSettings
 
 
