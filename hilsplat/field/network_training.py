@@ -11,11 +11,12 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from hilsplat.base.compiled import compiled
+from hilsplat.field.adam import Adam
 from hilsplat.field.network_code import NORM_EPS, Autoencoder, Layer, layers_of, torch_generator, unit
 from hilsplat.settings import AutoencoderSettings
 
-BETA1, BETA2, ADAM_EPS = 0.9, 0.999, 1e-8
-"""Of Adam, as in torch."""
+ADAM_EPS = 1e-8
+"""As in torch."""
 
 Arrays = dict[str, np.ndarray]
 
@@ -58,21 +59,18 @@ def train_autoencoder(
     steps = max(settings.epochs * per_epoch, settings.min_steps)
     drawn = Autoencoder.drawn(channels, latent, twister).arrays
     drawn = {name: values for name, values in drawn.items() if "running" not in name}
-    flat = np.zeros((4, sum(values.size for values in drawn.values())), np.float32)
-    flat[0] = np.concatenate([values.reshape(-1) for values in drawn.values()])
-    parameters, gradients = (_as_arrays(row, drawn) for row in flat[:2])
+    flat = np.concatenate([values.reshape(-1) for values in drawn.values()])
+    slope = np.empty_like(flat)
+    parameters, gradients = _as_arrays(flat, drawn), _as_arrays(slope, drawn)
+    adam = Adam(flat, settings.learning_rate, ADAM_EPS)
     for step in range(steps):
         place = step % per_epoch
         if place == 0:
             order = torch_order(len(data), twister)
         chosen = data[order[place * batch : (place + 1) * batch]]
         loss_gradients(parameters, chosen, latent, settings.cosine_weight, gradients)
-        rate = settings.learning_rate * (1 + math.cos(math.pi * step / steps)) / 2
-        _adam(
-            *flat,
-            np.float32(rate / (1 - BETA1 ** (step + 1))),
-            np.float32(1 / math.sqrt(1 - BETA2 ** (step + 1))),
-        )
+        adam.rate = settings.learning_rate * (1 + math.cos(math.pi * step / steps)) / 2
+        adam.step(slope)
     return Autoencoder(channels, latent, parameters | statistics(parameters, data, latent))
 
 
@@ -218,14 +216,3 @@ def _normalised_back(slope, scaled, spread, weight, of_weight, of_bias):
         for c in range(columns):
             common = share * (of_bias[c] + scaled[row, c] * of_weight[c])
             slope[row, c] = weight[c] * spread[c] * (slope[row, c] - common)
-
-
-@compiled(error_model="numpy")
-@no_type_check  # the shape checks of the test-suite cannot be compiled
-def _adam(values, gradient, first, second, rate, scale):
-    """One step in place; `rate` is over 1 - beta1^t, `scale` is 1 / sqrt(1 - beta2^t)."""
-    for k in range(len(values)):
-        g = gradient[k]
-        first[k] = np.float32(BETA1) * first[k] + np.float32(1 - BETA1) * g
-        second[k] = np.float32(BETA2) * second[k] + np.float32(1 - BETA2) * g * g
-        values[k] -= rate * first[k] / (np.sqrt(second[k]) * scale + np.float32(ADAM_EPS))

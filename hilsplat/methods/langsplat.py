@@ -27,7 +27,7 @@ from jaxtyping import Float32, Int32
 from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
-from hilsplat.methods.common.descent import Adam
+from hilsplat.field.adam import Adam
 from hilsplat.methods.common.pixels import labelled_views
 from hilsplat.methods.common.quads import WIDTH, load, plus, signs_of_difference, store, zeros
 from hilsplat.methods.method import Method, MethodInputs

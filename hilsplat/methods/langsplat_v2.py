@@ -20,8 +20,8 @@ from jaxtyping import Float32, Int64
 from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
+from hilsplat.field.adam import Adam
 from hilsplat.field.linear_code import LinearCode
-from hilsplat.methods.common.descent import Adam
 from hilsplat.methods.common.quantise import kmeans
 from hilsplat.methods.langsplat import LevelPixels, ViewPixels, ViewQueue, views_of
 from hilsplat.methods.method import Method, MethodInputs

@@ -12,10 +12,10 @@ from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.stage import mask_means, painted_indicator
+from hilsplat.field.adam import Adam
 from hilsplat.field.linear_code import LinearCode
 from hilsplat.field.network_code import Autoencoder
 from hilsplat.methods import dr_splat, occam
-from hilsplat.methods.common.descent import Adam
 from hilsplat.methods.common.quantise import ProductQuantiser
 from hilsplat.methods.langsplat import LevelPixels
 from hilsplat.methods.langsplat_v2 import as_vectors, cosine_loss, largest_shares, step

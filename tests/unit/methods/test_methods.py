@@ -12,8 +12,8 @@ import scipy.sparse as sp
 
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import Level
+from hilsplat.field.adam import Adam
 from hilsplat.methods import langsplat, lifted, registry, stage
-from hilsplat.methods.common.descent import Adam
 from hilsplat.methods.common.pixels import grid_pixels
 from hilsplat.methods.langsplat import (
     ViewPixels,
@@ -84,10 +84,10 @@ def adam_in_numpy(values, gradients, rate):
     """Adam in place, a step for each gradient, which may be computed from the values of that step."""
     first, second = np.zeros_like(values), np.zeros_like(values)
     for step, gradient in enumerate(gradients, 1):
-        first += (1 - 0.9) * (gradient - first)
-        second += (1 - 0.999) * (gradient * gradient - second)
-        mean, spread = first / (1 - 0.9**step), second / (1 - 0.999**step)
-        values -= rate * mean / (np.sqrt(spread) + 1e-15)
+        first[:] = np.float32(0.9) * first + np.float32(1 - 0.9) * gradient
+        second[:] = np.float32(0.999) * second + np.float32(1 - 0.999) * gradient * gradient
+        scale = np.float32((1 - 0.999**step) ** -0.5)
+        values -= np.float32(rate / (1 - 0.9**step)) * first / (np.sqrt(second) * scale + np.float32(1e-15))
 
 
 def test_adam_has_the_bytes_of_its_formula_in_numpy():
