@@ -203,8 +203,14 @@ class RunSettings(StageSettings):
         {}, "texts in the panel of a scene without labels on its images, by dataset/scene or by data set"
     )
 
+    def every_variant(self) -> list[str]:
+        """All variants, in any table or none: "default", then in the order of `variants`; per seed."""
+        return [
+            name for first in dict.fromkeys(["default", *self.variants]) for name in self._all_seeds(first)
+        ]
+
     def variant_names(self) -> list[str]:
-        """Variants that a run may need, "default" first; with several seeds, each of them per seed."""
+        """Variants of a run's tables, "default" first; with several seeds, each of them per seed."""
         names = (
             *self.main_variants,
             *self.ablation_variants,

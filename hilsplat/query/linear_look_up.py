@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from hilsplat.field.linear_code import LinearCode
-from hilsplat.query.look_up_kernels import lengths_and_generic, linear_relevancy
+from hilsplat.query.look_up_kernels import by_channel, lengths_and_generic, linear_relevancy
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class LinearLookUp:
 
     def place(self, latents: Float32[np.ndarray, "P D"]) -> PlacedLinear:
         """Compute all that does not depend on the text."""
-        channels = np.ascontiguousarray(latents.T, np.float32)
+        channels = by_channel(latents)
         length, generic = (np.empty(len(latents), np.float32) for _ in range(2))
         lengths_and_generic(
             channels,

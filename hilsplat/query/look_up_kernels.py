@@ -9,6 +9,23 @@ BLOCK = 2048
 enough for prefetching."""
 
 
+TRANSPOSED = 128
+"""Rows to transpose at once: their part of a channel fills a cache line."""
+
+
+@compiled
+def by_channel(rows):
+    """Transpose (P, D), a few rows at a time: numpy reads all rows once for every channel."""
+    count, channels = rows.shape
+    out = np.empty((channels, count), np.float32)
+    for begin in range(0, count, TRANSPOSED):
+        end = min(begin + TRANSPOSED, count)
+        for c in range(channels):
+            for p in range(begin, end):
+                out[c, p] = rows[p, c]
+    return out
+
+
 @compiled
 def _dots_of_block(channels, begin, end, offset, slope, out):
     """Write offset plus weighted sum of the channels of pixels begin..end to the start of `out`.

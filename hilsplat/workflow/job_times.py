@@ -100,7 +100,7 @@ def earlier_ratios(plan: Plan, threads: int) -> dict[str, list[float]]:
         threads: of a job; an earlier run is taken to have had as many.
     """
     ratios: dict[str, list[float]] = {}
-    variants = set(plan.run.variant_names())
+    variants = set(plan.run.every_variant())
     for row in plan.rows:
         folder = Path(scene_path(SimpleNamespace(dataset=row.dataset, scene=row.scene)))
         size = finished_size(folder / "scene")

@@ -106,7 +106,7 @@ class Plan:
         """
         return any_of(
             name
-            for name in self.run.variant_names()
+            for name in self.run.every_variant()
             if by_baseline is None or (self.stages_of(name).method.name != OURS) == by_baseline
         )
 
@@ -178,7 +178,9 @@ class Plan:
     def shared(self, stage: str, path: str) -> Callable[[VariantJob], str]:
         """Input: a stage's output, from the first variant with the same settings up to that stage.
 
-        Thus a sweep over Omega solves fields anew and shares masks, trees and embeddings with `default`.
+        Thus a sweep over Omega solves fields anew and shares masks, trees and embeddings with `default`. A
+        variant of the configuration that is in no table counts too, so that what is shared keeps its place
+        when the tables change.
         """
         return lambda job: scene_path(job, self.shared_variant(stage, job), path)
 
@@ -202,7 +204,7 @@ class Plan:
     def _first_alike(self, stage: str, variant: str, scopes: tuple[str, ...]) -> str:
         wanted = self.stages_of(variant, scopes)
         seed = self.run.seed_of(variant) if wanted.depends_on_seed(stage) else None
-        for name in self.run.variant_names():
+        for name in self.run.every_variant():
             other = self.stages_of(name, scopes)
             same = all(getattr(other, part) == getattr(wanted, part) for part in UPSTREAM[stage])
             if same and seed in (None, self.run.seed_of(name)):

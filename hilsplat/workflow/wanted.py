@@ -9,10 +9,13 @@ from hilsplat.configuration import SECTIONS
 from hilsplat.datasets.sources import is_exported
 from hilsplat.methods.registry import OURS
 from hilsplat.scene.sheet import SceneRow
-from hilsplat.workflow.jobs import Job, scene_path
+from hilsplat.workflow.jobs import Job, VariantJob, scene_path
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.soundness import Wanted
 from hilsplat.workflow.targets import tables
+
+SHARED = ("masks", "coverage_tree", "clip", "contributions", "semantic_tree", "autoencoder", "field")
+"""Stages whose outputs variants share."""
 
 
 def wanted(plan: Plan) -> list[Wanted]:
@@ -31,22 +34,14 @@ def _wanted_of(plan: Plan, row: SceneRow) -> Iterator[Wanted]:
         yield _want(plan, scene, "source", "source", plugins=plan.data.source_reader(scene))
     yield _want(plan, scene, "poses", "scene", seed=plan.run.seed)
     yield _want(plan, scene, "gaussians", "gaussians.ply", seed=plan.run.seed)
+    listed: set[tuple[str, str]] = set()
     for variant in plan.run.variant_names():
+        for stage in SHARED:
+            owner = plan.shared_variant(stage, SimpleNamespace(**vars(scene), variant=variant))
+            if (stage, owner) not in listed:
+                listed.add((stage, owner))
+                yield _want_shared(plan, SimpleNamespace(**vars(scene), variant=owner), stage)
         job = SimpleNamespace(**vars(scene), variant=variant)
-        stages, seed = plan.stages(job), plan.run.seed_of(variant)
-        for stage in ("coverage_tree", "clip", "contributions", "semantic_tree"):
-            if plan.shared_variant(stage, job) == variant:
-                yield _want(plan, job, stage, stage)
-        if plan.shared_variant("masks", job) == variant:
-            stage = plan.masks_stage(job)
-            yield _want(plan, job, stage, "masks", stages.perturb.seed if stage == "truth_masks" else None)
-        if plan.shared_variant("autoencoder", job) == variant:
-            yield _want(plan, job, "autoencoder", "autoencoder", seed)
-        if plan.shared_variant("field", job) == variant:
-            if stages.method.name == OURS:
-                yield _want(plan, job, "field", "field.safetensors")
-            else:
-                yield _want(plan, job, "method", "field.safetensors", seed, plan.baseline(job))
         yield _want(plan, job, "evaluate", "scores.csv", plugins=plan.data.label_readers(job))
     figures = {name: plan.values(name, scene) for name in ("figures", "evaluate")}
     for stage, picture in (("figures", "panel"), ("comparison", "comparison")):
@@ -54,6 +49,19 @@ def _wanted_of(plan: Plan, row: SceneRow) -> Iterator[Wanted]:
         yield Wanted(Path(path), path, stage, figures, None, plan.data.label_readers(scene))
     path = f"results/figures/{row.name}/masks.png"
     yield Wanted(Path(path), path, "mask_truth")
+
+
+def _want_shared(plan: Plan, job: VariantJob, stage: str) -> Wanted:
+    """What a variant makes for itself and for those that share it."""
+    stages, seed = plan.stages(job), plan.seed(job)
+    if stage == "masks":
+        stage = plan.masks_stage(job)
+        return _want(plan, job, stage, "masks", stages.perturb.seed if stage == "truth_masks" else None)
+    if stage == "field":
+        if stages.method.name == OURS:
+            return _want(plan, job, "field", "field.safetensors")
+        return _want(plan, job, "method", "field.safetensors", seed, plan.baseline(job))
+    return _want(plan, job, stage, stage, seed if stage == "autoencoder" else None)
 
 
 def _want(

@@ -15,6 +15,7 @@ from hilsplat.workflow.jobs import any_of
 from hilsplat.workflow.model_digests import model_digest
 from hilsplat.workflow.plan import Plan, some
 from hilsplat.workflow.resources import scene_threads, variant_threads
+from hilsplat.workflow.wanted import wanted
 
 SHEET = """dataset\tscene\tgroup\tsource\tunit
 synthetic\tone\tbenchmark\tworld:tabletop:1\tmetre
@@ -104,6 +105,17 @@ def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(
 def test_a_variant_shares_stages_up_to_the_first_that_it_changes(tmp_path, stage, variant, owner):
     job = Job("synthetic", "one", variant)
     assert plan(tmp_path, seeds=2).shared(stage, "file")(job) == f"results/synthetic/one/{owner}/file"
+
+
+def test_what_variants_share_keeps_its_place_when_the_tables_change(tmp_path):
+    variants = {**VARIANTS, "langsplat": {"autoencoder": NETWORK, "method": {"name": "langsplat"}}}
+    found = plan(tmp_path, main_variants=["langsplat"], variants=variants)
+    job = Job("synthetic", "one", "langsplat")
+    code = "results/synthetic/one/network/autoencoder"
+    assert found.shared("autoencoder", "autoencoder")(job) == code
+    outputs = [str(each.output) for each in wanted(found)]
+    assert outputs.count(code) == 1 and re.fullmatch(found.variants(), "network")
+    assert "results/synthetic/one/network/scores.csv" not in outputs
 
 
 def test_an_override_of_one_scene_changes_what_it_shares(tmp_path):
