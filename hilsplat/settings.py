@@ -554,6 +554,11 @@ class EvaluateSettings(Section):
     methods: tuple[Literal["tree", "tree-path", "field"], ...] = knob(
         ("tree", "tree-path", "field"), "what answers the queries; each has its rows in the tables"
     )
+    view_consistency: bool = knob(
+        True,
+        "score whether answers cover the same surface in neighbouring views (synthetic scenes): twice as many "
+        "views are answered",
+    )
     points: Literal["nearest", "vote", "density", "frozen"] = knob(
         "nearest",
         "Gaussians that answer for a labelled point; nearest: the nearest opaque one; vote: 5 within 10 cm; "

@@ -123,7 +123,7 @@ def run_evaluate(
                         texts = [query.text for query in of_view.categories[:TIMED_TEXTS]]
                         seconds = timed(answers, view, texts, settings)
                     answers.forget(view)  # memory that is used again need not be cleared again
-                if isinstance(known, TrueAnnotations) and truths:
+                if isinstance(known, TrueAnnotations) and truths and settings.view_consistency:
                     found = measure_world_consistency(
                         answers, selections, truths, kept, known.folder, settings
                     )

@@ -60,6 +60,14 @@ def test_scores_cover_every_method_level_and_are_shares(finished: Project) -> No
     assert {"whole", "part"} <= set(ious["level"])
 
 
+def test_view_consistency_is_scored_unless_a_variant_leaves_it_out(finished: Project) -> None:
+    metrics = {
+        variant: set(pd.read_csv(finished.root / SCENE / variant / "scores.csv")["metric"])
+        for variant in ("lifted", "regression")
+    }
+    assert metrics["lifted"] - metrics["regression"] == {"view_consistency"}
+
+
 def test_the_tiny_scene_reaches_what_was_recorded(finished: Project) -> None:
     moved = list(tiny.differences(tiny.measure(finished.root / SCENE), tiny.recorded()))
     assert not moved, "\n".join([f"{tiny.__name__} says how to record anew", *moved])
