@@ -556,8 +556,7 @@ class EvaluateSettings(Section):
     )
     view_consistency: bool = knob(
         True,
-        "score whether answers cover the same surface in neighbouring views (synthetic scenes): twice as many "
-        "views are answered",
+        "score whether answers cover the same surface in neighbouring views (synthetic scenes)",
     )
     points: Literal["nearest", "vote", "density", "frozen"] = knob(
         "nearest",

@@ -26,6 +26,7 @@ from hilsplat.evaluate.protocols.cards import (
     LERF_OPENGAUSSIAN,
     LEVEL_GIVEN,
     OVS_ARGMAX,
+    OVS_NODES,
     ProtocolCard,
 )
 from hilsplat.evaluate.protocols.flat_views import eighth
@@ -198,6 +199,8 @@ def _flat_rows(masks: Masks, truth: ViewTruth, asked: Asked) -> Iterator[Measure
     queries = [query for query in truth.queries if query.level is asked.level]
     flat = truth.categories if asked.level is None else queries
     for card in asked.flat:
+        if card is OVS_NODES:  # for trees
+            continue
         if card is OVS_ARGMAX:
             yield from _argmax_rows(flat, masks, words, labelled=asked.level is not None)
             continue

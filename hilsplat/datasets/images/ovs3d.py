@@ -152,6 +152,12 @@ DATASET = Dataset(
     layout=LAYOUT,
     required=lambda scene: (f"{scene}/images", f"{scene}/segmentations/classes.txt"),
     open=open_scene,
-    protocols=("3d-ovs/langsplat", "3d-ovs/langsplat-raw", "3d-ovs/langsplat-v2", "3d-ovs/argmax"),
+    protocols=(
+        "3d-ovs/langsplat",
+        "3d-ovs/langsplat-raw",
+        "3d-ovs/langsplat-v2",
+        "3d-ovs/tree-nodes",
+        "3d-ovs/argmax",
+    ),
     label_places=lambda scene: (f"{scene}/segmentations/**/*",),
 )

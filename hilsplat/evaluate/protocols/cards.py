@@ -213,6 +213,14 @@ LERF_MASK_SKIPPING = ProtocolCard(
     missing="left out",
     public=GAUSSIAN_GROUPING,
 )
+OVS_NODES = ProtocolCard(
+    "3d-ovs/tree-nodes",
+    1,
+    MASK,
+    "pairs",
+    "as lerf/tree-nodes: a tree answers with nodes, to which no rule for maps belongs",
+    OURS,
+)
 OVS_ARGMAX = ProtocolCard(
     "3d-ovs/argmax",
     2,
@@ -350,6 +358,7 @@ CARDS: tuple[ProtocolCard, ...] = (
         level_rule="mean_in_mask",
     ),
     OVS_LANGSPLAT_V2,
+    OVS_NODES,
     _points("scannet/opengaussian-19", "scannet-19", "OpenGaussian", public=OPENGAUSSIAN),
     _points("scannet/opengaussian-15", "scannet-15", "OpenGaussian", public=OPENGAUSSIAN),
     _points("scannet/opengaussian-10", "scannet-10", "OpenGaussian", public=OPENGAUSSIAN),

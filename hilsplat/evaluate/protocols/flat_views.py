@@ -27,6 +27,7 @@ from hilsplat.evaluate.protocols.cards import (
     LERF_MASK,
     LERF_MASK_SKIPPING,
     OVS_ARGMAX,
+    OVS_NODES,
     ProtocolCard,
 )
 from hilsplat.evaluate.protocols.masks import measure_class_maps, measure_masks
@@ -43,7 +44,7 @@ class FlatProtocols:
     """Scores one view under further protocols while its texts are answered one by one.
 
     Args:
-        cards: protocols with a rule for maps, those of LERF-Mask, and the argmax of 3D-OVS.
+        cards: protocols with a rule for maps, those of LERF-Mask, and the nodes and the argmax of 3D-OVS.
         level: only texts of this level are asked; None for data without levels.
         words: what the settings change in the relevancy, for the protocols' names.
     """
@@ -68,7 +69,8 @@ class FlatProtocols:
         Args:
             method: "field" or "tree".
             relevancy: its maps.
-            nodes_mask: the tree's own answer, which LERF-Mask takes; None: the map's mask.
+            nodes_mask: the tree's own answer, for LERF-Mask and `3d-ovs/tree-nodes`; None: LERF-Mask takes
+                the map's mask.
             category: the text with all levels united.
             queries: the same per level.
             maps: what the method's maps say of further texts.
@@ -88,8 +90,10 @@ class FlatProtocols:
 
         for card in self.cards:
             label = card.labelled(self.words)
-            if card in MASKS:
+            if card in MASKS or card is OVS_NODES:
                 mask = nodes_mask
+                if mask is None and card is OVS_NODES:
+                    continue
                 if mask is None:
                     rule = LERF_LANGSPLAT.rule
                     assert rule is not None

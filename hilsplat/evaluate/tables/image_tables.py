@@ -65,7 +65,8 @@ def ovs_table(sources: Sources) -> Table:
         "mIoU in %: mean over (view, text) pairs of a scene; Overall is the mean of the scenes.",
         "3d-ovs/langsplat: min-max relevancy above 0.7, unfiltered, level of the highest mean in its mask "
         "(LangSplat's supplement; its code is not released). 3d-ovs/langsplat-raw takes the printed 0.4 "
-        "literally. 3d-ovs/langsplat-v2: LangSplatV2's code: smoothed relevancy above 0.625, whole or part.",
+        "literally. 3d-ovs/langsplat-v2: LangSplatV2's code: smoothed relevancy above 0.625, whole or part. "
+        "These are rules for maps; 3d-ovs/tree-nodes scores the nodes that a tree answers with.",
         "3d-ovs/argmax: every pixel gets the text of the highest cosine, at an eighth of the image's size; "
         "accuracy is the share of pixels with the right text. Brackets name the level it is read from.",
         "On the stand-in the texts are those of whole objects in view; what surrounds them has no text, and "

@@ -6,7 +6,7 @@ from PIL import Image
 
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.protocols.answers import ViewMaps
-from hilsplat.evaluate.protocols.cards import LERF_MASK, OVS_ARGMAX, card_named
+from hilsplat.evaluate.protocols.cards import LERF_MASK, OVS_ARGMAX, OVS_NODES, card_named
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols, eighth
 from hilsplat.evaluate.protocols.view_truth import Query
 from hilsplat.query.relevancy import relevancy_of_margins
@@ -123,6 +123,15 @@ def test_lerf_mask_takes_the_trees_own_answer_and_the_fields_mask():
     assert {row.metric: row.value for row in tree}["iou"] == 0.5
     assert {row.metric: row.value for row in field}["iou"] > 0.9
     assert {row.protocol for row in tree + field} == {"lerf-mask/gaussian-grouping@1 (wholes)"}
+
+
+def test_nodes_of_a_tree_answer_3d_ovs_by_themselves():
+    cup = query("cup", (0, 16))
+    flat = FlatProtocols([OVS_NODES], Level.WHOLE)
+    tree = list(flat.add("tree", maps((0, 16)), region((0, 8)), cup, [cup], NO_MORE))
+    assert {row.metric: row.value for row in tree}["iou"] == 0.5
+    assert {row.protocol for row in tree} == {"3d-ovs/tree-nodes@1 (wholes)"}
+    assert not list(flat.add("field", maps((0, 16)), None, cup, [cup], NO_MORE))
 
 
 def test_rules_of_3d_ovs_are_applied_to_the_maps_of_either_method():

@@ -38,6 +38,7 @@ DECIDED = {
     "3d-ovs/langsplat@2": "f962ef1a",
     "3d-ovs/langsplat-raw@2": "7797b61a",
     "3d-ovs/langsplat-v2@2": "107e57a0",
+    "3d-ovs/tree-nodes@1": "3fb8af27",
     "scannet/opengaussian-19@1": "ced31f5d",
     "scannet/opengaussian-15@1": "df507111",
     "scannet/opengaussian-10@1": "e9893d38",
