@@ -10,9 +10,6 @@ LBFGS_MEMORY = 8
 SUFFICIENT_DECREASE = 1e-4
 MAX_HALVINGS = 12
 
-CHUNK = 2**18
-"""Numbers to sum at a time: two megabytes in float64, whatever the size of the field."""
-
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
 
@@ -29,13 +26,15 @@ def lbfgs(objective: Objective, start: np.ndarray, steps: int, first_step: float
     value, gradient = objective(point)
     memory: list[tuple[np.ndarray, np.ndarray, float]] = []
     for _ in range(steps):
-        direction = -_two_loops(gradient, memory, first_step)
+        direction = _two_loops(gradient, memory, first_step)
+        np.negative(direction, out=direction)
         slope = dot(direction, gradient)
         if slope >= 0:
             break
         length = 1.0
         for _halving in range(MAX_HALVINGS):
-            candidate = point + np.float32(length) * direction
+            candidate = np.float32(length) * direction
+            candidate += point
             new_value, new_gradient = objective(candidate)
             if new_value <= value + SUFFICIENT_DECREASE * length * slope:
                 break

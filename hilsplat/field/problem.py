@@ -18,7 +18,14 @@ from jaxtyping import Float32, Float64
 
 from hilsplat.contributions.mask_operator import MaskOperator, MaskProducts, lifted_average, lifted_median
 from hilsplat.contributions.quadratic import Quadratic, QuadraticProduct, level_mass
-from hilsplat.field.minimise import CHUNK, dot
+from hilsplat.field.one_pass import (
+    add_by_channel,
+    add_scaled,
+    channel_dots,
+    pull,
+    redirect,
+    scaled_squares,
+)
 
 
 @dataclass(frozen=True)
@@ -69,18 +76,22 @@ class QuadraticProblem:
     ) -> Float32[np.ndarray, "N 3 D"]:
         """Half the Hessian of the summed losses, times the features; `curved` is G F if it is known."""
         language, clustering, ridge = self.weights
-        curved = self.quadratic.product(features) if curved is None else curved
-        out = np.float32(language + clustering) * curved
+        out = self.quadratic.product(features) if curved is None else curved.copy()
+        out *= np.float32(language + clustering)
         if clustering:
-            means = self.masks.means(features)
-            out -= np.float32(clustering) * self.masks.spread(self.pixels[:, None] * means)
-        return out + np.float32(ridge) * self.mass[:, :, None] * features
+            spread = self.masks.spread(self.pixels[:, None] * self.masks.means(features))
+            spread *= np.float32(clustering)
+            out -= spread
+        add_scaled(np.float32(ridge), self.mass, features, out)
+        return out
 
     def right_side(self) -> Float32[np.ndarray, "N 3 D"]:
         """Right side of the optimality condition, hessian_product(F) = right_side()."""
         language, _, ridge = self.weights
-        target = np.float32(language) * self.masks.spread(self.pixels[:, None] * self.latents)
-        return target + np.float32(ridge) * self.mass[:, :, None] * self.lifted
+        target = self.masks.spread(self.pixels[:, None] * self.latents)
+        target *= np.float32(language)
+        add_scaled(np.float32(ridge), self.mass, self.lifted, target)
+        return target
 
     def terms(self, features: Float32[np.ndarray, "N 3 D"]) -> dict[str, float]:
         """Unweighted means over labelled pixels of the language loss, L_h and the ridge.
@@ -88,17 +99,15 @@ class QuadraticProblem:
         Both losses are small differences of large sums, so everything is summed in float64.
         """
         form = self.quadratic.form(features)
-        features = features.astype(np.float64)
-        means = self.masks.means(features)
+        means = self.masks.means(features.astype(np.float64))
         pixels = self.pixels[:, None].astype(np.float64)
         linear = float((pixels * means * self.latents).sum())
         constant = float((pixels * np.square(self.latents, dtype=np.float64)).sum())
         cohesion = float((pixels * means**2).sum())
-        pull = features - self.lifted
         return {
             "language": (form - 2 * linear + constant) / self.total_pixels,
             "clustering": (form - cohesion) / self.total_pixels,
-            "ridge": dot(self.mass[:, :, None] * pull, pull) / self.total_pixels,
+            "ridge": pull(self.mass, features, self.lifted) / self.total_pixels,
         }
 
 
@@ -115,37 +124,22 @@ def conjugate_gradient(
     Levels and channels do not interact, so each has its own step size. Dot products are summed in
     float64 in a fixed order.
     """
-    scale = problem.mass[:, :, None] * np.float32(max(sum(problem.weights), 1e-12))
+    scale = problem.mass * np.float32(max(sum(problem.weights), 1e-12))
     inverse = np.where(scale > 0, 1 / np.maximum(scale, 1e-20), 0).astype(np.float32)
     features = start.copy()
-    residual = problem.right_side() - problem.hessian_product(features, curved)
-    step = inverse * residual
-    direction = step.copy()
-    power = _channel_dot(residual, step)
+    residual = problem.right_side()
+    residual -= problem.hessian_product(features, curved)
+    direction, ratio = np.zeros_like(residual), np.zeros(residual.shape[1:], np.float32)
+    power = scaled_squares(inverse, residual)
     for _ in range(steps):
+        redirect(inverse, residual, ratio, direction)
         turned = problem.hessian_product(direction)
-        curvature = _channel_dot(direction, turned)
-        length = _ratio(power, curvature)
-        features += length * direction
-        residual -= length * turned
-        step = inverse * residual
-        before, power = power, _channel_dot(residual, step)
-        direction = (
-            step
-            + np.where(before > 0, power / np.where(before > 0, before, 1), 0).astype(np.float32) * direction
-        )
+        length = _ratio(power, channel_dots(direction, turned))
+        add_by_channel(length, direction, features)
+        add_by_channel(-length, turned, residual)
+        before, power = power, scaled_squares(inverse, residual)
+        ratio = _ratio(power, before)
     return features
-
-
-def _channel_dot(
-    a: Float32[np.ndarray, "N 3 D"], b: Float32[np.ndarray, "N 3 D"]
-) -> Float64[np.ndarray, "3 D"]:
-    """Sum of products over Gaussians, per level and channel."""
-    out = np.zeros(a.shape[1:])
-    rows = max(1, CHUNK // max(out.size, 1))
-    for begin in range(0, len(a), rows):
-        out += np.multiply(a[begin : begin + rows], b[begin : begin + rows], dtype=np.float64).sum(axis=0)
-    return out
 
 
 def _ratio(

@@ -8,6 +8,7 @@ from jaxtyping import Float, Float32
 
 from hilsplat.field.contrast import Contrast
 from hilsplat.field.minimise import dot, lbfgs
+from hilsplat.field.one_pass import add_slope
 from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
 from hilsplat.settings import FieldSettings
 
@@ -32,8 +33,8 @@ def solve_field(
         curved = problem.hessian_product(features)
         value = (dot(features, curved) - 2 * dot(features, right)) / total
         contrastive, gradient = contrast.weighted(features, weights)
-        gradient += np.float32(2 / total) * (curved - right)
-        return value + contrastive, gradient * inverse_root
+        add_slope(np.float32(2 / total), curved, right, inverse_root[:, :, 0], gradient)
+        return value + contrastive, gradient
 
     lifted = problem.lifted
     at_lift = problem.quadratic.product(lifted)
