@@ -33,7 +33,8 @@ def page(opened, browser, desk, root) -> Iterator:
 
 def saved(page) -> None:
     """Wait until every change has been saved."""
-    page.wait_for_timeout(150)
+    # by the page's own clock: a slow machine has then dealt with all keys and clicks before
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => setTimeout(done, 150)))")
     page.locator("body[data-saved=true]").wait_for()
 
 

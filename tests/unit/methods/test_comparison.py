@@ -25,7 +25,8 @@ def test_every_row_of_the_papers_tables_runs_here_or_the_page_says_why_not():
 def test_every_method_is_a_variant_of_the_file_that_runs_them_all():
     read = lambda name: yaml.safe_load((PROJECT / "config" / name).read_text())  # noqa: E731
     own, laid_over = read("config.yaml"), read("methods.yaml")
-    variants = own["variants"] | laid_over["variants"]
+    names = {**own["variants"], **laid_over["variants"]}
+    variants = {name: own["variants"].get(name, {}) | laid_over["variants"].get(name, {}) for name in names}
     listed = {
         variants.get(name, {}).get("method", {}).get("name", OURS) for name in laid_over["main_variants"]
     }
