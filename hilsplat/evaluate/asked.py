@@ -11,20 +11,13 @@ from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.datasets.registry import dataset_of, open_labels
 from hilsplat.evaluate.protocols.cards import ProtocolCard, card_named
 
-OVS = (
-    "3d-ovs/langsplat",
-    "3d-ovs/langsplat-raw",
-    "3d-ovs/langsplat-v2",
-    "3d-ovs/tree-nodes",
-    "3d-ovs/argmax",
-)
 SCANNET = ("scannet/opengaussian-19", "scannet/opengaussian-15", "scannet/opengaussian-10")
 SCANNET200 = ("scannet200/opengaussian", "scannet200/instances")
 REPLICA = ("replica/per-scene",)
 WAYMO = ("waymo/segmentation",)
 
 STAND_INS: Mapping[str, tuple[str, ...]] = {
-    "tabletop": (*OVS, "lerf-mask/gaussian-grouping"),
+    "tabletop": (*dataset_of("3d_ovs").protocols, "lerf-mask/gaussian-grouping"),
     "room": (*SCANNET, *SCANNET200, *REPLICA),
     "street": WAYMO,
 }

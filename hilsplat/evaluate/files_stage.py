@@ -199,7 +199,7 @@ def _flat_rows(masks: Masks, truth: ViewTruth, asked: Asked) -> Iterator[Measure
     queries = [query for query in truth.queries if query.level is asked.level]
     flat = truth.categories if asked.level is None else queries
     for card in asked.flat:
-        if card is OVS_NODES:  # for trees
+        if card is OVS_NODES:  # masks of files are no nodes of a tree
             continue
         if card is OVS_ARGMAX:
             yield from _argmax_rows(flat, masks, words, labelled=asked.level is not None)

@@ -8,14 +8,13 @@ BLOCK = 2048
 """Pixels to process at once: their sums stay in the fastest cache, and the part of a channel to read is long
 enough for prefetching."""
 
-
-TRANSPOSED = 128
+TRANSPOSED = 16
 """Rows to transpose at once: their part of a channel fills a cache line."""
 
 
 @compiled
 def by_channel(rows):
-    """Transpose (P, D), a few rows at a time: numpy reads all rows once for every channel."""
+    """Latents (P, D) as channels (D, P), a few rows at a time: numpy reads all rows for every channel."""
     count, channels = rows.shape
     out = np.empty((channels, count), np.float32)
     for begin in range(0, count, TRANSPOSED):

@@ -43,7 +43,7 @@ class Plan:
             HilsplatError: a setting, a method or a line of the sheet cannot be used, or no scene is left.
         """
         self.run = run = parse_run(dict(config))
-        for name in run.variant_names():
+        for name in run.every_variant():
             require_method(run.stages(name).method.name)
         sheet = Path(run.scenes)
         self.rows = tuple(read_sheet(sheet, run.groups, run.data_root))

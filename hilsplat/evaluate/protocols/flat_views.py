@@ -90,10 +90,10 @@ class FlatProtocols:
 
         for card in self.cards:
             label = card.labelled(self.words)
-            if card in MASKS or card is OVS_NODES:
+            if card is OVS_NODES and nodes_mask is None:
+                continue  # a field has no nodes
+            if card in (*MASKS, OVS_NODES):
                 mask = nodes_mask
-                if mask is None and card is OVS_NODES:
-                    continue
                 if mask is None:
                     rule = LERF_LANGSPLAT.rule
                     assert rule is not None

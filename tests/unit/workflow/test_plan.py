@@ -64,9 +64,12 @@ def test_a_run_without_scenes_says_what_there_is(tmp_path):
         plan(tmp_path, groups=["ci"])
 
 
-def test_an_unknown_method_stops_at_once(tmp_path):
+@pytest.mark.parametrize("name", ["lifted", "in-no-table"])
+def test_an_unknown_method_stops_at_once(tmp_path, name):
     with pytest.raises(HilsplatError, match="there is no method 'magic'"):
-        plan(tmp_path, variants={**VARIANTS, "lifted": {"method": {"name": "magic"}}})
+        plan(
+            tmp_path, main_variants=list(VARIANTS), variants={**VARIANTS, name: {"method": {"name": "magic"}}}
+        )
 
 
 def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(tmp_path):
