@@ -1,6 +1,6 @@
 """How seconds and memory of the stages after the fit grow with Gaussians, views, pixels and masks.
 
-    python -m benchmarks.growth FOLDER        # thirteen scenes, some 20 minutes on two cores
+    python -m benchmarks.growth FOLDER        # thirteen scenes, 4 minutes on two quiet cores
 
 Each series makes the base scene of `large_scene` with one quantity at half, once, twice and four times its
 size, and runs every stage in a process of its own. It writes `growth.json` and `growth.png`, and prints
@@ -65,7 +65,7 @@ def exponent(sizes: list[float], values: list[float]) -> float:
 
 
 def draw(series: dict[str, dict[str, dict[str, list[float]]]]) -> Figure:
-    """One column per quantity; seconds above, peak memory below."""
+    """One column per quantity, seconds above and peak memory below; each line ends with its exponent."""
     figure = Figure(figsize=(3.6 * len(series), 6.4), layout="constrained")
     panels = figure.subplots(len(MEASURES), len(series), sharey="row")
     for column, (quantity, found) in enumerate(series.items()):
@@ -74,19 +74,30 @@ def draw(series: dict[str, dict[str, dict[str, list[float]]]]) -> Figure:
             axes = panels[row, column]
             for stage in STAGES:
                 values = found[stage][measure]
-                label = f"{stage.replace('_', ' ')}, {exponent(sizes, values):.1f}"
-                axes.loglog(sizes, values, marker="o", markersize=3, label=label)
+                (line,) = axes.loglog(sizes, values, marker="o", markersize=3, label=stage.replace("_", " "))
+                axes.annotate(
+                    f"{exponent(sizes, values):.1f}".replace("-0.0", "0.0"),
+                    (sizes[-1], values[-1]),
+                    xytext=(5, 0),
+                    textcoords="offset points",
+                    va="center",
+                    fontsize=8,
+                    color=line.get_color(),
+                )
+            axes.set_xlim(sizes[0] / 1.2, sizes[-1] * 1.7)
             axes.set_xticks(sizes, [f"{size:,.0f}" for size in sizes])
             axes.minorticks_off()
             axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
             axes.yaxis.set_major_formatter("{x:g}")
             axes.grid(alpha=0.3)
-            axes.legend(fontsize=7, title="stage, exponent", title_fontsize=7)
             axes.set_xlabel(
-                {"pixels": "pixels of a view", "masks": "masks of a view"}.get(quantity, quantity)
+                {"gaussians": "Gaussians", "pixels": "pixels of a view", "masks": "masks of a view"}.get(
+                    quantity, quantity
+                )
             )
         panels[0, 0].set_ylabel("seconds, 2 threads")
         panels[1, 0].set_ylabel("peak memory, MiB")
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(STAGES))
     return figure
 
 
