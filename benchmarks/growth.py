@@ -23,6 +23,12 @@ from benchmarks.table import markdown_table
 
 FACTORS = (0.5, 1.0, 2.0, 4.0)
 MEASURES = ("seconds", "MiB")
+LABELS = {
+    "gaussians": "Gaussians",
+    "views": "views",
+    "pixels": "pixels of a view",
+    "masks": "masks of a view",
+}
 
 
 @dataclass(frozen=True)
@@ -90,11 +96,7 @@ def draw(series: dict[str, dict[str, dict[str, list[float]]]]) -> Figure:
             axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
             axes.yaxis.set_major_formatter("{x:g}")
             axes.grid(alpha=0.3)
-            axes.set_xlabel(
-                {"gaussians": "Gaussians", "pixels": "pixels of a view", "masks": "masks of a view"}.get(
-                    quantity, quantity
-                )
-            )
+            axes.set_xlabel(LABELS[quantity])
         panels[0, 0].set_ylabel("seconds, 2 threads")
         panels[1, 0].set_ylabel("peak memory, MiB")
     figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(STAGES))
