@@ -17,18 +17,16 @@ def normalised_weights(weights: sp.csr_matrix, min_alpha: float = MIN_ALPHA) -> 
     rasteriser dropped as too small do not count in the sum.
 
     Args:
-        weights: compositing weights (pixels x Gaussians).
+        weights: compositing weights (pixels x Gaussians), fresh: the result is made in their memory.
         min_alpha: pixels with a smaller sum become empty rows.
 
     Returns:
         the normalised matrix, columns sorted.
     """
-    if not weights.has_sorted_indices:
-        weights = weights.sorted_indices()
-    indptr = np.zeros(weights.shape[0] + 1, np.int64)
-    indices, data = np.empty(weights.nnz, np.int32), np.empty(weights.nnz, np.float32)
-    kept = _normalise(weights.indptr, weights.indices, weights.data, min_alpha, indptr, indices, data)
-    return sp.csr_matrix((data[:kept], indices[:kept], indptr.astype(np.int32)), shape=weights.shape)
+    weights.sort_indices()
+    kept = _normalise(weights.indptr, weights.indices, weights.data, min_alpha)
+    arrays = (weights.data[:kept], weights.indices[:kept], weights.indptr)
+    return sp.csr_matrix(arrays, shape=weights.shape, copy=False)
 
 
 def visible_mass(weights: sp.csr_matrix) -> Float32[np.ndarray, " N"]:
@@ -45,16 +43,17 @@ def _add_columns(indices, data, out):
 
 
 @compiled
-def _normalise(indptr, indices, data, min_alpha, out_indptr, out_indices, out_data):
-    done = 0
+def _normalise(indptr, indices, data, min_alpha):
+    done, begin = 0, indptr[0]
     for row in range(len(indptr) - 1):
+        end = indptr[row + 1]
         alpha = 0.0
-        for k in range(indptr[row], indptr[row + 1]):
+        for k in range(begin, end):
             alpha += data[k]
         if alpha >= min_alpha:
-            for k in range(indptr[row], indptr[row + 1]):
-                out_indices[done] = indices[k]
-                out_data[done] = data[k] / alpha
+            for k in range(begin, end):
+                indices[done] = indices[k]
+                data[done] = data[k] / alpha
                 done += 1
-        out_indptr[row + 1] = done
+        begin, indptr[row + 1] = end, done
     return done

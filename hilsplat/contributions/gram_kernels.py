@@ -8,7 +8,8 @@ from numba.extending import intrinsic
 from hilsplat.base.compiled import compiled
 
 SUMS = 4
-"""Numbers of a pair of Gaussians while they are summed: one a level, and one for a vector of four."""
+"""Numbers of a pair of Gaussians while they are summed: one a level, and how many pixels were added; a pair
+that none was added to is new."""
 
 
 @compiled
@@ -27,27 +28,35 @@ def transpose(indptr, indices, begins, pixels, places):
 
 
 @intrinsic
-def _add_products(typingctx, sums, at, whole, part, subpart, value):
-    """Add three numbers times `value` to the sums from `at` on, as one vector; nothing is fused."""
+def add_products(typingctx, sums, at, whole, part, subpart, value):
+    """Add three numbers times `value`, and 1, to the sums from `at` on, as one vector; nothing is fused.
+
+    Returns how often that was done before.
+    """
 
     def codegen(context, builder, sig, args):
         number, lane = ir.DoubleType(), ir.IntType(32)
         four = ir.VectorType(number, SUMS)
         data = context.make_array(sig.args[0])(context, builder, args[0]).data
         place = builder.bitcast(builder.gep(data, [args[1]]), four.as_pointer())
-        weights, values = (
-            ir.Constant(four, [ir.Constant(number, 0.0)] * SUMS),
-            ir.Constant(four, ir.Undefined),
-        )
+        weights = values = ir.Constant(four, [ir.Constant(number, 1.0)] * SUMS)
         for index, each in enumerate(args[2:5]):
             weights = builder.insert_element(weights, each, ir.Constant(lane, index))
-        for index in range(SUMS):
             values = builder.insert_element(values, args[5], ir.Constant(lane, index))
-        grown = builder.fadd(builder.load(place, align=8), builder.fmul(weights, values))
-        builder.store(grown, place, align=8)
-        return context.get_dummy_value()
+        before = builder.load(place, align=8)
+        builder.store(builder.fadd(before, builder.fmul(weights, values)), place, align=8)
+        return builder.extract_element(before, ir.Constant(lane, SUMS - 1))
 
-    return types.void(sums, types.intp, *[types.float64] * 4), codegen
+    return types.float64(sums, types.intp, *[types.float64] * 4), codegen
+
+
+@compiled
+def enlarged(indices, values, kept, room):
+    """Copies of both with more room, and the first `kept` entries."""
+    more_indices = np.empty(room, np.int32)
+    more_values = np.empty((room, values.shape[1]), np.float64)
+    more_indices[:kept], more_values[:kept] = indices[:kept], values[:kept]
+    return more_indices, more_values
 
 
 @compiled
@@ -64,27 +73,27 @@ def grown_block(
     old_indptr,
     old_indices,
     old_values,
-    levels,
+    sums,
+    fresh,
+    out_indptr,
+    out_indices,
+    out_values,
 ):
-    """Rows begin..end of G: old values plus the new pixels; columns sorted."""
-    num = len(begins) - 1
-    seen = np.full(num, -1, np.int64)
-    sums = np.zeros(num * SUMS, np.float64)
-    found = np.empty(num, np.int32)
-    out_indptr = np.zeros(end - begin + 1, np.int64)
-    out_indices = np.empty(max(1024, 2 * len(old_indices)), np.int32)
-    out_values = np.empty((len(out_indices), levels), np.float64)
+    """Rows begin..end of G: old values plus the new pixels; columns sorted.
+
+    `sums` must be zero, and is again; `fresh` has room for all columns. Returns the columns and the values,
+    which lie in `out_indices` and `out_values` unless these were too small.
+    """
+    levels = old_values.shape[1]
     done = 0
     for i in range(begin, end):
-        count = 0
-        for k in range(old_indptr[i - begin], old_indptr[i - begin + 1]):
-            j = old_indices[k]
-            seen[j] = i
-            found[count] = j
-            count += 1
+        old, old_end = old_indptr[i - begin], old_indptr[i - begin + 1]
+        for k in range(old, old_end):
+            at = np.int64(old_indices[k]) * SUMS
             for level in range(levels):
-                sums[j * SUMS + level] = old_values[k, level]
-        known = count
+                sums[at + level] = old_values[k, level]
+            sums[at + levels] = 1
+        count = 0
         for t in range(begins[i], begins[i + 1]):
             p = pixels[t]
             weight = np.float64(data[places[t]])
@@ -93,24 +102,27 @@ def grown_block(
             subpart = weight if valid[p, 2] else 0.0
             for k in range(np.uint64(places[t]), np.uint64(indptr[p + 1])):
                 j = np.uint64(indices[k])  # unsigned: no look for negative indices
-                at = np.int64(j) * SUMS
-                if seen[j] != i:
-                    seen[j] = i
-                    sums[at : at + SUMS] = 0
-                    found[count] = np.int32(j)
+                if add_products(sums, np.int64(j) * SUMS, whole, part, subpart, np.float64(data[k])) == 0:
+                    fresh[count] = np.int32(j)
                     count += 1
-                _add_products(sums, at, whole, part, subpart, np.float64(data[k]))
-        if count > known:
-            found[:count] = np.sort(found[:count])
-        if done + count > len(out_indices):
-            room = 2 * (done + count)
-            more_indices, more_values = np.empty(room, np.int32), np.empty((room, levels), np.float64)
-            more_indices[:done], more_values[:done] = out_indices[:done], out_values[:done]
-            out_indices, out_values = more_indices, more_values
-        for place in range(count):
-            out_indices[done + place] = found[place]
+        if count:
+            fresh[:count] = np.sort(fresh[:count])
+        size = old_end - old + count
+        if done + size > len(out_indices):
+            out_indices, out_values = enlarged(out_indices, out_values, done, 2 * (done + size))
+        new = 0
+        for place in range(done, done + size):
+            if new < count and (old == old_end or fresh[new] < old_indices[old]):
+                column = fresh[new]
+                new += 1
+            else:
+                column = old_indices[old]
+                old += 1
+            at = np.int64(column) * SUMS
+            out_indices[place] = column
             for level in range(levels):
-                out_values[done + place, level] = sums[found[place] * SUMS + level]
-        done += count
+                out_values[place, level] = sums[at + level]
+            sums[at : at + SUMS] = 0
+        done += size
         out_indptr[i - begin + 1] = done
-    return out_indptr, out_indices[:done].copy(), out_values[:done].copy()
+    return out_indices, out_values

@@ -6,6 +6,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
+from queue import SimpleQueue
 
 import numpy as np
 import scipy.sparse as sp
@@ -13,7 +14,7 @@ import scipy.sparse as sp
 from hilsplat.base.artifacts import INDEX, atomic_folder, read_index, read_npy, sha256_of_json, write_index
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
-from hilsplat.contributions.gram_kernels import grown_block, transpose
+from hilsplat.contributions.gram_kernels import SUMS, enlarged, grown_block, transpose
 from hilsplat.contributions.quadratic import Gram, Quadratic, StackedWeights
 
 logger = logging.getLogger(__name__)
@@ -35,6 +36,41 @@ CHECKPOINT_SECONDS = 300.0
 """Time between checkpoints of a long pass; short passes write none."""
 
 
+class _Block:
+    """Some rows of G, in memory that is used again: a page costs time and memory once it is written to."""
+
+    def __init__(self, rows: int) -> None:
+        self.indptr = np.zeros(rows + 1, np.int64)
+        self._indices, self._values = np.empty(0, np.int32), np.empty((0, len(LEVELS)))
+
+    @property
+    def nonzeros(self) -> int:
+        """Pairs of Gaussians."""
+        return int(self.indptr[-1])
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Row starts, columns, values."""
+        return self.indptr, self._indices[: self.nonzeros], self._values[: self.nonzeros]
+
+    def replace(self, indptr: np.ndarray, indices: np.ndarray, values: np.ndarray) -> None:
+        """Copy other rows over these; columns and values may have more room than `indptr` fills."""
+        self.indptr = indptr
+        if self.nonzeros > len(self._indices):
+            self._indices, self._values = enlarged(indices, values, self.nonzeros, 2 * self.nonzeros)
+            return
+        self._indices[: self.nonzeros] = indices[: self.nonzeros]
+        self._values[: self.nonzeros] = values[: self.nonzeros]
+
+
+class _Scratch:
+    """What one thread needs to add to a block."""
+
+    def __init__(self, num_gaussians: int) -> None:
+        self.sums = np.zeros(num_gaussians * SUMS)
+        self.fresh = np.empty(num_gaussians, np.int32)
+        self.indices, self.values = np.empty(1024, np.int32), np.empty((1024, len(LEVELS)))
+
+
 class GramBuilder:
     """Sums G over parts of W, such as one view's after another; memory grows with G alone.
 
@@ -51,12 +87,15 @@ class GramBuilder:
         self._ranges = list(pairwise(edges))
         self._threads = max(1, threads)
         self._pixels = self._places = np.zeros(0, np.int32)
-        self._blocks = [_empty_block(end - begin) for begin, end in self._ranges]
+        self._blocks = [_Block(end - begin) for begin, end in self._ranges]
+        self._idle: SimpleQueue[_Scratch] = SimpleQueue()
+        for _ in range(self._threads):
+            self._idle.put(_Scratch(num_gaussians))
 
     @property
     def nonzeros(self) -> int:
         """Pairs of Gaussians so far."""
-        return sum(len(indices) for _, indices, _ in self._blocks)
+        return sum(block.nonzeros for block in self._blocks)
 
     def add(self, part: StackedWeights) -> None:
         """Add W' diag(valid) W of further pixels; the columns of W must be sorted within rows."""
@@ -64,13 +103,15 @@ class GramBuilder:
         arrays = (weights.indptr, weights.indices, weights.data, part.valid)
         columns = self._columns(weights)
 
-        def grow(block: int) -> None:
-            begin, end = self._ranges[block]
+        def grow(number: int) -> None:
+            begin, end = self._ranges[number]
             if columns[0][begin] == columns[0][end]:
                 return
-            self._blocks[block] = grown_block(
-                begin, end, *arrays, *columns, *self._blocks[block], len(LEVELS)
-            )
+            block, own, indptr = self._blocks[number], self._idle.get(), np.zeros(end - begin + 1, np.int64)
+            rows = (begin, end, *arrays, *columns, *block.arrays(), own.sums, own.fresh)
+            own.indices, own.values = grown_block(*rows, indptr, own.indices, own.values)
+            block.replace(indptr, own.indices, own.values)
+            self._idle.put(own)
 
         with ThreadPoolExecutor(self._threads) as pool:
             list(pool.map(grow, range(len(self._blocks))))
@@ -95,15 +136,13 @@ class GramBuilder:
         return {
             f"{name}_{number}": array
             for number, block in enumerate(self._blocks)
-            for name, array in zip(names, block, strict=True)
+            for name, array in zip(names, block.arrays(), strict=True)
         }
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Continue from `state`."""
-        self._blocks = [
-            (state[f"indptr_{number}"], state[f"indices_{number}"], state[f"values_{number}"])
-            for number in range(len(self._blocks))
-        ]
+        for number, block in enumerate(self._blocks):
+            block.replace(*(state[f"{name}_{number}"] for name in ("indptr", "indices", "values")))
 
     def finish(self) -> Gram:
         """G of everything added; the builder is empty afterwards."""
@@ -111,19 +150,14 @@ class GramBuilder:
         indices = np.empty(self.nonzeros, np.int32)
         values = np.empty((len(indices), len(LEVELS)), np.float32)
         done = 0
-        for (begin, end), block in zip(self._ranges, range(len(self._blocks)), strict=True):
-            some_indptr, some_indices, some_values = self._blocks[block]
-            self._blocks[block] = _empty_block(end - begin)
+        for number, (begin, end) in enumerate(self._ranges):
+            some_indptr, some_indices, some_values = self._blocks[number].arrays()
+            self._blocks[number] = _Block(end - begin)
             indptr[begin + 1 : end + 1] = some_indptr[1:] + done
             indices[done : done + len(some_indices)] = some_indices
             values[done : done + len(some_indices)] = some_values
             done += len(some_indices)
         return Gram(indptr, indices, values)
-
-
-def _empty_block(rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of G without a pair: row starts, columns, values."""
-    return np.zeros(rows + 1, np.int64), np.zeros(0, np.int32), np.zeros((0, len(LEVELS)))
 
 
 class _Waiting:

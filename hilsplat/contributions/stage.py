@@ -12,7 +12,6 @@ into one label map per level, with indicator B and areas n:
 The losses of the language field and the 3D semantic tree need nothing else from the images.
 """
 
-import hashlib
 import logging
 from dataclasses import dataclass
 from functools import cache as cache_calls
@@ -20,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Int32, Int64
 
 from hilsplat.base.artifacts import (
     INDEX,
@@ -35,13 +33,13 @@ from hilsplat.base.artifacts import (
 )
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.identity import code_digest
-from hilsplat.base.levels import LEVELS
 from hilsplat.base.parallel import in_order
 from hilsplat.base.progress import stage_log, track
-from hilsplat.contributions.compositing import normalised_weights, visible_mass
+from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.contributions.quadratic import Gram, StackedWeights
 from hilsplat.contributions.quadratic_builder import QuadraticBuilder, QuadraticCheckpoint
 from hilsplat.contributions.streams import ArrayStream, MatrixStream
+from hilsplat.contributions.view_matrices import MATRICES, label_maps, labelled_rows, view_contributions
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
@@ -52,91 +50,11 @@ from hilsplat.splat.rasterise.device import choose_device
 
 logger = logging.getLogger(__name__)
 
-MATRICES = ("A", "A_half", "S")
-
 WEIGHTS_PER_PIXEL = 40
 """Of a typical scene."""
 
 MAX_WEIGHTS_TOGETHER = 2**24
 """Views with more weights are prepared one at a time; 128 MiB each, and up to four are waiting."""
-
-
-def label_maps(masks: HierarchicalMasks) -> Int32[np.ndarray, "P 3"]:
-    """Row of the painted mask at each pixel and level, -1 for none."""
-    return np.stack([masks.label_map(level).reshape(-1) for level in LEVELS], axis=1)
-
-
-def painted_indicator(labels: Int32[np.ndarray, "P 3"], num_masks: int, pixels: np.ndarray) -> sp.csr_matrix:
-    """B: one row per mask, ones at those of the given pixels that show it (float64)."""
-    rows, columns = [], []
-    for index in range(labels.shape[1]):
-        row = labels[:, index]
-        chosen = np.flatnonzero((row >= 0) & pixels)
-        rows.append(row[chosen])
-        columns.append(chosen)
-    row, column = np.concatenate(rows), np.concatenate(columns)
-    return sp.csr_matrix((np.ones(len(row)), (row, column)), shape=(num_masks, len(labels)))
-
-
-def mask_means(
-    indicator: sp.csr_matrix, weights: sp.csr_matrix
-) -> tuple[sp.csr_matrix, Int64[np.ndarray, " M"]]:
-    """diag(1/n) B W with weights in float64, and n; the row of a mask without a pixel is empty."""
-    pixels = np.diff(indicator.indptr).astype(np.int64)
-    scale = sp.diags(1.0 / np.maximum(pixels, 1))
-    return _single(scale @ (indicator @ weights)), pixels
-
-
-def raw_indicator(masks: HierarchicalMasks, pixels: np.ndarray) -> sp.csr_matrix:
-    """D: one row per raw mask, ones at the given pixels; masks may overlap."""
-    columns, lengths = [], []
-    for row in range(len(masks)):
-        inside = np.flatnonzero(masks.dense(np.array([row]))[0].reshape(-1) & pixels)
-        columns.append(inside)
-        lengths.append(len(inside))
-    indptr = np.concatenate(([0], np.cumsum(lengths))).astype(np.int64)
-    column = np.concatenate(columns) if columns else np.zeros(0, np.int64)
-    height, width = masks.size_hw
-    return sp.csr_matrix((np.ones(len(column)), column, indptr), shape=(len(masks), height * width))
-
-
-def random_half(view: str, pixels: int) -> np.ndarray:
-    """A random half of the pixels, a fair coin for each, seeded by the view's name."""
-    seed = int.from_bytes(hashlib.sha256(view.encode()).digest()[:8], "little")
-    return np.random.default_rng(seed).random(pixels) < 0.5
-
-
-def view_contributions(view: str, weights: sp.csr_matrix, masks: HierarchicalMasks) -> dict[str, np.ndarray]:
-    """All matrices of one view except W, as plain arrays (`A_data`, `A_indices`, `A_indptr`, ...).
-
-    Args:
-        view: its name, which seeds the random halves.
-        weights: normalised weights (see `normalised_weights`).
-        masks: the view's masks.
-    """
-    covered = np.diff(weights.indptr) > 0
-    labels = label_maps(masks)
-    num_masks = len(masks)
-    half = covered & random_half(view, len(covered))
-    exact = weights.astype(np.float64)
-    A, pixels = mask_means(painted_indicator(labels, num_masks, covered), exact)
-    A_half, half_pixels = mask_means(painted_indicator(labels, num_masks, half), exact)
-    S = _single(raw_indicator(masks, covered) @ exact)
-    arrays = {
-        "pixels": pixels,
-        "half_pixels": half_pixels,
-        "mass": visible_mass(weights),
-    }
-    for name, matrix in (("A", A), ("A_half", A_half), ("S", S)):
-        arrays |= {f"{name}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr")}
-    return arrays
-
-
-def labelled_rows(weights: sp.csr_matrix, labels: Int32[np.ndarray, "P 3"]) -> StackedWeights:
-    """The rows of W that have Gaussians and a mask at some level."""
-    valid = (labels >= 0) & (np.diff(weights.indptr) > 0)[:, None]
-    rows = np.flatnonzero(valid.any(axis=1))
-    return StackedWeights(weights[rows], valid[rows])
 
 
 @dataclass(frozen=True)
@@ -218,6 +136,7 @@ def run_contributions(
         matrices = {name: MatrixStream(folder / name) for name in MATRICES}
         with ArrayStream(folder / "mass.npy", np.float32, len(gaussians)) as mass:
             together = views_together(scene, threads)
+            threads_each = max(1, threads // together)
 
             def prepare(number: int) -> _Prepared:
                 view = views[number]
@@ -229,12 +148,14 @@ def run_contributions(
                         gaussians,
                         scene.cameras[view.name],
                         min_weight=settings.min_weight,
-                        threads=max(1, threads // together),
+                        threads=threads_each,
                         device=device,
                     )
                     return normalised_weights(raw)
 
-                part = store.get(view.key, lambda: view_contributions(view.name, weights(), masks))
+                part = store.get(
+                    view.key, lambda: view_contributions(view.name, weights(), masks, threads_each)
+                )
                 rows_of_W = labelled_rows(weights(), label_maps(masks)) if number >= summed else None
                 return _Prepared(masks, part, rows_of_W)
 
@@ -304,13 +225,3 @@ def _view(scene: Scene, name: str, masks_folder: Path, about: dict) -> _View:
         }
     )
     return _View(name, path, key)
-
-
-def _single(matrix: sp.spmatrix) -> sp.csr_matrix:
-    """float32 CSR with sorted int32 columns."""
-    matrix = sp.csr_matrix(matrix)
-    matrix.sort_indices()
-    return sp.csr_matrix(
-        (matrix.data.astype(np.float32), matrix.indices.astype(np.int32), matrix.indptr.astype(np.int64)),
-        shape=matrix.shape,
-    )

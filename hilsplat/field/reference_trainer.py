@@ -25,7 +25,7 @@ from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.base.progress import stage_log
 from hilsplat.contributions.compositing import MIN_ALPHA
 from hilsplat.contributions.rows import Contributions
-from hilsplat.contributions.stage import label_maps
+from hilsplat.contributions.view_matrices import label_maps
 from hilsplat.field.code import autoencoder_file, load_latents
 from hilsplat.field.language_field import LanguageField, report_path
 from hilsplat.field.losses.latent_regression import latent_regression_loss

@@ -17,7 +17,7 @@ from hilsplat.base.errors import SettingsError
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.rows import Contributions
-from hilsplat.contributions.stage import label_maps
+from hilsplat.contributions.view_matrices import label_maps
 from hilsplat.field.code import load_code, load_latents
 from hilsplat.field.linear_code import LinearCode
 from hilsplat.scene.cameras import Camera

@@ -12,7 +12,7 @@ from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.contributions.cuda_algebra import DeviceMasks, DeviceQuadratic
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.quadratic import StackedWeights
-from hilsplat.contributions.stage import painted_indicator
+from hilsplat.contributions.view_matrices import painted_indicator
 from hilsplat.field.autoencoder import run_autoencoder
 from hilsplat.field.contrast import Contrast, ViewRelations, distinct
 from hilsplat.field.field import run_field

@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.contributions.mask_operator import MaskOperator
-from hilsplat.contributions.stage import mask_means, painted_indicator
+from hilsplat.contributions.view_matrices import painted_indicator
 from hilsplat.field.adam import Adam
 from hilsplat.field.linear_code import LinearCode
 from hilsplat.field.network_code import Autoencoder
@@ -47,7 +47,9 @@ class OneRowOfPixels(MethodInputs):
         labels[:, Level.WHOLE.index] = np.arange(WIDTH) // (WIDTH // 2)
         own["labels"], own["code"] = labels, LinearCode.fit(vectors, vectors.shape[1])
         own["latents"] = self.code.encode_array(np.tile(vectors, (len(views), 1)))
-        one, pixels = mask_means(painted_indicator(labels, 2, np.ones(WIDTH, bool)), weights)
+        shown = painted_indicator(labels, 2, np.ones(WIDTH, bool))
+        pixels = np.diff(shown.indptr).astype(np.int64)
+        one = sp.diags(1 / np.maximum(pixels, 1)) @ shown @ weights
         level = np.full(2 * len(views), int(Level.WHOLE), np.uint8)
         means = sp.vstack([one] * len(views)).tocsr().astype(np.float32)
         own["contributions"] = types.SimpleNamespace(

@@ -1,0 +1,60 @@
+"""The compiled loop that sums a view's weights mask by mask; `view_matrices.mask_sums` calls it."""
+
+import numpy as np
+
+from hilsplat.base.compiled import compiled
+from hilsplat.contributions.gram_kernels import SUMS, add_products, enlarged
+
+
+@compiled
+def summed_masks(first, last, runs, offsets, level_index, labels, half, indptr, indices, data, num_gaussians):
+    """Sums of weights over masks first..last, and how many pixels were summed.
+
+    Args:
+        first, last: range of masks.
+        runs, offsets, level_index: the masks.
+        labels: row of the painted mask at each pixel and level.
+        half: whether a pixel is in the random half.
+        indptr, indices, data: W; a pixel without weights does not count.
+        num_gaussians: N.
+
+    Returns:
+        counts of pixels (masks x 2): painted ones and those in the half; row starts, columns, and sums over
+        raw mask, painted pixels and their half (entries x 3, float64, in the order of the pixels).
+    """
+    sums, found = np.zeros(num_gaussians * SUMS), np.empty(num_gaussians, np.int32)
+    counts = np.zeros((last - first, 2), np.int64)
+    starts = np.zeros(last - first + 1, np.int64)
+    columns, values = np.empty(1024, np.int32), np.empty((1024, 3))
+    done = 0
+    for m in range(first, last):
+        count, pixel, level = 0, np.int64(0), level_index[m]
+        for run in range(offsets[m], offsets[m + 1]):
+            begin, pixel = pixel, pixel + np.int64(runs[run])
+            if (run - offsets[m]) % 2 == 0:
+                continue  # outside
+            for p in range(begin, pixel):
+                if indptr[p] == indptr[p + 1]:
+                    continue
+                painted = 1.0 if labels[p, level] == m else 0.0
+                in_half = painted if half[p] else 0.0
+                counts[m - first, 0] += painted > 0
+                counts[m - first, 1] += in_half > 0
+                for k in range(indptr[p], indptr[p + 1]):
+                    j = np.uint64(indices[k])  # unsigned: no look for negative indices
+                    at = np.int64(j) * SUMS
+                    if sums[at + 3] == 0:
+                        found[count] = np.int32(j)
+                        count += 1
+                    add_products(sums, at, 1.0, painted, in_half, np.float64(data[k]))
+        found[:count] = np.sort(found[:count])
+        if done + count > len(columns):
+            columns, values = enlarged(columns, values, done, 2 * (done + count))
+        for k in range(count):
+            at = np.int64(found[k]) * SUMS
+            columns[done + k] = found[k]
+            values[done + k] = sums[at : at + 3]
+            sums[at : at + SUMS] = 0
+        done += count
+        starts[m - first + 1] = done
+    return counts, starts, columns[:done], values[:done]

@@ -1,0 +1,102 @@
+"""A, A_half, S and mass of one view, from its weights and masks; `stage` says what they are."""
+
+import hashlib
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float64, Int32, Int64
+
+from hilsplat.base.levels import LEVELS
+from hilsplat.contributions.compositing import visible_mass
+from hilsplat.contributions.mask_kernels import summed_masks
+from hilsplat.contributions.quadratic import StackedWeights
+from hilsplat.segment.masks import HierarchicalMasks
+
+MATRICES = ("A", "A_half", "S")
+
+
+def label_maps(masks: HierarchicalMasks) -> Int32[np.ndarray, "P 3"]:
+    """Row of the painted mask at each pixel and level, -1 for none."""
+    return np.stack([masks.label_map(level).reshape(-1) for level in LEVELS], axis=1)
+
+
+def painted_indicator(labels: Int32[np.ndarray, "P 3"], num_masks: int, pixels: np.ndarray) -> sp.csr_matrix:
+    """B: one row per mask, ones at those of the given pixels that show it (float64)."""
+    rows, columns = [], []
+    for index in range(labels.shape[1]):
+        row = labels[:, index]
+        chosen = np.flatnonzero((row >= 0) & pixels)
+        rows.append(row[chosen])
+        columns.append(chosen)
+    row, column = np.concatenate(rows), np.concatenate(columns)
+    return sp.csr_matrix((np.ones(len(row)), (row, column)), shape=(num_masks, len(labels)))
+
+
+def random_half(view: str, pixels: int) -> np.ndarray:
+    """A random half of the pixels, a fair coin for each, seeded by the view's name."""
+    seed = int.from_bytes(hashlib.sha256(view.encode()).digest()[:8], "little")
+    return np.random.default_rng(seed).random(pixels) < 0.5
+
+
+def mask_sums(
+    weights: sp.csr_matrix,
+    masks: HierarchicalMasks,
+    labels: Int32[np.ndarray, "P 3"],
+    half: np.ndarray,
+    threads: int,
+) -> tuple[
+    Int64[np.ndarray, "M 2"], Int64[np.ndarray, " M+1"], Int32[np.ndarray, " E"], Float64[np.ndarray, "E 3"]
+]:
+    """What `mask_kernels.summed_masks` returns, for all masks; the same for any number of threads."""
+    total_px = np.concatenate([[0], np.cumsum(masks.area_px)])
+    shares = np.linspace(0, total_px[-1], max(1, threads) + 1)[1:-1]
+    edges = [0, *np.searchsorted(total_px, shares).tolist(), len(masks)]
+    pixels = labels, half, weights.indptr, weights.indices, weights.data
+    level_index = masks.level.astype(np.int64) - 1
+
+    def some(first: int, last: int) -> tuple[np.ndarray, ...]:
+        return summed_masks(first, last, masks.runs, masks.offsets, level_index, *pixels, weights.shape[1])
+
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        counts, starts, columns, values = zip(*pool.map(some, edges[:-1], edges[1:]), strict=True)
+    sizes = np.concatenate([np.diff(each) for each in starts])
+    return (
+        np.concatenate(counts),
+        np.concatenate([[0], np.cumsum(sizes)]),
+        np.concatenate(columns),
+        np.concatenate(values),
+    )
+
+
+def view_contributions(
+    view: str, weights: sp.csr_matrix, masks: HierarchicalMasks, threads: int = 1
+) -> dict[str, np.ndarray]:
+    """All matrices of one view except W, as plain arrays (`A_data`, `A_indices`, `A_indptr`, ...).
+
+    Args:
+        view: its name, which seeds the random halves.
+        weights: normalised weights (see `normalised_weights`).
+        masks: the view's masks.
+        threads: number of threads; the result does not depend on it.
+    """
+    labels, half = label_maps(masks), random_half(view, weights.shape[0])
+    counts, starts, columns, sums = mask_sums(weights, masks, labels, half, threads)
+    pixels, half_pixels = counts.T
+    means = [1.0 / np.maximum(n, 1) for n in (pixels, half_pixels)]
+    arrays = {"pixels": pixels.copy(), "half_pixels": half_pixels.copy(), "mass": visible_mass(weights)}
+    scales = {"S": np.ones(len(masks)), "A": means[0], "A_half": means[1]}
+    for index, (name, scale) in enumerate(scales.items()):
+        present = sums[:, index] > 0
+        scaled = np.repeat(scale, np.diff(starts)) * sums[:, index]
+        arrays[f"{name}_data"] = scaled[present].astype(np.float32)
+        arrays[f"{name}_indices"] = columns[present]
+        arrays[f"{name}_indptr"] = np.concatenate([[0], np.cumsum(present)])[starts]
+    return arrays
+
+
+def labelled_rows(weights: sp.csr_matrix, labels: Int32[np.ndarray, "P 3"]) -> StackedWeights:
+    """The rows of W that have Gaussians and a mask at some level."""
+    valid = (labels >= 0) & (np.diff(weights.indptr) > 0)[:, None]
+    rows = np.flatnonzero(valid.any(axis=1))
+    return StackedWeights(weights[rows], valid[rows])
