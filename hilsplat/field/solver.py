@@ -23,34 +23,49 @@ def solve_field(
     """
     weights = (settings.weight_instance, settings.weight_part)
     total = problem.total_pixels
-    # The variables of L-BFGS are scaled by the root of the mass, which makes the quadratic part nearly round.
-    root = np.sqrt(problem.mass)[:, :, None]
-    inverse_root = np.where(root > 0, 1 / np.maximum(root, 1e-10), 0).astype(np.float32)
+    # The variables of L-BFGS are those that a mask shows (its steps take much memory), scaled by the root of the
+    # mass, which makes the quadratic part nearly round.
+    shown = np.flatnonzero(problem.mass)
+    root = np.sqrt(problem.mass.reshape(-1)[shown])[:, None]
+    inverse_root = np.zeros(problem.mass.shape, np.float32)
+    inverse_root.reshape(-1)[shown] = (1 / np.maximum(root, 1e-10))[:, 0]
     right = problem.right_side()
 
+    def unscaled(scaled: np.ndarray) -> np.ndarray:
+        features = np.zeros(problem.lifted.shape, np.float32)
+        _rows(features)[shown] = scaled * inverse_root.reshape(-1)[shown][:, None]
+        return features
+
     def objective(scaled: np.ndarray) -> tuple[float, np.ndarray]:
-        features = scaled * inverse_root
+        features = unscaled(scaled)
         curved = problem.hessian_product(features)
         value = (dot(features, curved) - 2 * dot(features, right)) / total
         contrastive, gradient = contrast.weighted(features, weights)
-        add_slope(np.float32(2 / total), curved, right, inverse_root[:, :, 0], gradient)
-        return value + contrastive, gradient
+        add_slope(np.float32(2 / total), curved, right, inverse_root, gradient)
+        return value + contrastive, _rows(gradient)[shown]
 
     lifted = problem.lifted
     at_lift = problem.quadratic.product(lifted)
     report: dict[str, object] = {
         "lifted": problem.terms(lifted) | contrast.values(lifted),
-        "gradient_norms": gradient_norms(problem, contrast, inverse_root, at_lift),
+        "gradient_norms": gradient_norms(problem, contrast, inverse_root[:, :, None], at_lift),
     }
     features = lifted
     if settings.cg_steps and any(problem.weights):
         features = conjugate_gradient(problem, lifted, settings.cg_steps, at_lift)
         report["after_cg"] = problem.terms(features) | contrast.values(features)
+    del at_lift
     if any(weights) and settings.lbfgs_steps:
         first_step = total / (2 * max(sum(problem.weights), 1e-3))
-        features = lbfgs(objective, features * root, settings.lbfgs_steps, first_step) * inverse_root
+        start = _rows(features)[shown] * root
+        features = unscaled(lbfgs(objective, start, settings.lbfgs_steps, first_step))
         report["after_lbfgs"] = problem.terms(features) | contrast.values(features)
     return features.astype(np.float32), report
+
+
+def _rows(features: Float32[np.ndarray, "N 3 D"]) -> Float32[np.ndarray, "R D"]:
+    """One row for each Gaussian and level, in the same memory."""
+    return features.reshape(-1, features.shape[2])
 
 
 def gradient_norms(
