@@ -23,8 +23,8 @@ def solve_field(
     """
     weights = (settings.weight_instance, settings.weight_part)
     total = problem.total_pixels
-    # The variables of L-BFGS, whose steps take much memory, are those that a mask shows. They are scaled by the
-    # root of the mass, which makes the quadratic part nearly round.
+    # The variables of L-BFGS, whose steps take much memory, are those that a mask shows. They are scaled by
+    # the root of the mass, which makes the quadratic part nearly round.
     shown = np.flatnonzero(problem.mass)
     root = np.sqrt(problem.mass.reshape(-1)[shown])[:, None]
     inverse_root = np.zeros(problem.mass.shape, np.float32)
