@@ -1,4 +1,4 @@
-"""Compiled loops that sum G from weights; `quadratic_builder.GramBuilder` calls them."""
+"""Compiled loops that sum G from weights, for `quadratic_builder.GramBuilder`; `mask_kernels` shares two."""
 
 import numpy as np
 from llvmlite import ir
@@ -8,8 +8,7 @@ from numba.extending import intrinsic
 from hilsplat.base.compiled import compiled
 
 SUMS = 4
-"""Numbers of a pair of Gaussians while they are summed: one a level, and how many pixels were added; a pair
-that none was added to is new."""
+"""Numbers that are summed at once: three sums, and how many products were added; 0 of those mean new."""
 
 
 @compiled

@@ -42,11 +42,9 @@ def summed_masks(first, last, runs, offsets, level_index, labels, half, indptr, 
                 counts[m - first, 1] += in_half > 0
                 for k in range(indptr[p], indptr[p + 1]):
                     j = np.uint64(indices[k])  # unsigned: no look for negative indices
-                    at = np.int64(j) * SUMS
-                    if sums[at + 3] == 0:
+                    if add_products(sums, np.int64(j) * SUMS, 1.0, painted, in_half, np.float64(data[k])) == 0:
                         found[count] = np.int32(j)
                         count += 1
-                    add_products(sums, at, 1.0, painted, in_half, np.float64(data[k]))
         found[:count] = np.sort(found[:count])
         if done + count > len(columns):
             columns, values = enlarged(columns, values, done, 2 * (done + count))

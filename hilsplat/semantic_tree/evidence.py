@@ -22,7 +22,7 @@ class Evidence:
     """How far every two of the M masks of a level agree on the Gaussians that both views see.
 
     Attributes:
-        intersection: of pairs that share Gaussians; symmetric, no diagonal, no pair of one view.
+        intersection: of pairs a < b that share Gaussians; no pair of one view.
         union: of the same pairs, in the same order of stored values.
         seen: size of each mask as each of the V views sees it: its full size in its own view, 0 in views
             that see too little of it. A pair that is not stored has intersection 0 and union
@@ -80,11 +80,7 @@ def mask_evidence(
     else:
         upper, seen = _evidence_by_torch(*products, device)
     shape = (len(view), len(view))
-    # Adding the transpose keeps the two patterns alike, since every stored value is positive.
-    matrices = (sp.csr_matrix((values, *upper[:2]), shape=shape) for values in upper[2:])
-    intersection, union = (sp.csr_matrix(each + each.T) for each in matrices)
-    intersection.sort_indices()
-    union.sort_indices()
+    intersection, union = (sp.csr_matrix((values, *upper[:2]), shape=shape) for values in upper[2:])
     return Evidence(intersection, union, seen, view)
 
 

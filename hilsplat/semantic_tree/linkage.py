@@ -1,7 +1,7 @@
 """Link the masks of one level across views: pooled average linkage of their evidence.
 
 Everything is sparse: only masks that share Gaussians can be joined, and how much two clusters see of each
-other is a product of two vectors over views. The cost grows with the number of pairs that share Gaussians,
+other is a sum over the views of their members. The cost grows with the number of pairs that share Gaussians,
 not of all pairs.
 """
 
@@ -10,6 +10,9 @@ from jaxtyping import Float, Int64
 
 from hilsplat.base.compiled import compiled
 from hilsplat.semantic_tree.evidence import Evidence
+
+ROWS_OF_A_BLOCK = 256
+"""The best score of so many rows is remembered, so that the best of all is found without a look at all."""
 
 
 def pooled_linkage(
@@ -27,29 +30,43 @@ def pooled_linkage(
     """
     num = len(evidence.view)
     pairs = evidence.intersection
-    row = np.repeat(np.arange(num), np.diff(pairs.indptr))
-    apart = (
-        evidence.seen[row, evidence.view[pairs.indices]] + evidence.seen[pairs.indices, evidence.view[row]]
-    )
-    members = np.zeros_like(evidence.seen)
-    members[np.arange(num), evidence.view] = 1.0
+    values = pairs.data, evidence.union.data
+    pool = _neighbours(pairs.indptr, pairs.indices, *values, evidence.seen, evidence.view)
     within = np.zeros((2, num))
     root = np.arange(num)
-    _link(
-        pairs.indptr.astype(np.int64),
-        pairs.indices.astype(np.int64),
-        pairs.data.astype(np.float64),
-        evidence.union.data - apart,
-        evidence.seen.copy(),
-        members,
-        float(threshold),
-        root,
-        within,
-    )
+    _link(*pool, evidence.seen.copy(), evidence.view, float(threshold), root, within)
     # A root is the lowest row of its cluster, so sorting roots numbers clusters by first appearance.
     tops, cluster = np.unique(root, return_inverse=True)
     quality = within[0, tops] / np.where(within[1, tops] > 0, within[1, tops], 1.0)
     return cluster.astype(np.int64), quality
+
+
+@compiled
+def _neighbours(indptr, indices, intersection, union, seen, view):
+    """The pool of neighbours that `_link` begins with, and where each mask's run starts and stops in it.
+
+    There is room for a quarter more than all pairs, both ways.
+    """
+    num = len(view)
+    start = np.zeros(num + 1, np.int64)
+    for a in range(num):
+        start[a + 1] += indptr[a + 1] - indptr[a]
+        for k in range(indptr[a], indptr[a + 1]):
+            start[indices[k] + 1] += 1
+    start = np.cumsum(start)[:num]
+    stop = start.copy()
+    room = 2 * len(indices) + len(indices) // 2 + 1024
+    neighbour = np.empty(room, np.int32)
+    inter, extra = np.empty(room), np.empty(room)
+    for a in range(num):  # rows in order, so that the neighbours in a run are in order too
+        for k in range(indptr[a], indptr[a + 1]):
+            b = np.int64(indices[k])
+            apart = seen[a, view[b]] + seen[b, view[a]]
+            for own, other in ((a, b), (b, a)):
+                at = stop[own]
+                neighbour[at], inter[at], extra[at] = other, intersection[k], union[k] - apart
+                stop[own] += 1
+    return start, stop, neighbour, inter, extra
 
 
 @compiled
@@ -78,7 +95,22 @@ def _merged_run(begin, end, first, neighbour, inter, extra, root, place_of, self
 
 
 @compiled
-def _best_neighbour(i, begin, end, neighbour, inter, extra, seen, members, place_of):
+def _plus_sizes(total, i, j, seen, members, shown, shows):
+    """`total` plus, over views, the size of each cluster as seen there times the other's members there."""
+    num_views = seen.shape[1]
+    at_i = at_j = 0
+    while at_i < shows[i] or at_j < shows[j]:
+        next_i = shown[i, at_i] if at_i < shows[i] else num_views
+        next_j = shown[j, at_j] if at_j < shows[j] else num_views
+        v = min(next_i, next_j)
+        at_i += next_i == v
+        at_j += next_j == v
+        total += seen[i, v] * members[j, v] + seen[j, v] * members[i, v]
+    return total
+
+
+@compiled
+def _best_neighbour(i, begin, end, neighbour, inter, extra, seen, members, shown, shows, place_of):
     """The neighbour with the best pooled IoU in a run that `_merged_run` wrote, -1 for none, and that IoU.
 
     Of equally good ones, the lowest row. Clears the run's marks in `place_of`.
@@ -87,9 +119,7 @@ def _best_neighbour(i, begin, end, neighbour, inter, extra, seen, members, place
     for k in range(begin, end):
         j = neighbour[k]
         place_of[j] = -1
-        union = extra[k]
-        for v in range(seen.shape[1]):
-            union += seen[i, v] * members[j, v] + seen[j, v] * members[i, v]
+        union = _plus_sizes(extra[k], i, j, seen, members, shown, shows)
         if union > 0.0:
             pooled = inter[k] / union
             if pooled > score or (pooled == score and j < best):
@@ -99,27 +129,51 @@ def _best_neighbour(i, begin, end, neighbour, inter, extra, seen, members, place
 
 @compiled
 def _compacted(needed, alive, start, stop, neighbour, inter, extra):
-    """Copy the runs of living clusters to the start of a pool with room for more; updates `start`, `stop`."""
+    """Move the runs of living clusters to the front of the pool, or to a larger one if `needed` more would
+    not fit; updates `start` and `stop`.
+    """
     living = 0
     for i in range(len(alive)):
         if alive[i]:
             living += stop[i] - start[i]
-    room = max(len(neighbour), 2 * (living + needed))
-    new_neighbour, new_inter, new_extra = np.empty(room, np.int64), np.empty(room), np.empty(room)
+    to_neighbour, to_inter, to_extra = neighbour, inter, extra
+    if living + needed > len(neighbour):
+        room = 2 * (living + needed)
+        to_neighbour, to_inter, to_extra = np.empty(room, np.int32), np.empty(room), np.empty(room)
     used = 0
-    for i in range(len(alive)):
+    for i in np.argsort(start):  # in the order of the pool: a run moves over none that has yet to move
         if alive[i]:
-            length = stop[i] - start[i]
-            new_neighbour[used : used + length] = neighbour[start[i] : stop[i]]
-            new_inter[used : used + length] = inter[start[i] : stop[i]]
-            new_extra[used : used + length] = extra[start[i] : stop[i]]
-            start[i], stop[i] = used, used + length
-            used += length
-    return new_neighbour, new_inter, new_extra, used
+            begin, start[i] = start[i], used
+            for k in range(begin, stop[i]):
+                to_neighbour[used], to_inter[used], to_extra[used] = neighbour[k], inter[k], extra[k]
+                used += 1
+            stop[i] = used
+    return to_neighbour, to_inter, to_extra, used
 
 
 @compiled
-def _link(indptr, indices, pair_inter, pair_extra, seen, members, threshold, root, within):
+def _set_score(i, value, score, block_best):
+    """Set a row's score, and the best of its block."""
+    score[i] = value
+    block = i // ROWS_OF_A_BLOCK
+    best = -np.inf
+    for row in range(block * ROWS_OF_A_BLOCK, min((block + 1) * ROWS_OF_A_BLOCK, len(score))):
+        best = max(best, score[row])
+    block_best[block] = best
+
+
+@compiled
+def _best_row(score, block_best):
+    """The lowest row with the best score, -1 without rows."""
+    block = np.argmax(block_best)
+    for row in range(block * ROWS_OF_A_BLOCK, min((block + 1) * ROWS_OF_A_BLOCK, len(score))):
+        if score[row] == block_best[block]:
+            return row
+    return -1
+
+
+@compiled
+def _link(start, stop, neighbour, inter, extra, seen, view, threshold, root, within):
     """Merge in place; at the end `root` is the lowest row of each mask's cluster.
 
     A pool holds the clusters' neighbours, one run per cluster: the neighbour, the sum of intersections
@@ -130,14 +184,13 @@ def _link(indptr, indices, pair_inter, pair_extra, seen, members, threshold, roo
     pool, which is compacted when full.
     """
     num, num_views = seen.shape
-    room = 2 * len(indices) + 1024
-    neighbour = np.empty(room, np.int64)
-    inter, extra = np.empty(room), np.empty(room)
-    neighbour[: len(indices)] = indices
-    inter[: len(indices)] = pair_inter
-    extra[: len(indices)] = pair_extra
-    start, stop = indptr[:-1].copy(), indptr[1:].copy()
-    used = len(indices)
+    used = stop[-1] if num else 0
+    members = np.zeros((num, num_views))
+    # the views of a cluster's members, in order, and how many
+    shown, shows = np.empty((num, num_views), np.int32), np.ones(num, np.int32)
+    for i in range(num):
+        members[i, view[i]] = 1.0
+        shown[i, 0] = view[i]
     alive = np.ones(num, np.bool_)
     best = np.full(num, -1, np.int64)
     # Merges of each cluster so far, and of its best neighbour when that was found. If those differ, the score
@@ -145,21 +198,21 @@ def _link(indptr, indices, pair_inter, pair_extra, seen, members, threshold, roo
     # computed again.
     merges, best_merges = np.zeros(num, np.int64), np.full(num, -1, np.int64)
     score = np.full(num, np.inf)
+    block_best = np.full(num // ROWS_OF_A_BLOCK + 1, -np.inf)
+    block_best[: -(-num // ROWS_OF_A_BLOCK)] = np.inf
     place_of = np.full(num, -1, np.int64)
     while True:
-        top, value = -1, threshold
-        for i in range(num):
-            if alive[i] and (score[i] > value or (top < 0 and score[i] >= value)):
-                top, value = i, score[i]
-        if top < 0:
+        top = _best_row(score, block_best)
+        if top < 0 or score[top] < threshold:
             break
         if best[top] < 0 or not alive[best[top]] or merges[best[top]] != best_merges[top]:
             stop[top], _, _ = _merged_run(
                 start[top], stop[top], start[top], neighbour, inter, extra, root, place_of, top, top
             )
-            best[top], score[top] = _best_neighbour(
-                top, start[top], stop[top], neighbour, inter, extra, seen, members, place_of
+            best[top], value = _best_neighbour(
+                top, start[top], stop[top], neighbour, inter, extra, seen, members, shown, shows, place_of
             )
+            _set_score(top, value, score, block_best)
             if best[top] >= 0:
                 best_merges[top] = merges[best[top]]
             continue
@@ -176,15 +229,20 @@ def _link(indptr, indices, pair_inter, pair_extra, seen, members, threshold, roo
         for k in range(first, used):
             place_of[neighbour[k]] = -1
         start[a], stop[a] = first, used
-        for v in range(num_views):
-            joined_extra += seen[a, v] * members[b, v] + seen[b, v] * members[a, v]
         within[0, a] += within[0, b] + joined_inter
-        within[1, a] += within[1, b] + joined_extra
+        within[1, a] += within[1, b] + _plus_sizes(joined_extra, a, b, seen, members, shown, shows)
         seen[a] += seen[b]
         members[a] += members[b]
+        shows[a] = 0
+        for v in range(num_views):
+            if members[a, v] > 0:
+                shown[a, shows[a]] = v
+                shows[a] += 1
         alive[b] = False
         for i in range(num):
             if root[i] == b:
                 root[i] = a
         merges[a] += 1
-        best[a], score[a] = -1, max(score[a], score[b])
+        best[a] = -1
+        _set_score(a, max(score[a], score[b]), score, block_best)
+        _set_score(b, -np.inf, score, block_best)

@@ -76,6 +76,16 @@ def test_mask_means_equal_their_definition(seed):
     assert arrays["mass"] == pytest.approx(dense.sum(axis=0), abs=1e-5)
 
 
+@pytest.mark.parametrize("threads", [2, 5, 20])
+def test_matrices_of_a_view_do_not_depend_on_threads(threads):
+    raw, masks = random_view(0)
+    weights = normalised_weights(raw)
+    one, many = (view_contributions("v", weights, masks, number) for number in (1, threads))
+    assert {name: array.tobytes() for name, array in one.items()} == {
+        name: array.tobytes() for name, array in many.items()
+    }
+
+
 def test_gram_and_weights_give_the_quadratic_form_of_every_level():
     stacked, dense = [], np.zeros((3, 40, 40))
     for seed in range(3):

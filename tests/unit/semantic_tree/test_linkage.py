@@ -10,7 +10,7 @@ from hilsplat.semantic_tree.linkage import pooled_linkage
 
 def dense_evidence(intersection, union):
     """Any intersections and unions of pairs: one view per mask, half a union seen from either side."""
-    shared = np.nonzero(intersection)
+    shared = np.nonzero(np.triu(intersection))
     shape = intersection.shape
     return Evidence(
         sp.csr_matrix((intersection[shared], shared), shape=shape),
@@ -22,6 +22,7 @@ def dense_evidence(intersection, union):
 
 def pair(evidence: Evidence, a: int, b: int) -> tuple[float, float]:
     """Intersection and union of two masks."""
+    a, b = min(a, b), max(a, b)
     row = slice(evidence.intersection.indptr[a], evidence.intersection.indptr[a + 1])
     found = np.flatnonzero(evidence.intersection.indices[row] == b)
     if len(found):
