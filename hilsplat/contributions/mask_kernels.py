@@ -42,7 +42,8 @@ def summed_masks(first, last, runs, offsets, level_index, labels, half, indptr, 
                 counts[m - first, 1] += in_half > 0
                 for k in range(indptr[p], indptr[p + 1]):
                     j = np.uint64(indices[k])  # unsigned: no look for negative indices
-                    if add_products(sums, np.int64(j) * SUMS, 1.0, painted, in_half, np.float64(data[k])) == 0:
+                    at, weight = np.int64(j) * SUMS, np.float64(data[k])
+                    if add_products(sums, at, 1.0, painted, in_half, weight) == 0:
                         found[count] = np.int32(j)
                         count += 1
         found[:count] = np.sort(found[:count])
