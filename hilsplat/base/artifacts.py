@@ -214,11 +214,12 @@ def parse_json(text: str | bytes) -> Any:
         raise ValueError("it is nested too deeply") from None
 
 
-def write_npz(path: Path, **arrays: np.ndarray) -> None:
-    """Write a compressed .npz atomically, with fixed time stamps: same arrays, same bytes."""
+def write_npz(path: Path, *, compressed: bool = True, **arrays: np.ndarray) -> None:
+    """Write an .npz atomically, with fixed time stamps: same arrays, same bytes."""
+    method = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
     with (
         atomic_path(path) as temporary,
-        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+        zipfile.ZipFile(temporary, "w", method, compresslevel=1) as archive,
     ):
         for name, array in arrays.items():
             # Entries opened by name get the time 1980-01-01. They are written piece by piece, so that neither
@@ -381,10 +382,12 @@ class ViewCache:
 
     Args:
         folder: holds the entries, such as `results/.cache/masks`.
+        compressed: whether entries are; floating-point numbers hardly shrink, and it takes time.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, compressed: bool = True) -> None:
         self.folder = Path(folder)
+        self._compressed = compressed
         self.hits = 0
         self.misses = 0
 
@@ -405,7 +408,7 @@ class ViewCache:
             except ArtifactError:
                 path.unlink(missing_ok=True)
         arrays = compute()
-        write_npz(path, **arrays)
+        write_npz(path, compressed=self._compressed, **arrays)
         self.misses += 1
         return arrays
 

@@ -59,49 +59,57 @@ def enlarged(indices, values, kept, room):
 
 
 @compiled
-def grown_block(
-    begin,
-    end,
-    indptr,
-    indices,
-    data,
-    valid,
-    begins,
-    pixels,
-    places,
-    old_indptr,
-    old_indices,
-    old_values,
-    sums,
-    fresh,
-    out_indptr,
-    out_indices,
-    out_values,
-):
-    """Rows begin..end of G: old values plus the new pixels; columns sorted.
+def _load(first, last, indices, values, sums):
+    """Put some pairs of a row where products are added, and mark them as known."""
+    levels = values.shape[1]
+    for k in range(first, last):
+        at = np.int64(indices[k]) * SUMS
+        for level in range(levels):
+            sums[at + level] = values[k, level]
+        sums[at + levels] = 1
 
-    `sums` must be zero, and is again; `fresh` has room for all columns. Returns the columns and the values,
-    which lie in `out_indices` and `out_values` unless these were too small.
+
+@compiled
+def add_to_block(begin, end, part, columns, rows, late, sums, fresh, out_indptr, out_indices, out_values):
+    """Add the pixels of a part to rows begin..end of G.
+
+    Pairs in `rows` are summed in place; pairs in `late`, and new ones, are written to the output.
+
+    Args:
+        begin, end: range of Gaussians.
+        part: row starts, columns and values of W, and which of its pixels count at each level.
+        columns: what `transpose` makes of it: starts, pixels and places.
+        rows, late: row starts, columns, and sums of a level each (E x 3); no pair is in both.
+        sums: zero, and zero again at the end; SUMS for each Gaussian.
+        fresh: room for all columns.
+        out_indptr, out_indices, out_values: the late pairs, columns sorted within rows.
+
+    Returns:
+        `out_indices` and `out_values`, or larger copies if these were too small.
     """
-    levels = old_values.shape[1]
+    indptr, indices, data, valid = part
+    begins, pixels, places = columns
+    row_indptr, row_indices, row_values = rows
+    late_indptr, late_indices, late_values = late
+    levels = row_values.shape[1]
     done = 0
     for i in range(begin, end):
-        old, old_end = old_indptr[i - begin], old_indptr[i - begin + 1]
-        for k in range(old, old_end):
-            at = np.int64(old_indices[k]) * SUMS
-            for level in range(levels):
-                sums[at + level] = old_values[k, level]
-            sums[at + levels] = 1
-        count = 0
+        first, last = row_indptr[i - begin], row_indptr[i - begin + 1]
+        old, old_end = late_indptr[i - begin], late_indptr[i - begin + 1]
+        count, shown = 0, begins[i] < begins[i + 1]
+        if shown:
+            _load(first, last, row_indices, row_values, sums)
+            _load(old, old_end, late_indices, late_values, sums)
         for t in range(begins[i], begins[i + 1]):
             p = pixels[t]
             weight = np.float64(data[places[t]])
             whole = weight if valid[p, 0] else 0.0
-            part = weight if valid[p, 1] else 0.0
+            part_weight = weight if valid[p, 1] else 0.0
             subpart = weight if valid[p, 2] else 0.0
             for k in range(np.uint64(places[t]), np.uint64(indptr[p + 1])):
                 j = np.uint64(indices[k])  # unsigned: no look for negative indices
-                if add_products(sums, np.int64(j) * SUMS, whole, part, subpart, np.float64(data[k])) == 0:
+                at, value = np.int64(j) * SUMS, np.float64(data[k])
+                if add_products(sums, at, whole, part_weight, subpart, value) == 0:
                     fresh[count] = np.int32(j)
                     count += 1
         if count:
@@ -109,19 +117,49 @@ def grown_block(
         size = old_end - old + count
         if done + size > len(out_indices):
             out_indices, out_values = enlarged(out_indices, out_values, done, 2 * (done + size))
-        new = 0
-        for place in range(done, done + size):
-            if new < count and (old == old_end or fresh[new] < old_indices[old]):
-                column = fresh[new]
-                new += 1
-            else:
-                column = old_indices[old]
-                old += 1
-            at = np.int64(column) * SUMS
-            out_indices[place] = column
-            for level in range(levels):
-                out_values[place, level] = sums[at + level]
-            sums[at : at + SUMS] = 0
+        if shown:
+            for k in range(first, last):
+                at = np.int64(row_indices[k]) * SUMS
+                for level in range(levels):
+                    row_values[k, level] = sums[at + level]
+                sums[at : at + SUMS] = 0
+            new = 0
+            for place in range(done, done + size):
+                if new < count and (old == old_end or fresh[new] < late_indices[old]):
+                    column = fresh[new]
+                    new += 1
+                else:
+                    column = late_indices[old]
+                    old += 1
+                at = np.int64(column) * SUMS
+                out_indices[place] = column
+                for level in range(levels):
+                    out_values[place, level] = sums[at + level]
+                sums[at : at + SUMS] = 0
+        else:
+            out_indices[done : done + size] = late_indices[old:old_end]
+            out_values[done : done + size] = late_values[old:old_end]
         done += size
         out_indptr[i - begin + 1] = done
     return out_indices, out_values
+
+
+@compiled
+def merge_rows(indptr, indices, values, late_indptr, late_indices, late_values):
+    """Merge the late pairs into the rows, in place from the end; `indices` and `values` have room for all."""
+    at = indptr[-1] + late_indptr[-1]
+    for i in range(len(indptr) - 2, -1, -1):
+        k, t = indptr[i + 1] - 1, late_indptr[i + 1] - 1
+        if at == k + 1:
+            break  # nothing late is left
+        indptr[i + 1] = at
+        while k >= indptr[i] or t >= late_indptr[i]:
+            at -= 1
+            if t < late_indptr[i] or (k >= indptr[i] and indices[k] > late_indices[t]):
+                indices[at] = indices[k]
+                values[at] = values[k]
+                k -= 1
+            else:
+                indices[at] = late_indices[t]
+                values[at] = late_values[t]
+                t -= 1

@@ -14,7 +14,7 @@ import scipy.sparse as sp
 from hilsplat.base.artifacts import INDEX, atomic_folder, read_index, read_npy, sha256_of_json, write_index
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
-from hilsplat.contributions.gram_kernels import SUMS, enlarged, grown_block, transpose
+from hilsplat.contributions.gram_kernels import SUMS, add_to_block, enlarged, merge_rows, transpose
 from hilsplat.contributions.quadratic import Gram, Quadratic, StackedWeights
 
 logger = logging.getLogger(__name__)
@@ -22,6 +22,9 @@ logger = logging.getLogger(__name__)
 BLOCKS = 64
 """G is built in this many blocks of rows, one per thread at a time; the result does not depend on it. A block
 of Gaussians that a part does not show stays untouched, which a Morton order makes frequent."""
+
+MERGE_AT = 8
+"""Late pairs of a block are merged with its rows when there is more than one to so many."""
 
 CHUNK_WEIGHTS = 2**25
 """Non-zeros of W to gather before adding them to G; adding takes 0.7 GiB."""
@@ -36,7 +39,7 @@ CHECKPOINT_SECONDS = 300.0
 """Time between checkpoints of a long pass; short passes write none."""
 
 
-class _Block:
+class _Rows:
     """Some rows of G, in memory that is used again: a page costs time and memory once it is written to."""
 
     def __init__(self, rows: int) -> None:
@@ -54,12 +57,48 @@ class _Block:
 
     def replace(self, indptr: np.ndarray, indices: np.ndarray, values: np.ndarray) -> None:
         """Copy other rows over these; columns and values may have more room than `indptr` fills."""
+        kept = int(indptr[-1])
+        self._make_room(kept, 0)
         self.indptr = indptr
-        if self.nonzeros > len(self._indices):
-            self._indices, self._values = enlarged(indices, values, self.nonzeros, 2 * self.nonzeros)
-            return
-        self._indices[: self.nonzeros] = indices[: self.nonzeros]
-        self._values[: self.nonzeros] = values[: self.nonzeros]
+        self._indices[:kept], self._values[:kept] = indices[:kept], values[:kept]
+
+    def merge(self, late: "_Rows") -> None:
+        """Add pairs that are in none of these rows."""
+        self._make_room(self.nonzeros + late.nonzeros, self.nonzeros)
+        merge_rows(self.indptr, self._indices, self._values, *late.arrays())
+
+    def _make_room(self, needed: int, kept: int) -> None:
+        if needed > len(self._indices):
+            self._indices, self._values = enlarged(self._indices, self._values, kept, 2 * needed)
+
+
+class _Block:
+    """Rows of G, and apart from them the few pairs that came late.
+
+    A part shows a tenth of the Gaussians of a large scene. Sums of known pairs change in place, and the late
+    ones alone are written anew, until there are enough of them to merge.
+    """
+
+    def __init__(self, rows: int) -> None:
+        self.rows, self.late = _Rows(rows), _Rows(rows)
+
+    @property
+    def nonzeros(self) -> int:
+        """Pairs of Gaussians."""
+        return self.rows.nonzeros + self.late.nonzeros
+
+    def replace_late(self, indptr: np.ndarray, indices: np.ndarray, values: np.ndarray) -> None:
+        """Replace the late pairs, and merge them if they are many."""
+        self.late.replace(indptr, indices, values)
+        if MERGE_AT * self.late.nonzeros > self.rows.nonzeros:
+            self.merged()
+
+    def merged(self) -> _Rows:
+        """All pairs."""
+        if self.late.nonzeros:
+            self.rows.merge(self.late)
+            self.late.replace(np.zeros_like(self.late.indptr), *self.late.arrays()[1:])
+        return self.rows
 
 
 class _Scratch:
@@ -108,9 +147,10 @@ class GramBuilder:
             if columns[0][begin] == columns[0][end]:
                 return
             block, own, indptr = self._blocks[number], self._idle.get(), np.zeros(end - begin + 1, np.int64)
-            rows = (begin, end, *arrays, *columns, *block.arrays(), own.sums, own.fresh)
-            own.indices, own.values = grown_block(*rows, indptr, own.indices, own.values)
-            block.replace(indptr, own.indices, own.values)
+            known = block.rows.arrays(), block.late.arrays()
+            scratch = own.sums, own.fresh, indptr, own.indices, own.values
+            own.indices, own.values = add_to_block(begin, end, arrays, columns, *known, *scratch)
+            block.replace_late(indptr, own.indices, own.values)
             self._idle.put(own)
 
         with ThreadPoolExecutor(self._threads) as pool:
@@ -136,13 +176,13 @@ class GramBuilder:
         return {
             f"{name}_{number}": array
             for number, block in enumerate(self._blocks)
-            for name, array in zip(names, block.arrays(), strict=True)
+            for name, array in zip(names, block.merged().arrays(), strict=True)
         }
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Continue from `state`."""
         for number, block in enumerate(self._blocks):
-            block.replace(*(state[f"{name}_{number}"] for name in ("indptr", "indices", "values")))
+            block.rows.replace(*(state[f"{name}_{number}"] for name in ("indptr", "indices", "values")))
 
     def finish(self) -> Gram:
         """G of everything added; the builder is empty afterwards."""
@@ -151,7 +191,7 @@ class GramBuilder:
         values = np.empty((len(indices), len(LEVELS)), np.float32)
         done = 0
         for number, (begin, end) in enumerate(self._ranges):
-            some_indptr, some_indices, some_values = self._blocks[number].arrays()
+            some_indptr, some_indices, some_values = self._blocks[number].merged().arrays()
             self._blocks[number] = _Block(end - begin)
             indptr[begin + 1 : end + 1] = some_indptr[1:] + done
             indices[done : done + len(some_indices)] = some_indices

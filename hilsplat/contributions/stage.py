@@ -125,7 +125,7 @@ def run_contributions(
         "min_weight": settings.min_weight,
     }
     views = [_view(scene, name, Path(masks_folder), about) for name in scene.views("train")]
-    store = ViewCache(Path(cache) / "contributions")
+    store = ViewCache(Path(cache) / "contributions", compressed=False)
     checkpoint = QuadraticCheckpoint(store.folder / "partial", [view.key for view in views], settings.keep)
     rows: dict[str, list[np.ndarray]] = {
         name: [] for name in ("view", "mask", "level", "area_px", "pixels", "half_pixels")

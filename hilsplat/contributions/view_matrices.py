@@ -7,6 +7,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float64, Int32, Int64
 
+from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS
 from hilsplat.contributions.compositing import visible_mass
 from hilsplat.contributions.mask_kernels import summed_masks
@@ -96,7 +97,22 @@ def view_contributions(
 
 
 def labelled_rows(weights: sp.csr_matrix, labels: Int32[np.ndarray, "P 3"]) -> StackedWeights:
-    """The rows of W that have Gaussians and a mask at some level."""
-    valid = (labels >= 0) & (np.diff(weights.indptr) > 0)[:, None]
+    """The rows of W that have Gaussians and a mask at some level, made in the memory of `weights`."""
+    sizes = np.diff(weights.indptr)
+    valid = (labels >= 0) & (sizes > 0)[:, None]
     rows = np.flatnonzero(valid.any(axis=1))
-    return StackedWeights(weights[rows], valid[rows])
+    kept = _move_to_front(rows, weights.indptr, weights.indices, weights.data)
+    indptr = np.concatenate([[0], np.cumsum(sizes[rows])])
+    arrays = (weights.data[:kept], weights.indices[:kept], indptr.astype(weights.indptr.dtype))
+    matrix = sp.csr_matrix(arrays, shape=(len(rows), weights.shape[1]), copy=False)
+    return StackedWeights(matrix, valid[rows])
+
+
+@compiled
+def _move_to_front(rows, indptr, indices, data):
+    done = 0
+    for row in rows:
+        for k in range(indptr[row], indptr[row + 1]):
+            indices[done], data[done] = indices[k], data[k]
+            done += 1
+    return done

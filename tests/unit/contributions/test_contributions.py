@@ -92,7 +92,7 @@ def test_gram_and_weights_give_the_quadratic_form_of_every_level():
         raw, masks = random_view(seed)
         weights = normalised_weights(raw)
         labels = label_maps(masks)
-        stacked.append(labelled_rows(weights, labels))
+        stacked.append(labelled_rows(weights.copy(), labels))
         full = weights.toarray().astype(np.float64)
         for index in range(3):
             valid = labels[:, index] >= 0
