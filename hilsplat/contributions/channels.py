@@ -59,9 +59,9 @@ def gram_product(begin, end, indptr, indices, values, features, width, out):
 
 
 @compiled
-def mask_means(indptr, indices, data, level_index, features, width, out):
+def mask_means(first, last, indptr, indices, data, level_index, features, width, out):
     """`mask_operator._means` for flat features and `out`, with `width` channels per row."""
-    for m in range(len(level_index)):
+    for m in range(first, last):
         for c in range(0, width, WIDTH):
             place = level_index[m] * width + c
             total = load(out, m * width + c)
@@ -71,12 +71,20 @@ def mask_means(indptr, indices, data, level_index, features, width, out):
 
 
 @compiled
-def mask_spread(indptr, indices, data, level_index, values, width, out):
+def mask_spread(begin, end, indptr, indices, data, level_index, values, width, out):
     """`mask_operator._spread` for flat values and `out`, with `width` channels per row."""
     for m in range(len(level_index)):
+        first, last = columns_between(begin, end, indptr[m], indptr[m + 1], indices)
         for c in range(0, width, WIDTH):
             place = level_index[m] * width + c
             value = load(values, m * width + c)
-            for k in range(indptr[m], indptr[m + 1]):
+            for k in range(first, last):
                 there = np.int64(indices[k]) * 3 * width + place
                 store(out, there, plus(load(out, there), lanes(data[k]), value))
+
+
+@compiled
+def columns_between(begin, end, first, last, indices):
+    """Where columns begin..end start and stop in a row, which lies in first..last of the sorted `indices`."""
+    row = indices[first:last]
+    return first + np.searchsorted(row, begin), first + np.searchsorted(row, end)

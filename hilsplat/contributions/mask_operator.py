@@ -1,5 +1,7 @@
 """Mask means as a linear map of the field, its adjoint, and averages of latents over masks."""
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -8,11 +10,14 @@ import scipy.sparse as sp
 from jaxtyping import Float, Float32, Int64, UInt8
 
 from hilsplat.base.compiled import compiled
-from hilsplat.contributions.channels import mask_means, mask_spread
+from hilsplat.contributions.channels import columns_between, mask_means, mask_spread
 from hilsplat.splat.rasterise.lanes import WIDTH
 
 MEDIAN_SOFTENING = 1e-4
 """Least distance of a latent to the median, so that a step never divides by zero."""
+
+SPREAD_PARTS = 4
+"""Ranges of Gaussians that a thread takes one after another: masks do not show all of them equally often."""
 
 
 @runtime_checkable
@@ -30,14 +35,16 @@ class MaskProducts(Protocol):
 class MaskOperator:
     """A for all levels: features of Gaussians to means of masks, and back.
 
-    A is used in place, for instance mapped from its file: nothing of its size is copied.
+    A is used in place, for instance mapped from its file: nothing of its size is copied. Every sum has one
+    order, whatever the number of threads.
 
     Attributes:
-        indptr: row starts of A in CSR form; a row is a mask.
+        indptr: row starts of A in CSR form; a row is a mask, its columns are sorted.
         indices: Gaussians of the stored values.
         data: the stored values, mean weights.
         level_index: level of each mask, from 0.
         num_gaussians: N.
+        threads: number of threads that share a product.
     """
 
     indptr: np.ndarray
@@ -45,21 +52,25 @@ class MaskOperator:
     data: Float32[np.ndarray, " E"]
     level_index: Int64[np.ndarray, " M"]
     num_gaussians: int
+    threads: int = 1
 
     @staticmethod
-    def of(A: sp.csr_matrix, level: UInt8[np.ndarray, " M"]) -> "MaskOperator":
+    def of(A: sp.csr_matrix, level: UInt8[np.ndarray, " M"], threads: int = 1) -> "MaskOperator":
         """From A (M x N) and the level of each row."""
-        return MaskOperator(A.indptr, A.indices, A.data, level.astype(np.int64) - 1, A.shape[1])
+        return MaskOperator(A.indptr, A.indices, A.data, level.astype(np.int64) - 1, A.shape[1], threads)
 
     def means(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "M D"]:
         """A F: mean rendered feature of each mask at its level."""
         out = np.zeros((len(self.level_index), features.shape[2]), features.dtype)
         features = np.ascontiguousarray(features)
         A = self.indptr, self.indices, self.data, self.level_index
+        shares = np.searchsorted(self.indptr, np.linspace(0, self.indptr[-1], self.threads + 1)[1:-1])
+        edges = [0, *shares.tolist(), len(out)]
         if _fills_lanes(out):
-            mask_means(*A, features.reshape(-1), out.shape[1], out.reshape(-1))
+            flat = features.reshape(-1), out.shape[1], out.reshape(-1)
+            self._share(lambda first, last: mask_means(first, last, *A, *flat), edges)
         else:
-            _means(*A, features, out)
+            self._share(lambda first, last: _means(first, last, *A, features, out), edges)
         return out
 
     def spread(self, values: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "N 3 D"]:
@@ -67,11 +78,19 @@ class MaskOperator:
         out = np.zeros((self.num_gaussians, 3, values.shape[1]), values.dtype)
         values = np.ascontiguousarray(values)
         A = self.indptr, self.indices, self.data, self.level_index
+        parts = 1 if self.threads == 1 else SPREAD_PARTS * self.threads
+        edges = np.linspace(0, self.num_gaussians, parts + 1).astype(np.int64).tolist()
         if _fills_lanes(out):
-            mask_spread(*A, values.reshape(-1), values.shape[1], out.reshape(-1))
+            flat = values.reshape(-1), values.shape[1], out.reshape(-1)
+            self._share(lambda begin, end: mask_spread(begin, end, *A, *flat), edges)
         else:
-            _spread(*A, values, out)
+            self._share(lambda begin, end: _spread(begin, end, *A, values, out), edges)
         return out
+
+    def _share(self, work: Callable[[int, int], None], edges: list[int]) -> None:
+        """Give the ranges between edges to the threads."""
+        with ThreadPoolExecutor(self.threads) as pool:
+            list(pool.map(work, edges[:-1], edges[1:]))
 
 
 def _fills_lanes(values: np.ndarray) -> bool:
@@ -134,8 +153,8 @@ def lifted_median(
 
 
 @compiled
-def _means(indptr, indices, data, level_index, features, out):
-    for m in range(len(level_index)):
+def _means(first, last, indptr, indices, data, level_index, features, out):
+    for m in range(first, last):
         level = level_index[m]
         for k in range(indptr[m], indptr[m + 1]):
             g, weight = indices[k], data[k]
@@ -144,10 +163,10 @@ def _means(indptr, indices, data, level_index, features, out):
 
 
 @compiled
-def _spread(indptr, indices, data, level_index, values, out):
+def _spread(begin, end, indptr, indices, data, level_index, values, out):
     for m in range(len(level_index)):
         level = level_index[m]
-        for k in range(indptr[m], indptr[m + 1]):
+        for k in range(*columns_between(begin, end, indptr[m], indptr[m + 1], indices)):
             g, weight = indices[k], data[k]
             for c in range(values.shape[1]):
                 out[g, level, c] += weight * values[m, c]

@@ -53,8 +53,8 @@ logger = logging.getLogger(__name__)
 WEIGHTS_PER_PIXEL = 40
 """Of a typical scene."""
 
-MAX_WEIGHTS_TOGETHER = 2**24
-"""Views with more weights are prepared one at a time; 128 MiB each, and up to four are waiting."""
+MAX_WEIGHTS_TOGETHER = 2**25
+"""Views with more weights are prepared one at a time; 256 MiB each, and up to four are waiting."""
 
 
 @dataclass(frozen=True)

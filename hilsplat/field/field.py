@@ -48,8 +48,8 @@ def run_field(
     parents = read_parents(tree_folder, contributions)
     with stage_log("field", scene) as counts:
         device = compute_device(settings.device)
-        masks = MaskOperator.of(contributions.matrix("A"), contributions.level)
-        half_masks = MaskOperator.of(contributions.matrix("A_half"), contributions.level)
+        masks = MaskOperator.of(contributions.matrix("A"), contributions.level, threads)
+        half_masks = MaskOperator.of(contributions.matrix("A_half"), contributions.level, threads)
         quadratic = contributions.quadratic(threads)
         pixels = contributions.pixels.astype(np.float32)
         problem = QuadraticProblem.of(

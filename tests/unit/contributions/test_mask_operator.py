@@ -1,5 +1,7 @@
 """A as an operator against dense algebra, on the CPU and by torch; the two lifts by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -46,16 +48,17 @@ def test_means_and_spread_equal_the_dense_products():
     assert (means * values).sum() == pytest.approx((features * spread).sum(), rel=1e-12)
 
 
-@pytest.mark.parametrize("channels", [16, 32])
-def test_sixteen_channels_at_a_time_give_the_bytes_of_the_plain_loops(channels):
-    operator, _, _ = random_operator()
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("channels", [3, 16, 32])
+def test_threads_and_sixteen_channels_at_a_time_give_the_bytes_of_the_plain_loops(channels, threads):
+    operator = replace(random_operator()[0], threads=threads)
     rng = np.random.default_rng(2)
     features = rng.normal(size=(30, 3, channels)).astype(np.float32)
     values = rng.normal(size=(14, channels)).astype(np.float32)
     A = operator.indptr, operator.indices, operator.data, operator.level_index
     means, spread = np.zeros_like(values), np.zeros_like(features)
-    _means(*A, features, means)
-    _spread(*A, values, spread)
+    _means(0, 14, *A, features, means)
+    _spread(0, 30, *A, values, spread)
     assert operator.means(features).tobytes() == means.tobytes()
     assert operator.spread(values).tobytes() == spread.tobytes()
 
