@@ -13,6 +13,9 @@ from numba.extending import intrinsic
 from hilsplat.base.compiled import compiled
 from hilsplat.splat.rasterise.lanes import LANES, WIDTH, lanes, load, store
 
+BLOCK = 2**15
+"""Gaussians that products with A visit at a time, so that their features stay in the processor's cache."""
+
 
 def padded(rows: Float32[np.ndarray, "*rows D"]) -> Float32[np.ndarray, "*rows E"]:
     """Rows with channels of 0 up to a multiple of sixteen, contiguous."""
@@ -61,30 +64,43 @@ def gram_product(begin, end, indptr, indices, values, features, width, out):
 @compiled
 def mask_means(first, last, indptr, indices, data, level_index, features, width, out):
     """`mask_operator._means` for flat features and `out`, with `width` channels per row."""
-    for m in range(first, last):
-        for c in range(0, width, WIDTH):
-            place = level_index[m] * width + c
-            total = load(out, m * width + c)
-            for k in range(indptr[m], indptr[m + 1]):
-                total = plus(total, lanes(data[k]), load(features, np.int64(indices[k]) * 3 * width + place))
-            store(out, m * width + c, total)
+    num_gaussians = len(features) // (3 * width)
+    at = indptr[first:last].copy()
+    for begin in range(0, num_gaussians, BLOCK):
+        for m in range(first, last):
+            some = at[m - first]
+            stop = at[m - first] = columns_below(begin + BLOCK, some, indptr[m + 1], indices)
+            for c in range(0, width if some < stop else 0, WIDTH):
+                place = level_index[m] * width + c
+                total = load(out, m * width + c)
+                for k in range(some, stop):
+                    there = np.int64(indices[k]) * 3 * width + place
+                    total = plus(total, lanes(data[k]), load(features, there))
+                store(out, m * width + c, total)
 
 
 @compiled
 def mask_spread(begin, end, indptr, indices, data, level_index, values, width, out):
     """`mask_operator._spread` for flat values and `out`, with `width` channels per row."""
-    for m in range(len(level_index)):
-        first, last = columns_between(begin, end, indptr[m], indptr[m + 1], indices)
-        for c in range(0, width, WIDTH):
-            place = level_index[m] * width + c
-            value = load(values, m * width + c)
-            for k in range(first, last):
-                there = np.int64(indices[k]) * 3 * width + place
-                store(out, there, plus(load(out, there), lanes(data[k]), value))
+    masks = len(level_index)
+    at = np.empty(masks, np.int64)
+    for m in range(masks):
+        at[m] = indptr[m] + np.searchsorted(indices[indptr[m] : indptr[m + 1]], begin)
+    for block in range(begin, end, BLOCK):
+        for m in range(masks):
+            some = at[m]
+            stop = at[m] = columns_below(min(block + BLOCK, end), some, indptr[m + 1], indices)
+            for c in range(0, width if some < stop else 0, WIDTH):
+                place = level_index[m] * width + c
+                value = load(values, m * width + c)
+                for k in range(some, stop):
+                    there = np.int64(indices[k]) * 3 * width + place
+                    store(out, there, plus(load(out, there), lanes(data[k]), value))
 
 
 @compiled
-def columns_between(begin, end, first, last, indices):
-    """Where columns begin..end start and stop in a row, which lies in first..last of the sorted `indices`."""
-    row = indices[first:last]
-    return first + np.searchsorted(row, begin), first + np.searchsorted(row, end)
+def columns_below(limit, begin, end, indices):
+    """Where the columns below a limit stop in a row, which lies in begin..end of the sorted `indices`."""
+    while begin < end and indices[begin] < limit:
+        begin += 1
+    return begin

@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from jaxtyping import Float, Float32, Int64, UInt8
 
 from hilsplat.base.compiled import compiled
-from hilsplat.contributions.channels import columns_between, mask_means, mask_spread
+from hilsplat.contributions.channels import columns_below, mask_means, mask_spread
 from hilsplat.splat.rasterise.lanes import WIDTH
 
 MEDIAN_SOFTENING = 1e-4
@@ -166,7 +166,8 @@ def _means(first, last, indptr, indices, data, level_index, features, out):
 def _spread(begin, end, indptr, indices, data, level_index, values, out):
     for m in range(len(level_index)):
         level = level_index[m]
-        for k in range(*columns_between(begin, end, indptr[m], indptr[m + 1], indices)):
+        first = indptr[m] + np.searchsorted(indices[indptr[m] : indptr[m + 1]], begin)
+        for k in range(first, columns_below(end, first, indptr[m + 1], indices)):
             g, weight = indices[k], data[k]
             for c in range(values.shape[1]):
                 out[g, level, c] += weight * values[m, c]

@@ -7,6 +7,7 @@ import pytest
 import scipy.sparse as sp
 
 from hilsplat.base.device import compute_device, cuda_missing
+from hilsplat.contributions.channels import BLOCK
 from hilsplat.contributions.cuda_algebra import DeviceMasks, DeviceQuadratic
 from hilsplat.contributions.mask_operator import (
     MaskOperator,
@@ -51,14 +52,15 @@ def test_means_and_spread_equal_the_dense_products():
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("channels", [3, 16, 32])
 def test_threads_and_sixteen_channels_at_a_time_give_the_bytes_of_the_plain_loops(channels, threads):
-    operator = replace(random_operator()[0], threads=threads)
+    num_gaussians = 2 * BLOCK + 5
+    operator = replace(random_operator(gaussians=num_gaussians)[0], threads=threads)
     rng = np.random.default_rng(2)
-    features = rng.normal(size=(30, 3, channels)).astype(np.float32)
+    features = rng.normal(size=(num_gaussians, 3, channels)).astype(np.float32)
     values = rng.normal(size=(14, channels)).astype(np.float32)
     A = operator.indptr, operator.indices, operator.data, operator.level_index
     means, spread = np.zeros_like(values), np.zeros_like(features)
     _means(0, 14, *A, features, means)
-    _spread(0, 30, *A, values, spread)
+    _spread(0, num_gaussians, *A, values, spread)
     assert operator.means(features).tobytes() == means.tobytes()
     assert operator.spread(values).tobytes() == spread.tobytes()
 
