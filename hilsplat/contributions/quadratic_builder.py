@@ -27,7 +27,10 @@ MERGE_AT = 8
 """Late pairs of a block are merged with its rows when there is more than one to so many."""
 
 CHUNK_WEIGHTS = 2**25
-"""Non-zeros of W to gather before adding them to G; adding takes 0.7 GiB."""
+"""Non-zeros of W to gather before adding them to G; gathering and adding takes 0.6 GiB."""
+
+LARGE_PART = 2**23
+"""A part with so many non-zeros is added to G at once: the copy would take memory, and gain little."""
 
 MAX_WEIGHTS = 2**28
 """W of all views is held in memory up to this many non-zeros, 2 GiB."""
@@ -97,7 +100,7 @@ class _Block:
         """All pairs."""
         if self.late.nonzeros:
             self.rows.merge(self.late)
-            self.late.replace(np.zeros_like(self.late.indptr), *self.late.arrays()[1:])
+            self.late = _Rows(len(self.rows.indptr) - 1)
         return self.rows
 
 
@@ -274,12 +277,20 @@ class QuadraticBuilder:
             self._parts.append(part)
         most = MAX_WEIGHTS
         if self._gram is not None:
-            self._waiting.append(part)
-            if self._waiting.nonzeros >= CHUNK_WEIGHTS:
-                self._gram.add(self._waiting.take())
+            is_large = part.nonzeros >= LARGE_PART
+            if not is_large:
+                self._waiting.append(part)
+            if is_large or self._waiting.nonzeros >= CHUNK_WEIGHTS:
+                self._add_waiting(self._gram)
+                if is_large:
+                    self._gram.add(part)
                 most = min(most, CLEARLY_MORE * self._gram.nonzeros)
         if self._may_drop and self.weights_nonzeros > most:
             self._parts, self._keeps_weights = [], False
+
+    def _add_waiting(self, gram: GramBuilder) -> None:
+        if self._waiting.nonzeros:
+            gram.add(self._waiting.take())
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything added so far, as arrays."""
@@ -313,8 +324,7 @@ class QuadraticBuilder:
         """G or W of everything added."""
         if self._gram is None:
             return stack_weights(self._parts)
-        if self._waiting.nonzeros:
-            self._gram.add(self._waiting.take())
+        self._add_waiting(self._gram)
         if self._keeps_weights and self.weights_nonzeros < self._gram.nonzeros:
             return stack_weights(self._parts)
         return self._gram.finish()

@@ -13,16 +13,15 @@ MAX_HALVINGS = 12
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
 
-def lbfgs(objective: Objective, start: np.ndarray, steps: int, first_step: float) -> np.ndarray:
+def lbfgs(objective: Objective, point: np.ndarray, steps: int, first_step: float) -> np.ndarray:
     """Limited-memory BFGS with step halving; every sum is taken in a fixed order.
 
     Args:
         objective: value and gradient at a point.
-        start: initial point.
+        point: where to start; it is freed once it is left.
         steps: iterations; each costs one evaluation unless its step must be halved.
         first_step: inverse curvature assumed before the first step.
     """
-    point = start
     value, gradient = objective(point)
     memory: list[tuple[np.ndarray, np.ndarray, float]] = []
     for _ in range(steps):

@@ -31,13 +31,11 @@ def solve_field(
     inverse_root.reshape(-1)[shown] = (1 / np.maximum(root, 1e-10))[:, 0]
     right = problem.right_side()
 
-    def unscaled(scaled: np.ndarray) -> np.ndarray:
-        features = np.zeros(problem.lifted.shape, np.float32)
+    def unscale(scaled: np.ndarray) -> None:
         _rows(features)[shown] = scaled * inverse_root.reshape(-1)[shown][:, None]
-        return features
 
     def objective(scaled: np.ndarray) -> tuple[float, np.ndarray]:
-        features = unscaled(scaled)
+        unscale(scaled)
         curved = problem.hessian_product(features)
         value = (dot(features, curved) - 2 * dot(features, right)) / total
         contrastive, gradient = contrast.weighted(features, weights)
@@ -50,15 +48,15 @@ def solve_field(
         "lifted": problem.terms(lifted) | contrast.values(lifted),
         "gradient_norms": gradient_norms(problem, contrast, inverse_root[:, :, None], at_lift),
     }
-    features = lifted
     if settings.cg_steps and any(problem.weights):
         features = conjugate_gradient(problem, lifted, settings.cg_steps, at_lift)
         report["after_cg"] = problem.terms(features) | contrast.values(features)
+    else:
+        features = lifted.copy()
     del at_lift
     if any(weights) and settings.lbfgs_steps:
         first_step = total / (2 * max(sum(problem.weights), 1e-3))
-        start = _rows(features)[shown] * root
-        features = unscaled(lbfgs(objective, start, settings.lbfgs_steps, first_step))
+        unscale(lbfgs(objective, _rows(features)[shown] * root, settings.lbfgs_steps, first_step))
         report["after_lbfgs"] = problem.terms(features) | contrast.values(features)
     return features.astype(np.float32), report
 
