@@ -1,4 +1,4 @@
-"""Compiled loops that sum G from weights, for `quadratic_builder.GramBuilder`; `mask_kernels` shares two."""
+"""Compiled loops that sum G from weights, for `gram_builder.GramBuilder`; `mask_kernels` shares two."""
 
 import numpy as np
 from llvmlite import ir

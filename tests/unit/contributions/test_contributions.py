@@ -9,11 +9,12 @@ import scipy.sparse as sp
 from hilsplat.base.artifacts import sha256_of_path
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
-from hilsplat.contributions import quadratic_builder, stage
+from hilsplat.contributions import gram_builder, quadratic_builder, stage
 from hilsplat.contributions.channels import gram_product, padded
 from hilsplat.contributions.compositing import normalised_weights
+from hilsplat.contributions.gram_builder import GramBuilder
 from hilsplat.contributions.quadratic import _gram_product, level_mass, load_quadratic
-from hilsplat.contributions.quadratic_builder import GramBuilder, QuadraticBuilder, stack_weights
+from hilsplat.contributions.quadratic_builder import QuadraticBuilder, stack_weights
 from hilsplat.contributions.rows import Contributions, mask_embeddings
 from hilsplat.contributions.stage import run_contributions
 from hilsplat.contributions.streams import ArrayStream
@@ -151,7 +152,9 @@ def test_gram_does_not_depend_on_threads():
     assert one.indices.tobytes() == two.indices.tobytes()
 
 
-def test_gram_does_not_depend_on_how_the_pixels_are_parted(monkeypatch):
+@pytest.mark.parametrize("merge_at", [0, 1, 8])
+def test_gram_does_not_depend_on_how_the_pixels_are_parted(merge_at, monkeypatch):
+    monkeypatch.setattr(gram_builder, "MERGE_AT", merge_at)
     parts = []
     for seed in range(4):
         raw, masks = random_view(seed)

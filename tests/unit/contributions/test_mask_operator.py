@@ -9,6 +9,7 @@ import scipy.sparse as sp
 from hilsplat.base.device import compute_device, cuda_missing
 from hilsplat.contributions.channels import BLOCK
 from hilsplat.contributions.cuda_algebra import DeviceMasks, DeviceQuadratic
+from hilsplat.contributions.gram_builder import GramBuilder
 from hilsplat.contributions.mask_operator import (
     MaskOperator,
     _means,
@@ -17,7 +18,6 @@ from hilsplat.contributions.mask_operator import (
     lifted_median,
 )
 from hilsplat.contributions.quadratic import StackedWeights
-from hilsplat.contributions.quadratic_builder import GramBuilder
 from hilsplat.semantic_tree.evidence import mask_evidence
 
 DEVICES = [
