@@ -187,9 +187,11 @@ def _shared_pairs(
         count = 0
         for k in range(indptr[a], indptr[a + 1]):
             g = indices[k]
-            for t in range(col_indptr[g], col_indptr[g + 1]):
+            for t in range(col_indptr[g + 1] - 1, col_indptr[g] - 1, -1):
                 b = col_rows[t]
-                if b > a and view[b] != view[a]:
+                if b <= a:
+                    break
+                if view[b] != view[a]:
                     if touched_by[b] != a:
                         touched_by[b] = a
                         sums[b] = 0.0
