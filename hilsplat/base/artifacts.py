@@ -214,9 +214,12 @@ def parse_json(text: str | bytes) -> Any:
         raise ValueError("it is nested too deeply") from None
 
 
-def write_npz(path: Path, *, compressed: bool = True, **arrays: np.ndarray) -> None:
-    """Write an .npz atomically, with fixed time stamps: same arrays, same bytes."""
-    method = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
+def write_npz(path: Path, **arrays: np.ndarray) -> None:
+    """Write a compressed .npz atomically, with fixed time stamps: same arrays, same bytes."""
+    _write_zip(path, arrays, zipfile.ZIP_DEFLATED)
+
+
+def _write_zip(path: Path, arrays: dict[str, np.ndarray], method: int) -> None:
     with (
         atomic_path(path) as temporary,
         zipfile.ZipFile(temporary, "w", method, compresslevel=1) as archive,
@@ -387,7 +390,7 @@ class ViewCache:
 
     def __init__(self, folder: Path, *, compressed: bool = True) -> None:
         self.folder = Path(folder)
-        self._compressed = compressed
+        self._method = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
         self.hits = 0
         self.misses = 0
 
@@ -408,7 +411,7 @@ class ViewCache:
             except ArtifactError:
                 path.unlink(missing_ok=True)
         arrays = compute()
-        write_npz(path, compressed=self._compressed, **arrays)
+        _write_zip(path, arrays, self._method)
         self.misses += 1
         return arrays
 

@@ -85,20 +85,20 @@ def test_two_nodes_that_compute_one_view_leave_one_whole_entry(tmp_path: Path, m
     """The other node, with the same process number, writes and ends while this one writes."""
     cache, other, names = artifacts.ViewCache(tmp_path), artifacts.ViewCache(tmp_path), []
     key = artifacts.sha256_of_json({"image": "abc"})
-    write = artifacts.write_npz
+    write = artifacts._write_zip
 
-    def write_beside_the_other(path: Path, **arrays: np.ndarray) -> None:
+    def write_beside_the_other(path: Path, arrays: dict[str, np.ndarray], method: int) -> None:
         with artifacts.atomic_path(path) as temporary:
             names.append(temporary.name)
             temporary.write_bytes(b"half an ent")
             with monkeypatch.context() as node:
-                node.setattr(artifacts, "write_npz", write)
+                node.setattr(artifacts, "_write_zip", write)
                 node.setattr("hilsplat.base.processes.machine", lambda: "0" * 8)
                 other.get(key, lambda: {"x": np.arange(3)})
                 names.append(artifacts.temporary_prefix())
-            write(temporary, **arrays)
+            write(temporary, arrays, method)
 
-    monkeypatch.setattr(artifacts, "write_npz", write_beside_the_other)
+    monkeypatch.setattr(artifacts, "_write_zip", write_beside_the_other)
     mine = cache.get(key, lambda: {"x": np.arange(3)})
     np.testing.assert_array_equal(mine["x"], artifacts.read_npz(cache.path(key))["x"])
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [cache.path(key)]
