@@ -103,7 +103,8 @@ class QuadraticBuilder:
         """Add the labelled pixels of a view."""
         self.weights_nonzeros += part.nonzeros
         if self._keeps_weights:
-            self._parts.append(part)
+            # A part lies in the memory of all weights of its view, of which it may be little.
+            self._parts.append(StackedWeights(part.weights.copy(), part.valid))
         most = MAX_WEIGHTS
         if self._gram is not None:
             is_large = part.nonzeros >= LARGE_PART
