@@ -171,6 +171,21 @@ def test_gram_does_not_depend_on_how_the_pixels_are_parted(merge_at, monkeypatch
     assert builder.finish().values.tobytes() == one.values.tobytes()
 
 
+def test_large_parts_join_g_in_their_turn(monkeypatch):
+    parts = []
+    for seed in range(4):
+        raw, masks = random_view(seed)
+        parts.append(labelled_rows(normalised_weights(raw), label_maps(masks)))
+    sizes = sorted(part.nonzeros for part in parts)
+    monkeypatch.setattr(quadratic_builder, "LARGE_PART", sizes[2])  # two of them
+    builder = QuadraticBuilder(40, "gram", threads=1)
+    for part in parts:
+        builder.add(part)
+    found, one = builder.finish(), built_gram(parts)
+    for name in ("indptr", "indices", "values"):
+        assert getattr(found, name).tobytes() == getattr(one, name).tobytes()
+
+
 def test_the_smaller_quadratic_is_kept_and_read_back_equal(tmp_path):
     raw, masks = random_view(0)
     weights = normalised_weights(raw)
