@@ -18,10 +18,10 @@ export PATH := $(CURDIR)/$(BIN):$(PATH)
 .PHONY: run demo test lint bench chaos report setup
 
 run: $(STAMP)
-	snakemake --cores $(CORES)
+	hilsplat run -- --cores $(CORES)
 
 demo: $(STAMP)
-	snakemake --cores $(CORES) --configfile config/demo.yaml
+	hilsplat run --config config/demo.yaml -- --cores $(CORES)
 
 setup: $(STAMP)
 
@@ -32,8 +32,8 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $(STAMP)
 
 lint: $(STAMP)
-	ruff check hilsplat tests benchmarks
-	ruff format --check hilsplat tests benchmarks
+	ruff check hilsplat snakemake_logger_plugin_hilsplat tests benchmarks
+	ruff format --check hilsplat snakemake_logger_plugin_hilsplat tests benchmarks
 	lint-imports
 	mypy
 	snakefmt --check Snakefile workflow/Snakefile rules
@@ -48,6 +48,5 @@ bench: $(STAMP)
 chaos: $(STAMP)
 	python -m tests.chaos --kills $(KILLS)
 
-report: $(STAMP)
-	snakemake --cores $(CORES)
+report: run
 	snakemake --report results/report.html

@@ -1,29 +1,22 @@
 # hilsplat: photographs to 3D scenes that answer text queries at three levels, and the paper's tables.
 #
-#   snakemake --cores 2                                             everything the configuration names
+#   snakemake --cores 2                                             everything that the configuration names
 #   snakemake --cores 2 results/synthetic/table-1/gaussians.ply     one file and what it needs
 #   snakemake --cores 2 tables                                      the tables
 #   snakemake --report results/report.html                          the report of a finished run
-
-
-from pathlib import Path
-
-from hilsplat.configuration import read_config
-
-if Path("config/config.yaml").is_file():
-    read_config(
-        Path("config/config.yaml")
-    )  # its message has the line, which Snakemake's has not
-
-
-configfile: "config/config.yaml"
+#
+# `hilsplat run` starts it with checks and all cores (docs/workflow.md). rules/common.smk reads config/config.yaml, also
+# for a `module:`, whose `config:` takes the place of any configfile here.
 
 
 report: "workflow/report/overview.rst"
 
 
 include: "rules/common.smk"
-include: "rules/progress.smk"
+
+
+pathvars:
+    results=PLAN.run.results,
 
 
 wildcard_constraints:
@@ -50,14 +43,14 @@ rule all:
     default_target: True
     input:
         targets.default(PLAN),
+        rules.efficiency.output,
 
 
 onstart:
-    refuse_infeasible()
-    for line in PLAN.answering():
+    mark_run()
+    for line in PLAN.model_lines():
         logger.info(line)
-    show_progress()
 
 
 onsuccess:
-    shell("hilsplat efficiency --results results --out results/efficiency.csv")
+    mark_run().unlink()

@@ -31,6 +31,7 @@ from hilsplat.field.field import run_field
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.coverage_stage import run_coverage_tree
+from hilsplat.segment.digests import MASKS_SHA256, digest_of, index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.semantic_tree.tree import run_semantic_tree
 from hilsplat.settings import (
@@ -137,8 +138,8 @@ def make(out: Path, number: int, views: int, size_hw: tuple[int, int], masks: in
             unit = np.stack(vectors)
             unit /= np.linalg.norm(unit, axis=1, keepdims=True)
             write_npy(clip_folder / f"{name}.npy", unit.astype(np.float16))
-            index_of_masks[name] = {which.label: len(found.rows_of(which)) for which in LEVELS}
-            index_of_clip[name] = {"masks": len(found)}
+            index_of_masks[name] = index_entry(found)
+            index_of_clip[name] = {MASKS_SHA256: digest_of(found), "masks": len(found)}
         print(f"{nonzeros / views / size_hw[0] / size_hw[1]:.1f} Gaussians a pixel")
         write_index(masks_folder, index_of_masks, scene="made/large", segmenter="made", model="")
         write_index(clip_folder, index_of_clip, scene="made/large", dim=CHANNELS, model="")

@@ -12,6 +12,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from hilsplat.base.errors import SettingsError
+from hilsplat.base.files import project_path
 from hilsplat.base.names import NAME_RULE, name_problem
 from hilsplat.models.store import AUTO, EMBEDDED, read_model, real_model
 from hilsplat.settings import (
@@ -37,7 +38,7 @@ from hilsplat.settings import (
 )
 
 CONFIG = Path("config/config.yaml")
-"""The configuration of the project; files of `--configfile` are laid over it."""
+"""The configuration of the project; files of `--configfile` override it."""
 
 
 class StageSettings(Section):
@@ -168,6 +169,7 @@ class RunSettings(StageSettings):
 
     seed: int = knob(0, "seed for everything random", ge=0)
     scenes: str = knob("config/scenes.tsv", "scene sheet, relative to the project")
+    results: str = knob("results", "results folder, relative to the working folder", pattern="^[^{}<>]+$")
     groups: tuple[str, ...] = knob(("benchmark",), "groups of the scene sheet to run")
     only: tuple[str, ...] = knob(
         (),
@@ -353,26 +355,32 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 def check_configs(paths: Sequence[Path]) -> None:
-    """Check files that are laid over the configuration of the project, in their order.
-
-    Snakemake reads files of `--configfile` before any line of the workflow, and names neither file nor line.
+    """Check configuration files that override the project's, in order.
 
     Raises:
         SettingsError: a file is not YAML, a key is unknown, or a value is of the wrong type or out of range.
     """
-    laid: dict[str, Any] = read_config(CONFIG) if CONFIG.is_file() else {}
-    for path in paths:
-        laid = _laid_over(laid, read_config(path))
-    parse_run(laid)
+    parse_run(merged_config(paths))
 
 
-def _laid_over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings with others over them, section by section, as Snakemake does it."""
-    laid = dict(below)
+def merged_config(paths: Sequence[Path], *overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge `config/config.yaml`, further files and settings in order, section by section as Snakemake does.
+
+    Raises:
+        SettingsError: a file is missing or is not YAML.
+    """
+    merged = read_config(project_path(CONFIG))
+    for layer in (*map(read_config, paths), *overrides):
+        merged = _merge(merged, layer)
+    return merged
+
+
+def _merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(below)
     for key, value in above.items():
-        both = isinstance(value, Mapping) and isinstance(laid.get(key), Mapping)
-        laid[key] = _laid_over(laid[key], value) if both else value
-    return laid
+        both = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
+        merged[key] = _merge(merged[key], value) if both else value
+    return merged
 
 
 def config_schema() -> dict[str, Any]:

@@ -1,26 +1,26 @@
 # One CLIP vector per mask.
 rule clip:
     input:
-        scene="results/{dataset}/{scene}/scene",
+        scene="<results>/{dataset}/{scene}/scene",
         masks=PLAN.shared("masks", "masks"),
     output:
-        clip=directory(update("results/{dataset}/{scene}/{variant}/clip")),
+        clip=directory("<results>/{dataset}/{scene}/{variant}/clip"),
     log:
-        "results/{dataset}/{scene}/{variant}/logs/clip.log",
+        "<results>/{dataset}/{scene}/{variant}/logs/clip.log",
     benchmark:
-        "results/{dataset}/{scene}/{variant}/benchmarks/clip.jsonl"
+        "<results>/{dataset}/{scene}/{variant}/benchmarks/clip.jsonl"
     priority: 50
     conda:
         ENVIRONMENT
-    threads: THREADS
+    threads: RESOURCES.threads
     resources:
         mem_mb=RESOURCES.memory_mb("clip"),
         runtime=RESOURCES.minutes("clip"),
     params:
         settings=PLAN.settings("clip"),
         model=PLAN.model("clip"),
-        cache="results/.cache",
+        cache=CACHE,
         code=PLAN.code("clip"),
     shell:
-        "hilsplat clip --scene {input.scene:q} --masks {input.masks:q} --settings {params.settings:q}"
-        " --threads {threads} --memory {resources.mem_mib} --cache {params.cache:q} --out {output.clip:q} --log {log:q}"
+        "python -m hilsplat clip --scene {input.scene:q} --masks {input.masks:q} --settings {params.settings:q}"
+        " --threads {threads} --memory {resources.mem_mib} --cache {params.cache:q} --out {output.clip:q} > {log:q} 2>&1"

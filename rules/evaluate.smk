@@ -1,25 +1,26 @@
 # Scores and tables. Only evaluation and figures read the labels of data sets.
 rule evaluate:
     input:
-        scene="results/{dataset}/{scene}/scene",
+        scene="<results>/{dataset}/{scene}/scene",
         truth=PLAN.data.truth_or_labels,
-        gaussians="results/{dataset}/{scene}/gaussians.ply",
+        gaussians="<results>/{dataset}/{scene}/gaussians.ply",
         semantic_tree=PLAN.shared("semantic_tree", "semantic_tree"),
         field=PLAN.shared("field", "field.safetensors"),
         autoencoder=PLAN.shared("autoencoder", "autoencoder"),
         clip=PLAN.shared("clip", "clip"),
         masks=PLAN.shared("masks", "masks"),
     output:
-        scores=update("results/{dataset}/{scene}/{variant}/scores.csv"),
-        times=update("results/{dataset}/{scene}/{variant}/times.csv"),
+        scores="<results>/{dataset}/{scene}/{variant}/scores.csv",
+        times="<results>/{dataset}/{scene}/{variant}/times.csv",
+        instances="<results>/{dataset}/{scene}/{variant}/instances.npz",
     log:
-        "results/{dataset}/{scene}/{variant}/logs/evaluate.log",
+        "<results>/{dataset}/{scene}/{variant}/logs/evaluate.log",
     benchmark:
-        "results/{dataset}/{scene}/{variant}/benchmarks/evaluate.jsonl"
+        "<results>/{dataset}/{scene}/{variant}/benchmarks/evaluate.jsonl"
     priority: 2
     conda:
         ENVIRONMENT
-    threads: VARIANT_THREADS
+    threads: RESOURCES.threads
     resources:
         mem_mb=RESOURCES.memory_mb("evaluate"),
         runtime=RESOURCES.minutes("evaluate"),
@@ -28,31 +29,35 @@ rule evaluate:
         code=PLAN.code("evaluate", PLAN.data.label_readers),
         truth=PLAN.data.truth_option,
     shell:
-        "hilsplat evaluate --scene {input.scene:q} {params.truth} --gaussians {input.gaussians:q}"
+        "python -m hilsplat evaluate --scene {input.scene:q} {params.truth} --gaussians {input.gaussians:q}"
         " --semantic-tree {input.semantic_tree:q} --field {input.field:q}"
         " --autoencoder {input.autoencoder:q} --clip {input.clip:q} --masks {input.masks:q}"
         " --dataset {wildcards.dataset:q} --name {wildcards.scene:q} --variant {wildcards.variant:q}"
-        " --settings {params.settings:q} --threads {threads} --out {output.scores:q} --log {log:q}"
+        " --settings {params.settings:q} --threads {threads} --out {output.scores:q} > {log:q} 2>&1"
 
 
 rule table:
     input:
-        scores=lambda wildcards: targets.scores(PLAN, wildcards.table),
+        scores=lambda wildcards: targets.scores(PLAN, wildcards.table, "scores.csv"),
+        times=lambda wildcards: targets.scores(PLAN, wildcards.table, "times.csv"),
+        instances=lambda wildcards: targets.scores(
+            PLAN, wildcards.table, "instances.npz"
+        ),
         published=lambda wildcards: str(published_values(wildcards.table)),
     output:
-        csv=update("results/tables/{table}.csv"),
-        md=update("results/tables/{table}.md"),
-        tex=update("results/tables/{table}.tex"),
+        csv="<results>/tables/{table}.csv",
+        md="<results>/tables/{table}.md",
+        tex="<results>/tables/{table}.tex",
         html=report(
-            update("results/tables/{table}.html"),
+            "<results>/tables/{table}.html",
             caption="../workflow/report/table.rst",
             category="Tables",
             labels={"table": "{table}"},
         ),
     log:
-        "results/logs/table-{table}.log",
+        "<results>/logs/table-{table}.log",
     benchmark:
-        "results/benchmarks/table-{table}.jsonl"
+        "<results>/benchmarks/table-{table}.jsonl"
     wildcard_constraints:
         table=any_of(TABLES),
     conda:
@@ -65,10 +70,31 @@ rule table:
         absent=lambda wildcards: targets.absent_options(PLAN, wildcards.table),
         code=PLAN.code("table"),
     shell:
-        "hilsplat table {wildcards.table:q} --published {input.published:q} --labels {params.labels:q}"
-        " {params.absent} --out {output.csv:q} --log {log:q} {input.scores:q}"
+        "python -m hilsplat table {wildcards.table:q} --published {input.published:q} --labels {params.labels:q}"
+        " {params.absent} --out {output.csv:q} {input.scores:q} > {log:q} 2>&1"
 
 
 rule tables:
     input:
         targets.tables(PLAN),
+
+
+# What the jobs of finished runs took, from their benchmark files.
+rule efficiency:
+    input:
+        targets.default(PLAN),
+    output:
+        csv="<results>/efficiency.csv",
+        md="<results>/efficiency.md",
+    log:
+        "<results>/logs/efficiency.log",
+    conda:
+        ENVIRONMENT
+    resources:
+        mem_mb=RESOURCES.memory_mb("efficiency"),
+        runtime=RESOURCES.minutes("efficiency"),
+    params:
+        results=lambda wildcards, output: str(Path(output.csv).parent),
+        code=PLAN.code("efficiency"),
+    shell:
+        "python -m hilsplat efficiency --results {params.results:q} --out {output.csv:q} > {log:q} 2>&1"

@@ -5,11 +5,11 @@ rule autoencoder:
         semantic_tree=PLAN.shared("semantic_tree", "semantic_tree"),
         contributions=PLAN.shared("contributions", "contributions"),
     output:
-        autoencoder=directory(update("results/{dataset}/{scene}/{variant}/autoencoder")),
+        autoencoder=directory("<results>/{dataset}/{scene}/{variant}/autoencoder"),
     log:
-        "results/{dataset}/{scene}/{variant}/logs/autoencoder.log",
+        "<results>/{dataset}/{scene}/{variant}/logs/autoencoder.log",
     benchmark:
-        "results/{dataset}/{scene}/{variant}/benchmarks/autoencoder.jsonl"
+        "<results>/{dataset}/{scene}/{variant}/benchmarks/autoencoder.jsonl"
     priority: 8
     conda:
         ENVIRONMENT
@@ -22,9 +22,9 @@ rule autoencoder:
         seed=PLAN.seed,
         code=PLAN.code("autoencoder"),
     shell:
-        "hilsplat autoencoder --clip {input.clip:q} --semantic-tree {input.semantic_tree:q}"
+        "python -m hilsplat autoencoder --clip {input.clip:q} --semantic-tree {input.semantic_tree:q}"
         " --contributions {input.contributions:q} --settings {params.settings:q} --seed {params.seed:q}"
-        " --out {output.autoencoder:q} --log {log:q}"
+        " --out {output.autoencoder:q} > {log:q} 2>&1"
 
 
 rule field:
@@ -33,17 +33,17 @@ rule field:
         coverage_tree=PLAN.shared("coverage_tree", "coverage_tree"),
         autoencoder=PLAN.shared("autoencoder", "autoencoder"),
     output:
-        field=update("results/{dataset}/{scene}/{variant}/field.safetensors"),
+        field="<results>/{dataset}/{scene}/{variant}/field.safetensors",
     log:
-        "results/{dataset}/{scene}/{variant}/logs/field.log",
+        "<results>/{dataset}/{scene}/{variant}/logs/field.log",
     benchmark:
-        "results/{dataset}/{scene}/{variant}/benchmarks/field.jsonl"
+        "<results>/{dataset}/{scene}/{variant}/benchmarks/field.jsonl"
     wildcard_constraints:
         variant=PLAN.variants(by_baseline=False),
     priority: 4
     conda:
         ENVIRONMENT
-    threads: VARIANT_THREADS
+    threads: RESOURCES.threads
     resources:
         mem_mb=RESOURCES.memory_mb("field"),
         runtime=RESOURCES.minutes("field"),
@@ -52,6 +52,6 @@ rule field:
         settings=PLAN.settings("field"),
         code=PLAN.code("field"),
     shell:
-        "hilsplat field --contributions {input.contributions:q} --coverage-tree {input.coverage_tree:q}"
+        "python -m hilsplat field --contributions {input.contributions:q} --coverage-tree {input.coverage_tree:q}"
         " --autoencoder {input.autoencoder:q} --settings {params.settings:q}"
-        " --threads {threads} --out {output.field:q} --log {log:q}"
+        " --threads {threads} --out {output.field:q} > {log:q} 2>&1"

@@ -1,23 +1,23 @@
 # Baselines: another method writes the field of a variant (variants with method.name, hilsplat/methods).
 rule method:
     input:
-        scene="results/{dataset}/{scene}/scene",
-        gaussians="results/{dataset}/{scene}/gaussians.ply",
+        scene="<results>/{dataset}/{scene}/scene",
+        gaussians="<results>/{dataset}/{scene}/gaussians.ply",
         masks=PLAN.shared("masks", "masks"),
         contributions=PLAN.shared("contributions", "contributions"),
         autoencoder=PLAN.shared("autoencoder", "autoencoder"),
     output:
-        field=update("results/{dataset}/{scene}/{variant}/field.safetensors"),
+        field="<results>/{dataset}/{scene}/{variant}/field.safetensors",
     log:
-        "results/{dataset}/{scene}/{variant}/logs/field.log",
+        "<results>/{dataset}/{scene}/{variant}/logs/field.log",
     benchmark:
-        "results/{dataset}/{scene}/{variant}/benchmarks/field.jsonl"
+        "<results>/{dataset}/{scene}/{variant}/benchmarks/field.jsonl"
     wildcard_constraints:
         variant=PLAN.variants(by_baseline=True),
     priority: 6
     conda:
         ENVIRONMENT
-    threads: VARIANT_THREADS
+    threads: RESOURCES.threads
     resources:
         mem_mb=RESOURCES.memory_mb("method"),
         runtime=RESOURCES.minutes("method"),
@@ -26,7 +26,7 @@ rule method:
         seed=PLAN.seed,
         code=PLAN.code("method", PLAN.baseline),
     shell:
-        "hilsplat method --scene {input.scene:q} --gaussians {input.gaussians:q} --masks {input.masks:q}"
+        "python -m hilsplat method --scene {input.scene:q} --gaussians {input.gaussians:q} --masks {input.masks:q}"
         " --contributions {input.contributions:q} --autoencoder {input.autoencoder:q}"
         " --settings {params.settings:q} --seed {params.seed:q} --threads {threads}"
-        " --out {output.field:q} --log {log:q}"
+        " --out {output.field:q} > {log:q} 2>&1"

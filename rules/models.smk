@@ -1,13 +1,13 @@
 # The small models of the synthetic world. A default run does not train them: trained ones are committed.
 rule train_models:
     output:
-        directory(update("results/models/sam-tiny")),
-        directory(update("results/models/clip-tiny")),
+        directory("<results>/models/sam-tiny"),
+        directory("<results>/models/clip-tiny"),
     log:
-        "results/models/train.log",
+        "<results>/models/train.log",
     conda:
         ENVIRONMENT
-    threads: CORES
+    threads: 64  # Snakemake lowers it to the cores
     resources:
         mem_mb=RESOURCES.memory_mb("train_models"),
         runtime=RESOURCES.minutes("train_models"),
@@ -16,5 +16,5 @@ rule train_models:
         seed=PLAN.run.seed,
         code=PLAN.code("models"),
     shell:
-        "hilsplat models train --out results/models --cache results/.cache/models"
-        " --settings {params.settings:q} --seed {params.seed:q} --threads {threads} --log {log:q}"
+        "python -m hilsplat models train --out results/models --cache results/.cache/models"
+        " --settings {params.settings:q} --seed {params.seed:q} --threads {threads} > {log:q} 2>&1"

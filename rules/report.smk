@@ -1,44 +1,44 @@
 # Pictures per scene and the report.
 rule figures:
     input:
-        scene="results/{dataset}/{scene}/scene",
-        fit="results/{dataset}/{scene}/gaussians",
+        scene="<results>/{dataset}/{scene}/scene",
+        fit="<results>/{dataset}/{scene}/gaussians",
         truth=PLAN.data.truth_or_labels,
-        gaussians="results/{dataset}/{scene}/gaussians.ply",
-        masks="results/{dataset}/{scene}/default/masks",
-        clip="results/{dataset}/{scene}/default/clip",
-        semantic_tree="results/{dataset}/{scene}/default/semantic_tree",
-        field="results/{dataset}/{scene}/default/field.safetensors",
-        autoencoder="results/{dataset}/{scene}/default/autoencoder",
+        gaussians="<results>/{dataset}/{scene}/gaussians.ply",
+        masks="<results>/{dataset}/{scene}/default/masks",
+        clip="<results>/{dataset}/{scene}/default/clip",
+        semantic_tree="<results>/{dataset}/{scene}/default/semantic_tree",
+        field="<results>/{dataset}/{scene}/default/field.safetensors",
+        autoencoder="<results>/{dataset}/{scene}/default/autoencoder",
     output:
         panel=report(
-            update("results/figures/{dataset}/{scene}/panel.png"),
+            "<results>/figures/{dataset}/{scene}/panel.png",
             caption="../workflow/report/panel.rst",
             category="Scenes",
             subcategory="{dataset}/{scene}",
             labels={"figure": "queries"},
         ),
         registration=report(
-            update("results/figures/{dataset}/{scene}/registration.png"),
+            "<results>/figures/{dataset}/{scene}/registration.png",
             caption="../workflow/report/registration.rst",
             category="Scenes",
             subcategory="{dataset}/{scene}",
             labels={"figure": "camera poses"},
         ),
         fit=report(
-            update("results/figures/{dataset}/{scene}/fit.png"),
+            "<results>/figures/{dataset}/{scene}/fit.png",
             caption="../workflow/report/fit.rst",
             category="Scenes",
             subcategory="{dataset}/{scene}",
             labels={"figure": "3D Gaussians"},
         ),
     log:
-        "results/figures/{dataset}/{scene}/figures.log",
+        "<results>/figures/{dataset}/{scene}/figures.log",
     benchmark:
-        "results/{dataset}/{scene}/benchmarks/figures.jsonl"
+        "<results>/{dataset}/{scene}/benchmarks/figures.jsonl"
     conda:
         ENVIRONMENT
-    threads: VARIANT_THREADS
+    threads: RESOURCES.threads
     resources:
         mem_mb=RESOURCES.memory_mb("figures"),
         runtime=RESOURCES.minutes("figures"),
@@ -49,32 +49,32 @@ rule figures:
         truth=PLAN.data.figure_truth_option,
         code=PLAN.code("figures", PLAN.data.label_readers),
     shell:
-        "hilsplat figures --scene {input.scene:q} {params.truth} --gaussians {input.gaussians:q}"
+        "python -m hilsplat figures --scene {input.scene:q} {params.truth} --gaussians {input.gaussians:q}"
         " --fit {input.fit:q} --masks {input.masks:q} --clip {input.clip:q}"
         " --semantic-tree {input.semantic_tree:q} --field {input.field:q}"
         " --autoencoder {input.autoencoder:q} --queries {params.queries:q}"
         " --settings {params.settings:q} --evaluate {params.evaluate:q}"
-        " --threads {threads} --out {output.panel:q} --log {log:q}"
+        " --threads {threads} --out {output.panel:q} > {log:q} 2>&1"
 
 
 rule mask_truth:
     input:
-        scene="results/{dataset}/{scene}/scene",
+        scene="<results>/{dataset}/{scene}/scene",
         truth=PLAN.data.truth,
-        masks="results/{dataset}/{scene}/default/masks",
+        masks="<results>/{dataset}/{scene}/default/masks",
     output:
         picture=report(
-            update("results/figures/{dataset}/{scene}/masks.png"),
+            "<results>/figures/{dataset}/{scene}/masks.png",
             caption="../workflow/report/masks.rst",
             category="Scenes",
             subcategory="{dataset}/{scene}",
             labels={"figure": "masks against the truth"},
         ),
-        table=update("results/figures/{dataset}/{scene}/masks.csv"),
+        table="<results>/figures/{dataset}/{scene}/masks.csv",
     log:
-        "results/figures/{dataset}/{scene}/masks.log",
+        "<results>/figures/{dataset}/{scene}/masks.log",
     benchmark:
-        "results/{dataset}/{scene}/benchmarks/mask_truth.jsonl"
+        "<results>/{dataset}/{scene}/benchmarks/mask_truth.jsonl"
     conda:
         ENVIRONMENT
     threads: 1
@@ -82,16 +82,17 @@ rule mask_truth:
         mem_mb=RESOURCES.memory_mb("mask_truth"),
         runtime=RESOURCES.minutes("mask_truth"),
     params:
+        results=lambda wildcards, input: str(Path(input.scene).parents[2]),
         code=PLAN.code("mask_truth"),
     shell:
-        "hilsplat world masks {wildcards.dataset:q}/{wildcards.scene:q} --out {output.picture:q} --log {log:q}"
+        "python -m hilsplat world masks {wildcards.dataset:q}/{wildcards.scene:q} --results {params.results:q} --out {output.picture:q} > {log:q} 2>&1"
 
 
 rule comparison:
     input:
-        scene="results/{dataset}/{scene}/scene",
+        scene="<results>/{dataset}/{scene}/scene",
         truth=PLAN.data.truth_or_labels,
-        gaussians="results/{dataset}/{scene}/gaussians.ply",
+        gaussians="<results>/{dataset}/{scene}/gaussians.ply",
         masks=PLAN.compared("masks", "masks"),
         clip=PLAN.compared("clip", "clip"),
         semantic_tree=PLAN.compared("semantic_tree", "semantic_tree"),
@@ -100,33 +101,33 @@ rule comparison:
         scores=PLAN.compared_scores,  # their provenance holds the settings of the answers
     output:
         methods=report(
-            update("results/figures/{dataset}/{scene}/comparison.png"),
+            "<results>/figures/{dataset}/{scene}/comparison.png",
             caption="../workflow/report/comparison.rst",
             category="Scenes",
             subcategory="{dataset}/{scene}",
             labels={"figure": "queries by method"},
         ),
         views=report(
-            update("results/figures/{dataset}/{scene}/views.png"),
+            "<results>/figures/{dataset}/{scene}/views.png",
             caption="../workflow/report/views.rst",
             category="Scenes",
             subcategory="{dataset}/{scene}",
             labels={"figure": "one query over views"},
         ),
         features=report(
-            update("results/figures/{dataset}/{scene}/features.png"),
+            "<results>/figures/{dataset}/{scene}/features.png",
             caption="../workflow/report/features.rst",
             category="Scenes",
             subcategory="{dataset}/{scene}",
             labels={"figure": "features at three levels"},
         ),
     log:
-        "results/figures/{dataset}/{scene}/comparison.log",
+        "<results>/figures/{dataset}/{scene}/comparison.log",
     benchmark:
-        "results/{dataset}/{scene}/benchmarks/comparison.jsonl"
+        "<results>/{dataset}/{scene}/benchmarks/comparison.jsonl"
     conda:
         ENVIRONMENT
-    threads: VARIANT_THREADS
+    threads: RESOURCES.threads
     resources:
         mem_mb=RESOURCES.memory_mb("comparison"),
         runtime=RESOURCES.minutes("comparison"),
@@ -140,26 +141,26 @@ rule comparison:
         truth=PLAN.data.figure_truth_option,
         code=PLAN.code("comparison", PLAN.data.label_readers),
     shell:
-        "hilsplat comparison --folder {params.folder:q} --variants {params.variants:q}"
+        "python -m hilsplat comparison --folder {params.folder:q} --variants {params.variants:q}"
         " --names {params.names:q} {params.truth} --queries {params.queries:q}"
         " --settings {params.settings:q} --evaluate {params.evaluate:q}"
-        " --threads {threads} --out {output.methods:q} --log {log:q}"
+        " --threads {threads} --out {output.methods:q} > {log:q} 2>&1"
 
 
 rule sweep_plot:
     input:
-        table="results/tables/{sweep}.csv",
+        table="<results>/tables/{sweep}.csv",
     output:
         plot=report(
-            update("results/figures/sweep-{sweep}.png"),
+            "<results>/figures/sweep-{sweep}.png",
             caption="../workflow/report/sweep.rst",
             category="Sweeps",
             labels={"figure": "{sweep}"},
         ),
     log:
-        "results/logs/sweep-{sweep}.log",
+        "<results>/logs/sweep-{sweep}.log",
     benchmark:
-        "results/benchmarks/sweep-{sweep}.jsonl"
+        "<results>/benchmarks/sweep-{sweep}.jsonl"
     wildcard_constraints:
         sweep="theta|omega",
     conda:
@@ -170,4 +171,4 @@ rule sweep_plot:
     params:
         code=PLAN.code("sweep"),
     shell:
-        "hilsplat sweep {wildcards.sweep:q} --table {input.table:q} --out {output.plot:q} --log {log:q}"
+        "python -m hilsplat sweep {wildcards.sweep:q} --table {input.table:q} --out {output.plot:q} > {log:q} 2>&1"

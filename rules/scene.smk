@@ -1,13 +1,13 @@
 # Camera poses: structure from motion, or import.
 rule source:
     input:
-        checked(PLAN.data.source_files),
+        PLAN.data.source_files,
     output:
-        directory(update("results/{dataset}/{scene}/source")),
+        directory("<results>/{dataset}/{scene}/source"),
     log:
-        "results/{dataset}/{scene}/logs/source.log",
+        "<results>/{dataset}/{scene}/logs/source.log",
     benchmark:
-        "results/{dataset}/{scene}/benchmarks/source.jsonl"
+        "<results>/{dataset}/{scene}/benchmarks/source.jsonl"
     priority: 10
     conda:
         ENVIRONMENT
@@ -20,22 +20,22 @@ rule source:
         root=str(Path(PLAN.run.data_root)),
         code=PLAN.code("source", PLAN.data.source_reader),
     shell:
-        "hilsplat datasets export {params.name:q} --data-root {params.root:q} --out {output:q} --log {log:q}"
+        "python -m hilsplat datasets export {params.name:q} --data-root {params.root:q} --out {output:q} > {log:q} 2>&1"
 
 
 rule poses:
     input:
-        checked(PLAN.data.image_files),
+        PLAN.data.image_files,
     output:
-        scene=directory(update("results/{dataset}/{scene}/scene")),
+        scene=directory("<results>/{dataset}/{scene}/scene"),
     log:
-        "results/{dataset}/{scene}/logs/poses.log",
+        "<results>/{dataset}/{scene}/logs/poses.log",
     benchmark:
-        "results/{dataset}/{scene}/benchmarks/poses.jsonl"
+        "<results>/{dataset}/{scene}/benchmarks/poses.jsonl"
     priority: 20
     conda:
         ENVIRONMENT
-    threads: THREADS
+    threads: RESOURCES.threads
     resources:
         mem_mb=RESOURCES.memory_mb("poses"),
         runtime=RESOURCES.minutes("poses"),
@@ -47,6 +47,6 @@ rule poses:
         seed=PLAN.run.seed,
         code=PLAN.code("poses"),
     shell:
-        "hilsplat poses --images {params.images:q} --name {wildcards.dataset:q}/{wildcards.scene:q}"
+        "python -m hilsplat poses --images {params.images:q} --name {wildcards.dataset:q}/{wildcards.scene:q}"
         " --unit {params.unit:q} {params.lens} --settings {params.settings:q} --seed {params.seed:q}"
-        " --threads {threads} --out {output.scene:q} --log {log:q}"
+        " --threads {threads} --out {output.scene:q} > {log:q} 2>&1"

@@ -1,18 +1,18 @@
 # Masks at three levels and the coverage tree of each view.
 rule masks:
     input:
-        scene="results/{dataset}/{scene}/scene",
+        scene="<results>/{dataset}/{scene}/scene",
         truth=PLAN.masks_truth,  # empty, except for the diagnostic segmenter
     output:
-        masks=directory(update("results/{dataset}/{scene}/{variant}/masks")),
+        masks=directory("<results>/{dataset}/{scene}/{variant}/masks"),
     log:
-        "results/{dataset}/{scene}/{variant}/logs/masks.log",
+        "<results>/{dataset}/{scene}/{variant}/logs/masks.log",
     benchmark:
-        "results/{dataset}/{scene}/{variant}/benchmarks/masks.jsonl"
+        "<results>/{dataset}/{scene}/{variant}/benchmarks/masks.jsonl"
     priority: 30
     conda:
         ENVIRONMENT
-    threads: THREADS
+    threads: RESOURCES.threads
     resources:
         mem_mb=RESOURCES.memory_mb("masks"),
         runtime=RESOURCES.minutes("masks"),
@@ -20,24 +20,22 @@ rule masks:
         settings=PLAN.settings("masks"),
         model=PLAN.model("masks"),
         truth=PLAN.masks_truth_option,
-        cache="results/.cache",
+        cache=CACHE,
         code=PLAN.code(PLAN.masks_stage),
     shell:
-        "hilsplat masks --scene {input.scene:q} --settings {params.settings:q} {params.truth}"
-        " --threads {threads} --memory {resources.mem_mib} --cache {params.cache:q} --out {output.masks:q} --log {log:q}"
+        "python -m hilsplat masks --scene {input.scene:q} --settings {params.settings:q} {params.truth}"
+        " --threads {threads} --memory {resources.mem_mib} --cache {params.cache:q} --out {output.masks:q} > {log:q} 2>&1"
 
 
 rule coverage_tree:
     input:
         masks=PLAN.shared("masks", "masks"),
     output:
-        coverage_tree=directory(
-            update("results/{dataset}/{scene}/{variant}/coverage_tree")
-        ),
+        coverage_tree=directory("<results>/{dataset}/{scene}/{variant}/coverage_tree"),
     log:
-        "results/{dataset}/{scene}/{variant}/logs/coverage_tree.log",
+        "<results>/{dataset}/{scene}/{variant}/logs/coverage_tree.log",
     benchmark:
-        "results/{dataset}/{scene}/{variant}/benchmarks/coverage_tree.jsonl"
+        "<results>/{dataset}/{scene}/{variant}/benchmarks/coverage_tree.jsonl"
     conda:
         ENVIRONMENT
     threads: 1
@@ -48,5 +46,5 @@ rule coverage_tree:
         settings=PLAN.settings("coverage_tree"),
         code=PLAN.code("coverage_tree"),
     shell:
-        "hilsplat coverage-tree --masks {input.masks:q} --settings {params.settings:q}"
-        " --out {output.coverage_tree:q} --log {log:q}"
+        "python -m hilsplat coverage-tree --masks {input.masks:q} --settings {params.settings:q}"
+        " --out {output.coverage_tree:q} > {log:q} 2>&1"

@@ -5,17 +5,15 @@ rule semantic_tree:
         masks=PLAN.shared("masks", "masks"),
         clip=PLAN.shared("clip", "clip"),
     output:
-        semantic_tree=directory(
-            update("results/{dataset}/{scene}/{variant}/semantic_tree")
-        ),
+        semantic_tree=directory("<results>/{dataset}/{scene}/{variant}/semantic_tree"),
     log:
-        "results/{dataset}/{scene}/{variant}/logs/semantic_tree.log",
+        "<results>/{dataset}/{scene}/{variant}/logs/semantic_tree.log",
     benchmark:
-        "results/{dataset}/{scene}/{variant}/benchmarks/semantic_tree.jsonl"
+        "<results>/{dataset}/{scene}/{variant}/benchmarks/semantic_tree.jsonl"
     priority: 70
     conda:
         ENVIRONMENT
-    threads: THREADS
+    threads: RESOURCES.threads
     resources:
         mem_mb=RESOURCES.memory_mb("semantic_tree"),
         runtime=RESOURCES.minutes("semantic_tree"),
@@ -24,6 +22,6 @@ rule semantic_tree:
         settings=PLAN.settings("semantic_tree"),
         code=PLAN.code("semantic_tree"),
     shell:
-        "hilsplat semantic-tree --contributions {input.contributions:q} --masks {input.masks:q}"
+        "python -m hilsplat semantic-tree --contributions {input.contributions:q} --masks {input.masks:q}"
         " --clip {input.clip:q} --settings {params.settings:q} --threads {threads}"
-        " --out {output.semantic_tree:q} --log {log:q}"
+        " --out {output.semantic_tree:q} > {log:q} 2>&1"

@@ -1,18 +1,16 @@
 # Synthetic scenes: images for the stages, truth for evaluation, figures and the diagnostic segmenter.
 rule world:
-    input:
-        checked(lambda wildcards: []),
     output:
-        images=directory(update("results/{dataset}/{scene}/world/images")),
-        truth=directory(update("results/{dataset}/{scene}/world/truth")),
+        images=directory("<results>/{dataset}/{scene}/world/images"),
+        truth=directory("<results>/{dataset}/{scene}/world/truth"),
     log:
-        "results/{dataset}/{scene}/logs/world.log",
+        "<results>/{dataset}/{scene}/logs/world.log",
     benchmark:
-        "results/{dataset}/{scene}/benchmarks/world.jsonl"
+        "<results>/{dataset}/{scene}/benchmarks/world.jsonl"
     priority: 10
     conda:
         ENVIRONMENT
-    threads: THREADS
+    threads: RESOURCES.threads
     resources:
         mem_mb=RESOURCES.memory_mb("world"),
         runtime=RESOURCES.minutes("world"),
@@ -20,7 +18,7 @@ rule world:
         source=lambda wildcards: PLAN.row(wildcards).source,
         settings=PLAN.settings("world"),
         code=PLAN.code("world"),
-        out="results/{dataset}/{scene}/world",
+        out=lambda wildcards, output: str(Path(output.images).parent),
     shell:
-        "hilsplat world make --source {params.source:q} --settings {params.settings:q}"
-        " --threads {threads} --out {params.out:q} --log {log:q}"
+        "python -m hilsplat world make --source {params.source:q} --settings {params.settings:q}"
+        " --threads {threads} --out {params.out:q} > {log:q} 2>&1"

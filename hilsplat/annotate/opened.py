@@ -29,7 +29,7 @@ class OpenedScene:
             raise ArtifactError(
                 f"{folder} has no photographs to annotate yet: {self.photographs} is missing",
                 expected="results/<dataset>/<scene> of a run, or a copy of it",
-                fix=f"snakemake --cores 2 {self.photographs}",
+                fix=f"hilsplat run {self.photographs}",
             )
         self.state, self._witness = secrets.token_hex(4), Witness()
         proposing = (folder / variant / "masks", folder / variant / "semantic_tree")

@@ -1,5 +1,6 @@
-"""Files that are either whole or absent: atomic writers, digests, provenance, view caches."""
+"""Atomic writers, readers and digests of artifacts, view caches and output locks."""
 
+import ctypes
 import errno
 import fcntl
 import hashlib
@@ -7,19 +8,19 @@ import json
 import os
 import shlex
 import shutil
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, TypeVar
 
 import numpy as np
 
 from hilsplat.base.errors import ArtifactError, DiskSpaceError, HilsplatError
-from hilsplat.base.processes import LITTER, temporary_prefix
+from hilsplat.base.processes import FORMER, UNFINISHED, is_unfinished, unfinished_folder
 
 Made = TypeVar("Made")
 
@@ -29,18 +30,28 @@ ZIP64_BYTES = 2**30
 INDEX = "index.json"
 """Written last into a folder artifact: its presence means that the folder is complete."""
 
-DAMAGE = (ValueError, zipfile.BadZipFile, zlib.error, NotImplementedError, EOFError, OSError, MemoryError)
-"""What numpy and zipfile raise on files whose bytes are not what was written."""
+DAMAGE = (
+    EOFError,
+    MemoryError,
+    NotImplementedError,
+    OSError,
+    SyntaxError,
+    TokenError,
+    ValueError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""Errors that numpy and zipfile raise on damaged files."""
 
 
 def provenance_path(artifact: Path) -> Path:
-    """Path of the provenance of a file or folder artifact: beside it, with its name."""
+    """Return the path of an artifact's provenance: beside the artifact, with its name."""
     artifact = Path(artifact)
     return artifact.parent / f"{artifact.name}.provenance.json"
 
 
 def remake(path: Path) -> str:
-    """How to have an artifact, or the one that a file belongs to, written again."""
+    """Return the command that rebuilds an artifact, or the artifact that a file belongs to."""
     places = [place for place in (Path(path), *Path(path).parents) if provenance_path(place).is_file()]
     if not places:
         return "run the stage that writes it again"
@@ -51,74 +62,129 @@ def remake(path: Path) -> str:
 
 
 @contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary name beside `path` that replaces it when the block ends without error.
+def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
+    """Yield a temporary file that replaces `path` when the block ends without error.
+
+    Args:
+        path: the file to write.
+        durable: write the file through to the disk, so that it survives a power failure.
 
     Raises:
         DiskSpaceError: the disk is full.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with full_disk_told(path):
-        handle, name = tempfile.mkstemp(prefix=temporary_prefix(), suffix=path.suffix[-16:], dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        with full_disk_told(path):
+    if is_unfinished(path):  # a file of a folder that is hidden and written through later
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with explain_full_disk(path), _keep_mode(path):
+                yield path
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
+        return
+    with work_folder(path) as folder:
+        temporary = folder / f"new{path.suffix[-16:]}"
+        with _keep_mode(temporary):
             yield temporary
-            temporary.chmod(0o644)
-            temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        if durable:
+            _flush(temporary)
+        temporary.replace(path)
+        if durable:
+            _flush(path.parent)
+
+
+@contextmanager
+def _keep_mode(path: Path) -> Iterator[None]:
+    """Create a file, whose mode follows the umask, and keep the mode: safetensors would change it to 0600."""
+    path.touch()
+    mode = path.stat().st_mode & 0o777
+    yield
+    path.chmod(mode)
 
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside `path` that replaces it when the block ends without error.
+    """Yield a temporary folder that replaces `path` when the block ends without error.
 
     Raises:
         DiskSpaceError: the disk is full.
     """
     path = Path(path)
-    with work_folder(path) as both:
-        temporary = both / "new"
-        with full_disk_told(path):
-            temporary.mkdir()
-            yield temporary
-            temporary.chmod(0o755)
-            if path.exists():  # moved, not deleted: there is no moment in which neither is whole
-                path.replace(both / "old")
-            temporary.replace(path)
+    durable = not is_unfinished(path)
+    with work_folder(path) as folder:
+        temporary = folder / "new"
+        temporary.mkdir()
+        yield temporary
+        if durable:
+            for place, _, names in os.walk(temporary, topdown=False):
+                for name in names:
+                    _flush(Path(place, name))
+                _flush(Path(place))
+        if not os.path.lexists(path):
+            temporary.rename(path)
+        elif not _exchange(temporary, path):
+            (folder / FORMER).mkdir()
+            path.rename(folder / FORMER / path.name)
+            temporary.rename(path)
+        if durable:
+            _flush(path.parent)
 
 
 @contextmanager
 def work_folder(path: Path) -> Iterator[Path]:
-    """A temporary folder beside `path`, removed at the end.
+    """Yield a temporary folder beside `path`, deleted at the end.
 
     Raises:
         DiskSpaceError: the disk is full.
     """
     path = Path(path)
-    with full_disk_told(path):
+    with explain_full_disk(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(prefix=temporary_prefix(), dir=path.parent))
-    try:
-        with full_disk_told(path):
+        with unfinished_folder(path.parent) as folder, explain_full_disk(path):
             yield folder
+
+
+def _flush(path: Path) -> None:
+    """Write a file, or the list of files in a folder, through to the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # file systems such as 9p have no such operation for folders
+            raise
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        os.close(descriptor)
+
+
+_renameat2 = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+"""A function of Linux, from <stdio.h>."""
+
+AT_FDCWD, RENAME_EXCHANGE = -100, 2
+"""From Linux's <fcntl.h> and <linux/fs.h>."""
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Exchange two paths atomically; return False if the operating or file system does not support this."""
+    if _renameat2 is None:
+        return False
+    if _renameat2(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE) == 0:
+        return True
+    code = ctypes.get_errno()
+    if code in (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP):
+        return False
+    raise OSError(code, os.strerror(code), str(other))
 
 
 FULL_DISK = ("No space left on device", "disk is full", "Disk quota exceeded")
-"""What libraries in C++ and Rust say, whose errors are not the system's: safetensors, SQLite."""
+"""Parts of the messages of C++ and Rust libraries that raise errors of their own: safetensors, SQLite."""
 
 FULL_BELOW_MIB = 1.0
-"""Other errors of libraries are put down to a full disk if less is free: COLMAP's do not say it."""
+"""Other library errors are attributed to a full disk if less is free, because COLMAP does not report it."""
 
 
 @contextmanager
-def full_disk_told(path: Path) -> Iterator[None]:
-    """Turn the system's "no space left" while `path` is written into an error that says so.
+def explain_full_disk(path: Path) -> Iterator[None]:
+    """Turn errors of a full disk while `path` is written into an error that names the disk and the fix.
 
     Raises:
         DiskSpaceError: the disk is full.
@@ -128,30 +194,30 @@ def full_disk_told(path: Path) -> Iterator[None]:
     except HilsplatError:
         raise
     except Exception as error:
-        folder = _lasting(path)
+        folder = _lasting_folder(path)
         usage = shutil.disk_usage(folder)
         full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
         full = full or any(words in str(error) for words in FULL_DISK)
-        full = full or (isinstance(error, LIBRARY) and usage.free < FULL_BELOW_MIB * 2**20)
+        full = full or (isinstance(error, LIBRARY_ERRORS) and usage.free < FULL_BELOW_MIB * 2**20)
         if full:
             raise DiskSpaceError(
                 f"no space left while writing {path.name} in {folder}",
                 found=f"{usage.free / 2**20:.1f} MiB free of {usage.total / 2**20:.0f} MiB on that disk",
                 fix=f"free space on the disk of {folder}, then run again; finished work is kept",
             ) from error
-        if isinstance(error, OSError) and LITTER.fullmatch(Path(str(error.filename)).name):
-            error.filename = str(path)  # the temporary name would tell nobody anything
+        if isinstance(error, OSError) and is_unfinished(Path(str(error.filename))):
+            error.filename = str(path)  # users know no temporary names
         raise
 
 
-LIBRARY = (RuntimeError, ChildProcessError)
-"""What libraries in C++ raise, and what stands for one that ended its process."""
+LIBRARY_ERRORS = (RuntimeError, ChildProcessError)
+"""Errors of C++ libraries, and of libraries that end their process."""
 
 
-def _lasting(path: Path) -> Path:
-    """The folder of a path, or the one that holds its unfinished artifact: what is unfinished goes."""
+def _lasting_folder(path: Path) -> Path:
+    """Return the innermost existing folder of a path that is not part of an unfinished artifact."""
     path = Path(path)
-    hidden = [place for place in path.parents if LITTER.fullmatch(place.name)]
+    hidden = [place for place in path.parents if UNFINISHED.fullmatch(place.name)]
     folder = hidden[-1].parent if hidden else path.parent
     while not folder.exists():
         folder = folder.parent
@@ -159,7 +225,7 @@ def _lasting(path: Path) -> Path:
 
 
 def require_free_space(folder: Path, needed_mib: float) -> None:
-    """Refuse to start if the disk cannot hold what is about to be written.
+    """Check that the disk has space for an output.
 
     Raises:
         DiskSpaceError: less than `needed_mib` MiB is free on the folder's disk.
@@ -203,10 +269,10 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse JSON that somebody else wrote.
+    """Parse JSON from outside the package.
 
     Raises:
-        ValueError: it is not JSON, or is nested too deeply to be anything that we read.
+        ValueError: it is not JSON, or is nested too deeply.
     """
     try:
         return json.loads(text)
@@ -219,14 +285,14 @@ def write_npz(path: Path, **arrays: np.ndarray) -> None:
     _write_zip(path, arrays, zipfile.ZIP_DEFLATED)
 
 
-def _write_zip(path: Path, arrays: dict[str, np.ndarray], method: int) -> None:
+def _write_zip(path: Path, arrays: dict[str, np.ndarray], method: int, *, durable: bool = True) -> None:
     with (
-        atomic_path(path) as temporary,
+        atomic_path(path, durable=durable) as temporary,
         zipfile.ZipFile(temporary, "w", method, compresslevel=1) as archive,
     ):
         for name, array in arrays.items():
-            # Entries opened by name get the time 1980-01-01. They are written piece by piece, so that neither
-            # a copy of a large array nor its compressed form is held in memory.
+            # Entries opened by name get the time 1980-01-01. They are written in pieces, so that memory holds
+            # neither a copy of a large array nor its compressed form.
             large = array.nbytes > ZIP64_BYTES
             with archive.open(f"{name}.npy", "w", force_zip64=large) as stream:
                 np.lib.format.write_array(stream, np.ascontiguousarray(array), allow_pickle=False)
@@ -245,6 +311,8 @@ def read_npz(path: Path, *needed: str) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
+        if any(isinstance(array, bytes) for array in arrays.values()):  # numpy found no header
+            raise ValueError("it contains other data than arrays")
     except FileNotFoundError as error:
         raise ArtifactError(f"{path} is missing", fix=remake(path)) from error
     except (*DAMAGE, AttributeError) as error:  # AttributeError: it is an .npy
@@ -330,18 +398,25 @@ def sha256_of_file(path: Path) -> str:
 
 
 def sha256_of_path(path: Path) -> str:
-    """SHA-256 of a file, or of the names and bytes of a folder's files, without hidden ones."""
+    """SHA-256 of a file, or of the names and bytes of a folder's files, without hidden files and folders."""
     path = Path(path)
     if path.is_file():
         return sha256_of_file(path)
-    files = sorted(file for file in path.rglob("*") if file.is_file() and not file.name.startswith("."))
+    files = visible_files(path)
     if not files:
         raise ArtifactError(f"{path} is missing or empty", fix=remake(path))
     return sha256_of_json([(file.relative_to(path).as_posix(), sha256_of_file(file)) for file in files])
 
 
+def visible_files(folder: Path) -> list[Path]:
+    """Return the files below a folder, sorted, without hidden files and those in hidden folders."""
+    folder = Path(folder)
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return sorted(f for f in files if not any(part[0] == "." for part in f.relative_to(folder).parts))
+
+
 def write_index(folder: Path, views: Mapping[str, Any], **more: Any) -> None:
-    """Close a folder artifact: write `index.json` with one entry per view, keyed by view name."""
+    """Complete a folder artifact: write `index.json` with one entry per view, keyed by view name."""
     write_json(Path(folder) / INDEX, {**more, "views": dict(views)})
 
 
@@ -377,15 +452,15 @@ def read_full_index(folder: Path, *entries: str) -> dict[str, Any]:
 
 
 class ViewCache:
-    """Finished views of a long stage, kept outside its declared output and keyed by content.
+    """Finished views of a long stage, stored outside its declared output and keyed by content.
 
-    A stage that was killed finds them again, and adding one photograph costs one photograph. An entry is an
-    .npz file. Its key must cover everything that the result depends on: the digests of image, model and code,
-    and the settings.
+    A stage that was killed reuses them, and an added photograph costs the time of one photograph. An entry is
+    an .npz file. Its key must cover everything that the result depends on: the digests of image, model and
+    code, and the settings.
 
     Args:
         folder: holds the entries, such as `results/.cache/masks`.
-        compressed: whether entries are; floating-point numbers hardly shrink, and it takes time.
+        compressed: compress the entries; floating-point numbers hardly shrink, and compression takes time.
     """
 
     def __init__(self, folder: Path, *, compressed: bool = True) -> None:
@@ -395,23 +470,23 @@ class ViewCache:
         self.misses = 0
 
     def path(self, key: str) -> Path:
-        """File of a key, whether it exists or not."""
+        """Return the file of a key, which may not exist."""
         return self.folder / key[:2] / f"{key}.npz"
 
     def get(self, key: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
         """Return the entry, computing and storing it if it is missing or damaged."""
         path = self.path(key)
         if path.is_file():
-            try:
-                arrays = read_npz(path)
-                self.hits += 1
-                with suppress(OSError):  # another node may prune it in this moment
-                    os.utime(path)  # last use, for pruning
-                return arrays
-            except ArtifactError:
-                path.unlink(missing_ok=True)
+            with suppress(ArtifactError):
+                if arrays := read_npz(path):  # a file whose end is zeros may pass for an empty archive
+                    self.hits += 1
+                    with suppress(OSError):  # another process may have pruned it
+                        os.utime(path)  # last use, for pruning
+                    return arrays
         arrays = compute()
-        _write_zip(path, arrays, self._method)
+        # A power failure may cut entries or fill them with zeros. Reading detects this by checksums and
+        # computes the entry again, so entries are not written through to the disk (milliseconds each).
+        _write_zip(path, arrays, self._method, durable=False)
         self.misses += 1
         return arrays
 
@@ -420,8 +495,8 @@ class ViewCache:
 def output_lock(output: Path) -> Iterator[None]:
     """Lock an output for writing; a second writer of the same output is refused.
 
-    A writer that does not reach the end leaves a mark in the lock: the output may then be neither what its
-    provenance says nor what the writer was about to write.
+    The lock file of a writer that is killed or fails is not empty: the output may then match neither its
+    provenance nor the inputs of that writer.
 
     Raises:
         ArtifactError: another process is writing it.
@@ -434,7 +509,7 @@ def output_lock(output: Path) -> Iterator[None]:
         except BlockingIOError as error:
             raise ArtifactError(
                 f"another process is writing {output}",
-                fix="wait for it, or end it, then run again",
+                fix="wait until it ends, or end it, then run again",
             ) from error
         stream.truncate(0)
         stream.write("unfinished\n")
@@ -444,5 +519,5 @@ def output_lock(output: Path) -> Iterator[None]:
 
 
 def lock_path(output: Path) -> Path:
-    """The lock of an output; not empty if its last writer was killed or failed."""
+    """Return the lock file of an output; it is not empty if the last writer was killed or failed."""
     return output.parent / f".{output.name}.lock"

@@ -1,14 +1,21 @@
-"""Sizes of the caches of finished views, and their pruning."""
+"""Sizes of the caches, and pruning of finished views and of checkpoints."""
 
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from hilsplat.base.artifacts import visible_files
 from hilsplat.base.errors import HilsplatError
-from hilsplat.base.processes import remove_litter
+from hilsplat.base.processes import remove_leftovers
 
 VIEW_CACHES = ("masks", "clip", "contributions")
-"""Caches that can be pruned: a missing entry costs time, never a result."""
+"""Caches of finished views: a missing entry costs time, but changes no result."""
+
+CHECKPOINTS = "gaussians"
+"""Cache of the checkpoints of fits."""
+
+FIT_DAYS = 1.0
+"""A checkpoint younger than this is kept: its fit may still run. Fits write them much more often."""
 
 
 @dataclass(frozen=True)
@@ -16,9 +23,9 @@ class Entries:
     """Files of one cache.
 
     Attributes:
-        name: of its folder.
-        files: complete entries, without those still being written.
-        size_mib: of all of them.
+        name: name of its folder, or of the only file.
+        files: complete entries, without unfinished files.
+        size_mib: total size.
     """
 
     name: str
@@ -31,18 +38,16 @@ def _mib(files: tuple[Path, ...]) -> float:
 
 
 def caches(folder: Path) -> list[Entries]:
-    """The caches under a cache folder, by name."""
+    """Return the caches in a cache folder, by name."""
     found = []
-    for cache in sorted(path for path in Path(folder).glob("*") if path.is_dir()):
-        files = tuple(
-            sorted(path for path in cache.rglob("*") if path.is_file() and not path.name.startswith("."))
-        )
+    for cache in sorted(Path(folder).glob("[!.]*")):
+        files = tuple(visible_files(cache)) if cache.is_dir() else (cache,)
         found.append(Entries(cache.name, files, _mib(files)))
     return found
 
 
 def size_table(folder: Path) -> str:
-    """Size of each cache as text."""
+    """Return the size of each cache as text."""
     found = caches(folder)
     lines = [f"{cache.name:<14} {len(cache.files):>7} files {cache.size_mib:>9.1f} MiB" for cache in found]
     total = sum(cache.size_mib for cache in found)
@@ -52,38 +57,39 @@ def size_table(folder: Path) -> str:
 def prune_cache(
     folder: Path, stages: list[str], *, days: float | None = None, max_mib: float | None = None
 ) -> tuple[int, float]:
-    """Delete what killed jobs left unfinished, and entries of view caches, the least recently used first.
+    """Delete unfinished files of killed jobs, and cache entries, the least recently used first.
 
     Args:
         folder: cache folder.
-        stages: which of `VIEW_CACHES`; empty: all of them.
+        stages: caches to prune, of `VIEW_CACHES` and `CHECKPOINTS`; empty: the view caches, and with `days`
+            the checkpoints too.
         days: delete entries not used for this many days.
-        max_mib: then delete entries until at most this much is left. Without either limit no entry goes.
+        max_mib: then delete entries until at most this much is left. No limit: no entry is deleted.
 
     Returns:
-        files deleted, and their size in MiB.
+        Number of deleted entries, and their size in MiB.
 
     Raises:
-        HilsplatError: a stage has no view cache.
+        HilsplatError: a stage has no cache that can be pruned.
     """
-    strangers = sorted(set(stages) - set(VIEW_CACHES))
-    if strangers:
+    known = (*VIEW_CACHES, CHECKPOINTS)
+    if unknown := sorted(set(stages) - set(known)):
         raise HilsplatError(
-            f"there is no cache of finished views for {', '.join(strangers)}",
-            expected=f"one of {', '.join(VIEW_CACHES)}",
+            f"no stage with a cache to prune is called {', '.join(unknown)}",
+            expected=f"one of {', '.join(known)}",
         )
-    # the caches lie in the results folder, whose stages leave theirs beside their outputs
-    remove_litter(folder.parent if Path(folder).name == ".cache" else folder)
-    chosen = set(stages or VIEW_CACHES)
-    files = [path for cache in caches(folder) if cache.name in chosen for path in cache.files]
-    used = {path: path.stat() for path in files}
-    oldest_first = sorted(files, key=lambda path: (used[path].st_mtime, str(path)))
-    total = sum(stat.st_size for stat in used.values())
+    # The cache is in the results folder, where killed jobs leave unfinished files beside their outputs.
+    remove_leftovers(folder.parent if Path(folder).name == ".cache" else folder)
+    chosen = set(stages or (VIEW_CACHES if days is None else known))
     now, freed, deleted = time.time(), 0, 0
+    used = {path: path.stat() for cache in caches(folder) if cache.name in chosen for path in cache.files}
+    oldest_first = sorted(used, key=lambda path: (used[path].st_mtime, str(path)))
+    total = sum(stat.st_size for stat in used.values())
     for path in oldest_first:
-        old = days is not None and now - used[path].st_mtime >= days * 86400
+        idle_days = (now - used[path].st_mtime) / 86400
+        old = days is not None and idle_days >= days
         much = max_mib is not None and total - freed > max_mib * 2**20
-        if old or much:
+        if (old or much) and not (path.parent.name == CHECKPOINTS and idle_days < FIT_DAYS):
             path.unlink(missing_ok=True)
             freed += used[path].st_size
             deleted += 1

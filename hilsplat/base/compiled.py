@@ -1,5 +1,6 @@
 """Loops compiled by numba and cached on disk, with a notice when they must be compiled."""
 
+import functools
 import inspect
 import logging
 from collections.abc import Callable
@@ -9,35 +10,48 @@ import numba
 from numba.core import event
 
 from hilsplat.base.definitions import PACKAGE
-from hilsplat.base.identity import code_digest
+from hilsplat.base.identity import code_digest, is_as_imported
 
 logger = logging.getLogger(__name__)
 
 
 def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """`numba.njit` without the interpreter lock, cached on disk until code that the loop reaches changes.
+    """Apply `numba.njit` without the interpreter lock, cached on disk until code that the loop uses changes.
 
-    numba itself recompiles a cached loop if and only if its own file changes: it would miss an edit to a
-    function of another file that the loop calls, and recompile for a comment.
+    numba itself recompiles a cached loop if and only if the loop's own file changes: it would miss an edit to
+    a function in another file that the loop calls, and recompile after an edited comment.
     """
     if function is None:
         return lambda later: compiled(later, **options)
     function = inspect.unwrap(function)  # the tests' type checker wraps every function
     dispatcher = numba.njit(nogil=True, cache=True, **options)(function)
     if function.__module__.split(".")[0] == PACKAGE and "<locals>" not in function.__qualname__:
-        # numba has no public way to declare what else a cached function depends on
-        dispatcher._cache._cache_file._source_stamp = _Stamp(function, options)
+        # numba has no public way to declare the dependencies of a cached function
+        cache = dispatcher._cache
+        cache._enabled = cache._cache_file._source_stamp = _Stamp(function, options)
     return dispatcher
 
 
 class _Stamp:
-    """Digest of what a loop is compiled from, taken when numba first looks into its cache."""
+    """Digest of the imported code that a loop is compiled from, computed when numba first opens its cache.
+
+    It is false if the package was edited since the import: numba then neither reads nor writes the cache.
+    """
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         self.function, self.options = function, options
 
+    @functools.cached_property
+    def _digest(self) -> str:
+        # The first check avoids half-edited files, which may not parse; the second covers edits meanwhile.
+        digest = code_digest(self.function) if is_as_imported() else ""
+        return digest if is_as_imported() else ""
+
+    def __bool__(self) -> bool:
+        return bool(self._digest)
+
     def __str__(self) -> str:
-        return f"{code_digest(self.function)} {sorted(self.options.items())}"
+        return f"{self._digest} {sorted(self.options.items())}"
 
     def __eq__(self, other: object) -> bool:
         return str(self) == str(other)
@@ -47,7 +61,7 @@ class _Stamp:
 
 
 class _Notice(event.Listener):
-    """Logs once that loops are being compiled; numba does not report loops from the cache."""
+    """Logs once that loops are being compiled; numba does not report loops that it reads from the cache."""
 
     given = False
 

@@ -17,6 +17,7 @@ too, and so do definitions whose decorators may register them, because importing
 import contextlib
 import functools
 import hashlib
+import json
 import os
 import sys
 import threading
@@ -25,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from hilsplat.base import definitions
-from hilsplat.base.artifacts import parse_json, write_json
+from hilsplat.base.artifacts import atomic_path, parse_json
 from hilsplat.base.definitions import PACKAGE, Import, Statement, module_of, path_of
 from hilsplat.base.errors import HilsplatError
 
@@ -59,34 +60,48 @@ def code_digest(*roots: Code, root: Path = ROOT) -> str:
 
 @functools.cache
 def _digest(roots: tuple[str, ...], root: Path) -> str:
-    """The digest, kept beside numba's compiled loops: finding it takes up to 0.6 s, as long as a table."""
+    """Return the digest, stored beside numba's compiled loops: computing it takes up to 0.6 s."""
     kept = root / "__pycache__" / f"identity.{sys.implementation.cache_tag}.json"
     state, key = _state(root), " ".join(roots)
     known = _known(kept, state)
     if key not in known:
         known[key] = _digest_of(roots, root)
-        with contextlib.suppress(OSError, HilsplatError):  # a package that we may not write to
-            write_json(kept, {"state": state, "digests": _known(kept, state) | known})
+        with contextlib.suppress(OSError, HilsplatError):  # the package may be read-only
+            if _read_state(root) == state:  # no module was edited meanwhile
+                with atomic_path(kept, durable=False) as temporary:
+                    text = json.dumps({"state": state, "digests": _known(kept, state) | known})
+                    temporary.write_text(text)
     return known[key]
 
 
-@functools.cache
-def _state(root: Path) -> str:
-    """Digest of the names, times and sizes of all modules, by which Python too tells that one has changed."""
-    digest = hashlib.sha256()
-    for folder, folders, files in os.walk(root):
-        folders[:] = sorted(set(folders) - {"__pycache__"})
-        for name in sorted(files):
-            if name.endswith(".py"):
-                place = Path(folder, name)
-                found = place.stat()
-                about = f"{place.relative_to(root)} {found.st_mtime_ns} {found.st_size}\n"
-                digest.update(about.encode())
-    return digest.hexdigest()
+def _read_state(root: Path) -> str:
+    """Return a digest of the names, times and sizes of all modules: Python detects changes by them too."""
+    found, folders = [], [str(root)]
+    for folder in folders:
+        with os.scandir(folder) as entries:
+            for entry in entries:
+                if entry.name.endswith(".py"):
+                    stat = entry.stat()
+                    found.append((entry.path, stat.st_mtime_ns, stat.st_size))
+                elif entry.is_dir() and entry.name != "__pycache__":
+                    folders.append(entry.path)
+    return hashlib.sha256(repr(sorted(found)).encode()).hexdigest()
+
+
+_state = functools.cache(_read_state)
+_STATE_AT_IMPORT = _read_state(ROOT)
+
+
+def is_as_imported() -> bool:
+    """Whether the package is as it was when this process imported this module, early in every command."""
+    try:
+        return _read_state(ROOT) == _STATE_AT_IMPORT
+    except FileNotFoundError:  # a module was deleted while the state was read
+        return False
 
 
 def _known(kept: Path, state: str) -> dict[str, str]:
-    """Digests found before for this state of the package."""
+    """Return the digests stored for this state of the package."""
     try:
         found = parse_json(kept.read_bytes())
         return dict(found["digests"]) if found["state"] == state else {}

@@ -1,40 +1,43 @@
-"""Processes: they end with their parent, what they left unfinished is removed, and many share a work."""
+"""Child processes that end with their parent, unfinished files of killed processes, and process pools."""
 
 import ctypes
+import fcntl
 import functools
 import hashlib
 import logging
 import os
 import re
+import secrets
 import shutil
 import signal
 import socket
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Thread
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar
 
 Result = TypeVar("Result")
 
 logger = logging.getLogger(__name__)
 
 PARENT = "HILSPLAT_PARENT"
-"""Variable that names the process whose jobs must not outlive it; the workflow sets it (rules/common.smk)."""
+"""Environment variable with the number of the process whose jobs must end with it (rules/common.smk)."""
 
 PR_SET_PDEATHSIG = 1
 """From Linux's <sys/prctl.h>."""
 
 
 def end_with_parent(parent: int) -> None:
-    """Have this process killed as soon as the one that started it ends, however that ends.
+    """Kill this process as soon as the process that started it ends, however that ends.
 
-    Otherwise the jobs of a killed Snakemake go on, and write outputs of old settings beside the next run.
-    The system does it where it can (Linux, no shell in between); elsewhere a thread looks every second.
+    Otherwise the jobs of a killed Snakemake continue, and write outputs of old settings during the next run.
+    Linux does this if no shell is in between; elsewhere a thread checks every second.
 
     Args:
-        parent: number of the process that started this one, perhaps through a shell.
+        parent: number of the process that started this one, possibly through a shell.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -51,36 +54,102 @@ def _watch(parent: int) -> None:
 
 
 def jobs_end_with_this_process() -> None:
-    """Have the commands that this process starts from now on end with it."""
+    """Make the commands that this process starts later end with it."""
     os.environ[PARENT] = str(os.getpid())
 
 
 def end_with_workflow() -> None:
-    """End with the Snakemake that started this job; a command that a person starts is left alone."""
-    parent = os.environ.pop(PARENT, "")  # popped: what this process starts has another parent
+    """End with the Snakemake that started this job; do nothing in a command that a person starts."""
+    parent = os.environ.pop(PARENT, "")  # popped, because the children of this process have another parent
     if parent.isdecimal():
         end_with_parent(int(parent))
 
 
-LITTER = re.compile(r"\.writing-(?P<machine>[0-9a-f]{8})-(?P<pid>[0-9]+)-.*", re.DOTALL)
+UNFINISHED = re.compile(r"\.writing-(?P<host>[0-9a-f]{8})-.*", re.DOTALL)
+"""Name of a folder of unfinished files: hidden, so no digest counts it."""
+
+LOCK = ".lock"
+"""File in such a folder that its writer locks."""
+
+FORMER = ".former"
+"""Folder in it that holds the former version of an artifact while the new one takes its place."""
 
 
 @functools.cache
-def machine() -> str:
-    """Eight digits that stand for this machine: a process number means nothing on another one."""
+def host_token() -> str:
+    """Return eight digits that identify this host by name; a host keeps its name when it reboots."""
     return hashlib.sha256(socket.gethostname().encode()).hexdigest()[:8]
 
 
-def temporary_prefix() -> str:
-    """Beginning of the name of whatever this process has not finished writing.
+def is_unfinished(path: Path) -> bool:
+    """Whether a path is a folder of unfinished files or in one."""
+    return any(UNFINISHED.fullmatch(part) for part in Path(path).parts)
 
-    It is short, so that every name that fits a folder can be written, and hidden: no digest counts it.
+
+@contextmanager
+def unfinished_folder(parent: Path) -> Iterator[Path]:
+    """Create a folder for unfinished files, and delete it at the end.
+
+    A lock on a file in it shows `remove_leftovers` that the writer is alive: the system frees the lock when
+    the writer ends, however it ends. Process numbers mean nothing in other containers and after a reboot.
+    The folder itself is not locked, because NFS locks only files.
     """
-    return f".writing-{machine()}-{os.getpid()}-"
+    is_locked = False
+    while not is_locked:
+        folder = Path(parent) / f".writing-{host_token()}-{secrets.token_hex(4)}"
+        folder.mkdir()
+        with suppress(FileNotFoundError):  # a clean-up found the folder without a lock and deleted it
+            stream = (folder / LOCK).open("ab")
+            fcntl.flock(stream, fcntl.LOCK_EX)
+            is_locked = os.fstat(stream.fileno()).st_nlink > 0
+    try:
+        yield folder
+    finally:
+        _discard(folder, stream)
+
+
+def _discard(folder: Path, lock: IO[bytes]) -> None:
+    """Delete a folder of unfinished files; a former version in it returns if no version took its place."""
+    former = folder / FORMER
+    if former.is_dir():
+        for version in former.iterdir():
+            if not os.path.lexists(folder.parent / version.name):
+                version.rename(folder.parent / version.name)
+        former.rename(folder / "old")  # a version that is partly deleted must never return
+    shutil.rmtree(folder, ignore_errors=True)
+    lock.close()
+    shutil.rmtree(folder, ignore_errors=True)  # NFS keeps a deleted file in its folder until it is closed
+
+
+def remove_leftovers(folder: Path) -> list[Path]:
+    """Delete the unfinished files of dead processes of this host below a folder.
+
+    Those of living processes are kept, also if these run in other containers, and those of other hosts that
+    share the folder, whose locks may be invisible here.
+
+    Returns:
+        The deleted folders.
+    """
+    removed = []
+    for place, folders, _ in os.walk(folder):
+        for name in folders:
+            found = UNFINISHED.fullmatch(name)
+            if found is None or found["host"] != host_token():
+                continue
+            path = Path(place) / name
+            with suppress(BlockingIOError, FileNotFoundError, PermissionError):
+                with (path / LOCK).open("ab") as stream:  # created if missing: a writer may be about to do so
+                    fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    _discard(path, stream)
+                removed.append(path)
+        folders[:] = [name for name in folders if not UNFINISHED.fullmatch(name)]
+    if removed:
+        logger.info("deleted the unfinished files of %d killed jobs", len(removed))
+    return removed
 
 
 def is_alive(pid: int) -> bool:
-    """Whether a process of this machine exists."""
+    """Whether a process with this number exists in this process namespace."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -90,36 +159,13 @@ def is_alive(pid: int) -> bool:
     return True
 
 
-def remove_litter(folder: Path) -> list[Path]:
-    """Remove what dead processes of this machine left unfinished below a folder.
-
-    What a living process writes, or one of another machine that shares the folder, stays.
-
-    Returns:
-        what was removed.
-    """
-    removed = []
-    for place, folders, files in os.walk(folder):
-        for name in [*folders, *files]:
-            found = LITTER.fullmatch(name)
-            if not found or found["machine"] != machine() or is_alive(int(found["pid"])):
-                continue
-            path = Path(place) / name
-            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
-            removed.append(path)
-        folders[:] = [name for name in folders if not LITTER.fullmatch(name)]
-    if removed:
-        logger.info("removed %d unfinished files and folders of jobs that were killed", len(removed))
-    return removed
-
-
 def in_processes(
     work: Callable[..., Result], items: Sequence[tuple[Any, ...]], workers: int, chunk: int = 1
 ) -> Iterator[Result]:
-    """Results of `work(*item)` in the order of `items`.
+    """Yield the results of `work(*item)` in the order of `items`, computed in several processes.
 
-    For work that holds Python's lock. Processes are spawned, since forking a process that has threads may
-    hang. With one worker or one item, no process is started.
+    For work that holds Python's lock. Processes are spawned, because forking a process with threads may hang.
+    With one worker or one item, no process is started.
 
     Args:
         work: a function at the top level of a module, or a `functools.partial` of one.
@@ -144,9 +190,9 @@ def in_processes(
 
 
 def in_own_process(work: Callable[..., Result], *given: Any) -> Result:
-    """`work(*given)`, computed in a process of its own, for libraries that may end theirs.
+    """Return `work(*given)`, computed in a separate process, for libraries that may end their process.
 
-    What they print on their way out is no message for people: the end of it is the end of the error.
+    Their stderr is not user-facing: the error ends with its last 2000 characters.
 
     Args:
         work: a function at the top level of a module.

@@ -1,8 +1,8 @@
-"""Progress of long work: a bar on a terminal, sparse lines in a log, a small file for the run around it."""
+"""Progress of long work: a bar on a terminal, otherwise lines in a log that a run reads."""
 
-import json
 import logging
 import os
+import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sized
@@ -16,55 +16,37 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 logger = logging.getLogger(__name__)
 
-LOG_EVERY_S = 15.0
-"""Seconds between progress lines if there is no terminal to draw a bar on."""
+LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
+"""Format of the log of a stage that a run starts; `last_progress` and `warnings_in` read it."""
 
-TELL_EVERY_S = 1.0
-"""Seconds between two writings of a stage's share."""
+LOG_EVERY_S = 5.0
+"""Seconds between progress lines if stderr is not a terminal."""
 
-IN_RUN = "HILSPLAT_IN_RUN"
-"""Environment variable that a run sets for its stages: it shows their progress, and they are quiet."""
-
-_share_file: Path | None = None
-
-
-def in_run() -> bool:
-    """Whether this process is a stage of a run that shows the progress itself."""
-    return bool(os.environ.get(IN_RUN))
+LOG_TAIL_BYTES = 20_000
+PROGRESS = re.compile(
+    r"^\d{4}-.* INFO hilsplat\.base\.progress: (?P<what>.+): (?P<done>\d+) of (?P<total>\d+)$", re.M
+)
+WARNING = re.compile(r"^\d{4}-\S+ \S+ WARNING \S+ (?P<text>.+?)(?=\n\d{4}-|\Z)", re.M | re.S)
 
 
-def share_file(log: Path) -> Path:
-    """Where a stage with this log tells the run how far it is."""
-    return log.with_suffix(".progress")
+def last_progress(log: Path) -> tuple[str, int, int] | None:
+    """Return the last progress in a stage's log: loop, items done, items in total. None without any."""
+    found = list(PROGRESS.finditer(_tail(log)))
+    return (found[-1]["what"], int(found[-1]["done"]), int(found[-1]["total"])) if found else None
 
 
-@contextmanager
-def share_told(log: Path | None) -> Iterator[None]:
-    """Tell the run, if there is one, how far the loops of this stage are, until it ends."""
-    global _share_file
-    _share_file = share_file(log) if log is not None and in_run() else None
+def warnings_in(log: Path) -> list[str]:
+    """Return the warnings in the last part of a stage's log."""
+    return [found["text"].rstrip() for found in WARNING.finditer(_tail(log))]
+
+
+def _tail(log: Path) -> str:
     try:
-        yield
-    finally:
-        if _share_file is not None:
-            _share_file.unlink(missing_ok=True)
-        _share_file = None
-
-
-def read_share(log: Path) -> tuple[str, int, int] | None:
-    """What a running stage told last: which loop, how many items are done, and of how many; None: nothing."""
-    try:
-        what, done, total = json.loads(share_file(log).read_text(encoding="utf-8"))
-    except (OSError, ValueError):  # not begun, or over
-        return None
-    return what, done, total
-
-
-def _tell(what: str, done: int, total: int) -> None:
-    assert _share_file is not None
-    temporary = _share_file.with_suffix(".progress.tmp")
-    temporary.write_text(json.dumps([what, done, total]), encoding="utf-8")
-    temporary.replace(_share_file)
+        with log.open("rb") as stream:
+            stream.seek(max(0, stream.seek(0, os.SEEK_END) - LOG_TAIL_BYTES))
+            return stream.read().decode("utf-8", errors="replace")
+    except OSError:  # the job has not written it yet
+        return ""
 
 
 def _bar(*measures: str) -> "Progress":
@@ -87,23 +69,20 @@ def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterato
     """
     if total is None:
         total = len(items) if isinstance(items, Sized) else None
-    if sys.stderr.isatty() and not in_run():
+    if sys.stderr.isatty():
         with _bar("MofNCompleteColumn") as progress:
             task = progress.add_task(what, total=total)
             for item in items:
                 yield item
                 progress.advance(task)
         return
-    last, told = time.monotonic(), -TELL_EVERY_S
+    last = time.monotonic()
     for done, item in enumerate(items, start=1):
         yield item
         now = time.monotonic()
-        if now - last >= LOG_EVERY_S and done != total:
+        if now - last >= LOG_EVERY_S:
             logger.info("%s: %d of %s", what, done, total if total is not None else "?")
             last = now
-        if _share_file is not None and total and (now - told >= TELL_EVERY_S or done == total):
-            _tell(what, done, total)
-            told = now
 
 
 @contextmanager
@@ -114,7 +93,7 @@ def transfer_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
         what: name of what is transferred.
         total: its bytes.
     """
-    if sys.stderr.isatty() and not in_run():
+    if sys.stderr.isatty():
         with _bar("DownloadColumn", "TransferSpeedColumn") as progress:
             task = progress.add_task(what, total=total)
             yield lambda reached: progress.update(task, completed=reached)

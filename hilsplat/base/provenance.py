@@ -9,7 +9,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from hilsplat.base.artifacts import provenance_path, sha256_of_path, write_json
+from hilsplat.base.artifacts import provenance_path, sha256_of_path, visible_files, write_json
+from hilsplat.base.errors import HilsplatError
 
 LIBRARIES = (
     "hilsplat",
@@ -25,6 +26,77 @@ LIBRARIES = (
 )
 
 
+class Inputs:
+    """Inputs of a stage with the digests that they had before it ran.
+
+    Args:
+        stage: name of the stage, for messages.
+        paths: files and folders that it reads, or lists of files, by name.
+
+    Raises:
+        HilsplatError: an input is missing.
+    """
+
+    def __init__(self, stage: str, paths: Mapping[str, Path | Sequence[Path]]) -> None:
+        self.stage = stage
+        self._paths = paths
+        for name, path in paths.items():
+            if isinstance(path, Path) and not path.exists():
+                raise HilsplatError(
+                    f"{stage}: input {name} is missing: {path}", fix="run the stage that writes it"
+                )
+        self._files = self._signatures()
+        self.records = {name: self._record(path) for name, path in paths.items()}
+
+    def require_unchanged(self) -> None:
+        """Check that no input changed since the digests were computed.
+
+        Files are compared by size, time and inode; only inputs with a difference are read again.
+
+        Raises:
+            HilsplatError: an input changed; the message names the file.
+        """
+        now = self._signatures()
+        for name, path in self._paths.items():
+            before, after = self._files[name], now[name]
+            changed = sorted(
+                file for file in before.keys() | after.keys() if before.get(file) != after.get(file)
+            )
+            if changed and self._record(path) != self.records[name]:
+                raise HilsplatError(
+                    f"{self.stage}: input {name} changed while the stage ran: {changed[0]}",
+                    expected="inputs that stay as they are until the stage ends",
+                    found="a new file" if changed[0] not in before else "another file or none",
+                    fix="run the stage again",
+                )
+
+    def _signatures(self) -> dict[str, dict[Path, tuple[int, ...]]]:
+        return {
+            name: {file: _signature(file) for file in files_of(path)} for name, path in self._paths.items()
+        }
+
+    @staticmethod
+    def _record(path: Path | Sequence[Path]) -> dict[str, Any]:
+        if isinstance(path, Path):
+            return {"path": str(path), "sha256": sha256_of_path(path) if files_of(path) else None}
+        digests = {str(file): sha256_of_path(file) if file.exists() else None for file in path}
+        return {"path": os.path.commonpath(digests) if digests else "", "files": digests}
+
+
+def files_of(path: Path | Sequence[Path]) -> list[Path]:
+    """Return the files of a folder without hidden ones, or the file or files themselves."""
+    if not isinstance(path, Path):
+        return [file for each in path for file in files_of(each)]
+    if not path.is_dir():
+        return [path] if path.exists() else []
+    return visible_files(path)
+
+
+def _signature(file: Path) -> tuple[int, ...]:
+    found = file.stat()
+    return found.st_size, found.st_mtime_ns, found.st_ino
+
+
 def write_provenance(
     artifact: Path,
     *,
@@ -33,13 +105,24 @@ def write_provenance(
     command: Sequence[str],
     settings: Mapping[str, Any],
     seed: int | None,
-    inputs: Mapping[str, Path],
+    inputs: Inputs,
     beside: Sequence[Path] = (),
     plugins: Sequence[str] = (),
+    device: str | None = None,
 ) -> None:
-    """Write stage, code digest, command, settings, seed, digests of inputs and outputs, versions, git commit.
+    """Write the record of an artifact: how it was made, from what, and the digests of what was written.
 
-    `beside` are further files and folders that the stage wrote, `plugins` the readers or baselines it used.
+    Args:
+        artifact: the output.
+        stage: key of `STAGES`.
+        code: digest of the stage's code.
+        command: command line.
+        settings: sections of the settings.
+        seed: seed of everything random, or None.
+        inputs: inputs with their digests from before the stage ran.
+        beside: further outputs.
+        plugins: import paths of the readers or baselines that the stage used.
+        device: device that `device: auto` stands for, if the stage has this setting.
     """
     folder = Path(artifact).parent
     write_json(
@@ -52,11 +135,8 @@ def write_provenance(
             "plugins": list(plugins),
             "settings": dict(settings),
             "seed": seed,
-            "inputs": {
-                name: {"path": str(path), "sha256": sha256_of_path(path)}
-                for name, path in inputs.items()
-                if Path(path).exists()
-            },
+            "device": device,
+            "inputs": inputs.records,
             "outputs": {
                 os.path.relpath(path, folder): {"sha256": sha256_of_path(path), "bytes": sizes_of(path)}
                 for path in (artifact, *beside)
@@ -69,15 +149,9 @@ def write_provenance(
 
 
 def sizes_of(path: Path) -> dict[str, int]:
-    """Bytes of each file of an artifact by its path inside, without hidden ones; a file has the path ".".
-
-    Reading them takes no time, and tells which file is gone or cut.
-    """
+    """Return the size in bytes of each file of an artifact by its path inside; a file has the path "."."""
     path = Path(path)
-    if path.is_file():
-        return {".": path.stat().st_size}
-    files = sorted(file for file in path.rglob("*") if file.is_file() and not file.name.startswith("."))
-    return {file.relative_to(path).as_posix(): file.stat().st_size for file in files}
+    return {file.relative_to(path).as_posix(): file.stat().st_size for file in files_of(path)}
 
 
 @functools.cache

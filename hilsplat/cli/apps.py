@@ -11,7 +11,7 @@ app = typer.Typer(
 world_app = typer.Typer(help="Make and inspect scenes of the synthetic world.", no_args_is_help=True)
 models_app = typer.Typer(help="Get, list, check, split and train models (SAM, CLIP).", no_args_is_help=True)
 datasets_app = typer.Typer(help="List, check and export published data sets.", no_args_is_help=True)
-cache_app = typer.Typer(help="Show or prune the caches of finished views.", invoke_without_command=True)
+cache_app = typer.Typer(help="Show or prune the caches of a results folder.", invoke_without_command=True)
 langsplat_app = typer.Typer(
     help="Read or write LangSplat's files of masks and CLIP vectors.", no_args_is_help=True
 )

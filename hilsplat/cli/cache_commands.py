@@ -1,4 +1,4 @@
-"""The caches of finished views."""
+"""The caches: finished views, checkpoints of fits, training data of the embedded models, model digests."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,10 +6,7 @@ from typing import Annotated
 import typer
 
 from hilsplat.cli.apps import cache_app
-from hilsplat.cli.stage import (
-    DEFAULT_CACHE,
-    start_logging,
-)
+from hilsplat.cli.stage import DEFAULT_CACHE, start_logging
 
 
 @cache_app.callback()
@@ -17,8 +14,8 @@ def cache_show(
     context: typer.Context,
     folder: Annotated[Path, typer.Option(help="cache folder")] = DEFAULT_CACHE,
 ) -> None:
-    """Show the size of the caches of finished views."""
-    start_logging(None)
+    """Show the size of each cache."""
+    start_logging()
     from hilsplat.base.cache import size_table
 
     context.obj = folder
@@ -37,10 +34,14 @@ def cache_prune(
         typer.Option(min=0, help="delete the least recently used entries until this much is left"),
     ] = None,
     stage: Annotated[
-        list[str] | None, typer.Option(help="cache to prune: masks, clip or contributions; default: all")
+        list[str] | None,
+        typer.Option(
+            help="cache to prune: masks, clip, contributions or gaussians (checkpoints of fits, kept for a "
+            "day); default: all, but gaussians only with --days"
+        ),
     ] = None,
 ) -> None:
-    """Delete what killed jobs left unfinished and, with a limit, cached views: they are computed again."""
+    """Delete unfinished files of killed jobs and, with a limit, cache entries, which are computed again."""
     from hilsplat.base.cache import prune_cache, size_table
 
     number, freed_mib = prune_cache(context.obj, stage or [], days=days, max_mib=max_mib)

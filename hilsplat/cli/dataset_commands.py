@@ -8,7 +8,6 @@ import typer
 from hilsplat.cli.apps import datasets_app
 from hilsplat.cli.stage import (
     DataRoot,
-    Log,
     PathOut,
     Results,
     Threads,
@@ -22,7 +21,7 @@ def datasets_list(
     data_root: Annotated[Path | None, typer.Option(help="folder that holds the data sets")] = None,
 ) -> None:
     """List the data sets: citation, licence, layout and, with --data-root, the scenes found."""
-    start_logging(None)
+    start_logging()
     from hilsplat.datasets.overview import overview
 
     typer.echo(overview(data_root))
@@ -35,7 +34,7 @@ def datasets_check(
     scene: Annotated[list[str] | None, typer.Option(help="scene to read; default: all found")] = None,
 ) -> None:
     """Read all labels of a data set and report, scene by scene, what was found and what is wrong."""
-    start_logging(None)
+    start_logging()
     from hilsplat.datasets.overview import check
     from hilsplat.datasets.registry import dataset_of
 
@@ -50,12 +49,13 @@ def datasets_export(
     name: Annotated[str, typer.Argument(help="scene with labelled points, such as scannet/scene0000_00")],
     data_root: DataRoot,
     out: PathOut,
-    log: Log = None,
 ) -> None:
     """Write the images and poses of a scene as a folder that `poses` imports."""
     from hilsplat.datasets.registry import readers_of
+    from hilsplat.datasets.sources import DATA_PREFIX, image_files
 
-    with stage("source", out, log, plugins=readers_of([name])):
+    files = image_files(f"{DATA_PREFIX}{name}", str(data_root))
+    with stage("source", out, plugins=readers_of([name]), inputs={"files": files}):
         from hilsplat.datasets.sources import export_images
 
         export_images(name, data_root, out)
@@ -86,7 +86,7 @@ def datasets_fits(
     }
     from hilsplat.datasets.registry import readers_of
 
-    with stage("label_fits", target, None, inputs=inputs, plugins=readers_of([name])):
+    with stage("label_fits", target, inputs=inputs, plugins=readers_of([name])):
         from hilsplat.evaluate.diagnostics.label_fits import run_label_fits
 
         table = run_label_fits(folder, variant, name, data_root, target, threads)

@@ -9,7 +9,6 @@ from hilsplat.cli.apps import app, langsplat_app
 from hilsplat.cli.stage import (
     DEFAULT_CACHE,
     Cache,
-    Log,
     Memory,
     PathIn,
     PathOut,
@@ -30,12 +29,11 @@ def clip(
     cache: Cache = DEFAULT_CACHE,
     threads: Threads = 1,
     memory: Memory = None,
-    log: Log = None,
 ) -> None:
     """Embed each mask with CLIP."""
     section = section_of("clip", settings)
     inputs = {"scene": scene, "masks": masks, **model_input(section)}
-    with stage("clip", out, log, settings=section, threads=threads, inputs=inputs):
+    with stage("clip", out, settings=section, threads=threads, inputs=inputs):
         from hilsplat.embed.stage import run_clip
 
         run_clip(scene, masks, out, cache, section, threads, memory)
@@ -51,25 +49,24 @@ def langsplat_read(
         bool, typer.Option(help="accept maps of another size and take the nearest pixel")
     ] = False,
     settings: Annotated[str, typer.Option(help="section clip as JSON; its model embeds the texts")] = "{}",
-    log: Log = None,
 ) -> None:
     """Import masks and CLIP vectors from LangSplat's preprocessing, instead of running masks and clip."""
     section = section_of("clip", settings)
     inputs = {"scene": scene, "files": files}
-    with stage("langsplat", masks, log, inputs=inputs):
+    with stage("langsplat", masks, inputs=inputs):
         from hilsplat.embed.langsplat_files import read_masks
 
         read_masks(scene, files, masks, resize)
-    with stage("langsplat", clip, log, settings=section, inputs={**inputs, "masks": masks}):
+    with stage("langsplat", clip, settings=section, inputs={**inputs, "masks": masks}):
         from hilsplat.embed.langsplat_files import read_clip
 
         read_clip(scene, files, clip, resize, section)
 
 
 @langsplat_app.command("write")
-def langsplat_write(masks: PathIn, clip: PathIn, out: PathOut, log: Log = None) -> None:
+def langsplat_write(masks: PathIn, clip: PathIn, out: PathOut) -> None:
     """Write masks and CLIP vectors in the format of LangSplat's preprocessing."""
-    with stage("langsplat", out, log, inputs={"masks": masks, "clip": clip}):
+    with stage("langsplat", out, inputs={"masks": masks, "clip": clip}):
         from hilsplat.embed.langsplat_files import write_langsplat
 
         write_langsplat(masks, clip, out)

@@ -9,7 +9,6 @@ import typer
 from hilsplat.cli.apps import app
 from hilsplat.cli.stage import (
     DataRoot,
-    Log,
     PathIn,
     PathOut,
     Results,
@@ -60,21 +59,19 @@ def evaluate(
     variant: Annotated[str, typer.Option(help="variant to name in the scores")] = "default",
     settings: Settings = "{}",
     threads: Threads = 1,
-    log: Log = None,
 ) -> None:
     """Query every annotated text in every test view, or every labelled view, and score the answers."""
     section = section_of("evaluate", settings)
     parts = _parts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
-    inputs = {**parts.as_inputs(), **({"truth": truth} if truth else {})}
+    inputs = {**parts.as_inputs(), **_truth_inputs(truth, labels or (), data_root)}
     with stage(
         "evaluate",
         out,
-        log,
         settings=section,
         threads=threads,
         inputs=inputs,
         plugins=_readers(labels or ()),
-        beside=(out.with_name("times.csv"),),
+        beside=(out.with_name("times.csv"), out.with_name("instances.npz")),
     ):
         from hilsplat.evaluate.stage import run_evaluate
 
@@ -113,12 +110,11 @@ def evaluate_files(
             min=1, help="smaller true regions of a synthetic scene are not scored, as in its settings"
         ),
     ] = None,
-    log: Log = None,
 ) -> None:
     """Score masks or point labels that any program wrote, under the same protocols."""
-    inputs = {"predictions": predictions, **({"truth": truth} if truth else {})}
+    inputs = {"predictions": predictions, **_truth_inputs(truth, [labels] if labels else [], data_root)}
     inputs |= {"scene": scene} if scene else {}
-    with stage("evaluate_files", out, log, inputs=inputs, plugins=_readers([labels] if labels else [])):
+    with stage("evaluate_files", out, inputs=inputs, plugins=_readers([labels] if labels else [])):
         from hilsplat.evaluate.files_stage import run_evaluate_files
 
         run_evaluate_files(
@@ -142,6 +138,16 @@ def _readers(labels: Sequence[str]) -> tuple[str, ...]:
     return readers_of(labels)
 
 
+def _truth_inputs(
+    truth: Path | None, labels: Sequence[str], data_root: Path
+) -> dict[str, Path | Sequence[Path]]:
+    """Return the annotations and label files that a stage scores against."""
+    from hilsplat.datasets.sources import label_files
+
+    found: dict[str, Path | Sequence[Path]] = {"truth": truth} if truth else {}
+    return found | {f"labels {name}": label_files(name, str(data_root)) for name in labels}
+
+
 def _parts(*paths: Path) -> "SceneParts":
     """The parts of a scene, in the order of `SceneParts`."""
     from hilsplat.scene.finished import SceneParts
@@ -161,13 +167,12 @@ def table(
     absent: Annotated[
         list[str] | None, typer.Option(help="a sentence about what was not measured, and why")
     ] = None,
-    log: Log = None,
 ) -> None:
     """Build one table of the paper, with reported, measured and stand-in rows."""
     scores = scores or []
     inputs = {"published": published, **{f"scores {number}": path for number, path in enumerate(scores)}}
     beside = tuple(out.with_suffix(ending) for ending in (".md", ".tex", ".html"))
-    with stage("table", out, log, inputs=inputs, beside=beside):
+    with stage("table", out, inputs=inputs, beside=beside):
         from hilsplat.evaluate.tables.build import run_table
 
         run_table(name, scores, published, json_option("--labels", labels, dict), out, absent or [])
@@ -191,17 +196,15 @@ def figures(
     settings: Settings = "{}",
     evaluate: EvaluateSection = "{}",
     threads: Threads = 1,
-    log: Log = None,
 ) -> None:
     """Draw the panel of a scene: photograph, masks, field, relevancy, answers, truth."""
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
     parts = _parts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
-    inputs = {**parts.as_inputs(), "fit": fit, **({"truth": truth} if truth else {})}
+    inputs = {**parts.as_inputs(), "fit": fit, **_truth_inputs(truth, [labels] if labels else [], data_root)}
     recorded = {"figures": section, "evaluate": protocol}
     with stage(
         "figures",
         out,
-        log,
         settings=recorded,
         threads=threads,
         inputs=inputs,
@@ -239,16 +242,15 @@ def comparison(
     settings: Settings = "{}",
     evaluate: EvaluateSection = "{}",
     threads: Threads = 1,
-    log: Log = None,
 ) -> None:
     """Compare variants: queries by method, one query in four views, features at three levels."""
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
     recorded, compared = {"figures": section, "evaluate": protocol}, json_option("--variants", variants, list)
     inputs = {f"scores of {variant}": folder / variant / "scores.csv" for variant in compared}
+    inputs |= _truth_inputs(truth, [labels] if labels else [], data_root)
     with stage(
         "comparison",
         out,
-        log,
         settings=recorded,
         threads=threads,
         inputs=inputs,
@@ -277,10 +279,9 @@ def sweep(
     name: Annotated[str, typer.Argument(help="theta or omega")],
     table: Annotated[Path, typer.Option(help="finished CSV of that table")],
     out: Annotated[Path, typer.Option(help="PNG to write, with a PDF beside it")],
-    log: Log = None,
 ) -> None:
     """Plot a sweep from its table: the paper's curves and ours."""
-    with stage("sweep", out, log, inputs={"table": table}):
+    with stage("sweep", out, inputs={"table": table}):
         from hilsplat.evaluate.figures.sweep_plot import run_sweep_plot
 
         run_sweep_plot(name, table, out)
@@ -294,7 +295,7 @@ def efficiency(
     ),
 ) -> None:
     """Print the time of each stage, from the benchmark files of a run."""
-    start_logging(None)
+    start_logging()
     from hilsplat.evaluate.tables.efficiency import run_efficiency
 
     typer.echo(run_efficiency(results, out))

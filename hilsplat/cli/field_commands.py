@@ -8,7 +8,6 @@ from hilsplat.cli.apps import app
 from hilsplat.cli.stage import (
     DEFAULT_CACHE,
     Cache,
-    Log,
     PathIn,
     PathOut,
     Seed,
@@ -28,12 +27,11 @@ def contributions(
     settings: Settings = "{}",
     cache: Cache = DEFAULT_CACHE,
     threads: Threads = 1,
-    log: Log = None,
 ) -> None:
     """Compute the weight of each Gaussian in each mask, in one pass over the views."""
     section = section_of("contributions", settings)
     inputs = {"scene": scene, "gaussians": gaussians, "masks": masks}
-    with stage("contributions", out, log, settings=section, threads=threads, inputs=inputs):
+    with stage("contributions", out, settings=section, threads=threads, inputs=inputs, device=section.device):
         from hilsplat.contributions.stage import run_contributions
 
         run_contributions(scene, gaussians, masks, out, cache, section, threads)
@@ -47,12 +45,11 @@ def semantic_tree(
     out: PathOut,
     settings: Settings = "{}",
     threads: Threads = 1,
-    log: Log = None,
 ) -> None:
     """Link the masks of all views into nodes at three levels."""
     section = section_of("semantic_tree", settings)
     inputs = {"contributions": contributions, "masks": masks, "clip": clip}
-    with stage("semantic_tree", out, log, settings=section, threads=threads, inputs=inputs):
+    with stage("semantic_tree", out, settings=section, threads=threads, inputs=inputs):
         from hilsplat.semantic_tree.tree import run_semantic_tree
 
         run_semantic_tree(contributions, masks, clip, out, section, threads)
@@ -66,12 +63,11 @@ def autoencoder(
     out: PathOut,
     settings: Settings = "{}",
     seed: Seed = 0,
-    log: Log = None,
 ) -> None:
     """Make the scene's code of CLIP vectors (PCA or autoencoder) and encode the masks."""
     section = section_of("autoencoder", settings)
     inputs = {"clip": clip, "semantic_tree": semantic_tree, "contributions": contributions}
-    with stage("autoencoder", out, log, settings=section, seed=seed, inputs=inputs):
+    with stage("autoencoder", out, settings=section, seed=seed, inputs=inputs):
         from hilsplat.field.autoencoder import run_autoencoder
 
         run_autoencoder(clip, semantic_tree, contributions, out, section, seed)
@@ -85,12 +81,11 @@ def field(
     out: PathOut,
     settings: Settings = "{}",
     threads: Threads = 1,
-    log: Log = None,
 ) -> None:
     """Solve the language field: regression, L_h, L_ins and L_part over three levels."""
     section = section_of("field", settings)
     inputs = {"contributions": contributions, "coverage_tree": coverage_tree, "autoencoder": autoencoder}
-    with stage("field", out, log, settings=section, threads=threads, inputs=inputs):
+    with stage("field", out, settings=section, threads=threads, inputs=inputs):
         from hilsplat.field.field import run_field
 
         run_field(contributions, coverage_tree, autoencoder, out, section, threads)
@@ -108,7 +103,6 @@ def field_reference(
     device: Annotated[str, typer.Option(help="rasteriser: auto, cpu or cuda")] = "auto",
     seed: Seed = 0,
     threads: Threads = 1,
-    log: Log = None,
 ) -> None:
     """Train a field by rendering one random view per step: the slow reference for the solver."""
     section = section_of("reference", settings)
@@ -119,7 +113,7 @@ def field_reference(
         "contributions": contributions,
         "autoencoder": autoencoder,
     }
-    with stage("field_reference", out, log, settings=section, seed=seed, threads=threads, inputs=inputs):
+    with stage("field_reference", out, settings=section, seed=seed, threads=threads, inputs=inputs):
         from hilsplat.field.reference_trainer import run_reference
 
         run_reference(
@@ -138,7 +132,6 @@ def method(
     settings: Settings = "{}",
     seed: Seed = 0,
     threads: Threads = 1,
-    log: Log = None,
 ) -> None:
     """Compute the language field by a baseline (name in the settings)."""
     section = section_of("method", settings)
@@ -149,9 +142,7 @@ def method(
 
     parts = MethodInputs(scene, gaussians, masks, contributions, autoencoder, threads)
     plugins = (METHODS.places[section.name],) if section.name in METHODS else ()
-    with stage(
-        "method", out, log, settings=section, seed=seed, threads=threads, inputs=inputs, plugins=plugins
-    ):
+    with stage("method", out, settings=section, seed=seed, threads=threads, inputs=inputs, plugins=plugins):
         from hilsplat.methods.stage import run_method
 
         run_method(parts, out, section, seed)

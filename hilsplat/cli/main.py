@@ -23,7 +23,7 @@ from hilsplat.cli.apps import app  # noqa: E402
 
 # `hilsplat --help` lists the commands in this order.
 # isort: off
-from hilsplat.cli import scene_commands, segment_commands, embed_commands  # noqa: E402, F401
+from hilsplat.cli import run_command, scene_commands, segment_commands, embed_commands  # noqa: E402, F401
 from hilsplat.cli import field_commands  # noqa: E402, F401
 from hilsplat.cli import evaluate_commands, user_commands, view_command, cache_commands  # noqa: E402, F401
 from hilsplat.cli import world_commands, model_commands, dataset_commands  # noqa: E402, F401

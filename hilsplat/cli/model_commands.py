@@ -8,7 +8,6 @@ import typer
 from hilsplat.cli.apps import models_app
 from hilsplat.cli.stage import (
     DEFAULT_CACHE,
-    Log,
     Seed,
     Settings,
     Threads,
@@ -38,7 +37,7 @@ def models_get(
     A transfer that was cut goes on where it stopped. HF_ENDPOINT, HF_HOME, HF_TOKEN, HF_HUB_OFFLINE and the
     usual proxy variables are respected.
     """
-    start_logging(None)
+    start_logging()
     from hilsplat.hub.get import get_models
 
     typer.echo(get_models(names or (), out, revision, variant))
@@ -47,7 +46,7 @@ def models_get(
 @models_app.command("list")
 def models_list(folder: Annotated[Path, typer.Option(help="folder of the models")] = MODELS) -> None:
     """List released models and those that are here, with size, licence and use."""
-    start_logging(None)
+    start_logging()
     from hilsplat.hub.overview import models_table
 
     typer.echo(models_table(folder))
@@ -59,7 +58,7 @@ def models_check(
     variant: Annotated[str, typer.Option(help="ending of the networks' names, such as fp16")] = "",
 ) -> None:
     """Describe a model folder, or all that are here, and time one image."""
-    start_logging(None)
+    start_logging()
     from hilsplat.embed.model_check import check_model
     from hilsplat.hub.overview import check_models
 
@@ -72,7 +71,7 @@ def models_check(
 @models_app.command("split")
 def models_split(folder: Annotated[Path, typer.Argument(help="folder of an exported CLIP")]) -> None:
     """Split the model.onnx of an exported CLIP into its image and text networks."""
-    start_logging(None)
+    start_logging()
     from hilsplat.models.clip_split import split_clip
 
     for path in split_clip(folder):
@@ -90,13 +89,12 @@ def models_train(
     stage: Annotated[
         list[str] | None, typer.Option(help="step to run: render, sam or clip; default: all")
     ] = None,
-    log: Log = None,
 ) -> None:
     """Train the small SAM and CLIP on training scenes of the synthetic world.
 
     Training resumes after a kill, and continues if a finished one is given more minutes.
     """
-    start_logging(log)
+    start_logging(timestamps=True)
     from hilsplat.world.tiny.train import train_models
 
     train_models(out, cache, section_of("training", settings), seed, threads, stage)

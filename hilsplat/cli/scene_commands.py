@@ -9,7 +9,6 @@ from hilsplat.cli.apps import app
 from hilsplat.cli.stage import (
     DEFAULT_CACHE,
     Cache,
-    Log,
     PathIn,
     PathOut,
     Seed,
@@ -31,15 +30,15 @@ def new(
     frames: Annotated[int, typer.Option(min=3, max=1000, help="most frames taken from videos")] = 60,
 ) -> None:
     """Add photographs, or the frames of a video, to the scene sheet, and say what is likely to fail."""
-    start_logging(None)
+    start_logging()
     from hilsplat.photos.add import add_scene
-    from hilsplat.workflow.answering import models_of_photographs
+    from hilsplat.workflow.models import models_of_photographs
 
     report = add_scene(sheet, name, photos, frames=frames)
     typer.echo(str(report))
     typer.echo(
         f"\nadded photos/{name} to {sheet}. Next:\n"
-        f"  snakemake --cores 2 --config 'groups=[photos]' 'only=[{name}]'\n"
+        f"  hilsplat run photos/{name}\n"
         f"  hilsplat query photos/{name} 'bear nose'"
     )
     for line in models_of_photographs(sheet.with_name("config.yaml"), name):
@@ -56,11 +55,10 @@ def poses(
     settings: Settings = "{}",
     seed: Seed = 0,
     threads: Threads = 1,
-    log: Log = None,
 ) -> None:
     """Find the cameras of photographs, or import a COLMAP model or transforms.json."""
     section = section_of("poses", settings)
-    with stage("poses", out, log, settings=section, seed=seed, threads=threads, inputs={"images": images}):
+    with stage("poses", out, settings=section, seed=seed, threads=threads, inputs={"images": images}):
         from hilsplat.scene.poses import run_poses
 
         run_poses(images, out, name, unit, render, section, seed, threads)
@@ -79,14 +77,20 @@ def gaussians(
     cache: Cache = DEFAULT_CACHE,
     seed: Seed = 0,
     threads: Threads = 1,
-    log: Log = None,
 ) -> None:
     """Fit 3D Gaussians to the training views, or take your own; a JSON beside them gives the coordinates."""
     section = section_of("gaussians", settings)
     inputs = {"scene": scene, **({"brought": brought} if brought else {})}
     beside = (out.with_suffix(".json"), report)
     with stage(
-        "gaussians", out, log, settings=section, seed=seed, threads=threads, inputs=inputs, beside=beside
+        "gaussians",
+        out,
+        settings=section,
+        seed=seed,
+        threads=threads,
+        inputs=inputs,
+        beside=beside,
+        device=section.device,
     ):
         from hilsplat.splat.fit import run_gaussians
 

@@ -10,7 +10,6 @@ from hilsplat.cli.apps import app
 from hilsplat.cli.stage import (
     DEFAULT_CACHE,
     Cache,
-    Log,
     Memory,
     PathIn,
     PathOut,
@@ -35,12 +34,11 @@ def masks(
     cache: Cache = DEFAULT_CACHE,
     threads: Threads = 1,
     memory: Memory = None,
-    log: Log = None,
 ) -> None:
     """Segment each training view at three levels."""
     section = section_of("masks", settings)
     if section.segmenter == "truth-perturbed":
-        _masks_from_truth(scene, truth, out, section, section_of("perturb", perturb), threads, log)
+        _masks_from_truth(scene, truth, out, section, section_of("perturb", perturb), threads)
         return
     if truth is not None:
         raise HilsplatError(
@@ -49,14 +47,14 @@ def masks(
             fix="leave out --truth, or set masks.segmenter: truth-perturbed, a diagnostic",
         )
     inputs = {"scene": scene, **(model_input(section) if section.segmenter == "sam" else {})}
-    with stage("masks", out, log, settings=section, threads=threads, inputs=inputs):
+    with stage("masks", out, settings=section, threads=threads, inputs=inputs):
         from hilsplat.segment.stage import run_masks
 
         run_masks(scene, out, cache, section, threads, memory)
 
 
 def _masks_from_truth(
-    scene: Path, truth: Path | None, out: Path, section: Any, faults: Any, threads: int, log: Path | None
+    scene: Path, truth: Path | None, out: Path, section: Any, faults: Any, threads: int
 ) -> None:
     """Run the diagnostic segmenter, which is a separate stage in provenance and code."""
     if truth is None:
@@ -66,17 +64,18 @@ def _masks_from_truth(
             fix="name the folder, or choose masks.segmenter: sam or graph",
         )
     inputs = {"scene": scene, "truth": truth}
-    with stage("truth_masks", out, log, settings=faults, seed=faults.seed, threads=threads, inputs=inputs):
+    recorded = {"masks": section, "perturb": faults}
+    with stage("truth_masks", out, settings=recorded, seed=faults.seed, threads=threads, inputs=inputs):
         from hilsplat.datasets.synthetic.truth_masks import run_truth_masks
 
         run_truth_masks(scene, truth, out, faults, section.min_area_px, threads)
 
 
 @app.command("coverage-tree")
-def coverage_tree(masks: PathIn, out: PathOut, settings: Settings = "{}", log: Log = None) -> None:
+def coverage_tree(masks: PathIn, out: PathOut, settings: Settings = "{}") -> None:
     """Find the parent of each mask: the coverage tree of each view."""
     section = section_of("coverage_tree", settings)
-    with stage("coverage_tree", out, log, settings=section, inputs={"masks": masks}):
+    with stage("coverage_tree", out, settings=section, inputs={"masks": masks}):
         from hilsplat.segment.coverage_stage import run_coverage_tree
 
         run_coverage_tree(masks, out, section)
@@ -93,7 +92,7 @@ def show_masks(
     view: Annotated[str | None, typer.Option(help="name of the view; default: the middle one")] = None,
 ) -> None:
     """Draw a view's masks at three levels, and its coverage trees."""
-    start_logging(None)
+    start_logging()
     from hilsplat.segment.pictures import masks_overview
 
     typer.echo(f"wrote {out}, view {masks_overview(scene, masks, out, view, coverage_tree)}")

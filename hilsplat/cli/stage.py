@@ -1,18 +1,19 @@
-"""What surrounds every command: options, log, lock, disk space, provenance."""
+"""Options that commands share, and the log, lock and provenance around each stage."""
 
 import logging
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
-from hilsplat.base.artifacts import output_lock, parse_json, require_free_space
+from hilsplat.base.artifacts import output_lock, parse_json, provenance_path, require_free_space
 from hilsplat.base.errors import HilsplatError, SettingsError, place_error
-from hilsplat.base.progress import in_run, share_told
+from hilsplat.base.files import project_path
+from hilsplat.base.progress import LOG_FORMAT
 from hilsplat.workflow.stages import stage_code
 
 PathIn = Annotated[Path, typer.Option(help="input artifact", show_default=False)]
@@ -28,7 +29,6 @@ Memory = Annotated[
     ),
 ]
 Seed = Annotated[int, typer.Option(min=0, max=2_000_000_000, help="seed for everything random")]
-Log = Annotated[Path | None, typer.Option(help="also write the log to this file")]
 Cache = Annotated[Path, typer.Option(help="folder of the caches of finished views, for resuming")]
 Results = Annotated[Path, typer.Option(help="results folder")]
 DataRoot = Annotated[Path, typer.Option(help="folder that holds the data sets")]
@@ -38,29 +38,20 @@ MIN_FREE_MIB = 200.0
 """A stage does not start with less free space than this."""
 
 
-def start_logging(log: Path | None) -> None:
-    """Send log records to the terminal (short) and, if given, to a file (with times).
+def start_logging(*, timestamps: bool = False) -> None:
+    """Send log records to stderr.
 
-    A run that shows the progress leaves warnings and errors to the terminal; the file has everything.
+    Args:
+        timestamps: start each record with its time, level and logger, unless stderr is a terminal. Rules
+            redirect the stderr of a stage to its log.
     """
     root = logging.getLogger()
     root.setLevel(logging.INFO)
     root.handlers.clear()
-    terminal = logging.StreamHandler(sys.stderr)
-    clear_line = "\r\033[K" if in_run() and sys.stderr.isatty() else ""  # the run's own line is there
-    terminal.setFormatter(logging.Formatter(f"{clear_line}%(message)s"))
-    if in_run() and log is not None:
-        terminal.setLevel(logging.WARNING)
-    root.addHandler(terminal)
-    if log is not None:
-        try:
-            log.parent.mkdir(parents=True, exist_ok=True)
-            log.touch()
-        except OSError as error:
-            raise place_error(error) or error from None
-        file = logging.FileHandler(log, mode="w", encoding="utf-8")
-        file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-        root.addHandler(file)
+    handler = logging.StreamHandler(sys.stderr)
+    if timestamps and not sys.stderr.isatty():
+        handler.setFormatter(logging.Formatter(LOG_FORMAT))
+    root.addHandler(handler)
     for noisy in ("matplotlib", "numba", "PIL", "fontTools", "urllib3"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
 
@@ -69,49 +60,63 @@ def start_logging(log: Path | None) -> None:
 def stage(
     name: str,
     out: Path,
-    log: Path | None,
     *,
     settings: Any = None,
     seed: int | None = None,
     threads: int = 1,
-    inputs: dict[str, Path] | None = None,
+    inputs: Mapping[str, Path | Sequence[Path]] | None = None,
     plugins: tuple[str, ...] = (),
     beside: tuple[Path, ...] = (),
+    device: Literal["auto", "cpu", "cuda"] | None = None,
 ) -> Iterator[None]:
-    """Everything around a stage's one function call: log, lock, disk space, provenance.
+    """Surround a stage's function call with its log, lock, disk space check and provenance.
 
-    `settings` is the section that the stage takes, or several by name; `plugins` are the places of the
-    readers or baselines that it uses (`base.plugins`); `beside` is what it writes besides `out`.
+    Args:
+        name: key of `STAGES`.
+        out: output; its provenance is written beside it.
+        settings: the section that the stage takes, or several sections by name.
+        seed: seed of everything random; None if nothing is random.
+        threads: number of threads.
+        inputs: files and folders that the stage reads, or lists of files, by name.
+        plugins: import paths of the readers or baselines that it uses (`base.plugins`).
+        beside: further outputs.
+        device: setting of the rasteriser's device; provenance records the device that `auto` stands for.
+
+    Raises:
+        HilsplatError: an input is missing, or changed while the stage ran.
     """
-    from hilsplat.base.provenance import write_provenance
+    from hilsplat.base.provenance import Inputs, write_provenance
+    from hilsplat.splat.rasterise.device import choose_device
 
-    start_logging(log)
+    start_logging(timestamps=True)
     os.environ["NUMBA_NUM_THREADS"] = str(max(threads, int(os.environ.get("NUMBA_NUM_THREADS", "1"))))
     try:
-        for what, path in (inputs or {}).items():
-            if not path.exists():
-                raise HilsplatError(
-                    f"{name}: input {what} is missing: {path}", fix="run the stage that writes it"
-                )
         require_free_space(out.parent, MIN_FREE_MIB)
-        with output_lock(out), share_told(log):
+        with output_lock(out):
+            read, code = Inputs(name, inputs or {}), stage_code(name, plugins)
             yield
+            try:
+                read.require_unchanged()
+            except HilsplatError:
+                provenance_path(out).unlink(missing_ok=True)  # the new output is not accepted
+                raise
             write_provenance(
                 out,
                 stage=name,
-                code=stage_code(name, plugins),
+                code=code,
                 command=["hilsplat", *sys.argv[1:]],
                 settings=_recorded(settings),
                 seed=seed,
-                inputs=inputs or {},
+                inputs=read,
                 beside=beside,
                 plugins=plugins,
+                device=None if device is None else choose_device(device),
             )
     except HilsplatError:
         raise
     except Exception as error:  # a bug of ours: the traceback belongs in the log
-        if isinstance(error, OSError) and (told := place_error(error)) is not None:
-            raise told from error
+        if isinstance(error, OSError) and (problem := place_error(error)) is not None:
+            raise problem from error
         logging.getLogger("hilsplat").exception("%s failed on %s", name, out)
         sys.exit(1)
 
@@ -132,7 +137,7 @@ def section_of(name: str, text: str) -> Any:
 
 def model_input(section: Any) -> dict[str, Path]:
     """The model folder of a section as an input; a missing one is for the stage to report."""
-    folder = Path(section.model)
+    folder = project_path(section.model)
     return {"model": folder} if folder.is_dir() else {}
 
 

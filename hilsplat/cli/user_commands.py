@@ -54,7 +54,7 @@ def query(
     Prints score, level, position, size and best views of each answer; writes a picture (panel.png) and the
     answer's Gaussians (selection.ply).
     """
-    start_logging(None)
+    start_logging()
     gc.disable()  # two seconds of work, of which searching for garbage would be a tenth
     try:
         from hilsplat.query.answer import answer
@@ -87,7 +87,7 @@ def export(
     threads: Threads = 2,
 ) -> None:
     """Write the semantic tree of a finished scene as JSON, a picture, and a PLY with nodes per Gaussian."""
-    start_logging(None)
+    start_logging()
     from hilsplat.query.tree_picture import export_tree
 
     typer.echo(export_tree(scene_folder(scene, results), variant, out, threads))
@@ -103,9 +103,9 @@ def scene_folder(scene: str, results: Path) -> Path:
 def verify(
     results: Annotated[Path, typer.Argument(help="results folder, or a copy of it")] = Path("results"),
 ) -> None:
-    """Check every digest of a results folder: what is whole, stale or damaged."""
-    start_logging(None)
-    from hilsplat.workflow.verify import verify
+    """Check every digest of a results folder, and print the Snakemake command that repairs it."""
+    start_logging()
+    from hilsplat.workflow.records import verify
 
     report, is_whole = verify(results)
     typer.echo(report)

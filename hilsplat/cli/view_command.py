@@ -26,7 +26,7 @@ def view(
 
     Shows what exists: Gaussians while the run goes, answers as soon as they are there. Ctrl-C ends it.
     """
-    start_logging(None)
+    start_logging()
     from hilsplat.viewer.app import run_view
 
     folder = scene_folder(scene, results)
@@ -47,7 +47,7 @@ def annotate(
 
     Writes annotated/DATASET/SCENE below the data root after each change; evaluate reads it like any data set.
     """
-    start_logging(None)
+    start_logging()
     from hilsplat.annotate.app import run_annotate
     from hilsplat.scene.scene import Scene
 

@@ -7,7 +7,6 @@ import typer
 
 from hilsplat.cli.apps import world_app
 from hilsplat.cli.stage import (
-    Log,
     PathOut,
     Results,
     Settings,
@@ -24,12 +23,11 @@ def world_make(
     out: PathOut,
     settings: Settings = "{}",
     threads: Threads = 1,
-    log: Log = None,
 ) -> None:
     """Make a synthetic scene: images, and the truth that only evaluate reads."""
     section = section_of("world", settings)
     beside = (out / "images", out / "truth")
-    with stage("world", out, log, settings=section, threads=threads, beside=beside):
+    with stage("world", out, settings=section, threads=threads, beside=beside):
         from hilsplat.world.stage import run_world
 
         run_world(source, section, out, threads)
@@ -42,7 +40,7 @@ def world_show(
     out: Annotated[Path | None, typer.Option(help="PNG to write; default: beside the scene")] = None,
 ) -> None:
     """Draw a contact sheet: views, labels by level, the tree with its texts."""
-    start_logging(None)
+    start_logging()
     from hilsplat.world.sheet import show_world
 
     target = out or results / scene / "world.png"
@@ -55,7 +53,7 @@ def world_classes(
     out: Annotated[Path, typer.Option(help="PNG to write")] = Path("world_classes.png"),
 ) -> None:
     """Draw one object of each class."""
-    start_logging(None)
+    start_logging()
     from hilsplat.world.gallery import draw_classes
 
     draw_classes(out)
@@ -69,7 +67,7 @@ def world_gallery(
     out: Annotated[Path | None, typer.Option(help="PNG to write; default: world_KIND.png")] = None,
 ) -> None:
     """Draw one view of each of some scenes, with its true labels by level."""
-    start_logging(None)
+    start_logging()
     from hilsplat.world.gallery import draw_scenes
 
     target = out or Path(f"world_{kind}.png")
@@ -90,7 +88,7 @@ def world_inconsistency(
     """Measure by exact geometry how often a surface point gets different masks in neighbouring views."""
     truth, masks_folder = results / scene / "world" / "truth", results / scene / variant / "masks"
     target = out or masks_folder.with_name("consistency.csv")
-    with stage("consistency", target, None, inputs={"truth": truth, "masks": masks_folder}):
+    with stage("consistency", target, inputs={"truth": truth, "masks": masks_folder}):
         from hilsplat.evaluate.diagnostics.world_consistency import run_consistency
 
         table = run_consistency(truth, masks_folder, target, neighbours)
@@ -106,14 +104,13 @@ def world_masks(
         Path | None,
         typer.Option(help="PNG to write, with a CSV and a PDF beside it; default: beside the masks"),
     ] = None,
-    log: Log = None,
 ) -> None:
     """Measure masks against the true regions by level, and draw where they fail."""
     folder = results / scene
     truth, masks_folder = folder / "world" / "truth", folder / variant / "masks"
     target = out or masks_folder.with_name("masks_truth.png")
     inputs = {"scene": folder / "scene", "truth": truth, "masks": masks_folder}
-    with stage("mask_truth", target, log, inputs=inputs, beside=(target.with_suffix(".csv"),)):
+    with stage("mask_truth", target, inputs=inputs, beside=(target.with_suffix(".csv"),)):
         from hilsplat.evaluate.diagnostics.mask_truth import run_mask_truth
 
         table = run_mask_truth(folder / "scene", truth, masks_folder, target)
@@ -138,7 +135,7 @@ def world_tree(
         "truth": truth,
         "semantic_tree": semantic_tree,
     }
-    with stage("tree_truth", target, None, inputs=inputs):
+    with stage("tree_truth", target, inputs=inputs):
         from hilsplat.evaluate.diagnostics.tree_truth import run_tree_truth
 
         table = run_tree_truth(inputs["scene"], inputs["gaussians"], semantic_tree, truth, target, threads)

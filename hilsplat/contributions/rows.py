@@ -8,10 +8,10 @@ import scipy.sparse as sp
 from jaxtyping import Float32, Int32, Int64, UInt8
 
 from hilsplat.base.artifacts import read_full_index, read_into, read_npy
-from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.contributions.quadratic import Quadratic, load_quadratic
 from hilsplat.contributions.streams import mapped
+from hilsplat.segment.digests import require_same_masks
 
 
 @dataclass(frozen=True)
@@ -98,18 +98,8 @@ def mask_embeddings(clip_folder: Path, contributions: Contributions) -> Float32[
     """CLIP vectors of all masks, in the contributions' row order.
 
     Raises:
-        MisalignedArtifactError: a view has more or fewer vectors than masks.
+        MisalignedArtifactError: the vectors were computed from other masks.
     """
-    parts = []
-    counts = np.bincount(contributions.view, minlength=len(contributions.views))
-    for view, count in zip(contributions.views, counts, strict=True):
-        vectors = read_npy(Path(clip_folder) / f"{view}.npy")
-        if len(vectors) != count:
-            raise MisalignedArtifactError(
-                f"CLIP vectors of view {view} do not belong to these contributions",
-                expected=f"{count} vectors, one per mask",
-                found=f"{len(vectors)} in {clip_folder}",
-                fix="run the clip and contributions stages again on the same masks",
-            )
-        parts.append(vectors.astype(np.float32))
-    return np.concatenate(parts)
+    require_same_masks(clip_folder, contributions.folder)
+    parts = [read_npy(Path(clip_folder) / f"{view}.npy") for view in contributions.views]
+    return np.concatenate(parts, dtype=np.float32)

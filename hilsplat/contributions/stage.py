@@ -13,6 +13,7 @@ The losses of the language field and the 3D semantic tree need nothing else from
 """
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache as cache_calls
 from pathlib import Path
@@ -21,10 +22,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from hilsplat.base.artifacts import (
-    INDEX,
     ViewCache,
     atomic_folder,
-    read_index,
     sha256_of_bytes,
     sha256_of_file,
     sha256_of_json,
@@ -42,6 +41,7 @@ from hilsplat.contributions.streams import ArrayStream, MatrixStream
 from hilsplat.contributions.view_matrices import MATRICES, label_maps, labelled_rows, view_contributions
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
+from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ContributionsSettings
 from hilsplat.splat.ply import load_ply
@@ -55,27 +55,6 @@ WEIGHTS_PER_PIXEL = 40
 
 MAX_WEIGHTS_TOGETHER = 2**25
 """Views with more weights are prepared one at a time; 256 MiB each, and up to four are waiting."""
-
-
-@dataclass(frozen=True)
-class _View:
-    """One train view: its masks, and the digest of everything its matrices depend on."""
-
-    name: str
-    masks_path: Path
-    key: str
-
-    def masks(self, camera: Camera) -> HierarchicalMasks:
-        """Read the masks and check their size."""
-        masks = HierarchicalMasks.load(self.masks_path)
-        if masks.size_hw != camera.size_hw:
-            raise MisalignedArtifactError(
-                f"masks of view {self.name} do not fit its camera",
-                expected=f"{camera.size_hw[0]} x {camera.size_hw[1]} (height x width)",
-                found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
-                fix="run the masks stage again",
-            )
-        return masks
 
 
 @dataclass(frozen=True)
@@ -110,23 +89,25 @@ def run_contributions(
     `CHECKPOINT_SECONDS` (and one view) before; it rasterises W again for the views that G lacks.
 
     Raises:
-        MisalignedArtifactError: masks and images differ in size.
+        MisalignedArtifactError: masks and images differ in size, or the masks of a view are not those that
+            their index records.
         ArtifactError: no train view has masks.
     """
     scene = Scene.load(scene_folder)
     gaussians = load_ply(gaussians_ply)
     gaussians_sha256 = sha256_of_file(gaussians_ply)
     device = choose_device(settings.device)
-    read_index(masks_folder)
+    digests = digests_in(masks_folder)
     about = {
         "code": code_digest(run_contributions),
         "device": device,
         "gaussians": gaussians_sha256,
         "min_weight": settings.min_weight,
     }
-    views = [_view(scene, name, Path(masks_folder), about) for name in scene.views("train")]
+    cameras = [scene.cameras[name] for name in scene.views("train")]
+    keys = [_key(camera, digests, about) for camera in cameras]
     store = ViewCache(Path(cache) / "contributions", compressed=False)
-    checkpoint = QuadraticCheckpoint(store.folder / "partial", [view.key for view in views], settings.keep)
+    checkpoint = QuadraticCheckpoint(store.folder / "partial", keys, settings.keep)
     rows: dict[str, list[np.ndarray]] = {
         name: [] for name in ("view", "mask", "level", "area_px", "pixels", "half_pixels")
     }
@@ -139,14 +120,15 @@ def run_contributions(
             threads_each = max(1, threads // together)
 
             def prepare(number: int) -> _Prepared:
-                view = views[number]
-                masks = view.masks(scene.cameras[view.name])
+                camera = cameras[number]
+                masks = load_masks(masks_folder, camera.name, digests)
+                _require_fit(masks, camera)
 
                 @cache_calls
                 def weights() -> sp.csr_matrix:
                     raw = pixel_weights(
                         gaussians,
-                        scene.cameras[view.name],
+                        camera,
                         min_weight=settings.min_weight,
                         threads=threads_each,
                         device=device,
@@ -154,13 +136,13 @@ def run_contributions(
                     return normalised_weights(raw)
 
                 part = store.get(
-                    view.key, lambda: view_contributions(view.name, weights(), masks, threads_each)
+                    keys[number], lambda: view_contributions(camera.name, weights(), masks, threads_each)
                 )
                 rows_of_W = labelled_rows(weights(), label_maps(masks)) if number >= summed else None
                 return _Prepared(masks, part, rows_of_W)
 
-            prepared = in_order(prepare, range(len(views)), together)
-            for number, made in enumerate(track(prepared, "contributions of views", len(views))):
+            prepared = in_order(prepare, range(len(cameras)), together)
+            for number, made in enumerate(track(prepared, "contributions of views", len(cameras))):
                 masks, part = made.masks, made.part
                 for name, matrix in matrices.items():
                     matrix.append(*(part[f"{name}_{what}"] for what in ("data", "indices", "indptr")))
@@ -187,7 +169,7 @@ def run_contributions(
         kept = "G" if isinstance(quadratic, Gram) else "W"
         quadratic.save(folder)
         counts |= {
-            "views": len(views),
+            "views": len(cameras),
             "masks": sum(len(part) for part in rows["view"]),
             "kept": kept,
             "nonzeros": quadratic.nonzeros,
@@ -196,12 +178,14 @@ def run_contributions(
         }
         write_index(
             folder,
-            {view.name: {"masks": len(part)} for view, part in zip(views, rows["view"], strict=True)},
+            {
+                camera.name: {MASKS_SHA256: digests[camera.name], "masks": len(part)}
+                for camera, part in zip(cameras, rows["view"], strict=True)
+            },
             scene=scene.name,
             num_gaussians=len(gaussians),
             gaussians_sha256=gaussians_sha256,
             min_weight=settings.min_weight,
-            masks_sha256=sha256_of_file(Path(masks_folder) / INDEX),
             num_masks=counts["masks"],
             quadratic=kept,
             nonzeros={
@@ -213,15 +197,23 @@ def run_contributions(
     checkpoint.forget()
 
 
-def _view(scene: Scene, name: str, masks_folder: Path, about: dict) -> _View:
-    path = masks_folder / f"{name}.npz"
-    camera = scene.cameras[name]
-    key = sha256_of_json(
+def _key(camera: Camera, digests: Mapping[str, str], about: dict) -> str:
+    """Return the digest of everything that the matrices of a view depend on."""
+    return sha256_of_json(
         {
             **about,
-            "masks": sha256_of_file(path),
+            "masks": digests.get(camera.name),
             "camera": sha256_of_bytes(camera.cam_from_world.tobytes(), camera.K.tobytes()),
-            "view": name,
+            "view": camera.name,
         }
     )
-    return _View(name, path, key)
+
+
+def _require_fit(masks: HierarchicalMasks, camera: Camera) -> None:
+    if masks.size_hw != camera.size_hw:
+        raise MisalignedArtifactError(
+            f"masks of view {camera.name} do not fit its camera",
+            expected=f"{camera.size_hw[0]} x {camera.size_hw[1]} (height x width)",
+            found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
+            fix="run the masks stage again",
+        )

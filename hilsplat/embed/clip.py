@@ -12,6 +12,7 @@ from tokenizers import Tokenizer
 from hilsplat.base.artifacts import read_full_index, read_json
 from hilsplat.base.crops import crop_to_square
 from hilsplat.base.errors import MisalignedArtifactError, ModelError
+from hilsplat.base.files import INSTALLED
 from hilsplat.base.parallel import in_order
 from hilsplat.models.folder import ModelFolder, input_side_px, open_model_folder
 from hilsplat.models.network import Network, require_one_space
@@ -19,9 +20,6 @@ from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ClipSettings
 
 logger = logging.getLogger(__name__)
-
-INSTALLED = Path(__file__).resolve().parents[2]
-"""The project that this package runs from; a checkout has its `models/` there."""
 
 SIGLIP_TOKENS = 64
 """Length of every text of a SigLIP whose configuration names none."""

@@ -14,10 +14,18 @@ from jaxtyping import Float16, Float32, Int64
 
 from hilsplat.base.artifacts import atomic_folder, read_index, read_npy, write_index, write_npy
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
-from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.levels import Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, unit
 from hilsplat.scene.scene import Scene
+from hilsplat.segment.digests import (
+    MASKS_SHA256,
+    digest_of,
+    digests_in,
+    index_entry,
+    load_masks,
+    require_same_masks,
+)
 from hilsplat.segment.masks import HierarchicalMasks, runs_of_labels
 from hilsplat.segment.stage import train_views
 from hilsplat.settings import ClipSettings
@@ -147,7 +155,7 @@ def read_masks(scene_folder: Path, files: Path, out: Path, resize: bool) -> None
         index = {}
         for view, (masks, _) in _read_all(scene, files, resize).items():
             masks.save(folder / f"{view}.npz")
-            index[view] = {level.label: len(masks.rows_of(level)) for level in LEVELS}
+            index[view] = index_entry(masks)
         write_index(folder, index, scene=scene.name, segmenter="langsplat", model=None, model_sha256=None)
         counts.update(views=len(index))
 
@@ -163,10 +171,10 @@ def read_clip(scene_folder: Path, files: Path, out: Path, resize: bool, settings
     model = ClipModel.load(Path(settings.model), variant=settings.variant)
     with stage_log("langsplat clip", scene.name) as counts, atomic_folder(out) as folder:
         index = {}
-        for view, (_, vectors) in _read_all(scene, files, resize).items():
+        for view, (masks, vectors) in _read_all(scene, files, resize).items():
             model.require_width(vectors.shape[1], f"{files / stem_of(view)}_f.npy")
             write_npy(folder / f"{view}.npy", vectors)
-            index[view] = {"masks": len(vectors)}
+            index[view] = {MASKS_SHA256: digest_of(masks), "masks": len(vectors)}
         write_index(
             folder,
             index,
@@ -203,21 +211,15 @@ def write_langsplat(masks_folder: Path, clip_folder: Path, out: Path) -> None:
     """Write `<stem>_s.npy` and `<stem>_f.npy` of every view that has masks.
 
     Raises:
-        MisalignedArtifactError: a view has more or fewer vectors than masks.
+        MisalignedArtifactError: the vectors were computed from other masks.
     """
-    index = read_index(masks_folder)
-    stems = _stems(list(index["views"]))
-    with stage_log("langsplat write", index["scene"]) as counts, atomic_folder(out) as folder:
+    scene, digests = read_index(masks_folder)["scene"], digests_in(masks_folder)
+    require_same_masks(clip_folder, masks_folder)
+    stems = _stems(list(digests))
+    with stage_log("langsplat write", scene) as counts, atomic_folder(out) as folder:
         for view, stem in stems.items():
-            masks = HierarchicalMasks.load(Path(masks_folder) / f"{view}.npz")
+            masks = load_masks(masks_folder, view, digests)
             vectors = read_npy(Path(clip_folder) / f"{view}.npy")
-            if len(vectors) != len(masks):
-                raise MisalignedArtifactError(
-                    f"masks and vectors of view {view} do not belong together",
-                    expected=f"{len(masks)} vectors, one per mask",
-                    found=f"{len(vectors)}",
-                    fix="run the clip stage again",
-                )
             maps, rows = maps_of(masks)
             write_npy(folder / f"{stem}_s.npy", maps)
             write_npy(folder / f"{stem}_f.npy", vectors[rows].astype(np.float32))

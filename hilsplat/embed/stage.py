@@ -2,13 +2,13 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from hilsplat.base.artifacts import (
     ViewCache,
     atomic_folder,
-    read_index,
     sha256_of_file,
     sha256_of_json,
     write_index,
@@ -21,7 +21,7 @@ from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel
 from hilsplat.models.memory import available_mib, needs_of
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks
 from hilsplat.settings import ClipSettings
 
 
@@ -47,21 +47,22 @@ def run_clip(
         memory_mib: memory that the stage may use; None: what is free.
 
     Raises:
-        MisalignedArtifactError: the masks belong to other views, or have other sizes, than the scene's.
+        MisalignedArtifactError: the masks belong to other views or sizes than the scene's, or are not
+            those that their index records.
     """
     scene = Scene.load(scene_folder)
-    views = list(read_index(masks_folder)["views"])
+    digests = digests_in(masks_folder)
+    views = list(digests)
     model = ClipModel.load(Path(settings.model), variant=settings.variant)
     needs = needs_of(model.model, settings.batch)
     threads = needs.views_at_once(threads, min(memory_mib or math.inf, available_mib()))
     view_cache = ViewCache(Path(cache) / "clip")
 
     def embed(view: str) -> np.ndarray:
-        masks_path = Path(masks_folder) / f"{view}.npz"
         key = sha256_of_json(
             {
                 "image": sha256_of_file(scene.image_path(view)),
-                "masks": sha256_of_file(masks_path),
+                "masks": digests[view],
                 "model": model.digest,
                 "providers": model.vision.providers,
                 "settings": settings.model_dump(exclude={"model", "variant"}),
@@ -70,7 +71,7 @@ def run_clip(
         )
 
         def compute() -> dict[str, np.ndarray]:
-            masks = HierarchicalMasks.load(masks_path)
+            masks = load_masks(masks_folder, view, digests)
             if masks.size_hw != scene.cameras[view].size_hw:
                 raise MisalignedArtifactError(
                     f"masks of view {view} of {scene.name} do not fit its camera",
@@ -91,12 +92,12 @@ def run_clip(
             fix="run the masks stage again for this scene",
         )
     with stage_log("clip", scene.name) as counts, atomic_folder(out) as folder:
-        index: dict[str, dict[str, int]] = {}
+        index: dict[str, dict[str, Any]] = {}
         found = in_order(embed, views, threads)
         dimensions = 0
         for view, vectors in zip(views, track(found, "CLIP of views", len(views)), strict=True):
             write_npy(folder / f"{view}.npy", vectors)
-            index[view] = {"masks": len(vectors)}
+            index[view] = {MASKS_SHA256: digests[view], "masks": len(vectors)}
             dimensions = vectors.shape[1]
         write_index(
             folder,

@@ -21,15 +21,11 @@ def instances_path(scores: Path) -> Path:
 
 
 def write_instances(scores: Path, matches: Mapping[tuple[str, ...], "InstanceMatches"]) -> None:
-    """Write a scene's matches by (data set, scene, variant, masks, method); without any, remove the file."""
-    path = instances_path(scores)
-    if not matches:
-        path.unlink(missing_ok=True)
-        return
+    """Write a scene's matches by (data set, scene, variant, masks, method); the file may hold none."""
     arrays = {
         "/".join([*key, name]): getattr(found, name) for key, found in matches.items() for name in FIELDS
     }
-    write_npz(path, **arrays)
+    write_npz(instances_path(scores), **arrays)
 
 
 def read_instances(scores: Iterable[Path]) -> dict[tuple[str, ...], "InstanceMatches"]:

@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Float32
 
 from hilsplat.base.artifacts import atomic_folder, read_index, sha256_of_file, write_index, write_npz
-from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.progress import stage_log
 from hilsplat.contributions.rows import Contributions, mask_embeddings
 from hilsplat.field.code import Code, autoencoder_file
 from hilsplat.field.linear_code import LinearCode
+from hilsplat.segment.digests import MASKS_SHA256, digests_in, require_same_masks
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import AutoencoderSettings
 
@@ -45,16 +45,13 @@ def run_autoencoder(
     """Train the scene's autoencoder and encode every mask.
 
     Writes `autoencoder.safetensors`, `latents.npz` (rows as in the contributions) and `index.json`.
+
+    Raises:
+        MisalignedArtifactError: the semantic tree or the CLIP vectors belong to other masks.
     """
     contributions = Contributions.load(contributions_folder)
     tree = SemanticTree.load(semantic_tree_folder)
-    if len(tree.node_of_mask) != len(contributions):
-        raise MisalignedArtifactError(
-            f"{semantic_tree_folder} and {contributions_folder} belong to different masks",
-            expected=f"{len(contributions)} masks",
-            found=f"{len(tree.node_of_mask)}",
-            fix="rerun the semantic_tree stage",
-        )
+    require_same_masks(semantic_tree_folder, contributions_folder)
     clip = mask_embeddings(clip_folder, contributions)
     target, train = mask_targets(clip, tree, settings.targets)
     with stage_log("autoencoder", read_index(contributions_folder)["scene"]) as counts:
@@ -75,7 +72,7 @@ def run_autoencoder(
             write_npz(folder / "latents.npz", latents=latents)
             write_index(
                 folder,
-                {view: {} for view in contributions.views},
+                {view: {MASKS_SHA256: digest} for view, digest in digests_in(contributions_folder).items()},
                 code=settings.code,
                 channels=model.channels,
                 latent=model.latent,

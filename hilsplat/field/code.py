@@ -7,10 +7,11 @@ import numpy as np
 from jaxtyping import Float32
 from safetensors import SafetensorError, safe_open
 
-from hilsplat.base.artifacts import parse_json, read_index, read_npz, remake
-from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.base.artifacts import parse_json, read_npz, remake
+from hilsplat.base.errors import ArtifactError
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.linear_code import METADATA_KEY, LinearCode
+from hilsplat.segment.digests import require_same_masks
 
 CHUNK_ROWS = 4096
 """Rows to decode at once: 4096 vectors of 128 numbers, 2 MiB, stay in the processor's cache."""
@@ -64,18 +65,10 @@ def autoencoder_file(folder: Path) -> Path:
 
 
 def load_latents(folder: Path, contributions: Contributions) -> Float32[np.ndarray, "M D"]:
-    """Latent of each mask, checked against the contributions' rows.
+    """Return the latent of each mask, in the contributions' row order.
 
     Raises:
-        MisalignedArtifactError: the numbers of rows differ.
+        MisalignedArtifactError: the latents belong to other masks.
     """
-    read_index(folder)
-    latents = read_npz(Path(folder) / "latents.npz", "latents")["latents"]
-    if len(latents) != len(contributions):
-        raise MisalignedArtifactError(
-            f"latents of {folder} do not belong to these contributions",
-            expected=f"{len(contributions)} rows",
-            found=f"{len(latents)} rows",
-            fix="run the autoencoder stage again",
-        )
-    return latents
+    require_same_masks(folder, contributions.folder)
+    return read_npz(Path(folder) / "latents.npz", "latents")["latents"]

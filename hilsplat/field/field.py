@@ -12,7 +12,6 @@ import numpy as np
 
 from hilsplat.base.artifacts import read_index, read_npz, sha256_of_file, write_json
 from hilsplat.base.device import compute_device
-from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.progress import stage_log
 from hilsplat.contributions.mask_operator import MaskOperator, MaskProducts
 from hilsplat.contributions.rows import Contributions
@@ -21,6 +20,7 @@ from hilsplat.field.contrast import Contrast, view_relations
 from hilsplat.field.language_field import LanguageField, report_path
 from hilsplat.field.problem import QuadraticProblem
 from hilsplat.field.solver import keep_labelled, solve_field
+from hilsplat.segment.digests import require_same_masks
 from hilsplat.settings import FieldSettings
 
 logger = logging.getLogger(__name__)
@@ -96,19 +96,9 @@ def read_parents(tree_folder: Path, contributions: Contributions) -> dict[str, n
     """Parent of each mask in the coverage tree of each view.
 
     Raises:
-        MisalignedArtifactError: a tree has more or fewer masks than the contributions.
+        MisalignedArtifactError: the trees were computed from other masks.
     """
-    read_index(tree_folder)
-    counts = np.bincount(contributions.view, minlength=len(contributions.views))
-    parents = {}
-    for view, count in zip(contributions.views, counts, strict=True):
-        parent = read_npz(Path(tree_folder) / f"{view}.npz", "parent")["parent"]
-        if len(parent) != count:
-            raise MisalignedArtifactError(
-                f"the coverage tree of view {view} belongs to other masks",
-                expected=f"{count} masks",
-                found=f"{len(parent)} in {tree_folder}",
-                fix="rerun the coverage_tree and contributions stages on the same masks",
-            )
-        parents[view] = parent
-    return parents
+    require_same_masks(tree_folder, contributions.folder)
+    return {
+        view: read_npz(Path(tree_folder) / f"{view}.npz", "parent")["parent"] for view in contributions.views
+    }

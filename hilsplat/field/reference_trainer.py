@@ -31,7 +31,7 @@ from hilsplat.field.language_field import LanguageField, report_path
 from hilsplat.field.losses.latent_regression import latent_regression_loss
 from hilsplat.scene.finished import require_same
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.digests import digests_in, load_masks
 from hilsplat.settings import ReferenceSettings
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import draw
@@ -116,7 +116,7 @@ def run_reference(
         device: "auto", "cpu" or "cuda" for the rasteriser.
 
     Raises:
-        MisalignedArtifactError: the contributions belong to other Gaussians.
+        MisalignedArtifactError: the contributions belong to other Gaussians or other masks.
     """
     scene = Scene.load(scene_folder)
     gaussians = load_ply(gaussians_ply)
@@ -124,7 +124,8 @@ def run_reference(
     require_same("contributions", scene.name, gaussians_ply, contributions.gaussians_sha256)
     latents = load_latents(autoencoder_folder, contributions)
     views = contributions.views
-    labels = [label_maps(HierarchicalMasks.load(Path(masks_folder) / f"{view}.npz")) for view in views]
+    digests = digests_in(contributions_folder)
+    labels = [label_maps(load_masks(masks_folder, view, digests)) for view in views]
     own_latents = [latents[rows] for rows in contributions.rows_of_views()]
     chosen = choose_device(device)
     shape = (len(gaussians), len(LEVELS) * latents.shape[1])

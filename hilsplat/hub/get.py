@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hilsplat.base.artifacts import full_disk_told, output_lock, read_json, work_folder, write_json
+from hilsplat.base.artifacts import explain_full_disk, output_lock, read_json, work_folder, write_json
 from hilsplat.base.errors import DiskSpaceError, DownloadError
 from hilsplat.base.progress import transfer_bar
 from hilsplat.embed.model_check import check_model
@@ -219,7 +219,7 @@ def _install(found: Prepared) -> str:
         return _place(found, found.staging)
     with work_folder(found.target) as temporary:
         made = temporary / found.target.name
-        with full_disk_told(made):
+        with explain_full_disk(made):
             versions = export_networks(found.staging, made)
         text = _place(found, made, exported=versions)
     shutil.rmtree(found.staging)

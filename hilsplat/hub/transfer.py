@@ -14,7 +14,7 @@ import huggingface_hub
 import requests
 from huggingface_hub.utils import build_hf_headers, get_session, hf_raise_for_status
 
-from hilsplat.base.artifacts import full_disk_told
+from hilsplat.base.artifacts import explain_full_disk
 from hilsplat.base.errors import DownloadError
 from hilsplat.hub.listing import HubFile, Listing
 
@@ -54,7 +54,7 @@ def fetch(listing: Listing, file: HubFile, target: Path, tell: Callable[[int], N
         cached = file.cached or huggingface_hub.try_to_load_from_cache(
             listing.repository, file.path, revision=listing.revision
         )
-        with full_disk_told(target):
+        with explain_full_disk(target):
             if isinstance(cached, str | Path):
                 shutil.copyfile(cached, part)
             else:

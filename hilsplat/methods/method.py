@@ -23,6 +23,7 @@ from hilsplat.field.linear_code import LinearCode
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.finished import require_same
 from hilsplat.scene.scene import Scene
+from hilsplat.segment.digests import digests_in, load_masks
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import MethodSettings
 from hilsplat.splat.ply import load_ply
@@ -70,9 +71,13 @@ class MethodInputs:
         )
         return normalised_weights(weights)
 
+    def view_masks(self, view: str) -> HierarchicalMasks:
+        """Return the masks of a view, checked to be those of the contributions."""
+        return load_masks(self.masks_folder, view, digests_in(self.contributions_folder))
+
     def view_labels(self, view: str) -> Int32[np.ndarray, "P 3"]:
         """Row of the view's painted mask at each pixel and level, -1 for none."""
-        return label_maps(HierarchicalMasks.load(Path(self.masks_folder) / f"{view}.npz"))
+        return label_maps(self.view_masks(view))
 
     def view_size_hw(self, view: str) -> tuple[int, int]:
         """Height and width of a view, px."""

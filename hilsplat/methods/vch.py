@@ -18,8 +18,6 @@ Departs:
     - the authors know no text.
 """
 
-from pathlib import Path
-
 import numpy as np
 import scipy.sparse as sp
 import torch
@@ -36,7 +34,6 @@ from hilsplat.methods.common.pixels import LabelledView, labelled_views
 from hilsplat.methods.common.training import alike, product, train, unit
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.segment.coverage import coverage_tree
-from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import CoverageTreeSettings, MethodSettings
 
 CHANNELS = 16
@@ -227,7 +224,7 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     views = labelled_views(inputs, settings.pixel_step)
     trees = {}
     for view in views:
-        masks = HierarchicalMasks.load(Path(inputs.masks_folder) / f"{contributions.views[view.number]}.npz")
+        masks = inputs.view_masks(contributions.views[view.number])
         trees[view.number] = (masks.level, coverage_tree(masks, CoverageTreeSettings().theta)[0])
     features = train_features(views, trees, contributions.num_gaussians, settings, seed)
     return cluster_field(inputs, components(features, contributions.means(), thresholds))

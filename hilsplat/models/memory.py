@@ -1,4 +1,4 @@
-"""How much memory a model takes at run time, so that as many views run at once as fit."""
+"""Memory that a model takes and memory that is free, from which follows how many views run at once."""
 
 import os
 from dataclasses import dataclass
@@ -88,26 +88,60 @@ def _crop_mib(vision: dict[str, Any], side_px: int) -> float:
     return 2 * _attention_mib(vision, side_px) + 0.03 * tokens
 
 
-def machine_mib() -> float:
-    """Memory of this machine, or of the container or job that we are in."""
+SYSTEM = Path("/")
+"""Folder of `proc` and `sys`; tests use others."""
+
+CGROUP_FILES = {
+    1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+    2: ("memory.max", "memory.current", "inactive_file"),
+}
+"""Limit, use, and the key in `memory.stat` of reclaimable file pages, by version of control groups."""
+
+
+def machine_mib(system: Path = SYSTEM) -> float:
+    """Return the memory of this machine, or of the container or cluster job of this process."""
     physical = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / MIB
-    return min(physical, _cgroup_mib())
+    return min([physical, *(limit for limit, _ in _cgroups(system))])
 
 
-def available_mib() -> float:
-    """Memory that is free to use now."""
+def available_mib(system: Path = SYSTEM) -> float:
+    """Return the memory that is free now, on this machine and in the container or cluster job."""
     try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        lines = (system / "proc/meminfo").read_text(encoding="ascii").splitlines()
     except OSError:  # not Linux
-        return machine_mib()
+        return machine_mib(system)
     (found,) = [line.split()[1] for line in lines if line.startswith("MemAvailable:")]
-    return min(int(found) / 1024, _cgroup_mib())
+    return min([int(found) / 1024, *(limit - used for limit, used in _cgroups(system))])
 
 
-def _cgroup_mib() -> float:
-    """Limit of the control group, as clusters and containers set it; infinite without one."""
+def _cgroups(system: Path) -> list[tuple[float, float]]:
+    """Return limit and use in MiB of each control group with a memory limit that contains this process.
+
+    Groups are nested, and each limit holds. File pages that can be reclaimed do not count as used. Version 1
+    reports a limit of 8 EiB for groups without limit.
+    """
     try:
-        limit = Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii").strip()
-    except OSError:
-        return float("inf")
-    return int(limit) / MIB if limit.isdigit() else float("inf")
+        lines = (system / "proc/self/cgroup").read_text(encoding="utf-8").splitlines()
+    except OSError:  # not Linux
+        return []
+    found = []
+    for _, controllers, path in (line.split(":", 2) for line in lines):
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        mount = system / "sys/fs/cgroup" / ("memory" if controllers else "")
+        limit_file, use_file, reclaimable = CGROUP_FILES[1 if controllers else 2]
+        own = mount / path.lstrip("/")
+        if ".." in own.parts or not own.is_dir():  # in a container the mount shows the container's group
+            own = mount
+        for group in (own, *own.parents):
+            if not group.is_relative_to(mount):
+                break
+            limit, used, stat = (_text(group / name) for name in (limit_file, use_file, "memory.stat"))
+            if limit.isdigit():
+                pages = dict(line.split() for line in stat.splitlines())
+                found.append((int(limit) / MIB, (int(used) - int(pages[reclaimable])) / MIB))
+    return found
+
+
+def _text(path: Path) -> str:
+    return path.read_text(encoding="ascii").strip() if path.is_file() else ""

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hilsplat.base.artifacts import parse_json
+from hilsplat.base.files import project_path
 from hilsplat.models.layouts import LAYOUTS, layout_of
 
 MODELS = Path("models")
@@ -107,12 +108,13 @@ def is_embedded(config: Mapping[str, Any]) -> bool:
 
 def read_model(folder: Path) -> PresentModel | None:
     """What a folder holds, by its config.json; None if it has no network or is not a model that we read."""
+    place = project_path(folder)
     try:
-        config = parse_json((folder / "config.json").read_text(encoding="utf-8"))
+        config = parse_json((place / "config.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
     layout = layout_of(config)
-    if layout is None or not any(folder.rglob("*.onnx")):
+    if layout is None or not any(place.rglob("*.onnx")):
         return None
     return PresentModel(folder, LAYOUTS[layout].kind, is_embedded(config))
 

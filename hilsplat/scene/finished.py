@@ -151,9 +151,7 @@ def finished_variants(folder: Path) -> list[str]:
 
 
 def _unfinished(folder: Path, missing: Path) -> ArtifactError:
-    return ArtifactError(
-        f"{folder} is not finished: {missing} is missing", fix=f"snakemake --cores 2 {missing}"
-    )
+    return ArtifactError(f"{folder} is not finished: {missing} is missing", fix=f"hilsplat run {missing}")
 
 
 def _input_of(artifact: Path, name: str, folder: Path) -> Path:

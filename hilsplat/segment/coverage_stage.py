@@ -7,7 +7,7 @@ from hilsplat.base.artifacts import atomic_folder, read_index, write_index, writ
 from hilsplat.base.levels import NONE, Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.segment.coverage import coverage_tree
-from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks
 from hilsplat.settings import CoverageTreeSettings
 
 
@@ -19,23 +19,27 @@ def run_coverage_tree(masks_folder: Path, out: Path, settings: CoverageTreeSetti
         out: folder to write: `<view>.npz` with `parent` i32 (M) and `depth` u8 (M), rows as the
             masks, and `index.json`.
         settings: threshold.
+
+    Raises:
+        MisalignedArtifactError: the masks of a view are not those that their index records.
     """
-    masks_index = read_index(masks_folder)
+    scene, digests = read_index(masks_folder)["scene"], digests_in(masks_folder)
     index: dict[str, Any] = {}
-    with stage_log("coverage_tree", masks_index["scene"]) as counts, atomic_folder(out) as folder:
-        for view in track(list(masks_index["views"]), "coverage trees"):
-            masks = HierarchicalMasks.load(Path(masks_folder) / f"{view}.npz")
+    with stage_log("coverage_tree", scene) as counts, atomic_folder(out) as folder:
+        for view in track(list(digests), "coverage trees"):
+            masks = load_masks(masks_folder, view, digests)
             parent, depth = coverage_tree(masks, settings.theta)
             write_npz(folder / f"{view}.npz", parent=parent, depth=depth)
             has_parent = parent != NONE
             index[view] = {
+                MASKS_SHA256: digests[view],
                 "masks": len(masks),
                 "roots": int((~has_parent).sum()),
                 "part_with_parent": int(has_parent[masks.rows_of(Level.PART)].sum()),
                 "subpart_with_parent": int(has_parent[masks.rows_of(Level.SUBPART)].sum()),
                 "deepest": int(depth.max(initial=0)),
             }
-        write_index(folder, index, scene=masks_index["scene"], theta=settings.theta)
+        write_index(folder, index, scene=scene, theta=settings.theta)
         counts.update(
             views=len(index),
             masks=sum(entry["masks"] for entry in index.values()),

@@ -13,6 +13,7 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.scene.scene import Scene
+from hilsplat.segment.digests import require_same_masks
 from hilsplat.segment.masks import HierarchicalMasks
 
 GOLDEN = 0.6180339887498949
@@ -155,6 +156,7 @@ def masks_overview(
 
     Raises:
         ArtifactError: the view has no masks.
+        MisalignedArtifactError: the trees belong to other masks.
     """
     views = list(read_index(masks_folder)["views"])
     chosen = view or views[len(views) // 2]
@@ -166,6 +168,7 @@ def masks_overview(
     image = Scene.load(scene_folder).image(chosen)
     write_png(out_png, masks_picture(image, masks))
     if tree_folder is not None:
+        require_same_masks(tree_folder, masks_folder)
         parent = read_npz(Path(tree_folder) / f"{chosen}.npz", "parent")["parent"]
         write_png(out_png.with_name(f"{out_png.stem}_tree.png"), tree_picture(image, masks, parent))
     return chosen

@@ -20,6 +20,7 @@ from hilsplat.base.progress import stage_log, track
 from hilsplat.models.memory import available_mib, needs_of
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.candidates import Candidates, candidates_key, decode_candidates
+from hilsplat.segment.digests import index_entry
 from hilsplat.segment.generate import masks_from_candidates
 from hilsplat.segment.graph import segment_graph
 from hilsplat.segment.masks import HierarchicalMasks
@@ -53,7 +54,7 @@ def run_masks(
 
     Args:
         scene_folder: the `Scene` artifact.
-        out: folder to write: `<view>.npz` (`HierarchicalMasks`) and `index.json`.
+        out: folder to write: `<view>.npz` (`HierarchicalMasks`) and `index.json` (`digests.index_entry`).
         cache: folder of the view cache. With SAM it holds the decoder's candidates, so a change of
             thresholds runs no network.
         settings: which segmenter, and how.
@@ -94,7 +95,7 @@ def run_masks(
             found = in_order(segment, views, threads)
             for view, masks in zip(views, track(found, "masks of views", len(views)), strict=True):
                 masks.save(folder / f"{view}.npz")
-                index[view] = {level.label: len(masks.rows_of(level)) for level in LEVELS}
+                index[view] = index_entry(masks)
             write_index(folder, index, scene=scene.name, **identity)
         total = {level.label: sum(entry[level.label] for entry in index.values()) for level in LEVELS}
         for level, number in total.items():

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Int64
 
 from hilsplat.base.artifacts import atomic_path
-from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, Level
+from hilsplat.scene.finished import require_same
 
 if TYPE_CHECKING:
     from hilsplat.semantic_tree.tree import SemanticTree
@@ -41,18 +41,12 @@ def write_tree_ply(gaussians_ply: Path, tree: "SemanticTree", out: Path) -> None
     Viewers of Gaussians ignore them; tools that show scalar fields can colour by them. -1 means no node.
 
     Raises:
-        MisalignedArtifactError: the PLY has more or fewer Gaussians than the tree.
+        MisalignedArtifactError: the tree was made for another PLY.
     """
     from plyfile import PlyData
 
+    require_same("semantic tree", str(gaussians_ply.parent), gaussians_ply, tree.gaussians_sha256)
     vertex = PlyData.read(str(gaussians_ply))["vertex"].data
-    if len(vertex) != len(tree.node_of_gaussian):
-        raise MisalignedArtifactError(
-            f"the semantic tree was made for other Gaussians than {gaussians_ply}",
-            expected=f"{len(tree.node_of_gaussian)} Gaussians",
-            found=f"{len(vertex)}",
-            fix="rerun the contributions and semantic_tree stages",
-        )
     more = [(f"node_{level.label}", "<i4") for level in LEVELS]
     table = np.empty(len(vertex), [*vertex.dtype.descr, *more])
     for name in vertex.dtype.names:

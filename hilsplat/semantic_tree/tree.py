@@ -15,20 +15,18 @@ import scipy.sparse as sp
 from jaxtyping import Float, Float32, Int32, Int64, UInt8
 
 from hilsplat.base.artifacts import (
-    INDEX,
     atomic_folder,
     read_full_index,
     read_index,
     read_into,
-    sha256_of_file,
     write_index,
     write_json,
     write_npz,
 )
-from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log
 from hilsplat.contributions.rows import Contributions, mask_embeddings
+from hilsplat.segment.digests import MASKS_SHA256, digests_in, require_same_masks
 from hilsplat.semantic_tree.boxes import node_boxes
 from hilsplat.semantic_tree.export import readable_nodes
 from hilsplat.semantic_tree.level_nodes import MIN_FIT, level_nodes
@@ -229,16 +227,8 @@ def run_semantic_tree(
         ArtifactError: the masks do not say what made them.
     """
     contributions = Contributions.load(contributions_folder)
-    index = read_index(contributions_folder)
-    scene = index["scene"]
-    masks_sha256 = sha256_of_file(Path(masks_folder) / INDEX)
-    if masks_sha256 != index["masks_sha256"]:
-        raise MisalignedArtifactError(
-            f"contributions of {scene} belong to other masks",
-            expected=f"{masks_folder} with index sha256 {index['masks_sha256'][:12]}",
-            found=f"sha256 {masks_sha256[:12]}",
-            fix="run the contributions stage again",
-        )
+    scene = read_index(contributions_folder)["scene"]
+    require_same_masks(contributions_folder, masks_folder)
     with stage_log("semantic tree", scene) as counts:
         tree = build_tree(
             contributions,
@@ -262,14 +252,18 @@ def run_semantic_tree(
                 scene,
                 settings.min_views,
             )
-        masks = np.bincount(contributions.view, minlength=len(contributions.views))
+        masks = np.bincount(contributions.view, minlength=len(contributions.views)).tolist()
+        digests = digests_in(contributions_folder)
         with atomic_folder(out) as folder:
             fields = {name: value for name, value in vars(tree).items() if isinstance(value, np.ndarray)}
             write_npz(folder / "tree.npz", **fields)
             write_json(folder / "tree.json", {"scene": scene, "nodes": readable_nodes(tree)})
             write_index(
                 folder,
-                {view: {"masks": int(count)} for view, count in zip(contributions.views, masks, strict=True)},
+                {
+                    view: {MASKS_SHA256: digests[view], "masks": count}
+                    for view, count in zip(contributions.views, masks, strict=True)
+                },
                 scene=scene,
                 nodes=per_level,
                 orphans=orphans,

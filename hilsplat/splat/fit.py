@@ -207,6 +207,8 @@ def run_gaussians(
             gaussians, origin = bring_gaussians(brought, scene)
             curve = None
         else:
+            # `auto` may choose CUDA once and the CPU later; their sums differ, so a fit stays on one device.
+            settings = settings.model_copy(update={"device": choose_device(settings.device)})
             key = sha256_of_json(
                 [
                     settings.model_dump(mode="json"),

@@ -63,7 +63,7 @@ class ShownScene:
             )
         if not ply.exists():
             raise ArtifactError(
-                f"{folder} has no Gaussians to show yet: {ply} is missing", fix=f"snakemake --cores 2 {ply}"
+                f"{folder} has no Gaussians to show yet: {ply} is missing", fix=f"hilsplat run {ply}"
             )
         self.witness.note((self.folder / "scene", ply))
         self.scene: Scene = self.opened.get(Scene.load, self.folder / "scene")

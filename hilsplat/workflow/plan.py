@@ -1,8 +1,7 @@
 """The plan of a run: its scenes, and the settings, shared inputs and parameters of each job.
 
-The rules get their paths from this module, `scene_data` and `targets`. They know nothing of Snakemake: a
-*job* is anything with the attributes `dataset` and `scene`, and `variant` for the stages that variants share
-or change, such as the wildcards of a rule.
+A *job* is anything with the attributes `dataset` and `scene`, and `variant` in the stages of a variant, such
+as the wildcards of a rule.
 """
 
 import difflib
@@ -15,14 +14,14 @@ from types import SimpleNamespace
 from typing import Any
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.configuration import UPSTREAM, RunSettings, StageSettings, parse_run, require_known
+from hilsplat.base.files import project_path
+from hilsplat.configuration import SECTIONS, UPSTREAM, RunSettings, StageSettings, parse_run, require_known
 from hilsplat.methods.registry import METHODS, OURS, require_method
+from hilsplat.models.digests import model_digest
 from hilsplat.scene.sheet import GROUPS, PHOTOS, SceneRow, choose_scenes, read_sheet
-from hilsplat.workflow.answering import doubt_about_photographs, models_of
-from hilsplat.workflow.feasible import require_feasible
-from hilsplat.workflow.jobs import CACHE, Job, VariantJob, any_of, inert, scene_path
-from hilsplat.workflow.model_digests import model_digest
-from hilsplat.workflow.scene_data import SceneData
+from hilsplat.workflow.jobs import Job, VariantJob, any_of, inert
+from hilsplat.workflow.models import check_device, check_models, describe_models, doubt_about_photographs
+from hilsplat.workflow.scene_data import SceneData, truth_argument
 from hilsplat.workflow.stages import stage_code
 
 
@@ -31,8 +30,9 @@ class Plan:
 
     Attributes:
         run: the validated configuration.
+        results: results folder.
         rows: every scene of the sheet.
-        scenes: those that are run.
+        scenes: scenes that are run.
         absent: chosen scenes that are skipped -> the reason.
     """
 
@@ -43,12 +43,13 @@ class Plan:
             HilsplatError: a setting, a method or a line of the sheet cannot be used, or no scene is left.
         """
         self.run = run = parse_run(dict(config))
+        self.results = Path(run.results)
         for name in run.every_variant():
             require_method(run.stages(name).method.name)
-        sheet = Path(run.scenes)
+        sheet = project_path(run.scenes)
         self.rows = tuple(read_sheet(sheet, run.groups, run.data_root))
         require_known_scenes(run, self.rows)
-        self.data = SceneData(self.rows, run.data_root)
+        self.data = SceneData(self.rows, run.data_root, self.path)
         chosen = choose_scenes(self.rows, run.groups, run.only)
         if more := {row.group for row in chosen} - set(run.groups):  # check their sources too
             read_sheet(sheet, {*run.groups, *more}, run.data_root)
@@ -71,13 +72,15 @@ class Plan:
         self.stages_of = functools.cache(lambda *which: run.stages(*which).with_models())
         self._seeded = functools.cache(run.seeded)
         self._section = functools.cache(self._section_of)
+        self._first_alike = functools.cache(self._first_with_equal_settings)
         for row in self.scenes:
             self.data.require_no_braces(row)
 
-    def require_feasible(self) -> None:
-        """Refuse devices that this machine does not have, and model folders that cannot be used.
+    def require_usable(self, *, devices: bool) -> None:
+        """Check that models exist, and that this machine has the devices of the settings.
 
-        A stage would find out too, but hours later.
+        Args:
+            devices: check devices too; False if other machines run the jobs.
 
         Raises:
             HilsplatError: the message names the setting, and a scene and variant that have it.
@@ -88,21 +91,27 @@ class Plan:
                 stages = self.stages_of(variant, self.scopes(row))
                 if stages not in seen:
                     seen.add(stages)
-                    require_feasible(stages, f"{row.name}, variant {variant}")
+                    check_models(stages, f"{row.name}, variant {variant}")
+                    if devices:
+                        check_device(stages, f"{row.name}, variant {variant}")
+
+    def path(self, job: Job, *parts: str) -> str:
+        """Return a path in the folder of a scene."""
+        return "/".join([self.run.results, job.dataset, job.scene, *parts])
 
     def datasets(self) -> str:
-        """Regular expression of the wildcard `dataset`."""
+        """Return the regular expression of the wildcard `dataset`."""
         return any_of(row.dataset for row in self.rows)
 
     def scene_names(self) -> str:
-        """Regular expression of the wildcard `scene`."""
+        """Return the regular expression of the wildcard `scene`."""
         return any_of(row.scene for row in self.rows)
 
     def variants(self, by_baseline: bool | None = None) -> str:
-        """Regular expression of the wildcard `variant`.
+        """Return the regular expression of the wildcard `variant`.
 
         Args:
-            by_baseline: variants whose field a baseline writes, or those whose field is ours; None: all.
+            by_baseline: True for variants with a field by a baseline, False for ours, None for all.
         """
         return any_of(
             name
@@ -111,36 +120,36 @@ class Plan:
         )
 
     def row(self, job: Job) -> SceneRow:
-        """Row of the scene sheet."""
+        """Return a scene's row of the sheet."""
         return self.data.row(job)
 
     def stages(self, job: Job) -> StageSettings:
-        """All settings of a scene and, if the job has one, a variant."""
+        """Return all settings of a scene and, if the job has one, a variant."""
         return self.stages_of(*self.which(job))
 
     def which(self, job: Job) -> tuple[str, tuple[str, ...]]:
-        """What all settings of a job follow from: its variant and the overrides of its scene."""
+        """Return the variant and the overrides that determine a job's settings."""
         return getattr(job, "variant", "default"), self.scopes(self.row(job))
 
     def _section_of(self, section: str, variant: str, scopes: tuple[str, ...]) -> tuple[str, dict[str, Any]]:
-        """A section's settings as JSON, and as the values in it."""
+        """Return a section's settings as JSON and as the values in it."""
         settings = getattr(self.stages_of(variant, scopes), section)
         return inert(settings.model_dump_json()), settings.model_dump(mode="json")
 
     def settings(self, section: str) -> Callable[[Job], str]:
-        """Parameter: a section's settings, as JSON."""
+        """Parameter: a section's settings as JSON."""
         return lambda job: self._section(section, *self.which(job))[0]
 
     def values(self, section: str, job: Job) -> dict[str, Any]:
-        """A section's settings for a job, as the values of its JSON."""
-        return self._section(section, *self.which(job))[1]
+        """Return a section's settings for a job; empty for stages without a section."""
+        return self._section(section, *self.which(job))[1] if section in SECTIONS else {}
 
     def seeded(self, variant: str, row: SceneRow) -> list[str]:
-        """A variant and its repetitions with other seeds, where it depends on a seed."""
+        """Return a variant and, if it depends on the seed, its repetitions with other seeds."""
         return self._seeded(variant, self.scopes(row))
 
     def seed(self, job: VariantJob) -> int:
-        """Parameter: the seed of a variant's networks."""
+        """Parameter: seed of a variant's networks."""
         return self.run.seed_of(job.variant)
 
     def code(
@@ -148,7 +157,7 @@ class Plan:
         stage: str | Callable[[Any], str],
         plugins: Callable[[Any], tuple[str, ...]] = lambda job: (),
     ) -> Callable[[Any], str]:
-        """Parameter: digest of the code of a stage, with the readers or the baseline that a job uses."""
+        """Parameter: digest of a stage's code, with the readers or the baseline that a job uses."""
         return lambda job: stage_code(stage(job) if callable(stage) else stage, plugins(job))
 
     def model(self, section: str) -> Callable[[Job], str]:
@@ -158,50 +167,49 @@ class Plan:
             stages = self.stages(job)
             if section == "masks" and stages.masks.segmenter != "sam":
                 return "none"
-            return model_digest(Path(getattr(stages, section).model), CACHE)
+            return model_digest(project_path(getattr(stages, section).model), self.results / ".cache")
 
         return digest
 
-    def answering(self) -> list[str]:
-        """Which models make the masks and the words of which scenes, one line each, doubts included."""
+    def model_lines(self) -> list[str]:
+        """Return which models each scene uses, and warnings about models that don't fit photographs."""
         scenes: dict[tuple[str, str], list[str]] = {}
         for row in self.scenes:
             stages = self.stages_of("default", self.scopes(row))
-            key = (models_of(stages), "" if row.world else doubt_about_photographs(stages))
+            key = (describe_models(stages), "" if row.world else doubt_about_photographs(stages))
             scenes.setdefault(key, []).append(row.name)
-        lines = []
-        for (models, doubt), names in scenes.items():
-            lines.append(f"{some(names)}: {models}")
-            lines += [doubt] if doubt else []
-        return lines
+        return [
+            line
+            for (models, doubt), names in scenes.items()
+            for line in (f"{some(names)}: {models}", doubt)
+            if line
+        ]
 
     def shared(self, stage: str, path: str) -> Callable[[VariantJob], str]:
         """Input: a stage's output, from the first variant with the same settings up to that stage.
 
-        Thus a sweep over Omega solves fields anew and shares masks, trees and embeddings with `default`. A
-        variant of the configuration that is in no table counts too, so that what is shared keeps its place
-        when the tables change.
+        A sweep over Omega thus fits only fields, and shares masks, trees and embeddings with `default`.
+        Variants that are in no table count too, so that shared files keep their place when tables change.
         """
-        return lambda job: scene_path(job, self.shared_variant(stage, job), path)
+        return lambda job: self.path(job, self.shared_variant(stage, job), path)
 
     def compared(self, stage: str, path: str) -> Callable[[Job], list[str]]:
-        """Input: a stage's output for every variant of the main tables, wherever it is shared."""
+        """Input: a stage's output for every variant of the main tables."""
         return lambda job: list(dict.fromkeys(map(self.shared(stage, path), self._main_jobs(job))))
 
     def compared_scores(self, job: Job) -> list[str]:
         """Input: the scores of every variant of the main tables."""
-        return [scene_path(each, each.variant, "scores.csv") for each in self._main_jobs(job)]
+        return [self.path(each, each.variant, "scores.csv") for each in self._main_jobs(job)]
 
     def _main_jobs(self, job: Job) -> list[SimpleNamespace]:
         scene = {"dataset": job.dataset, "scene": job.scene}
         return [SimpleNamespace(**scene, variant=name) for name in self.run.main_variants]
 
     def shared_variant(self, stage: str, job: VariantJob) -> str:
-        """First variant whose settings up to a stage equal those of the job's variant."""
+        """Return the first variant whose settings up to a stage equal those of the job's variant."""
         return self._first_alike(stage, job.variant, self.scopes(self.row(job)))
 
-    @functools.cache  # noqa: B019  a process has one plan
-    def _first_alike(self, stage: str, variant: str, scopes: tuple[str, ...]) -> str:
+    def _first_with_equal_settings(self, stage: str, variant: str, scopes: tuple[str, ...]) -> str:
         wanted = self.stages_of(variant, scopes)
         seed = self.run.seed_of(variant) if wanted.depends_on_seed(stage) else None
         for name in self.run.every_variant():
@@ -212,11 +220,11 @@ class Plan:
         return variant
 
     def scopes(self, row: SceneRow) -> tuple[str, ...]:
-        """Keys of `overrides` that apply to a scene and exist: scenes without any share their settings."""
+        """Return the keys of `overrides` that apply to a scene and exist."""
         return tuple(scope for scope in scopes_of(row) if scope in self.run.overrides)
 
     def masks_stage(self, job: VariantJob) -> str:
-        """Stage that makes the masks: the diagnostic segmenter is a separate one."""
+        """Return the stage that makes the masks: the diagnostic segmenter is a separate one."""
         diagnostic = self.stages(job).masks.segmenter == "truth-perturbed"
         return "truth_masks" if diagnostic else "masks"
 
@@ -237,13 +245,12 @@ class Plan:
             )
         return self.data.truth(job)
 
-    def masks_truth_option(self, job: VariantJob) -> str:
+    def masks_truth_option(self, job: VariantJob, input: Any) -> str:
         """Options of the diagnostic segmenter, if it is chosen."""
-        truth = self.masks_truth(job)
-        if not truth:
+        if self.masks_stage(job) == "masks":
             return ""
         faults = self.stages(job).perturb.model_dump_json()
-        return f"--truth {shlex.quote(truth[0])} --perturb {shlex.quote(faults)}"
+        return f"{truth_argument(input)} --perturb {shlex.quote(faults)}"
 
     def baseline(self, job: VariantJob) -> tuple[str, ...]:
         """The baseline that computes a variant's field."""

@@ -1,154 +1,100 @@
-"""What a job asks for: threads, memory, minutes and GPUs, from the size of its scene and its settings.
+"""Threads, memory, time and GPUs of a job, from the size of its scene and its settings.
 
-Memory is a sum of parts that grow with the pixels, the Gaussians and the threads. The constants lie above the
-peaks in Snakemake's `benchmark:` records, of scenes from the tiny one to a million Gaussians
-(tests/unit/workflow/peak_memory.tsv); models go by `models.memory`. A job that is killed all the same is
-tried again with twice as much of everything.
+`resources.tsv` has, for each rule, core seconds per megapixel of all views and the parts of its memory in
+megabytes: a base, per megapixel of all views (`mp`, and `capped_mp` up to `cap`), per megapixel of one view
+(`view_mp`, and `thread_mp` per thread), and per thousand Gaussians. The memory is above the peaks in
+Snakemake's `benchmark:` records (tests/unit/workflow/peak_memory.tsv; `source` and `train_models` were not
+measured). Times were measured on the benchmark scenes and can be wrong by a factor of three elsewhere. A job
+that is killed is tried again with twice as much of everything.
 """
 
+import csv
 import functools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
+from PIL import Image
 
 from hilsplat.base.errors import ModelError
+from hilsplat.base.files import project_path
+from hilsplat.models.store import read_model
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.splat.ply import vertex_count
-from hilsplat.workflow.job_times import size_of
 from hilsplat.workflow.jobs import Job
 from hilsplat.workflow.plan import Plan
-from hilsplat.workflow.time_left import Size, first_guess
-from hilsplat.workflow.wanted import wanted
+
+with Path(__file__).with_suffix(".tsv").open(encoding="utf-8") as _stream:
+    _rows = list(csv.DictReader(_stream, delimiter="\t"))
+COSTS = {row.pop("rule"): {name: float(value) for name, value in row.items()} for row in _rows}
 
 MP_PER_THREAD = 2.0
-"""Megapixels of all views that keep a thread busy; a job of a small scene gets fewer threads than it may."""
+"""Megapixels of all views that keep a thread busy."""
 
-SNAKEMAKE_MB = 700
-"""Of the two Snakemakes that a job of a cluster starts before its stage: they count against its limit."""
+RUNNER_MB = 700
+"""Memory of the two Snakemakes that a cluster job starts before its stage."""
 
-TIMES_GUESS = 6
-"""A job may take this many times its first guess, which is rough (`time_left`), on a slow node."""
+COMPARED_MB = (450, 4)
+"""Memory of `comparison` for each method: base, and per thousand Gaussians."""
 
-LEAST_MINUTES = 10
+TIME_FACTOR, LEAST_MINUTES = 6, 10
+"""Time limit of a job divided by its estimate, and the lowest limit."""
 
-SHARE_OF_MACHINE = 0.8
-"""Of the memory of this machine, for one stage with a model."""
+START_S = 2.0
+"""Seconds that every job takes to start Python, load libraries and read."""
 
+FIT_S_PER_MP, GRAPH_S_PER_MP = 0.18, 4.0
+"""Core seconds per megapixel of a view and step of the fit, and of the graph segmenter per megapixel."""
 
-@dataclass(frozen=True)
-class Memory:
-    """Memory of a stage, in megabytes.
+EMBEDDED_S, FULL_S = {"masks": 2.5, "clip": 0.2}, {"masks": 76.0, "clip": 87.0}
+"""Core seconds per view of the embedded models, and of SAM ViT-B and CLIP B/16 (docs/models.md)."""
 
-    Attributes:
-        base: whatever the scene, libraries included.
-        mp: per megapixel of all views.
-        capped_mp: the same, up to `cap`.
-        cap: most that `capped_mp` comes to.
-        view_mp: per megapixel of one view.
-        thread_mp: per megapixel of one view and thread.
-        thousand: per thousand Gaussians.
-    """
-
-    base: int | float
-    mp: int | float = 0.0
-    capped_mp: int | float = 0.0
-    cap: int | float = 0.0
-    view_mp: int | float = 0.0
-    thread_mp: int | float = 0.0
-    thousand: int | float = 0.0
-
-    def of(self, size: Size, gaussians: int, threads: int) -> float:
-        """Memory for a scene."""
-        total_mp = size.views * size.view_mp
-        return (
-            self.base
-            + self.mp * total_mp
-            + min(self.cap, self.capped_mp * total_mp)
-            + (self.view_mp + self.thread_mp * threads) * size.view_mp
-            + self.thousand * gaussians / 1000
-        )
+UNKNOWN_MP = 0.5
+"""Megapixels of a view if no image header can be read before the run, such as in an archive."""
 
 
-MEMORY = {
-    "source": Memory(2000, mp=5),
-    "world": Memory(500, thread_mp=800),
-    "poses": Memory(550, mp=8, thread_mp=100),
-    "gaussians": Memory(500, mp=15, thousand=3),
-    "masks": Memory(800, mp=4, view_mp=500),
-    "coverage_tree": Memory(300, mp=3),
-    "clip": Memory(600, mp=4),
-    "contributions": Memory(1000, capped_mp=330, cap=2900, thousand=5.5),
-    "semantic_tree": Memory(600, mp=24, thousand=4),
-    "autoencoder": Memory(550, mp=15),
-    "field": Memory(650, mp=18, thousand=7.5),
-    "method": Memory(1000, mp=40, thousand=9),
-    "evaluate": Memory(1900, view_mp=1200, thousand=4),
-    "figures": Memory(1000, view_mp=1200, thousand=4),
-    "mask_truth": Memory(700, view_mp=500),
-    "comparison": Memory(1000, view_mp=1200, thousand=4),
-    "train_models": Memory(8000),
-    "table": Memory(500),
-    "sweep_plot": Memory(500),
-}
-"""Rule -> its memory without models. The constants of `source` and of `train_models` were not measured."""
+class Size(NamedTuple):
+    """Number of views of a scene, and the megapixels of one view."""
 
-COMPARED = Memory(450, thousand=4)
-"""What `comparison` takes for each method beside the other."""
-
-
-def scene_threads(plan: Plan, cores: int) -> int:
-    """Threads of a job on this machine: one, if there are as many scenes as cores."""
-    return max(1, cores // min(len(plan.scenes), cores))
-
-
-def variant_threads(plan: Plan, cores: int) -> int:
-    """Threads of a job of one variant: the fields of a single scene too are solved side by side."""
-    fields = sum(str(each.output).endswith("field.safetensors") for each in wanted(plan))
-    return max(1, cores // min(max(fields, 1), cores))
+    views: int
+    view_mp: float
 
 
 class JobResources:
     """Resources of the jobs of a plan, as functions of wildcards that Snakemake calls.
 
-    A job on a cluster computes them again on its node: there they depend on nothing that differs between
-    machines.
-
-    Args:
-        plan: the plan of the run.
-        most_threads: of a job on a cluster (`max-threads` of the profile); None: jobs run on this machine.
+    They depend on nothing that differs between machines: a cluster job computes them again on its node.
     """
 
-    def __init__(self, plan: Plan, most_threads: int | None = None) -> None:
+    def __init__(self, plan: Plan) -> None:
         self.plan = plan
-        self._most_threads = most_threads
         self.size = functools.cache(self._size)
         self.gaussians = functools.cache(self._gaussians)
-        self._seconds = functools.cache(self._guess)
+        self._seconds = functools.cache(self._estimate)
 
     def threads(self, wildcards: Job) -> int:
-        """Threads of a job on a cluster: those that the scene's pixels keep busy, at most `most_threads`."""
-        size = self.size(self.plan.row(wildcards))
-        busy = math.ceil(size.views * size.view_mp / MP_PER_THREAD)
-        return max(1, min(self._most_threads or 1, busy))
+        """Return as many threads as the scene's pixels keep busy; Snakemake lowers it to `--max-threads`."""
+        views, view_mp = self.size(self.plan.row(wildcards))
+        return max(1, math.ceil(views * view_mp / MP_PER_THREAD))
 
     def memory_mb(self, rule: str) -> Callable[..., int]:
         """Resource `mem_mb` of a rule."""
 
         def needed(wildcards: Any, threads: int, attempt: int) -> int:
+            cost = COSTS[rule]
+            mb = cost["base"]
             if hasattr(wildcards, "scene"):
                 row = self.plan.row(wildcards)
-                mb = MEMORY[rule].of(self.size(row), self.gaussians(row), threads)
+                (views, view_mp), thousand = self.size(row), self.gaussians(row) / 1000
+                mb += (cost["mp"] * views + cost["view_mp"] + cost["thread_mp"] * threads) * view_mp
+                mb += min(cost["cap"], cost["capped_mp"] * views * view_mp) + cost["thousand"] * thousand
                 mb = max(mb, self._model_mb(rule, wildcards, threads))
                 if rule == "comparison":
-                    methods = len(self.plan.run.main_variants)
-                    mb += methods * COMPARED.of(self.size(row), self.gaussians(row), threads)
-            else:
-                mb = float(MEMORY[rule].base)
-            more = SNAKEMAKE_MB if self._most_threads else 0
-            return _hundreds(mb + more) * 2 ** (attempt - 1)
+                    mb += len(self.plan.run.main_variants) * (COMPARED_MB[0] + COMPARED_MB[1] * thousand)
+            return math.ceil((mb + RUNNER_MB) / 100) * 100 * 2 ** (attempt - 1)
 
         return needed
 
@@ -156,11 +102,8 @@ class JobResources:
         """Resource `runtime` of a rule."""
 
         def needed(wildcards: Any, threads: int, attempt: int) -> int:
-            seconds = 0.0
-            if hasattr(wildcards, "scene"):
-                size = self.size(self.plan.row(wildcards))
-                seconds = self._seconds(rule, *self.plan.which(wildcards), size, threads)
-            minutes = max(LEAST_MINUTES, TIMES_GUESS * seconds / 60)
+            seconds = self.core_seconds(rule, wildcards) / threads if hasattr(wildcards, "scene") else 0.0
+            minutes = max(LEAST_MINUTES, TIME_FACTOR * seconds / 60)
             return math.ceil(minutes / 5) * 5 * 2 ** (attempt - 1)
 
         return needed
@@ -169,38 +112,70 @@ class JobResources:
         """Resource `gpu` of a rule: 1 if its section says `device: cuda`."""
         return lambda wildcards: int(getattr(self.plan.stages(wildcards), section).device == "cuda")
 
+    def core_seconds(self, rule: str, job: Job) -> float:
+        """Return the estimated core seconds of a scene's job."""
+        return START_S + self._seconds(rule, *self.plan.which(job), self.size(self.plan.row(job)))
+
+    def _estimate(self, rule: str, variant: str, scopes: tuple[str, ...], size: Size) -> float:
+        stages = self.plan.stages_of(variant, scopes)
+        if rule == "gaussians":
+            fit = stages.gaussians
+            steps = min(fit.iterations, fit.steps_per_view * size.views)
+            return FIT_S_PER_MP * steps * size.view_mp * fit.image_scale**2
+        if rule == "masks" and stages.masks.segmenter == "graph":
+            return GRAPH_S_PER_MP * size.views * size.view_mp
+        if rule in EMBEDDED_S:
+            model = read_model(Path(getattr(stages, rule).model))
+            return size.views * (EMBEDDED_S if model is None or model.embedded else FULL_S)[rule]
+        return COSTS.get(rule, {}).get("core_s_per_mp", 0.0) * size.views * size.view_mp
+
     def _size(self, row: SceneRow) -> Size:
-        return size_of(self.plan, row)
+        """Return the size of a scene from its cameras, or from its settings or image headers."""
+        job = SimpleNamespace(dataset=row.dataset, scene=row.scene)
+        try:
+            with np.load(Path(self.plan.path(job, "scene")) / "cameras.npz") as cameras:
+                sizes = cameras["size_hw"].astype(np.float64)
+            return Size(len(sizes), float(sizes.prod(axis=1).mean()) / 1e6)
+        except (OSError, ValueError, KeyError):  # the poses stage has not written it yet
+            stages = self.plan.stages(job)
+        if row.world:
+            return Size(stages.world.views, stages.world.image_px**2 / 1e6)
+        files = self.plan.data.image_files(job)
+        images = self.plan.data.source_files(job) if isinstance(files, str) else files
+        return Size(len(images), _first_mp(images, stages.poses.max_side_px))
 
     def _gaussians(self, row: SceneRow) -> int:
-        """Gaussians of a scene: of the PLY that replaces the fit, or as many as the fit may make."""
+        """Return the number of Gaussians: of the PLY that replaces the fit, or the limit of the fit."""
         known = vertex_count(row.gaussians) if row.gaussians is not None else None
         job = SimpleNamespace(dataset=row.dataset, scene=row.scene)
         return known or self.plan.stages(job).gaussians.max_gaussians
 
-    def _guess(self, rule: str, variant: str, scopes: tuple[str, ...], size: Size, threads: int) -> float:
-        return first_guess(rule, self.plan.stages_of(variant, scopes), size, threads)
-
     def _model_mb(self, rule: str, wildcards: Job, threads: int) -> int:
-        """Memory of a stage that runs a model, with a view per thread, as far as this machine can hold them.
-
-        The stage runs fewer at once if it is given less (`--set-resources masks:mem_mb=...`).
-        """
-        if rule not in ("masks", "clip"):
-            return 0
-        settings = getattr(self.plan.stages(wildcards), rule)
-        if rule == "masks" and settings.segmenter != "sam":
+        """Return the memory of a model with one view per thread; the stage uses less if less is free."""
+        settings = getattr(self.plan.stages(wildcards), rule) if rule in EMBEDDED_S else None
+        if settings is None or getattr(settings, "segmenter", "sam") != "sam":
             return 0
         batch = settings.batch if rule == "clip" else settings.points_per_batch
-        here = self._most_threads is None
-        return _model_memory_mb(Path(settings.model), settings.variant, batch, threads, here)
+        return _model_memory_mb(project_path(settings.model), settings.variant, batch, threads)
+
+
+def _first_mp(images: Iterable[str], max_side_px: int) -> float:
+    """Return the megapixels of the first image with a readable header, scaled as `poses` scales it."""
+    for image in images:
+        try:
+            with Image.open(image) as opened:
+                width, height = opened.size
+        except OSError:  # labels, sheets and other files beside the images
+            continue
+        return width * height * min(1.0, max_side_px / max(width, height)) ** 2 / 1e6
+    return UNKNOWN_MP
 
 
 @functools.cache
-def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int, here: bool) -> int:
-    """Memory of a stage with a model; 0 if its folder cannot be read, which the stage reports."""
+def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int) -> int:
+    """Return the memory of a stage with a model; 0 if the folder cannot be read, which the stage reports."""
     from hilsplat.models.folder import open_model_folder
-    from hilsplat.models.memory import MIB, machine_mib, needs_of  # onnxruntime takes a while to import
+    from hilsplat.models.memory import MIB, needs_of  # onnxruntime takes a while to import
     from hilsplat.segment.sam import own_thresholds
 
     try:
@@ -208,10 +183,4 @@ def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int,
         prompts = own_thresholds(model).points_per_batch if isinstance(batch, str) else batch
     except ModelError:
         return 0
-    needs = needs_of(model, prompts)
-    views = needs.views_at_once(threads, SHARE_OF_MACHINE * machine_mib()) if here else threads
-    return round(needs.total_mib(views) * MIB / 1e6)
-
-
-def _hundreds(mb: int | float) -> int:
-    return math.ceil(mb / 100) * 100
+    return round(needs_of(model, prompts).total_mib(threads) * MIB / 1e6)

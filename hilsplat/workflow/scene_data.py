@@ -5,9 +5,10 @@ Labels are given to evaluation and figures alone.
 
 import functools
 import shlex
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.datasets.registry import readers_of
@@ -20,20 +21,21 @@ from hilsplat.datasets.sources import (
     label_sets,
 )
 from hilsplat.scene.sheet import SceneRow
-from hilsplat.workflow.jobs import Job, scene_path
+from hilsplat.workflow.jobs import Job
 
 
 class SceneData:
     """Inputs and options of the jobs that read a scene's photographs, Gaussians and labels."""
 
-    def __init__(self, rows: Iterable[SceneRow], data_root: str) -> None:
-        """Data of the scenes of a sheet.
+    def __init__(self, rows: Iterable[SceneRow], data_root: str, path: Callable[..., str]) -> None:
+        """Store the scenes of a sheet.
 
         Args:
             rows: scenes of the sheet.
             data_root: folder of the published data sets.
+            path: returns a path in the results folder of a job's scene.
         """
-        self.data_root = data_root
+        self.data_root, self.path = data_root, path
         self._row_of = {(row.dataset, row.scene): row for row in rows}
         # a thousand scenes have tens of thousands of jobs: folders are read once
         self.absence = functools.cache(lambda row: absence(row.source, data_root))
@@ -44,19 +46,17 @@ class SceneData:
         """Row of the scene sheet."""
         return self._row_of[job.dataset, job.scene]
 
-    def images(self, job: Job) -> str:
-        """Folder of the images that the poses of a scene are found from."""
+    def images(self, job: Job, input: Sequence[str]) -> str:
+        """Parameter of poses: the folder of the images."""
         row = self.row(job)
-        if row.world:
-            return scene_path(job, "world/images")
-        return scene_path(job, "source") if is_exported(row.source) else str(row.folder)
+        return input[0] if row.world or is_exported(row.source) else str(row.folder)
 
     def image_files(self, job: Job) -> str | list[str]:
         """Input of poses: a folder that a rule writes, or each file of a folder of photographs."""
         row = self.row(job)
-        if row.world or is_exported(row.source):
-            return self.images(job)
-        return self._folder_files(row)
+        if row.world:
+            return self.path(job, "world/images")
+        return self.path(job, "source") if is_exported(row.source) else self._folder_files(row)
 
     def _files_of(self, row: SceneRow) -> list[str]:
         """Files of a folder of photographs, without labels."""
@@ -124,25 +124,25 @@ class SceneData:
 
     def truth(self, job: Job) -> list[str]:
         """Input: the annotations of a synthetic scene; nothing for others."""
-        return [scene_path(job, "world/truth")] if self.row(job).world else []
+        return [self.path(job, "world/truth")] if self.row(job).world else []
 
     def truth_or_labels(self, job: Job) -> list[str]:
         """Input of evaluate: the annotations of a synthetic scene, or the label files of a published one."""
         return self.truth(job) or self._label_files(self.row(job))
 
-    def truth_option(self, job: Job) -> str:
-        """Options of evaluate: the truth that a scene is scored against."""
+    def truth_option(self, job: Job, input: Any) -> str:
+        """Options of evaluate: the truth or labels that a scene is scored against."""
         row = self.row(job)
         if row.world:
-            return f"--truth {shlex.quote(self.truth(job)[0])} --kind {row.world[0]}"
+            return f"{truth_argument(input)} --kind {row.world[0]}"
         options = [f"--labels {shlex.quote(labels)}" for labels in self.labels(row)]
         return " ".join([*options, self._data_root_option()])
 
-    def figure_truth_option(self, job: Job) -> str:
+    def figure_truth_option(self, job: Job, input: Any) -> str:
         """Options of figures: the truth or labels that give queries and outlines, if there are any."""
         row = self.row(job)
         if row.world:
-            return f"--truth {shlex.quote(self.truth(job)[0])}"
+            return truth_argument(input)
         on_images = [labels for labels in self.labels(row) if not is_exported(f"{DATA_PREFIX}{labels}")]
         if not on_images:
             return ""
@@ -150,3 +150,8 @@ class SceneData:
 
     def _data_root_option(self) -> str:
         return f"--data-root {shlex.quote(str(Path(self.data_root)))}"
+
+
+def truth_argument(input: Any) -> str:
+    """Return the option that names the input `truth`: the path of the job, which a module may prefix."""
+    return f"--truth {shlex.quote(str(input.truth if isinstance(input.truth, str) else input.truth[0]))}"

@@ -8,17 +8,17 @@ from hilsplat.scene.sheet import SceneRow
 from hilsplat.workflow.plan import Plan, some
 
 
-def scores(plan: Plan, table: str) -> list[str]:
-    """Score files that a table is built from; sweeps take the scenes configured for them."""
+def scores(plan: Plan, table: str, name: str = "scores.csv") -> list[str]:
+    """Return the score files of a table, or files beside them; sweeps use the scenes configured for them."""
     kind = TABLES[table]
     rows = [row for row in labelled(plan) if data_of(row) in kind.data]
     if kind.is_sweep and plan.run.sweep_scenes:
         rows = [row for row in rows if row.scene in plan.run.sweep_scenes]
     return [
-        f"results/{row.dataset}/{row.scene}/{name}/scores.csv"
+        plan.path(row, variant, name)
         for row in rows
-        for variant in getattr(plan.run, kind.variants)
-        for name in plan.seeded(variant, row)
+        for first in getattr(plan.run, kind.variants)
+        for variant in plan.seeded(first, row)
     ]
 
 
@@ -55,7 +55,11 @@ def data_of(row: SceneRow) -> str:
 def tables(plan: Plan) -> list[str]:
     """Every table that has variants to compare, measured on the scenes that there are; all have the
     paper's rows."""
-    return [f"results/tables/{name}.csv" for name, kind in TABLES.items() if getattr(plan.run, kind.variants)]
+    return [
+        f"{plan.run.results}/tables/{name}.csv"
+        for name, kind in TABLES.items()
+        if getattr(plan.run, kind.variants)
+    ]
 
 
 def default(plan: Plan) -> list[str]:
@@ -65,12 +69,12 @@ def default(plan: Plan) -> list[str]:
     A run of photographs would otherwise replace a benchmark's tables by ones of reported rows alone.
     """
     plots = [
-        f"results/figures/sweep-{name}.png"
+        f"{plan.run.results}/figures/sweep-{name}.png"
         for name in ("theta", "omega")
         if getattr(plan.run, TABLES[name].variants)
     ]
     own = [row for row in labelled(plan) if not data_of(row)]
-    scores = [f"results/{row.dataset}/{row.scene}/default/scores.csv" for row in own]
+    scores = [plan.path(row, "default", "scores.csv") for row in own]
     has_tables = len(labelled(plan)) > len(own)
     return [*figures(plan), *scores, *(tables(plan) + plots if has_tables else [])]
 
@@ -82,5 +86,5 @@ def figures(plan: Plan) -> list[str]:
     for row in plan.scenes:
         compared = not plan.run.sweep_scenes or row.scene in plan.run.sweep_scenes
         pictures = ["panel", *(["masks"] if row.world else []), *(["comparison"] if compared else [])]
-        found += [f"results/figures/{row.dataset}/{row.scene}/{picture}.png" for picture in pictures]
+        found += [f"{plan.run.results}/figures/{row.name}/{picture}.png" for picture in pictures]
     return found

@@ -159,6 +159,7 @@ def torment(
             for part in (project.root / "results").iterdir():
                 shutil.rmtree(part) if part.is_dir() else part.unlink()
             shutil.rmtree(project.root / ".snakemake")
+            shutil.rmtree(project.root / ".hilsplat")
 
 
 def differences(reference: Project, project: Project) -> list[str]:

@@ -140,7 +140,7 @@ class Run:
     @property
     def command(self) -> list[str]:
         """What a person types."""
-        return [sys.executable, "-m", "snakemake", "--configfile", "config/ci.yaml", "--cores", "2"]
+        return [sys.executable, "-m", "hilsplat", "run", "--config", "config/ci.yaml", "--", "--cores", "2"]
 
     def said(self) -> str:
         """The end of what it printed."""
@@ -248,7 +248,9 @@ class Run:
             text=True,
             check=False,
         )
-        if self.is_running() and (second.returncode == 0 or "lock" not in second.stdout + second.stderr):
+        if self.is_running() and (
+            second.returncode == 0 or "another hilsplat run" not in second.stdout + second.stderr
+        ):
             self.problems.append(f"a second run was not refused:\n{second.stdout}{second.stderr}")
         return []
 
@@ -259,8 +261,13 @@ def stage_of(pid: int) -> str | None:
         words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
     except OSError:
         return None
-    places = [number for number, word in enumerate(words) if Path(word).name == "hilsplat"]
-    return words[places[0] + 1] if places and len(words) > places[0] + 1 else None
+    places = [
+        number
+        for number, word in enumerate(words)
+        if word == "-m" and words[number + 1 :][:1] == ["hilsplat"]
+    ]
+    stage = words[places[0] + 2] if places and len(words) > places[0] + 2 else None
+    return stage if stage != "run" else None
 
 
 @dataclass(frozen=True)

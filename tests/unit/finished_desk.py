@@ -18,10 +18,11 @@ from tokenizers import Tokenizer, models, pre_tokenizers
 
 from hilsplat.base.artifacts import write_index
 from hilsplat.base.images import write_png
-from hilsplat.base.provenance import write_provenance
+from hilsplat.base.provenance import Inputs, write_provenance
 from hilsplat.cli.main import app
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
+from hilsplat.segment.digests import index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.splat.ply import save_ply
 from tests.unit.round_gaussians import round_gaussians
@@ -130,17 +131,19 @@ def _write_scene() -> None:
     means = np.stack([columns, rows, np.zeros(count)], axis=1)
     plain = round_gaussians(means, log_scale=np.log(0.25), opacity_logit=5.0)
     save_ply(SCENE / "gaussians.ply", replace(plain, sh=colours.astype(np.float32)[:, None]))
-    masks = SCENE / "default/masks"
+    masks, entries = SCENE / "default/masks", {}
     for shift, name in enumerate(names[:-1]):
         dense = np.stack([region_mask(region[0], shift) for region in REGIONS])
         levels, ones = (
             np.array([region[1] for region in REGIONS], np.uint8),
             np.ones(len(REGIONS), np.float32),
         )
-        HierarchicalMasks.from_dense(dense, levels, ones, ones).save(masks / f"{name}.npz")
+        found = HierarchicalMasks.from_dense(dense, levels, ones, ones)
+        found.save(masks / f"{name}.npz")
+        entries[name] = index_entry(found)
     identity = {"segmenter": "graph", "model": None, "model_sha256": None}
-    write_index(masks, {name: {} for name in names[:-1]}, scene="photos/desk", **identity)
-    inputs = {"scene": SCENE / "scene"}
+    write_index(masks, entries, scene="photos/desk", **identity)
+    inputs = Inputs("masks", {"scene": SCENE / "scene"})
     record = {"code": "", "command": (), "settings": {}, "seed": None, "inputs": inputs}
     write_provenance(masks, stage="masks", **record)
 

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from hilsplat.base.artifacts import write_index, write_npy, write_npz
+from hilsplat.base.artifacts import read_index, write_index, write_npy, write_npz
 from hilsplat.base.images import write_png
 from hilsplat.contributions import stage
 from hilsplat.contributions.stage import run_contributions
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
+from hilsplat.segment.digests import index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ContributionsSettings
 from tests.unit.round_gaussians import round_gaussians
@@ -127,18 +128,21 @@ def build_two_boxes(
     own = {name: list(rows) for name, rows in zip(names, regions, strict=False)}
     world = TwoBoxes(tmp_path, own, rng.normal(size=(len(REGIONS), CHANNELS)))
     world.region_vectors[:] /= np.linalg.norm(world.region_vectors, axis=1, keepdims=True)
+    entries = {}
     for shift, (view, rows) in enumerate(world.regions.items()):
         dense = np.stack([np.roll(region_mask(row), shift, axis=1) for row in rows])
         level = np.array([REGIONS[row][1] for row in rows], np.uint8)
         ones = np.ones(len(rows), np.float32)
-        HierarchicalMasks.from_dense(dense, level, ones, ones).save(world.masks / f"{view}.npz")
+        masks = HierarchicalMasks.from_dense(dense, level, ones, ones)
+        masks.save(world.masks / f"{view}.npz")
+        entries[view] = index_entry(masks)
         parent = [rows.index(REGIONS[row][4]) if REGIONS[row][4] in rows else -1 for row in rows]
         write_npz(world.coverage_tree / f"{view}.npz", parent=np.array(parent, np.int32))
         noisy = world.region_vectors[rows] + 0.02 * rng.normal(size=(len(rows), CHANNELS))
         noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
         write_npy(world.clip / f"{view}.npy", noisy.astype(np.float16))
     for folder in (world.masks, world.coverage_tree, world.clip):
-        write_index(folder, {view: {} for view in world.views}, segmenter="sam")
+        write_index(folder, entries, segmenter="sam")
     world.ply.write_bytes(b"two boxes")
 
     gaussian = np.arange(NUM_GAUSSIANS)
@@ -159,3 +163,14 @@ def build_contributions(world: TwoBoxes) -> Path:
     cache = world.folder / "cache"
     run_contributions(world.scene, world.ply, world.masks, out, cache, ContributionsSettings(), 1)
     return out
+
+
+def reverse_masks(world: TwoBoxes, view: str, *, record: bool = True) -> None:
+    """Reverse the order of a view's masks, with or without recording their digest in the index."""
+    path = world.masks / f"{view}.npz"
+    masks = HierarchicalMasks.load(path)
+    masks = masks.take(np.arange(len(masks))[::-1])
+    masks.save(path)
+    if record:
+        index = read_index(world.masks)
+        write_index(world.masks, {**index.pop("views"), view: index_entry(masks)}, **index)

@@ -14,7 +14,8 @@ import pytest
 
 MODELS = ("models/sam-tiny", "models/clip-tiny")
 """Of the checkout's models the tests see these alone, whatever was fetched."""
-PARTS = ("Snakefile", "rules", "workflow", "profiles", "config", "hilsplat", *MODELS)
+PLUGIN = "snakemake_logger_plugin_hilsplat"
+PARTS = ("Snakefile", "rules", "workflow", "profiles", "config", "hilsplat", PLUGIN, *MODELS)
 SCENE = Path("results/synthetic/tiny")
 UNFINISHED = shutil.ignore_patterns("*.pyc", "*.pyc.*", "*.tmp.*")
 """Files of Python and numba that other tests may be writing; they are renamed once complete."""
@@ -58,6 +59,11 @@ class Project:
         """Run Snakemake with the CI configuration."""
         command = [sys.executable, "-m", "snakemake", "--configfile", "config/ci.yaml", "--cores", str(cores)]
         return self.run(*command, *words, check=check)
+
+    def hilsplat_run(self, *words: str, check: bool = True) -> subprocess.CompletedProcess[str]:
+        """Run `hilsplat run` with the CI configuration."""
+        command = [sys.executable, "-m", "hilsplat", "run", "--config", "config/ci.yaml", *words]
+        return self.run(*command, check=check)
 
     def planned(self, *words: str) -> set[str]:
         """Rules that a dry run would run."""

@@ -1,50 +1,40 @@
-"""Nothing is lost and nothing stale is taken, shown on the quickest job: the views of the tiny scene."""
+"""`hilsplat run` repairs damage and recovers from kills, shown on the quickest jobs of the tiny scene."""
 
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
-from tests.workflow.conftest import SCENE, Project
+from tests.workflow.conftest import SCENE, Project, copy_project
 
 IMAGES = f"{SCENE}/world/images"
+RUN = ("-m", "hilsplat", "run", "--config", "config/ci.yaml")
+SNAKEMAKE = ("-m", "snakemake", "--configfile", "config/ci.yaml", "--cores", "2")
 
 
 @pytest.fixture(scope="module")
-def drawn(project, tmp_path_factory) -> Project:
-    """A project in which that job ran."""
-    from tests.workflow.conftest import copy_project
-
+def drawn(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Project:
+    """A project in which the views of the tiny scene are rendered."""
     made = copy_project(project, tmp_path_factory.mktemp("drawn") / "project", results=False)
-    made.snakemake(IMAGES)
+    made.hilsplat_run(IMAGES)
     return made
 
 
-def with_command(project: Project, script: str) -> str:
-    """A PATH on which `hilsplat` is this script."""
-    folder = project.root / "stub"
-    folder.mkdir(exist_ok=True)
-    (folder / "hilsplat").write_text(f"#!/bin/sh\n{script}\n")
-    (folder / "hilsplat").chmod(0o755)
-    return f"{folder}{os.pathsep}{project.environment()['PATH']}"
+def planned(project: Project, *words: str) -> str:
+    """Return what a dry run of `hilsplat run` prints."""
+    return project.hilsplat_run(*words, IMAGES, "--", "-n").stdout
 
 
-def snakemake(project: Project, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    command = (sys.executable, "-m", "snakemake", "--configfile", "config/ci.yaml", "--cores", "2", *words)
-    return project.run(*command, check=False, **environment)
-
-
-def test_a_job_that_fails_leaves_the_former_output_as_it_was(drawn: Project) -> None:
-    before = {path: (path.stat().st_ino, path.stat().st_mtime_ns) for path in (drawn.root / IMAGES).iterdir()}
-    failed = snakemake(drawn, IMAGES, "--forcerun", IMAGES, PATH=with_command(drawn, "exit 1"))
-    assert failed.returncode != 0 and "Error in rule world" in failed.stdout + failed.stderr
-    after = {path: (path.stat().st_ino, path.stat().st_mtime_ns) for path in (drawn.root / IMAGES).iterdir()}
-    assert after == before
-    assert drawn.planned(IMAGES) == set()
+def forget(project: Project) -> None:
+    """Remove Snakemake's own records."""
+    for record in (project.root / ".snakemake/metadata").iterdir():
+        record.unlink()
 
 
 def damage_file(project: Project) -> None:
@@ -56,62 +46,148 @@ def damage_provenance(project: Project) -> None:
 
 
 @pytest.mark.parametrize("damage", [damage_file, damage_provenance])
-def test_damage_is_made_good_even_without_the_records_of_snakemake(
+def test_damage_is_repaired_even_without_snakemakes_records(
     drawn: Project, damage: Callable[[Project], None]
 ) -> None:
     before = drawn.files(IMAGES)
     damage(drawn)
-    for record in (drawn.root / ".snakemake/metadata").iterdir():
-        record.unlink()
-    assert drawn.planned(IMAGES) == {"world"}
-    made = snakemake(drawn, IMAGES)
-    assert f"{IMAGES} is made again" in made.stdout + made.stderr
+    forget(drawn)
+    found = drawn.run(sys.executable, "-m", "hilsplat", "verify", check=False)
+    assert f"snakemake --cores 2 --forcerun {IMAGES}" in found.stdout
+    made = drawn.hilsplat_run(IMAGES)
+    assert f"{IMAGES} is made again" in made.stderr
     assert drawn.files(IMAGES) == before
-    assert drawn.planned(IMAGES) == set()
+    assert "Nothing to be done" in drawn.hilsplat_run(IMAGES).stderr
 
 
-def test_other_settings_count_even_without_the_records_of_snakemake(drawn: Project) -> None:
-    for record in (drawn.root / ".snakemake/metadata").iterdir():
-        record.unlink()
+def test_other_settings_count_even_without_snakemakes_records(drawn: Project) -> None:
+    forget(drawn)
     config = drawn.root / "config/config.yaml"
     text = config.read_text()
     try:
         drawn.edit("config/config.yaml", "world: {views: 12,", "world: {views: 13,")
-        assert drawn.planned(IMAGES) == {"world"}
-        assert drawn.planned(IMAGES, "--rerun-triggers", "mtime") == set()
+        assert "rule world:" in planned(drawn)
     finally:
         config.write_text(text)
+    assert "rule world:" not in planned(drawn)
 
 
-def test_a_setting_that_cannot_work_is_refused_before_anything_is_touched(drawn: Project) -> None:
+def test_an_unusable_setting_is_refused_before_any_job(drawn: Project) -> None:
     before = drawn.files("results")
-    refused = snakemake(drawn, IMAGES, "--forcerun", IMAGES, "--config", "clip={'model': 'models/nope'}")
-    assert refused.returncode != 0
-    assert "models/nope is missing" in refused.stdout + refused.stderr
+    for start in (drawn.hilsplat_run, drawn.snakemake):
+        separator = ["--"] if start == drawn.hilsplat_run else []
+        words = [*separator, "--forcerun", IMAGES, "--config", "clip={'model': 'models/nope'}"]
+        refused = start(IMAGES, *words, check=False)
+        assert refused.returncode != 0
+        assert "models/nope is missing" in refused.stdout + refused.stderr
     assert drawn.files("results") == before
 
 
-def test_the_lock_of_a_killed_run_is_lifted_by_the_next(drawn: Project) -> None:
-    path = with_command(drawn, "touch started; exec sleep 60")
-    words = [sys.executable, "-m", "snakemake", "--configfile", "config/ci.yaml", "--cores", "2"]
-    run = subprocess.Popen(
-        [*words, IMAGES, "--forcerun", IMAGES],
-        cwd=drawn.root,
-        env=drawn.environment(PATH=path),
+def test_a_file_that_is_added_during_a_stage_is_refused(copy_of_finished: Project, tmp_path: Path) -> None:
+    """The photographs of a scene change while its poses are computed."""
+    project, images = copy_of_finished, copy_of_finished.root / IMAGES
+    out = tmp_path / "scene"
+    stage = [
+        sys.executable,
+        "-m",
+        "hilsplat",
+        "poses",
+        "--images",
+        str(images),
+        "--out",
+        str(out),
+        "--render",
+    ]
+    first = sorted(images.glob("*.png"))[0]
+    code = f"""
+import shutil
+import hilsplat.scene.poses as poses
+run = poses.run_poses
+def adding(*given):
+    run(*given)
+    shutil.copy({str(first)!r}, {str(images / "added.png")!r})
+poses.run_poses = adding
+import sys
+sys.argv = {["hilsplat", *stage[3:]]!r}
+from hilsplat.cli.main import main
+main()
+"""
+    refused = project.run(sys.executable, "-c", code, check=False)
+    assert refused.returncode == 1
+    assert (
+        "poses: input images changed while the stage ran" in refused.stderr and "added.png" in refused.stderr
+    )
+    assert not out.with_name("scene.provenance.json").exists()
+
+
+@contextmanager
+def job_of(project: Project, log: str, *words: str) -> Iterator[subprocess.Popen]:
+    """Start a run, and yield its process once the log of its job exists."""
+    (project.root / log).unlink(missing_ok=True)
+    process = subprocess.Popen(
+        [sys.executable, *words],
+        cwd=project.root,
+        env=project.environment(),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
     deadline = time.monotonic() + 120
-    while not (drawn.root / "started").exists() and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert (drawn.root / "started").exists()
-    group = os.getpgid(run.pid)
-    run.kill()
-    run.wait()
-    os.killpg(group, signal.SIGKILL)  # the stand-in for the job does not end with its parent
+    while not (project.root / log).exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert (project.root / log).exists() and process.poll() is None, "the job did not start"
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def test_the_next_run_recovers_from_a_kill(drawn: Project) -> None:
     before = drawn.files(IMAGES)
-    again = snakemake(drawn, IMAGES, "--rerun-incomplete")
-    assert again.returncode == 0
-    assert f"lifted the lock of a run that was killed (process {run.pid})" in again.stdout + again.stderr
+    log = f"{SCENE}/logs/world.log"
+    with job_of(drawn, log, *RUN, IMAGES, "--", "--forcerun", IMAGES) as run:
+        refused = drawn.hilsplat_run(IMAGES, check=False)
+        assert refused.returncode == 1 and "another hilsplat run" in refused.stderr
+        run.kill()
+        run.wait()
+        drawn.hilsplat_run(IMAGES)
     assert drawn.files(IMAGES) == before
+    assert not list((drawn.root / "results").rglob(".writing-*"))
+    assert "Nothing to be done" in drawn.hilsplat_run(IMAGES).stderr
+
+
+def test_plain_snakemake_after_a_kill_asks_for_unlock(drawn: Project) -> None:
+    log = f"{SCENE}/logs/world.log"
+    with job_of(drawn, log, *SNAKEMAKE, IMAGES, "--forcerun", IMAGES) as run:
+        os.killpg(run.pid, signal.SIGKILL)
+        run.wait()
+        refused = drawn.snakemake(IMAGES, check=False)
+        assert refused.returncode != 0 and "--unlock" in refused.stderr
+        drawn.snakemake("--unlock")
+        drawn.snakemake("--rerun-incomplete", IMAGES)
+
+
+def test_the_locks_of_a_live_run_are_never_removed(copy_of_finished: Project) -> None:
+    """A runs; B, plain Snakemake, runs other targets; A is killed; C starts."""
+    project, default = copy_of_finished, f"{SCENE}/default"
+    masks = "results/figures/synthetic/tiny/masks.png"
+    locks = project.root / ".snakemake/locks"
+    clip = [*RUN, f"{default}/clip", "--", "--forcerun", f"{default}/clip"]
+    plain = [*SNAKEMAKE, masks, "--forcerun", masks]
+    with (
+        job_of(project, f"{default}/logs/clip.log", *clip) as a,
+        job_of(project, "results/figures/synthetic/tiny/masks.log", *plain) as b,
+    ):
+        os.killpg(b.pid, signal.SIGSTOP)
+        held = {path.name: path.read_bytes() for path in locks.iterdir() if b"masks.png" in path.read_bytes()}
+        assert held
+        a.kill()
+        a.wait()
+        project.hilsplat_run(f"{default}/coverage_tree", check=False)
+        left = {path.name: path.read_bytes() for path in locks.iterdir()}
+        assert held.items() <= left.items()
+        os.killpg(b.pid, signal.SIGCONT)
+        assert b.wait(timeout=300) == 0
+    project.hilsplat_run(f"{default}/clip")

@@ -21,6 +21,7 @@ from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.synthetic.faults import Draws, TrueNodes, faulty_masks
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.scene.scene import Scene
+from hilsplat.segment.digests import index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.stage import train_views
 from hilsplat.settings import PerturbSettings
@@ -100,8 +101,7 @@ def run_truth_masks(
             found = in_order(segment, views, threads)
             for view, (masks, faults) in zip(views, track(found, "masks of views", len(views)), strict=True):
                 masks.save(folder / f"{view}.npz")
-                index[view] = {level.label: len(masks.rows_of(level)) for level in LEVELS}
-                index[view]["faults"] = faults
+                index[view] = {**index_entry(masks), "faults": faults}
             write_index(
                 folder,
                 index,

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import ArtifactError
+from hilsplat.base.files import project_path
 from hilsplat.evaluate.instance_files import read_instances
 from hilsplat.evaluate.scores import read_scores
 from hilsplat.evaluate.tables.ablation import ablation_table, omega_table, theta_table
@@ -78,8 +79,8 @@ TABLES: dict[str, TableKind] = {
 
 
 def published_values(table: str) -> Path:
-    """The paper's values for a table; one of seconds shares them with the one that it completes."""
-    return Path("config/published") / f"{table.removesuffix(SECONDS)}.csv"
+    """Return the file with the paper's values for a table; tables of seconds share the main table's."""
+    return project_path(f"config/published/{table.removesuffix(SECONDS)}.csv")
 
 
 def run_table(

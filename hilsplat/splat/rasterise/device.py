@@ -30,7 +30,9 @@ def cuda_problem() -> str | None:
 
 @cache
 def choose_device(wanted: Literal["auto", "cpu", "cuda"]) -> Device:
-    """The backend for a stage, logged the first time.
+    """Return the device that a setting stands for on this machine, and log it the first time.
+
+    Imports torch (1.3 to 3 s) only if gsplat is installed and `wanted` is not `cpu`; otherwise 0.01 s.
 
     Args:
         wanted: `auto` takes CUDA if torch finds a device and gsplat can be imported.
@@ -38,7 +40,7 @@ def choose_device(wanted: Literal["auto", "cpu", "cuda"]) -> Device:
     Raises:
         DeviceError: `cuda` was requested and cannot be used. There is no fallback.
     """
-    problem = cuda_problem()
+    problem = None if wanted == "cpu" else cuda_problem()
     if wanted == "cuda" and problem:
         raise DeviceError(
             "device: cuda was requested but cannot be used",

@@ -1,11 +1,14 @@
 """Files are whole or absent; digests and caches follow content."""
 
 import errno
+import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.numpy
 
 from hilsplat.base import artifacts
 from hilsplat.base.errors import ArtifactError, DiskSpaceError
@@ -26,6 +29,60 @@ def test_a_failed_folder_is_absent(tmp_path: Path) -> None:
         (folder / "view.npz").write_bytes(b"x")
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(params=[0o022, 0o077, 0o002, 0o027], ids=oct)
+def umask(request) -> Iterator[None]:
+    """Permissions that new files and folders do not get."""
+    before = os.umask(request.param)
+    yield
+    os.umask(before)
+
+
+@pytest.mark.usefixtures("umask")
+def test_outputs_have_the_permissions_of_other_new_files(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    artifacts.write_text(tmp_path / "out/a.txt", "text")
+    with artifacts.atomic_folder(tmp_path / "out/new") as folder:
+        artifacts.write_text(folder / "inner/b.txt", "text")
+        for path in (tmp_path / "out/c.safetensors", folder / "d.safetensors"):
+            with artifacts.atomic_path(path) as temporary:
+                safetensors.numpy.save_file({"a": np.zeros(1)}, temporary)
+    found = {path.name: path.stat().st_mode for path in (tmp_path / "out").rglob("*")}
+    file, folder = ((tmp_path / name).stat().st_mode for name in ("file", "folder"))
+    files = dict.fromkeys(("a.txt", "b.txt", "c.safetensors", "d.safetensors"), file)
+    assert found == files | {"new": folder, "inner": folder}
+
+
+@pytest.fixture
+def flushed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the files and folders that are written through to the disk, as they are called then."""
+    names: list[str] = []
+    monkeypatch.setattr(os, "fsync", lambda file: names.append(str(Path(f"/proc/self/fd/{file}").readlink())))
+    return names
+
+
+def test_a_file_is_flushed_before_it_replaces_the_former_one_and_its_folder_after_that(
+    tmp_path: Path, flushed: list[str]
+) -> None:
+    artifacts.write_text(tmp_path / "a.txt", "text")
+    file, folder = flushed
+    assert artifacts.is_unfinished(Path(file)) and folder == str(tmp_path)
+
+
+def test_the_files_of_a_folder_are_flushed_once_before_it_replaces_the_former_one(
+    tmp_path: Path, flushed: list[str]
+) -> None:
+    with artifacts.atomic_folder(tmp_path / "out") as new:
+        artifacts.write_text(new / "a.txt", "text")
+        with artifacts.atomic_folder(new / "inner") as inner:
+            artifacts.write_text(inner / "b.txt", "text")
+            (inner / "c.txt").touch()
+        assert flushed == []
+    files = [str(new / name) for name in ("inner/b.txt", "inner/c.txt", "inner", "a.txt")]
+    assert sorted(flushed[:4]) == sorted(files)
+    assert flushed[4:] == [str(new), str(tmp_path)]
 
 
 def test_a_full_disk_is_told_with_the_file_and_the_way_out(tmp_path: Path) -> None:
@@ -81,28 +138,50 @@ def test_cache_computes_once_and_recovers_from_a_damaged_entry(tmp_path: Path) -
     assert len(calls) == 2
 
 
+@pytest.mark.parametrize("compressed", [True, False])
+def test_entries_that_a_power_failure_cut_or_filled_with_zeros_are_computed_again(
+    tmp_path: Path, flushed: list[str], compressed: bool
+) -> None:
+    cache = artifacts.ViewCache(tmp_path, compressed=compressed)
+    arrays = {"x": np.arange(60.0), "none": np.zeros((0, 3)), "is": np.arange(100) % 3 == 0}
+    cache.get("key", lambda: arrays)
+    assert flushed == []
+    path = cache.path("key")
+    whole = path.read_bytes()
+    size = len(whole)
+    zeros = [(start, start + 16) for start in range(0, size, 5)] + [
+        (end, size) for end in range(size - 40, size)
+    ]
+    cut = [whole[:end] for end in range(0, size, 9)]
+    for damaged in [whole[:start] + bytes(end - start) + whole[end:] for start, end in zeros] + cut:
+        path.write_bytes(damaged)
+        found = cache.get("key", lambda: arrays)
+        assert {name: found[name].tolist() for name in found} == {
+            name: arrays[name].tolist() for name in arrays
+        }
+
+
 def test_two_nodes_that_compute_one_view_leave_one_whole_entry(tmp_path: Path, monkeypatch) -> None:
-    """The other node, with the same process number, writes and ends while this one writes."""
-    cache, other, names = artifacts.ViewCache(tmp_path), artifacts.ViewCache(tmp_path), []
+    """The other node writes and ends while this one writes."""
+    cache, other = artifacts.ViewCache(tmp_path), artifacts.ViewCache(tmp_path)
     key = artifacts.sha256_of_json({"image": "abc"})
     write = artifacts._write_zip
 
-    def write_beside_the_other(path: Path, arrays: dict[str, np.ndarray], method: int) -> None:
+    def write_beside_the_other(
+        path: Path, arrays: dict[str, np.ndarray], method: int, **options: bool
+    ) -> None:
         with artifacts.atomic_path(path) as temporary:
-            names.append(temporary.name)
             temporary.write_bytes(b"half an ent")
             with monkeypatch.context() as node:
                 node.setattr(artifacts, "_write_zip", write)
-                node.setattr("hilsplat.base.processes.machine", lambda: "0" * 8)
+                node.setattr("hilsplat.base.processes.host_token", lambda: "0" * 8)
                 other.get(key, lambda: {"x": np.arange(3)})
-                names.append(artifacts.temporary_prefix())
-            write(temporary, arrays, method)
+            write(temporary, arrays, method, **options)
 
     monkeypatch.setattr(artifacts, "_write_zip", write_beside_the_other)
     mine = cache.get(key, lambda: {"x": np.arange(3)})
     np.testing.assert_array_equal(mine["x"], artifacts.read_npz(cache.path(key))["x"])
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [cache.path(key)]
-    assert not names[0].startswith(names[1])  # neither takes the other's file for its own
 
 
 def test_an_entry_that_another_node_prunes_meanwhile_is_still_read(tmp_path: Path, monkeypatch) -> None:
@@ -133,6 +212,9 @@ def test_folder_digest_follows_names_and_bytes(tmp_path: Path) -> None:
     folder.mkdir()
     (folder / "a").write_bytes(b"1")
     first = artifacts.sha256_of_path(folder)
+    with artifacts.work_folder(folder / "hidden") as unfinished:
+        (unfinished / "c").write_bytes(b"2")
+        assert artifacts.sha256_of_path(folder) == first
     (folder / "a").rename(folder / "b")
     assert artifacts.sha256_of_path(folder) != first
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from hilsplat.base.artifacts import sha256_of_path
+from hilsplat.base.artifacts import read_index, sha256_of_path, write_index
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.contributions import gram_builder, quadratic_builder, stage
@@ -24,9 +24,17 @@ from hilsplat.contributions.view_matrices import (
     random_half,
     view_contributions,
 )
+from hilsplat.segment.digests import index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ContributionsSettings
-from tests.unit.two_boxes_world import HEIGHT, REGIONS, WIDTH, two_boxes_weights
+from tests.unit.two_boxes_world import (
+    HEIGHT,
+    REGIONS,
+    WIDTH,
+    build_contributions,
+    reverse_masks,
+    two_boxes_weights,
+)
 
 SIZE = (9, 7)
 PIXELS = 63
@@ -313,6 +321,8 @@ def test_masks_of_another_size_are_refused(two_boxes):
     ones = np.ones(1, np.float32)
     wrong = HierarchicalMasks.from_dense(np.ones((1, 4, 4), bool), np.ones(1, np.uint8), ones, ones)
     wrong.save(two_boxes.masks / f"{view}.npz")
+    index = read_index(two_boxes.masks)["views"]
+    write_index(two_boxes.masks, {**index, view: index_entry(wrong)}, segmenter="sam")
     with pytest.raises(MisalignedArtifactError, match=r"masks of view 001.png do not fit its camera"):
         run_contributions(
             two_boxes.scene,
@@ -325,8 +335,16 @@ def test_masks_of_another_size_are_refused(two_boxes):
         )
 
 
-def test_missing_clip_vectors_are_named(two_boxes_contributions):
+def test_masks_that_their_index_does_not_record_are_refused(two_boxes_contributions):
+    world, _ = two_boxes_contributions
+    reverse_masks(world, "001.png", record=False)
+    with pytest.raises(MisalignedArtifactError, match=r"001\.png\.npz contains other masks"):
+        build_contributions(world)
+
+
+def test_views_without_clip_vectors_are_named(two_boxes_contributions):
     world, out = two_boxes_contributions
-    np.save(world.clip / f"{world.views[2]}.npy", np.zeros((2, 16), np.float16))
-    with pytest.raises(MisalignedArtifactError, match=r"view 002.png"):
+    views = read_index(world.clip)["views"]
+    write_index(world.clip, {view: entry for view, entry in views.items() if view != "002.png"})
+    with pytest.raises(MisalignedArtifactError, match=r"view 002\.png(.|\n)*found +no masks"):
         mask_embeddings(world.clip, Contributions.load(out))

@@ -19,6 +19,7 @@ from hilsplat.embed.stage import run_clip
 from hilsplat.models.network import Network
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
+from hilsplat.segment.digests import digests_in, index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ClipSettings
 
@@ -236,8 +237,7 @@ def red_scene(tmp_path) -> tuple[Path, Path]:
     ).save()
     for name in names:
         pack(mask, ~mask).save(tmp_path / "masks" / f"{name}.npz")
-    views = {name: {"whole": 2} for name in names}
-    (tmp_path / "masks" / "index.json").write_text(json.dumps({"scene": "set/scene", "views": views}))
+    write_index(tmp_path / "masks", dict.fromkeys(names, index_entry(pack(mask, ~mask))), scene="set/scene")
     return tmp_path / "scene", tmp_path / "masks"
 
 
@@ -247,6 +247,7 @@ def test_stage_writes_a_row_per_mask_and_reuses_finished_views(red_scene, colour
     run_clip(scene, masks, tmp_path / "first", tmp_path / "cache", settings, threads=2)
     np.testing.assert_array_equal(read_npy(tmp_path / "first" / "0.png.npy"), [[1, 0, 0], [0, 1, 0]])
     assert read_index(tmp_path / "first")["dim"] == 3
+    assert digests_in(tmp_path / "first") == digests_in(masks)
 
     def refuse(self: Network, **feeds: np.ndarray):
         raise AssertionError("the network ran again")
@@ -258,8 +259,16 @@ def test_stage_writes_a_row_per_mask_and_reuses_finished_views(red_scene, colour
 
 def test_masks_of_other_views_are_refused(red_scene, colour_clip, tmp_path):
     scene, masks = red_scene
-    (masks / "index.json").write_text(json.dumps({"scene": "set/scene", "views": {"7.png": {}}}))
+    write_index(masks, {"7.png": read_index(masks)["views"]["0.png"]}, scene="set/scene")
     with pytest.raises(MisalignedArtifactError, match=r"7\.png"):
+        run_clip(scene, masks, tmp_path / "out", tmp_path / "cache", ClipSettings(model=str(colour_clip)), 1)
+
+
+def test_masks_that_their_index_does_not_record_are_refused(red_scene, colour_clip, tmp_path):
+    scene, masks = red_scene
+    found = HierarchicalMasks.load(masks / "0.png.npz")
+    found.take(np.array([1, 0])).save(masks / "0.png.npz")
+    with pytest.raises(MisalignedArtifactError, match=r"contains other masks \(view 0\.png\)"):
         run_clip(scene, masks, tmp_path / "out", tmp_path / "cache", ClipSettings(model=str(colour_clip)), 1)
 
 

@@ -1,17 +1,17 @@
 """LangSplat's files: what is written is read back, and what others wrote is checked."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hilsplat.base.artifacts import read_index, read_npy
+from hilsplat.base.artifacts import read_index, read_npy, write_index
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.images import write_png
 from hilsplat.embed.langsplat_files import maps_of, read_clip, read_masks, read_view, write_langsplat
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
+from hilsplat.segment.digests import digest_of, index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ClipSettings
 
@@ -47,8 +47,8 @@ def ours(tmp_path) -> tuple[Path, Path]:
     for name in names:
         masks.save(tmp_path / "masks" / f"{name}.npz")
         np.save(tmp_path / "clip" / f"{name}.npy", unit_rows(4))
-    index = {"scene": "set/scene", "views": {name: {} for name in names}}
-    (tmp_path / "masks" / "index.json").write_text(json.dumps(index))
+    for folder in ("masks", "clip"):
+        write_index(tmp_path / folder, dict.fromkeys(names, index_entry(masks)), scene="set/scene")
     return tmp_path / "masks", tmp_path / "clip"
 
 
@@ -103,7 +103,7 @@ def test_what_is_written_is_read_back(ours, scene, tmp_path):
     # masks of a level do not overlap here, so nothing was painted over
     for name in ("runs", "offsets", "level", "area_px", "box_xyxy"):
         np.testing.assert_array_equal(getattr(found, name), getattr(nested(), name), err_msg=name)
-    assert read_index(tmp_path / "again")["views"]["a.png"] == {"whole": 1, "part": 1, "subpart": 2}
+    assert read_index(tmp_path / "again")["views"]["a.png"] == index_entry(found)
     _, clip = read_view(tmp_path / "files", "a.png", SIZE, resize=False)
     np.testing.assert_allclose(clip.astype(float), unit_rows(4).astype(float), atol=1e-3)
 
@@ -164,16 +164,19 @@ def test_missing_views_are_listed(ours, scene, tmp_path):
 
 def test_views_that_differ_after_a_dot_only_are_refused(ours, tmp_path):
     masks_folder, clip_folder = ours
-    index = {"scene": "set/scene", "views": {"a.1.png": {}, "a.2.png": {}}}
-    (masks_folder / "index.json").write_text(json.dumps(index))
+    for folder in ours:
+        write_index(folder, dict.fromkeys(("a.1.png", "a.2.png"), index_entry(nested())), scene="set/scene")
     with pytest.raises(ArtifactError, match=r"a.1.png, a.2.png"):
         write_langsplat(masks_folder, clip_folder, tmp_path / "files")
 
 
 def test_vectors_of_other_masks_are_refused(ours, tmp_path):
     masks_folder, clip_folder = ours
-    np.save(clip_folder / "b.png.npy", unit_rows(3))
-    with pytest.raises(MisalignedArtifactError, match=r"4 vectors(.|\n)*found +3"):
+    reverse = nested().take(np.arange(4)[::-1])
+    reverse.save(masks_folder / "b.png.npz")
+    entries = {"a.png": index_entry(nested()), "b.png": index_entry(reverse)}
+    write_index(masks_folder, entries, scene="set/scene")
+    with pytest.raises(MisalignedArtifactError, match=r"clip .*different masks \(view b\.png\)"):
         write_langsplat(masks_folder, clip_folder, tmp_path / "files")
 
 
@@ -198,6 +201,11 @@ def test_vectors_of_the_same_clip_are_taken(ours, scene, tmp_path, project):
         np.save(tmp_path / "files" / f"{stem}_f.npy", vectors)
     read_clip(scene, tmp_path / "files", tmp_path / "out", False, ClipSettings(model=str(model)))
     index = read_index(tmp_path / "out")
-    assert (index["dim"], index["model"], index["views"]["a.png"]) == (width, str(model), {"masks": 4})
+    masks, _ = read_view(tmp_path / "files", "a.png", SIZE, resize=False)
+    assert (index["dim"], index["model"], index["views"]["a.png"]) == (
+        width,
+        str(model),
+        {"masks_sha256": digest_of(masks), "masks": 4},
+    )
     lengths = np.linalg.norm(read_npy(tmp_path / "out" / "a.png.npy").astype(float), axis=1)
     np.testing.assert_allclose(lengths, 1, atol=2e-3)

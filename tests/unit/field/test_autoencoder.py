@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from hilsplat.base.artifacts import read_index
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.autoencoder import mask_targets, run_autoencoder
 from hilsplat.field.code import autoencoder_file, load_code, load_latents
@@ -17,6 +17,7 @@ from hilsplat.field.network_code import Autoencoder, torch_generator
 from hilsplat.field.network_training import loss_gradients, statistics, torch_order, train_autoencoder
 from hilsplat.semantic_tree.tree import SemanticTree, run_semantic_tree
 from hilsplat.settings import AutoencoderSettings, SemanticTreeSettings
+from tests.unit.two_boxes_world import build_contributions, reverse_masks
 
 QUICK = AutoencoderSettings(code="network", latent=3, epochs=1, min_steps=200)
 
@@ -209,6 +210,14 @@ def test_targets_are_node_vectors_where_a_mask_fits_one(boxes_with_tree):
     assert np.array_equal(target[0], tree.clip[tree.node_of_mask[0]])
     assert len(train) == len(tree) + 1
     assert mask_targets(own, tree, "mask")[0] is own
+
+
+def test_a_tree_of_masks_in_another_order_is_refused(boxes_with_tree):
+    world, _, tree = boxes_with_tree
+    reverse_masks(world, "003.png")
+    contributions = build_contributions(world)
+    with pytest.raises(MisalignedArtifactError, match=rf"{tree} .*different masks \(view 003\.png\)"):
+        run_autoencoder(world.clip, tree, contributions, world.folder / "out", AutoencoderSettings(), 0)
 
 
 def test_stage_encodes_every_mask(boxes_with_tree):

@@ -7,7 +7,7 @@ import pytest
 import scipy.sparse as sp
 import torch
 
-from hilsplat.base.artifacts import read_json
+from hilsplat.base.artifacts import read_index, read_json, write_index
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.contributions.cuda_algebra import DeviceMasks, DeviceQuadratic
 from hilsplat.contributions.mask_operator import MaskOperator
@@ -28,6 +28,7 @@ from hilsplat.settings import AutoencoderSettings, FieldSettings, ReferenceSetti
 from tests.unit.field.clustering import clustering_loss
 from tests.unit.field.torch_losses import instance_term, part_term
 from tests.unit.round_gaussians import round_gaussians
+from tests.unit.two_boxes_world import reverse_masks
 
 PIXELS, GAUSSIANS, CHANNELS = 60, 12, 2
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
@@ -332,10 +333,25 @@ def test_the_reference_trainer_lowers_its_loss(boxes_with_latents, monkeypatch):
     assert LanguageField.load(out).features.shape == (96, 3, 3)
 
 
-def test_tree_of_other_masks_is_refused(boxes_with_latents):
+@pytest.mark.parametrize("stale", ["coverage_tree", "autoencoder", "contributions"])
+def test_parts_of_masks_in_another_order_are_refused(boxes_with_latents, stale):
     world, contributions, autoencoder = boxes_with_latents
-    np.savez(world.coverage_tree / "001.png.npz", parent=np.zeros(2, np.int32))
-    with pytest.raises(MisalignedArtifactError, match=r"view 001.png belongs to other masks"):
-        run_field(
-            contributions, world.coverage_tree, autoencoder, world.folder / "l.safetensors", SMALL_MASKS, 1
-        )
+    reverse_masks(world, "001.png")
+    reversed_entries = read_index(world.masks)["views"]
+    for folder in {world.coverage_tree, autoencoder, contributions} - {world.folder / stale}:
+        index = read_index(folder)  # as if its stage had run again
+        write_index(folder, reversed_entries, **{key: index[key] for key in index if key != "views"})
+    parts = (contributions, world.coverage_tree, autoencoder)
+    with pytest.raises(MisalignedArtifactError, match=rf"{stale} .*different masks \(view 001\.png\)"):
+        run_field(*parts, world.folder / "l.safetensors", SMALL_MASKS, 1)
+
+
+def test_the_reference_trainer_and_baselines_refuse_masks_in_another_order(boxes_with_latents, monkeypatch):
+    world, contributions, autoencoder = boxes_with_latents
+    reverse_masks(world, "001.png")
+    monkeypatch.setattr("hilsplat.field.reference_trainer.load_ply", lambda path: None)
+    parts = (world.scene, world.ply, world.masks, contributions, autoencoder)
+    with pytest.raises(MisalignedArtifactError, match=r"contains other masks \(view 001\.png\)"):
+        run_reference(*parts, world.folder / "l.safetensors", ReferenceSettings(), "cpu", 0, 1)
+    with pytest.raises(MisalignedArtifactError, match=r"contains other masks \(view 001\.png\)"):
+        MethodInputs(*parts).view_labels("001.png")

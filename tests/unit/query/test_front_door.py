@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 import hilsplat
-from hilsplat.base.artifacts import read_npy
+from hilsplat.base.artifacts import provenance_path, read_npy
 from hilsplat.base.errors import ArtifactError, ModelError, SettingsError
-from hilsplat.base.provenance import provenance_path, write_provenance
+from hilsplat.base.provenance import Inputs, write_provenance
 from hilsplat.evaluate.figures.comparison import open_variants
 from hilsplat.evaluate.figures.panel import run_figures
 from hilsplat.field.code import autoencoder_file
@@ -161,7 +161,7 @@ def test_answers_about_photographs_by_the_embedded_clip_are_called_meaningless(
         command=(),
         settings={},
         seed=None,
-        inputs={"images": desk / SCENE / "scene"},
+        inputs=Inputs("poses", {"images": desk / SCENE / "scene"}),
     )
     record = provenance_path(elsewhere / "copy" / SCENE / "scene")
     text = record.read_text()

@@ -264,7 +264,7 @@ def test_a_tree_answers_before_there_is_a_field_and_no_tree_before_its_own(tmp_p
     for part in ("scene", "default/clip", "default/masks", "omega"):
         (folder / part).mkdir(parents=True)
     (folder / "gaussians.ply").touch()
-    with pytest.raises(ArtifactError, match=r"snakemake --cores 2 .*default/semantic_tree"):
+    with pytest.raises(ArtifactError, match=r"hilsplat run .*default/semantic_tree"):
         FinishedScene.locate(folder)
     (folder / "default/semantic_tree").mkdir()
     parts = FinishedScene.locate(folder).parts

@@ -52,7 +52,8 @@ def test_second_run_calls_no_network_and_writes_the_same_bytes(make_scene, tmp_p
     stricter = settings.model_copy(update={"predicted_iou_min": 0.75})
     run_masks(scene, tmp_path / "third", tmp_path / "cache", stricter, threads=1)
     assert calls == []
-    assert read_index(tmp_path / "third")["views"]["000.png"] == {"whole": 0, "part": 4, "subpart": 4}
+    entry = read_index(tmp_path / "third")["views"]["000.png"]
+    assert (entry["whole"], entry["part"], entry["subpart"]) == (0, 4, 4)
 
 
 def test_prompts_that_repeat_others_in_the_preview_are_not_decoded(

@@ -7,13 +7,21 @@ import pytest
 import scipy.sparse as sp
 
 from hilsplat.base.artifacts import read_index, read_json, sha256_of_path, write_index
-from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.semantic_tree.level_nodes import level_nodes
 from hilsplat.semantic_tree.nodes import gaussian_nodes, node_parents
 from hilsplat.semantic_tree.tree import SemanticTree, run_semantic_tree
 from hilsplat.settings import SemanticTreeSettings
-from tests.unit.two_boxes_world import HEIGHT, NUM_GAUSSIANS, REGIONS, WIDTH, region_mask
+from tests.unit.two_boxes_world import (
+    HEIGHT,
+    NUM_GAUSSIANS,
+    REGIONS,
+    WIDTH,
+    build_contributions,
+    region_mask,
+    reverse_masks,
+)
 
 
 def test_gaussians_join_the_node_with_the_largest_share():
@@ -137,10 +145,24 @@ def test_more_views_asked_for_than_there_are_leave_an_empty_tree(two_boxes_contr
     assert "has no node" in caplog.text
 
 
-def test_other_masks_are_refused(two_boxes_contributions):
+@pytest.mark.parametrize("rerun", ["nothing", "contributions"])
+def test_masks_in_another_order_are_refused(two_boxes_contributions, rerun):
     world, contributions = two_boxes_contributions
-    write_index(world.masks, {}, changed=True)
-    with pytest.raises(MisalignedArtifactError, match="belong to other masks"):
+    reverse_masks(world, "002.png")
+    stale = contributions
+    if rerun == "contributions":  # the CLIP vectors are the only old part, as many as there are masks
+        build_contributions(world)
+        stale = world.clip
+    with pytest.raises(MisalignedArtifactError, match=rf"{stale} .*different masks \(view 002\.png\)"):
+        run_semantic_tree(
+            contributions, world.masks, world.clip, world.folder / "out", SemanticTreeSettings()
+        )
+
+
+def test_an_artifact_without_digests_is_refused(two_boxes_contributions):
+    world, contributions = two_boxes_contributions
+    write_index(world.clip, {view: {"masks": 6} for view in world.views}, model="models/clip-tiny")
+    with pytest.raises(ArtifactError, match=r"clip is of another version\n *expected +masks_sha256 of every"):
         run_semantic_tree(
             contributions, world.masks, world.clip, world.folder / "out", SemanticTreeSettings()
         )

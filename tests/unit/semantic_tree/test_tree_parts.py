@@ -5,6 +5,7 @@ import pytest
 import scipy.sparse as sp
 from plyfile import PlyData
 
+from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.query.view_nodes import ViewNodes
 from hilsplat.semantic_tree.boxes import OrientedBox, oriented_box
@@ -77,12 +78,15 @@ def ply(tmp_path):
 
 
 class SomeTree:
+    def __init__(self, ply):
+        self.gaussians_sha256 = sha256_of_file(ply)
+
     node_of_gaussian = np.array([[0, -1, 5], [0, 3, -1], [1, -1, -1], [-1, -1, -1]], np.int32)
 
 
 def test_the_exported_ply_is_still_one_of_gaussians(ply, tmp_path):
     out = tmp_path / "tree.ply"
-    write_tree_ply(ply, SomeTree(), out)
+    write_tree_ply(ply, SomeTree(ply), out)
     vertex = PlyData.read(out)["vertex"]
     assert vertex["node_whole"].tolist() == [0, 0, 1, -1]
     assert vertex["node_part"].tolist() == [-1, 3, -1, -1]
@@ -91,11 +95,10 @@ def test_the_exported_ply_is_still_one_of_gaussians(ply, tmp_path):
 
 
 def test_a_tree_of_other_gaussians_is_not_exported(ply, tmp_path):
-    class Other:
-        node_of_gaussian = SomeTree.node_of_gaussian[:2]
-
-    with pytest.raises(MisalignedArtifactError, match="2 Gaussians"):
-        write_tree_ply(ply, Other(), tmp_path / "tree.ply")
+    other = SomeTree(ply)
+    save_ply(ply, round_gaussians(np.arange(12.0).reshape(4, 3) + 1))  # as many Gaussians
+    with pytest.raises(MisalignedArtifactError, match=r"made for another .*\.ply"):
+        write_tree_ply(ply, other, tmp_path / "tree.ply")
 
 
 def test_a_selection_holds_the_chosen_gaussians(ply, tmp_path):

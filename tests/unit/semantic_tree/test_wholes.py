@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from hilsplat.base.artifacts import write_index
+from hilsplat.base.artifacts import read_index, write_index
 from hilsplat.base.levels import Level
 from hilsplat.contributions.stage import run_contributions
 from hilsplat.semantic_tree import wholes
@@ -134,7 +134,7 @@ def test_joined_nodes_keep_their_masks_gaussians_and_mean_quality():
 )
 def test_only_wholes_of_the_graph_segmenter_are_joined(two_boxes, segmenter, most, wholes):
     # boxes A and B fill every view together and touch only each other: the pair costs 1
-    write_index(two_boxes.masks, {view: {} for view in two_boxes.views}, segmenter=segmenter)
+    write_index(two_boxes.masks, read_index(two_boxes.masks)["views"], segmenter=segmenter)
     folder = two_boxes.folder
     settings = ContributionsSettings()
     run_contributions(

@@ -88,6 +88,35 @@ def test_another_fits_checkpoint_is_not_used(scene, tmp_path):
     assert len(FitState.load(tmp_path / "c.npz", "this").adam) == len(adam)
 
 
+def test_a_fit_does_not_resume_on_another_device(scene, tmp_path, monkeypatch):
+    draw, step, device, steps = fit.draw, fit.fit_step, "cuda", []
+
+    def stage(name: str) -> bytes:
+        out = tmp_path / name
+        fit.run_gaussians(scene.folder, out, tmp_path / "report", tmp_path / "cache", SETTINGS, 3, 1)
+        return out.read_bytes()
+
+    def counted(state, *rest):
+        if device == "cuda" and state.step == 40:
+            raise KeyboardInterrupt
+        steps.append(state.step)
+        step(state, *rest)
+
+    def drawn(*arguments, device: str, **more):  # the second device draws as the CPU does
+        return draw(*arguments, **more, device="cpu")
+
+    on_the_cpu = stage("whole.ply")
+    monkeypatch.setattr(fit, "choose_device", lambda wanted: device if wanted == "auto" else wanted)
+    monkeypatch.setattr(fit, "draw", drawn)
+    monkeypatch.setattr(fit, "fit_step", counted)
+    with pytest.raises(KeyboardInterrupt):
+        stage("stopped.ply")
+    assert len(list((tmp_path / "cache").rglob("*.npz"))) == 1
+    device, steps[:] = "cpu", []
+    assert stage("other.ply") == on_the_cpu
+    assert steps[0] == 0
+
+
 def test_random_start_holds_as_many_points_as_asked_in_sight_of_cameras(scene):
     cameras = [scene.cameras[name] for name in scene.views("train")]
     settings = GaussiansSettings(initial="random")

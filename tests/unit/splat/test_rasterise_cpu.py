@@ -112,6 +112,11 @@ def test_auto_takes_the_cpu_without_cuda_and_says_so_once(caplog):
     assert "finds no CUDA device" in caplog.text
 
 
+def test_the_cpu_is_chosen_without_a_check_for_cuda(monkeypatch):
+    monkeypatch.setattr("hilsplat.splat.rasterise.device.cuda_problem", lambda: pytest.fail("it ran"))
+    assert choose_device.__wrapped__("cpu") == "cpu"
+
+
 @pytest.mark.usefixtures("no_cuda")
 def test_cuda_is_never_replaced_by_the_cpu():
     with pytest.raises(DeviceError, match=r"device: cuda was requested(?s:.*)finds no CUDA device(?s:.*)gpu"):

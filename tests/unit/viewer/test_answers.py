@@ -348,7 +348,7 @@ def test_a_scene_without_gaussians_says_what_to_run(tmp_path):
     with pytest.raises(ArtifactError, match=r"scene folder .* is missing"):
         ShownScene(tmp_path / "nothing")
     (tmp_path / "scene").mkdir()
-    with pytest.raises(ArtifactError, match=r"snakemake --cores 2 .*gaussians\.ply"):
+    with pytest.raises(ArtifactError, match=r"hilsplat run .*gaussians\.ply"):
         ShownScene(tmp_path)
 
 

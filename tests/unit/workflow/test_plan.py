@@ -4,18 +4,18 @@ import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.configuration import SECTIONS
+from hilsplat.models.digests import model_digest
 from hilsplat.workflow import targets
-from hilsplat.workflow.answering import models_of_photographs
 from hilsplat.workflow.jobs import any_of
-from hilsplat.workflow.model_digests import model_digest
+from hilsplat.workflow.models import models_of_photographs
 from hilsplat.workflow.plan import Plan, some
-from hilsplat.workflow.resources import scene_threads, variant_threads
-from hilsplat.workflow.wanted import wanted
+from hilsplat.workflow.records import expected_artifacts
 
 SHEET = """dataset\tscene\tgroup\tsource\tunit
 synthetic\tone\tbenchmark\tworld:tabletop:1\tmetre
@@ -81,7 +81,7 @@ def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(
     job = Job("photos", "desk")
     assert targets.default(found) == [*alone, "results/photos/desk/default/scores.csv"]
     assert found.data.truth_or_labels(job) == [str(file)] and str(file) not in found.data.image_files(job)
-    assert f"--labels annotated/photos/desk --data-root {tmp_path}" in found.data.truth_option(job)
+    assert f"--labels annotated/photos/desk --data-root {tmp_path}" in found.data.truth_option(job, None)
     assert found.data.label_readers(job) == ("hilsplat.datasets.images.annotated:DATASET",)
     both = plan(tmp_path, groups=["photos", "benchmark"], data_root=str(tmp_path))
     assert "results/tables/lerf.csv" in targets.default(both) and not any(
@@ -116,7 +116,7 @@ def test_what_variants_share_keeps_its_place_when_the_tables_change(tmp_path):
     job = Job("synthetic", "one", "langsplat")
     code = "results/synthetic/one/network/autoencoder"
     assert found.shared("autoencoder", "autoencoder")(job) == code
-    outputs = [str(each.output) for each in wanted(found)]
+    outputs = list(expected_artifacts(found))
     assert outputs.count(code) == 1 and re.fullmatch(found.variants(), "network")
     assert "results/synthetic/one/network/scores.csv" not in outputs
 
@@ -152,9 +152,9 @@ def test_true_labels_reach_masks_of_the_diagnostic_segmenter_alone(tmp_path):
     truth = Job("synthetic", "one", "truth")
     assert found.masks_truth(Job("synthetic", "one")) == [] and found.masks_stage(truth) == "truth_masks"
     assert found.masks_truth(truth) == ["results/synthetic/one/world/truth"]
-    assert found.masks_truth_option(truth).startswith(
-        "--truth results/synthetic/one/world/truth --perturb '{"
-    )
+    inputs = SimpleNamespace(truth=["inner/results/synthetic/one/world/truth"])
+    option = found.masks_truth_option(truth, inputs)
+    assert option.startswith("--truth inner/results/synthetic/one/world/truth --perturb '{")
     with pytest.raises(SettingsError, match="photos/desk, variant truth: masks"):
         found.masks_truth(Job("photos", "desk", "truth"))
 
@@ -179,10 +179,10 @@ def test_labels_of_a_published_scene_bring_their_reader_and_their_options(tmp_pa
     job = Job("lerf", "figurines")
     assert found.data.label_readers(job) == ("hilsplat.datasets.images.lerf_ovs:DATASET",)
     assert [Path(file).name for file in found.data.truth_or_labels(job)] == ["frame_1.json"]
-    assert found.data.truth_option(job) == f"--labels lerf_ovs/figurines --data-root {tmp_path}"
-    assert (
-        found.data.truth_option(Job("rooms", "room")) == "--truth results/rooms/room/world/truth --kind room"
-    )
+    assert found.data.truth_option(job, None) == f"--labels lerf_ovs/figurines --data-root {tmp_path}"
+    inputs = SimpleNamespace(truth="results/rooms/room/world/truth")
+    option = found.data.truth_option(Job("rooms", "room"), inputs)
+    assert option == "--truth results/rooms/room/world/truth --kind room"
     assert found.data.label_readers(Job("rooms", "room")) == ()
 
 
@@ -227,14 +227,6 @@ def test_queries_of_a_scene_come_before_those_of_its_data_set(tmp_path):
     found = plan(tmp_path, queries={"photos": ["cup"], "photos/desk": ["mug"]})
     assert json.loads(found.queries(Job("photos", "desk"))) == ["mug"]
     assert json.loads(found.queries(Job("photos", "other"))) == ["cup"]
-
-
-def test_threads_go_to_scenes_first(tmp_path):
-    assert scene_threads(plan(tmp_path), 6) == 2
-    # the fields of each scene's variants run side by side
-    assert variant_threads(plan(tmp_path), 6) == 1
-    assert scene_threads(plan(tmp_path, only=["one"]), 6) == 6
-    assert scene_threads(plan(tmp_path), 2) == 1
 
 
 def test_a_model_folder_counts_by_its_bytes(tmp_path):
@@ -288,14 +280,16 @@ def test_a_downloaded_model_reruns_masks_and_clip_of_photographs_alone(tmp_path,
     assert json.loads(after[photo]["clip"])["model"] == "models/clip-vit-base-patch16"
 
 
-def test_a_run_says_which_models_answer_and_when_answers_mean_nothing(tmp_path, monkeypatch):
+def test_a_run_names_its_models_and_warns_if_answers_mean_nothing(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     lay_model("sam-tiny", "sam", embedded=True)
     lay_model("clip-tiny", "clip", embedded=True)
     config = {"groups": ["benchmark", "photos"], "overrides": OF_PHOTOGRAPHS}
-    drawn, photo, doubt = plan(tmp_path, **config).answering()
-    assert drawn == "synthetic/one, synthetic/two, rooms/room: masks by sam-tiny; words by clip-tiny"
-    assert photo.startswith("photos/desk: masks by the graph segmenter") and "words by clip-tiny" in photo
+    drawn, photo, doubt = plan(tmp_path, **config).model_lines()
+    assert drawn == "synthetic/one, synthetic/two, rooms/room: masks by sam-tiny; text queries by clip-tiny"
+    assert (
+        photo.startswith("photos/desk: masks by the graph segmenter") and "text queries by clip-tiny" in photo
+    )
     assert "answers about photographs mean nothing" in doubt and "hilsplat models get" in doubt
     (tmp_path / "config/config.yaml").write_text(json.dumps({"overrides": OF_PHOTOGRAPHS}))
     assert models_of_photographs(tmp_path / "config/config.yaml", "desk") == [
@@ -304,11 +298,11 @@ def test_a_run_says_which_models_answer_and_when_answers_mean_nothing(tmp_path, 
     ]
     lay_model("clip-vit-base-patch16", "clip")
     lay_model("sam-vit-base", "sam")
-    assert plan(tmp_path, **config).answering()[1:] == [
-        "photos/desk: masks by sam-vit-base; words by clip-vit-base-patch16"
+    assert plan(tmp_path, **config).model_lines()[1:] == [
+        "photos/desk: masks by sam-vit-base; text queries by clip-vit-base-patch16"
     ]
     assert models_of_photographs(tmp_path / "config/config.yaml", "desk") == [
-        "masks by sam-vit-base; words by clip-vit-base-patch16"
+        "masks by sam-vit-base; text queries by clip-vit-base-patch16"
     ]
     assert models_of_photographs(tmp_path / "nowhere.yaml", "desk") == []
 

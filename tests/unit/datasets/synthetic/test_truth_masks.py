@@ -151,7 +151,7 @@ def test_probabilities_stay_probabilities():
 @pytest.fixture
 def command(world, monkeypatch):
     """The subcommand `hilsplat masks`, without its hold on the log."""
-    monkeypatch.setattr(around, "start_logging", lambda log: None)
+    monkeypatch.setattr(around, "start_logging", lambda *_, **__: None)
     return lambda **options: segment_commands.masks(scene=world / "scene", out=world / "out", **options)
 
 
@@ -162,7 +162,7 @@ def test_the_command_wants_the_truth_and_records_it(world, command):
     command(settings=asked, truth=world / "truth", perturb='{"seed": 3}')
     record = read_json(provenance_path(world / "out"))
     assert record["stage"] == "truth_masks"
-    assert record["settings"]["seed"] == record["seed"] == 3
+    assert record["settings"]["perturb"]["seed"] == record["seed"] == 3
     assert set(record["inputs"]) == {"scene", "truth"}
 
 

@@ -152,7 +152,7 @@ def test_parts_of_a_variant_are_found_through_provenance(tmp_path):
 def test_unfinished_scene_names_the_missing_part(tmp_path):
     folder = finished_scene(tmp_path)
     (folder / "gaussians.ply").unlink()
-    with pytest.raises(ArtifactError, match=r"snakemake --cores 2 .*gaussians\.ply"):
+    with pytest.raises(ArtifactError, match=r"hilsplat run .*gaussians\.ply"):
         FinishedScene.locate(folder, "default")
 
 

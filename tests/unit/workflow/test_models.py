@@ -1,10 +1,10 @@
-"""What this machine cannot do is refused before a job begins."""
+"""Models and devices are checked before a job begins."""
 
 import pytest
 
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.configuration import StageSettings, parse_run
-from hilsplat.workflow.feasible import require_feasible
+from hilsplat.workflow.models import check_device, check_models
 
 
 def stages(**sections: dict) -> StageSettings:
@@ -12,7 +12,8 @@ def stages(**sections: dict) -> StageSettings:
 
 
 def test_the_default_settings_can_be_met():
-    require_feasible(stages(), "d/s")
+    check_models(stages(), "d/s")
+    check_device(stages(), "d/s")
 
 
 @pytest.mark.parametrize("section", ["gaussians", "contributions", "semantic_tree", "field"])
@@ -22,7 +23,7 @@ def test_a_device_that_is_not_here_is_refused(section):
     if cuda_missing() is None:
         pytest.skip("this machine has CUDA")
     with pytest.raises(HilsplatError, match=rf"^{section}\.device of d/s, variant v: (.|\n)*device: cuda"):
-        require_feasible(stages(**{section: {"device": "cuda"}}), "d/s, variant v")
+        check_device(stages(**{section: {"device": "cuda"}}), "d/s, variant v")
 
 
 @pytest.mark.parametrize(
@@ -37,11 +38,11 @@ def test_a_device_that_is_not_here_is_refused(section):
 )
 def test_a_model_folder_that_cannot_be_used_is_refused(section, model, words):
     with pytest.raises(HilsplatError, match=rf"^{section}\.model of d/s: (.|\n)*{words}"):
-        require_feasible(stages(**{section: {"model": model}}), "d/s")
+        check_models(stages(**{section: {"model": model}}), "d/s")
 
 
 def test_a_model_that_nothing_runs_is_not_looked_at():
-    require_feasible(stages(masks={"segmenter": "graph", "model": "models/nope"}), "d/s")
+    check_models(stages(masks={"segmenter": "graph", "model": "models/nope"}), "d/s")
 
 
 @pytest.mark.parametrize("value", [float("inf"), float("-inf"), float("nan")])

@@ -1,4 +1,4 @@
-"""Digests of model folders, cached by sizes and times of their files, since ViT-H takes seconds to read."""
+"""Digests of model folders, cached by sizes and times of their files."""
 
 import functools
 import json
@@ -9,11 +9,11 @@ from hilsplat.base.artifacts import parse_json, sha256_of_path, write_json
 
 @functools.cache
 def model_digest(folder: Path, cache: Path) -> str:
-    """Digest of a folder's files; for a missing folder a note, since the stage itself says what to do.
+    """Return the digest of a model folder, cached: ViT-H takes seconds to read.
 
     Args:
-        folder: model folder.
-        cache: folder of the file that keeps digests.
+        folder: model folder. If it is missing, the result says so; the stage reports how to fix it.
+        cache: folder of the file with known digests.
     """
     if not folder.is_dir():
         return f"{folder} is missing"

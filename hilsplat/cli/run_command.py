@@ -1,0 +1,38 @@
+"""The command that runs the workflow."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilsplat.cli.apps import app
+from hilsplat.cli.stage import start_logging
+
+
+@app.command("run")
+def run_command(
+    targets: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[TARGET]... [-- SNAKEMAKE OPTIONS]",
+            help="scenes (photos/desk or desk), rules (tables) or files; default: everything",
+            show_default=False,
+        ),
+    ] = None,
+    config: Annotated[
+        list[Path] | None,
+        typer.Option(help="configuration file that overrides config/config.yaml; may be repeated"),
+    ] = None,
+) -> None:
+    """Run the workflow: everything that the configuration names, or single scenes, tables or files.
+
+    A run that was killed continues. Options after -- go to Snakemake, such as: hilsplat run desk -- --cores 1
+    """
+    start_logging()
+    from hilsplat.workflow.run import run
+
+    options = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else []
+    names = targets or []
+    status = run(names[: len(names) - len(options)], config or [], options)
+    raise typer.Exit(status)

@@ -1,0 +1,287 @@
+"""Progress of a run: a line per finished stage, and on a terminal a last line with the time left.
+
+Only the attributes of Snakemake's log records are used here; `snakemake_logger_plugin_hilsplat` connects this
+module to Snakemake. Warnings and errors are shown in full.
+"""
+
+import logging
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from io import TextIOBase
+from pathlib import Path
+from types import SimpleNamespace
+from typing import IO, cast
+
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from hilsplat.base.artifacts import parse_json
+from hilsplat.base.progress import last_progress, warnings_in
+from hilsplat.workflow.jobs import Job
+from hilsplat.workflow.resources import START_S, JobResources
+
+REPLACED = frozenset({"progress", "job_started", "workflow_started", "resources_info"})
+"""Events that are not printed, besides the start and end of a job."""
+
+TARGETS = ("all", "everything", "tables", "total")
+"""Entries of Snakemake's job counts that are not jobs."""
+
+SELECTING = "Select jobs to execute..."
+"""A message before every job; it has no event."""
+
+LOOPS = {
+    "world": "rendered views",
+    "gaussians": "fit steps",
+    "masks": "masks of views",
+    "clip": "CLIP of views",
+    "contributions": "contributions of views",
+    "evaluate": "views scored",
+    "comparison": "queries compared",
+}
+"""Rule -> the loop (`base.progress.track`) that takes nearly all of its time."""
+
+
+@dataclass(frozen=True)
+class RunningJob:
+    """A job that runs.
+
+    Attributes:
+        rule: name of its rule.
+        wildcards: their values by name.
+        threads: number of cores.
+        log: its log, or None.
+        start_s: when it began, on the clock of the run.
+    """
+
+    rule: str
+    wildcards: Mapping[str, str]
+    threads: int
+    log: Path | None
+    start_s: float
+
+    @property
+    def name(self) -> str:
+        """Scene, variant unless it is the default one, and stage."""
+        places = [self.wildcards.get(name, "") for name in ("dataset", "scene", "variant")]
+        scene = "/".join(filter(None, places[:2]))
+        variant = "" if places[2] == "default" else places[2]
+        table = self.wildcards.get("table", self.wildcards.get("sweep", ""))
+        return " ".join(filter(None, [scene, variant, self.rule.replace("_", " "), table]))
+
+    def progress(self) -> tuple[str, int, int] | None:
+        """Return loop, items done and items in total from the log, or None outside a loop."""
+        found = last_progress(self.log) if self.log is not None else None
+        return found if found is not None and found[1] < found[2] else None
+
+
+class Estimates:
+    """Core seconds of jobs: estimates by rule, scaled by what jobs took so far.
+
+    Args:
+        resources: estimates of the plan's jobs; None if there is no plan.
+    """
+
+    def __init__(self, resources: JobResources | None = None) -> None:
+        self.resources = resources
+        self._measured, self._estimated = defaultdict[str, float](float), defaultdict[str, float](float)
+        self._means: dict[str, float] = {}
+
+    def learn(self, rule: str, wildcards: Mapping[str, str], core_s: float) -> None:
+        """Add what a job took."""
+        estimate = self._estimate(rule, SimpleNamespace(**wildcards)) if "scene" in wildcards else START_S
+        for key in (rule, ""):
+            self._measured[key] += core_s
+            self._estimated[key] += estimate
+
+    def learn_from_benchmarks(self) -> None:
+        """Add what the jobs of earlier runs took, from Snakemake's benchmark files."""
+        if self.resources is None:
+            return
+        for row in self.resources.plan.rows:
+            folder = Path(self.resources.plan.path(row))
+            for file in [*folder.glob("benchmarks/*.jsonl"), *folder.glob("*/benchmarks/*.jsonl")]:
+                job = {"dataset": row.dataset, "scene": row.scene}
+                try:
+                    last = parse_json(file.read_text(encoding="utf-8").splitlines()[-1])
+                    self.learn(file.stem, job, max(float(last["cpu_time"]), float(last["s"])))
+                except (OSError, ValueError, KeyError, IndexError, TypeError):  # a job is writing it
+                    continue
+
+    def seconds(self, rule: str) -> float:
+        """Return the mean core seconds of a rule's jobs."""
+        if rule not in self._means:
+            rows = self.resources.plan.scenes if self.resources else ()
+            jobs = [self._estimate(rule, row) for row in rows]
+            self._means[rule] = sum(jobs) / len(jobs) if jobs else START_S
+        key = rule if rule in self._estimated else ""
+        return self._means[rule] * (
+            self._measured[key] / self._estimated[key] if key in self._estimated else 1.0
+        )
+
+    def _estimate(self, rule: str, job: Job) -> float:
+        return self.resources.core_seconds(rule, job) if self.resources else START_S
+
+
+estimates = Estimates()
+"""Estimates of this process's run; the Snakefile sets `estimates.resources` once it has read the plan."""
+
+
+class RunProgress:
+    """Jobs of a run that wait, run and are done, and the time left.
+
+    Args:
+        clock: monotonic clock, s.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self.clock = clock
+        self.cores = 1
+        self.total = self.done = self.failed = 0
+        self.waiting = Counter[str]()
+        self.running: dict[int, RunningJob] = {}
+        self._hint_given = False
+
+    def begin(self, jobs: Mapping[str, int]) -> None:
+        """Start a run with so many jobs of each rule."""
+        self.waiting = Counter({rule: number for rule, number in jobs.items() if rule not in TARGETS})
+        self.total = self.waiting.total()
+        estimates.learn_from_benchmarks()
+
+    def start(self, number: int, job: RunningJob) -> None:
+        """Start a job, perhaps not for the first time."""
+        if job.rule in TARGETS:
+            return
+        if self.waiting[job.rule] > 0:
+            self.waiting[job.rule] -= 1
+        else:
+            self.failed -= 1
+        self.running[number] = job
+
+    def fail(self, number: int) -> None:
+        """End a job with an error."""
+        if self.running.pop(number, None) is not None:
+            self.failed += 1
+
+    def end(self, number: int) -> list[str]:
+        """End a job, and return the lines to print."""
+        job = self.running.pop(number, None)
+        if job is None:
+            return []
+        self.done += 1
+        seconds = self.clock() - job.start_s
+        estimates.learn(job.rule, job.wildcards, seconds * job.threads)
+        warnings = warnings_in(job.log) if job.log is not None else []
+        return [*warnings, f"{job.name}: {seconds:.0f} s ({self.counts()})", *self._hint(job)]
+
+    def counts(self) -> str:
+        """Return how many jobs are done, and the time left."""
+        failed = f", {self.failed} failed" if self.failed else ""
+        left = f", {duration(self.seconds_left())} left" if self.running or self.waiting.total() else ""
+        return f"{self.done} of {self.total} done{failed}{left}"
+
+    def line(self) -> str:
+        """Return the last line of the terminal; empty if nothing runs."""
+        jobs = [self._describe(self.running[number]) for number in sorted(self.running)]
+        return f"{self.counts()} | {', '.join(jobs)}" if jobs else ""
+
+    def _describe(self, job: RunningJob) -> str:
+        progress = job.progress()
+        if progress is None:
+            return job.name
+        loop = "" if progress[0] == LOOPS.get(job.rule) else f": {progress[0]}"
+        return f"{job.name}{loop} {progress[1]} of {progress[2]}"
+
+    def seconds_left(self) -> float:
+        """Return the core seconds left divided by the cores, but at least those of the longest job."""
+        waiting = sum(number * estimates.seconds(rule) for rule, number in self.waiting.items() if number)
+        running = [(self._left(job), job.threads) for job in self.running.values()]
+        spread = (waiting + sum(left * threads for left, threads in running)) / self.cores
+        return max([spread, *(left for left, _ in running)])
+
+    def _left(self, job: RunningJob) -> float:
+        """Return the seconds that a running job still takes; its own progress counts once it has any."""
+        elapsed, progress = self.clock() - job.start_s, job.progress()
+        if progress is not None and progress[1] and progress[0] == LOOPS.get(job.rule):
+            return elapsed * (progress[2] / progress[1] - 1)
+        return max(estimates.seconds(job.rule) / job.threads - elapsed, 0.1 * elapsed)
+
+    def _hint(self, job: RunningJob) -> list[str]:
+        """Return the query commands when a scene's tree is done; once in a run."""
+        if self._hint_given or job.rule != "semantic_tree" or job.wildcards.get("variant") != "default":
+            return []
+        self._hint_given = True
+        scene = f"{job.wildcards['dataset']}/{job.wildcards['scene']}"
+        return [f"{scene} is ready to query:", f'  hilsplat query {scene} "..."', f"  hilsplat view {scene}"]
+
+
+class ProgressDisplay:
+    """Writes progress, warnings and errors to a terminal or a file.
+
+    Args:
+        stream: where to write.
+        text: formats other log records.
+        run: the progress.
+    """
+
+    def __init__(
+        self, stream: TextIOBase, text: Callable[[logging.LogRecord], str], run: RunProgress
+    ) -> None:
+        self.text, self.run = text, run
+        file = cast(IO[str], stream)
+        self._console = Console(file=file, highlight=False, markup=False, emoji=False, soft_wrap=True)
+        self._line = Live(
+            console=self._console,
+            get_renderable=self._draw,
+            refresh_per_second=1,
+            transient=True,
+            redirect_stdout=False,
+            redirect_stderr=False,
+        )
+        self._line.start()
+
+    def show(self, record: logging.LogRecord) -> None:
+        """Update the progress from a log record of Snakemake's, and print what is worth a line."""
+        event, facts, lines = getattr(record, "event", None), record.__dict__, []
+        if event == "resources_info" and facts.get("cores"):
+            self.run.cores = facts["cores"]
+        if event in REPLACED or record.getMessage() == SELECTING:
+            return
+        if event == "job_info":
+            log = next(map(Path, facts["log"]), None)
+            job = RunningJob(facts["rule_name"], facts["wildcards"], facts["threads"], log, self.run.clock())
+            self.run.start(facts["jobid"], job)
+        elif event == "job_finished":
+            lines = self.run.end(facts["job_id"])
+        else:
+            if event == "run_info":
+                self.run.begin(facts["stats"])
+            elif event == "job_error":
+                self.run.fail(facts["jobid"])
+            lines = [self.text(record)]
+        style = {logging.WARNING: "yellow", logging.ERROR: "red"}.get(record.levelno)
+        for line in lines:
+            self._console.print(line, style=style)
+        self._line.refresh()
+
+    def close(self) -> None:
+        """Remove the last line."""
+        self._line.stop()
+
+    def _draw(self) -> Text:
+        return Text(self.run.line() if self._console.is_terminal else "", no_wrap=True, overflow="ellipsis")
+
+
+def duration(seconds: float) -> str:
+    """Return a time as text, no more exact than an estimate is."""
+    if seconds < 10:
+        return "less than 10 s"
+    if seconds < 55:
+        return f"about {round(seconds, -1):.0f} s"
+    minutes = round(seconds / 60)
+    if minutes < 90:
+        return f"about {max(minutes, 1)} min"
+    hours, rest = divmod(round(minutes, -1), 60)
+    return f"about {hours} h {rest} min" if rest else f"about {hours} h"

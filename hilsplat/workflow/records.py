@@ -1,0 +1,253 @@
+"""Check artifacts against their provenance, and the provenance against the plan of a run.
+
+Snakemake compares times and its own metadata. Both miss a file that was deleted inside a folder, an output
+that a killed job left, and everything once the metadata is lost.
+"""
+
+import shlex
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from hilsplat.base.artifacts import lock_path, provenance_path, read_json, sha256_of_path
+from hilsplat.base.errors import ArtifactError, HilsplatError
+from hilsplat.base.progress import track
+from hilsplat.base.provenance import sizes_of
+from hilsplat.datasets.sources import is_exported
+from hilsplat.methods.registry import OURS
+from hilsplat.models.digests import model_digest
+from hilsplat.workflow.plan import Plan
+from hilsplat.workflow.stages import stage_code
+from hilsplat.workflow.targets import tables
+
+IMPORTED = "langsplat"
+"""Stage of artifacts that a user imported in place of a stage's output: no settings of a plan made them."""
+
+SHARED = ("masks", "coverage_tree", "clip", "contributions", "semantic_tree", "autoencoder", "field")
+"""Stages whose outputs variants share."""
+
+WHOLE, STALE, DAMAGED = "whole", "stale", "damaged"
+
+
+@dataclass(frozen=True)
+class Expected:
+    """How a plan makes an artifact.
+
+    Attributes:
+        output: one of the outputs that its rule declares, if it is not the artifact itself.
+        stage: key of `STAGES`.
+        settings: as its provenance should record them.
+        seed: as its provenance should record it; None if nothing is random.
+        plugins: readers or baselines that its code digest covers.
+    """
+
+    stage: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    seed: int | None = None
+    plugins: tuple[str, ...] = ()
+    output: str = ""
+
+
+def expected_artifacts(plan: Plan) -> dict[str, Expected]:
+    """Return how the plan makes each artifact that the run may write, by path."""
+    found: dict[str, Expected] = {}
+    for row in plan.scenes:
+        scene = SimpleNamespace(dataset=row.dataset, scene=row.scene)
+        readers = plan.data.label_readers(scene)
+
+        def add(
+            name: str,
+            stage: str,
+            job: Any,
+            *,
+            seed: int | None = None,
+            plugins: tuple[str, ...] = (),
+            **more: Any,
+        ) -> None:
+            variant = [job.variant] if hasattr(job, "variant") else []
+            settings = more.pop("settings", None) or plan.values(stage, job)
+            found.setdefault(plan.path(job, *variant, name), Expected(stage, settings, seed, plugins, **more))
+
+        if row.world:
+            add("world", "world", scene, output=plan.path(scene, "world/images"))
+        if is_exported(row.source):
+            add("source", "source", scene, plugins=plan.data.source_reader(scene))
+        add("scene", "poses", scene, seed=plan.run.seed)
+        add("gaussians.ply", "gaussians", scene, seed=plan.run.seed)
+        for variant in plan.run.variant_names():
+            own = SimpleNamespace(**vars(scene), variant=variant)
+            for stage in SHARED:
+                job = SimpleNamespace(**vars(scene), variant=plan.shared_variant(stage, own))
+                settings, seed = plan.stages(job), plan.seed(job)
+                if stage == "masks" and plan.masks_stage(job) == "truth_masks":
+                    both = {name: plan.values(name, job) for name in ("masks", "perturb")}
+                    add("masks", "truth_masks", job, seed=settings.perturb.seed, settings=both)
+                elif stage == "field" and settings.method.name != OURS:
+                    add("field.safetensors", "method", job, seed=seed, plugins=plan.baseline(job))
+                elif stage == "field":
+                    add("field.safetensors", "field", job)
+                else:
+                    add(stage, stage, job, seed=seed if stage == "autoencoder" else None)
+            add("scores.csv", "evaluate", own, plugins=readers)
+        drawn = {name: plan.values(name, scene) for name in ("figures", "evaluate")}
+        figures = f"{plan.run.results}/figures/{row.name}"
+        found[f"{figures}/panel.png"] = Expected("figures", drawn, None, readers)
+        found[f"{figures}/comparison.png"] = Expected("comparison", drawn, None, readers)
+        found[f"{figures}/masks.png"] = Expected("mask_truth")
+    return found | {table: Expected("table") for table in tables(plan)}
+
+
+def outdated(plan: Plan) -> dict[str, str]:
+    """Return the existing outputs that must be made again, with the reason.
+
+    Contents are compared only after a job that did not finish; otherwise sizes are.
+    """
+    expected = expected_artifacts(plan)
+    records = Records(plan.results, every_byte=False)
+    found = {}
+    for path, how in expected.items():
+        if provenance_path(Path(path)).is_file() or Path(how.output or path).exists():
+            state, reason = records.state(Path(path), how)
+            if state != WHOLE:
+                found[how.output or path] = reason
+    return found
+
+
+def verify(results: Path) -> tuple[str, bool]:
+    """Read every byte of a results folder and compare it with the provenance.
+
+    An artifact is damaged if its files are not what was written. It is stale if other code made it or its
+    inputs have changed. Inputs outside the folder that no longer exist are ignored.
+
+    Args:
+        results: the results folder, or a copy of it anywhere.
+
+    Returns:
+        A report that ends with the Snakemake command that repairs the folder, and whether all is whole.
+
+    Raises:
+        ArtifactError: the folder holds no artifact.
+    """
+    results = Path(results)
+    paths = sorted(path for path in results.rglob("*.provenance.json") if ".cache" not in path.parts)
+    if not paths:
+        raise ArtifactError(
+            f"{results} holds no artifact", expected="a results folder, with *.provenance.json in it"
+        )
+    counts, lines, again, records = Counter[str](), [], [], Records(results, every_byte=True)
+    for path in track(paths, "artifacts read"):
+        artifact = path.with_name(path.name.removesuffix(".provenance.json"))
+        state, reason = records.state(artifact)
+        counts[state] += 1
+        if state != WHOLE:
+            lines.append(f"{state:<8} {artifact}: {reason}")
+            output = (
+                artifact / "images" if artifact.name == "world" else artifact
+            )  # its rule declares two folders
+            again.append("/".join(("results", *output.relative_to(results).parts)))
+    states = ", ".join(f"{counts[state]} {state}" for state in (WHOLE, STALE, DAMAGED) if counts[state])
+    lines.append(f"{len(paths)} artifacts in {results}: {states}")
+    if again:
+        lines.append(f"to make them again: snakemake --cores 2 --forcerun {shlex.join(again)}")
+    return "\n".join(lines), not again
+
+
+class Records:
+    """The provenance of artifacts, compared with their files.
+
+    Args:
+        results: results folder. Provenance names its files as `results/...`, wherever it is now.
+        every_byte: compare contents; otherwise sizes.
+    """
+
+    def __init__(self, results: Path, *, every_byte: bool) -> None:
+        self.results = results
+        self.every_byte = every_byte
+        self._digests: dict[Path, str | None] = {}
+
+    def state(self, artifact: Path, expected: Expected | None = None) -> tuple[str, str]:
+        """Return the state of an artifact, and why it is not whole.
+
+        Args:
+            artifact: file or folder.
+            expected: how the plan makes it; None compares only with the current code.
+        """
+        path = provenance_path(artifact)
+        if not path.is_file():
+            return DAMAGED, "it has no provenance"
+        try:
+            record = read_json(path)
+            damage = self._damage(artifact, record)
+            reason = next(self._differences(record, expected), None)
+        except (ArtifactError, KeyError, TypeError, AttributeError):
+            return DAMAGED, "its provenance is damaged"
+        if damage:
+            return DAMAGED, damage
+        return (STALE, reason) if reason else (WHOLE, "")
+
+    def _damage(self, artifact: Path, record: Mapping[str, Any]) -> str | None:
+        """Return which file is missing or not as it was written."""
+        lock = lock_path(artifact)
+        unfinished = lock.is_file() and lock.stat().st_size > 0
+        for name, written in record["outputs"].items():
+            path, sizes = artifact.parent / name, written["bytes"]
+            if not path.exists():
+                return f"{path.name} is missing"
+            found = sizes_of(path)
+            if gone := sorted(sizes.keys() - found.keys()):
+                return f"{gone[0]} is missing in {path.name}"
+            if wrong := sorted(file for file in found if sizes.get(file) != found[file]):
+                return f"{path.name if wrong[0] == '.' else wrong[0]} is not as it was written"
+            if not self.every_byte and not unfinished:
+                self._digests[path] = written["sha256"]
+            elif self._digest(path) != written["sha256"]:
+                return f"{path.name} is not as it was written"
+        return None
+
+    def _differences(self, record: Mapping[str, Any], expected: Expected | None) -> Iterator[str]:
+        """Yield how an artifact was made differently from now, and which of its inputs changed."""
+        stage, plugins = record["stage"], tuple(record["plugins"])
+        if expected is not None and stage != IMPORTED:
+            if stage != expected.stage:
+                yield f"stage {stage} made it, not {expected.stage}"
+            then, now = record["settings"], expected.settings
+            for name in sorted(then.keys() | now.keys()):
+                made, wanted = then.get(name), now.get(name)
+                if made != wanted:
+                    yield f"it was made with {name} {made!r}, and the configuration says {wanted!r}"
+            if record["seed"] != expected.seed:
+                yield f"it was made with seed {record['seed']}, and the configuration says {expected.seed}"
+            stage, plugins = expected.stage, expected.plugins
+        try:
+            code = stage_code(stage, plugins)
+        except HilsplatError:  # a stage or a reader that this version does not have
+            code = ""
+        if code != record["code"]:
+            yield "other code made it"
+        for name, read in record["inputs"].items():
+            files = read.get("files") or {read["path"]: read["sha256"]}
+            for file, digest in files.items():
+                recorded = Path(file)
+                inside = recorded.parts[:1] in (("results",), (self.results.name,))
+                path = self.results.joinpath(*recorded.parts[1:]) if inside else recorded
+                known = self._digest(path) if self.every_byte else self._known_digest(name, path)
+                if known != digest and (known is not None or (self.every_byte and inside)):
+                    yield f"its input {name} {'is missing' if known is None else 'has changed'}: {path}"
+
+    def _digest(self, path: Path) -> str | None:
+        """Return the digest of a file or folder, or None if there is none."""
+        if path not in self._digests:
+            try:
+                self._digests[path] = sha256_of_path(path)
+            except (ArtifactError, OSError):
+                self._digests[path] = None
+        return self._digests[path]
+
+    def _known_digest(self, name: str, path: Path) -> str | None:
+        """Return the recorded digest of an artifact, or a model's; None if only Snakemake watches it."""
+        if name == "model" and path.is_dir():
+            return model_digest(path, self.results / ".cache")
+        return self._digests.get(path)

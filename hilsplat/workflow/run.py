@@ -1,0 +1,199 @@
+"""`hilsplat run`: Snakemake with the checks and options that people would otherwise type.
+
+It recovers from a killed run, has artifacts that don't match their provenance made again, and starts
+Snakemake in this process. Plain `snakemake --cores 2` gives the same bytes.
+"""
+
+import argparse
+import fcntl
+import json
+import logging
+import os
+import runpy
+import socket
+import subprocess
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from io import TextIOWrapper
+from pathlib import Path
+
+import yaml
+
+from hilsplat.base.errors import HilsplatError
+from hilsplat.base.files import INSTALLED
+from hilsplat.base.processes import jobs_end_with_this_process, remove_leftovers
+from hilsplat.configuration import CONFIG, merged_config
+from hilsplat.workflow.plan import Plan
+from hilsplat.workflow.records import outdated
+
+logger = logging.getLogger(__name__)
+
+STATE = Path(".hilsplat")
+"""Folder of locks and markers, in the working folder."""
+
+UNLOCKING = "HILSPLAT_UNLOCKING"
+"""Environment variable of the Snakemake that removes the locks of a dead run."""
+
+VARIANT_RULES = ("field", "method", "evaluate", "figures", "comparison")
+"""Rules with many short jobs per scene, which run side by side rather than with several threads."""
+
+ELSEWHERE = ("--executor", "-e", "--profile", "--workflow-profile")
+"""Options of Snakemake after which cores and threads are not set here."""
+
+
+def prepare_process() -> TextIOWrapper | None:
+    """Prepare a process that reads the Snakefile: the interpreter and end of its jobs, and a lock.
+
+    Jobs use the interpreter that runs Snakemake, whether or not its environment is activated, and end with
+    Snakemake. The lock is shared and is taken before Snakemake's own locks, which name no owner: if nobody
+    holds it, Snakemake's locks are left from a dead run.
+
+    Returns:
+        The locked file, to keep until the process ends; None in a folder that is read-only.
+    """
+    os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
+    jobs_end_with_this_process()
+    if os.environ.get(UNLOCKING):
+        return None
+    with suppress(OSError):
+        return _locked("processes.lock", fcntl.LOCK_SH)
+    return None
+
+
+def mark_run() -> Path:
+    """Write the marker of this process's run; it stays if the run fails or is killed."""
+    STATE.mkdir(exist_ok=True)
+    marker = STATE / f"run-{os.getpid()}"
+    marker.write_text(socket.gethostname(), encoding="utf-8")
+    return marker
+
+
+def _locked(name: str, kind: int) -> TextIOWrapper:
+    STATE.mkdir(exist_ok=True)
+    stream = (STATE / name).open("a", encoding="utf-8")
+    try:
+        fcntl.flock(stream, kind)
+    except OSError:
+        stream.close()
+        raise
+    return stream
+
+
+def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str]) -> int:
+    """Run the workflow in the working folder.
+
+    Args:
+        targets: scenes (`photos/desk`, `desk`), rules (`tables`) or files; empty for everything.
+        configs: configuration files that override `config/config.yaml`, in order.
+        options: further options of Snakemake, passed on unchanged.
+
+    Returns:
+        Snakemake's exit status.
+
+    Raises:
+        HilsplatError: another run is going on in this folder, or the configuration cannot be used.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--config", "-C", nargs="*", action="extend", default=[])
+    parser.add_argument("--configfile", "--configfiles", nargs="+", action="extend", type=Path, default=[])
+    given, others = parser.parse_known_args(list(options))
+    configs = [*configs, *given.configfile]
+    pairs = [word.partition("=") for word in given.config]
+    settings = merged_config(configs, {key: yaml.safe_load(value) for key, _, value in pairs})
+    plan = Plan(settings)
+    scenes = [target for target in targets if any(target in (row.name, row.scene) for row in plan.rows)]
+    if scenes:
+        given.config.append(f"only={json.dumps(scenes)}")
+        plan = Plan({**settings, "only": scenes})
+    command = ["snakemake", "--snakefile", str(_snakefile(configs)), *others]
+    command += ["--configfile", *map(str, configs)] if configs else []
+    command += ["--config", *given.config] if given.config else []
+    if not _has(others, *ELSEWHERE):
+        command += _local_options(plan, others)
+    if _has(others, "-n", "--dry-run", "--dryrun"):
+        return _start(command, plan, targets, scenes)
+    try:
+        lock = _locked("run.lock", fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise HilsplatError(
+            f"another hilsplat run holds the lock of {Path.cwd()}", fix="wait until it ends, or stop it"
+        ) from error
+    with lock:
+        _recover(command, plan.results)
+        marker = mark_run()
+        status = _start(command, plan, targets, scenes)
+        if status == 0:
+            marker.unlink(missing_ok=True)
+        return status
+
+
+def _start(command: list[str], plan: Plan, targets: Sequence[str], scenes: Sequence[str]) -> int:
+    """Start Snakemake in this process, and make again what doesn't match its provenance."""
+    wrong = outdated(plan)
+    for output, reason in wrong.items():
+        logger.warning("%s is made again: %s", output, reason)
+    logging.getLogger().handlers.clear()  # Snakemake's records would be printed twice
+    files = [target for target in targets if target not in scenes]
+    sys.argv = [*command, *(["--forcerun", *wrong] if wrong else []), *(["--", *files] if files else [])]
+    try:
+        runpy.run_module("snakemake", run_name="__main__", alter_sys=True)
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(bool(end.code))
+    return 0
+
+
+def _snakefile(configs: Sequence[Path]) -> Path:
+    """Return the Snakefile beside the configuration, or else the installed one."""
+    beside = [
+        folder for path in (CONFIG, *configs) if path.is_file() for folder in path.resolve().parents[:2]
+    ]
+    return next(folder / "Snakefile" for folder in [*beside, INSTALLED] if (folder / "Snakefile").is_file())
+
+
+def _has(words: Sequence[str], *options: str) -> bool:
+    """Return whether words contain an option, also as `--option=value` or `-o8`."""
+    return any(
+        word.split("=")[0] == option or (len(option) == 2 and word.startswith(option))
+        for word in words
+        for option in options
+    )
+
+
+def _local_options(plan: Plan, others: Sequence[str]) -> list[str]:
+    """Return cores and threads for this machine: one thread per job where there are jobs for all cores."""
+    words = []
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if not _has(others, "--cores", "-c", "--jobs", "-j"):
+        words += ["--cores", str(cores)]
+    if not _has(others, "--max-threads"):
+        words += ["--max-threads", str(max(1, cores // len(plan.scenes)))]
+    if not _has(others, "--set-threads") and len(plan.run.variant_names()) >= cores:
+        words += ["--set-threads", *(f"{rule}=1" for rule in VARIANT_RULES)]
+    return words
+
+
+def _recover(command: Sequence[str], results: Path) -> None:
+    """Remove what a killed run left: unfinished files and, if no process is alive, Snakemake's locks."""
+    markers = sorted(STATE.glob("run-*"))
+    if not markers:
+        return
+    remove_leftovers(results)
+    if any(marker.read_text(encoding="utf-8") != socket.gethostname() for marker in markers):
+        logger.warning("a run of another machine may be going on here; if none is: snakemake --unlock")
+        return
+    try:
+        alone = _locked("processes.lock", fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return
+    with alone:
+        words = [sys.executable, "-m", *command, "--unlock", "--quiet"]
+        done = subprocess.run(
+            words, env={**os.environ, UNLOCKING: "1"}, capture_output=True, text=True, check=False
+        )
+        if done.returncode != 0:
+            raise HilsplatError(
+                "the locks of a killed run cannot be removed", found=done.stderr.strip()[-500:]
+            )
+        for marker in markers:
+            marker.unlink(missing_ok=True)

@@ -1,0 +1,211 @@
+"""Killed writers leave artifacts whole, and the next clean-up removes what they did not finish."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hilsplat.base import artifacts, processes
+from hilsplat.base.artifacts import atomic_folder, atomic_path, work_folder, write_text
+from hilsplat.base.processes import host_token, remove_leftovers
+
+KILL = """
+import ctypes, errno, os, shutil, signal, sys
+from pathlib import Path
+from hilsplat.base import artifacts, processes
+
+kind, folder = sys.argv[1], Path(sys.argv[2])
+path = folder / "artifact"
+TRACED = {artifacts.__file__, processes.__file__, shutil.__file__}
+
+def no_exchange(*arguments):
+    ctypes.set_errno(errno.EINVAL)
+    return -1
+
+if "without exchange" in kind:
+    artifacts._renameat2 = no_exchange
+
+def write(text):
+    if kind == "file":
+        artifacts.write_text(path, text)
+    else:
+        with artifacts.atomic_folder(path) as new:
+            for name in "ab":
+                artifacts.write_text(new / name, text)
+
+def found():
+    if not path.exists():
+        return "nothing"
+    texts = [path] if kind == "file" else sorted(path.iterdir())
+    return "+".join(text.read_text() for text in texts)
+
+def killed_before(line, action):
+    child = os.fork()
+    if child == 0:
+        def trace(frame, event, argument):
+            nonlocal line
+            if frame.f_code.co_filename not in TRACED:
+                return None
+            if event == "line":
+                line -= 1
+                if line == 0:
+                    os.kill(os.getpid(), signal.SIGKILL)
+            return trace
+        sys.settrace(trace)
+        action()
+        os._exit(0)
+    return os.waitpid(child, 0)[1] == signal.SIGKILL
+
+line, is_killed = 0, True
+while is_killed:
+    line += 1
+    if "old" not in found():
+        write("old")
+    if kind == "clean-up":
+        former = folder / f".writing-{processes.host_token()}-x/.former"
+        former.mkdir(parents=True)
+        path.rename(former / "artifact")
+        write("new")
+        is_killed = killed_before(line, lambda: processes.remove_leftovers(folder))
+        shutil.rmtree(path)  # by Snakemake, for instance
+    else:
+        is_killed = killed_before(line, lambda: write("new"))
+    processes.remove_leftovers(folder)
+    print(found(), *(name for name in os.listdir(folder) if name != "artifact"))
+"""
+
+
+def after_kills(kind: str, folder: Path) -> list[str]:
+    """Content of an artifact and names of leftovers, after kills before every line of the writer."""
+    command = [sys.executable, "-c", KILL, kind, str(folder)]
+    return subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.splitlines()
+
+
+@pytest.mark.parametrize("kind", ["file", "folder", "folder without exchange"])
+def test_an_artifact_is_the_former_or_the_new_one_wherever_its_writer_is_killed(tmp_path, kind):
+    versions = {"old", "new"} if kind == "file" else {"old+old", "new+new"}
+    found = after_kills(kind, tmp_path)
+    assert set(found) == versions
+    assert found == sorted(found, reverse=True), "the new version never disappears again"
+
+
+def test_a_former_version_never_returns_in_part(tmp_path):
+    """A clean-up is killed while it deletes a former version, and then the artifact is deleted."""
+    assert set(after_kills("clean-up", tmp_path)) == {"old+old", "nothing"}
+
+
+WRITER = """
+import os, sys, time
+os.getpid = lambda: int(sys.argv[2])  # the number in another process namespace
+from hilsplat.base.artifacts import atomic_folder, atomic_path
+with {writer}(sys.argv[1]) as temporary:
+    print(flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.fixture(params=["atomic_path", "atomic_folder"])
+def writers(tmp_path, request) -> Iterator[list[subprocess.Popen]]:
+    """Processes that write, with process numbers of a dead and of a living process here."""
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    script = WRITER.format(writer=request.param)
+    running = []
+    for pid in (dead.pid, os.getpid()):
+        command = [sys.executable, "-c", script, str(tmp_path / f"scene/{pid}"), str(pid)]
+        running.append(subprocess.Popen(command, stdout=subprocess.PIPE))
+        running[-1].stdout.readline()
+    yield running
+    for writer in running:
+        writer.kill()
+        writer.wait()
+
+
+def test_unfinished_files_are_kept_while_their_writer_lives_in_any_container(tmp_path, writers):
+    assert remove_leftovers(tmp_path) == []
+    for left in (1, 0):
+        writers[left].send_signal(signal.SIGKILL)
+        writers[left].wait()
+        assert len(remove_leftovers(tmp_path)) == 1
+        assert len(list((tmp_path / "scene").iterdir())) == left
+
+
+def test_only_folders_of_unfinished_files_of_this_host_are_removed(tmp_path):
+    folder = tmp_path / "d/s"
+    leftover = folder / f".writing-{host_token()}-01234567"
+    (leftover / f".writing-{host_token()}-01234567").mkdir(parents=True)
+    kept = [folder / ".writing-00000000-01234567", folder / ".masks.lock", folder / "masks"]
+    for path in kept:
+        path.mkdir()
+    assert remove_leftovers(tmp_path) == [leftover]
+    assert sorted(folder.iterdir()) == sorted(kept)
+    assert remove_leftovers(tmp_path / "nowhere") == []
+
+
+@pytest.mark.parametrize("is_lock_created", [True, False])
+def test_a_writer_whose_folder_is_removed_before_it_is_locked_takes_another(
+    tmp_path, monkeypatch, is_lock_created
+):
+    module, name = (processes.fcntl, "flock") if is_lock_created else (Path, "open")
+    function = getattr(module, name)
+
+    def after_a_clean_up(*arguments):
+        monkeypatch.undo()
+        assert len(remove_leftovers(tmp_path)) == 1
+        return function(*arguments)
+
+    monkeypatch.setattr(module, name, after_a_clean_up)
+    write_text(tmp_path / "a", "text")
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["text"]
+
+
+def test_every_name_that_fits_a_folder_can_be_written(tmp_path):
+    for name in ("a" * 255, "b" * 251 + ".npz"):
+        write_text(tmp_path / name, "text")
+        assert (tmp_path / name).read_text() == "text"
+    with atomic_folder(tmp_path / ("f" * 255)) as folder:
+        write_text(folder / ("x" * 255), "text")
+    assert (tmp_path / ("f" * 255) / ("x" * 255)).exists()
+
+
+@pytest.mark.parametrize("writer", [atomic_path, atomic_folder, work_folder])
+def test_nothing_is_left_after_an_error(tmp_path, writer):
+    with pytest.raises(ZeroDivisionError), writer(tmp_path / "out") as temporary:
+        assert temporary.exists()
+        raise ZeroDivisionError
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("can_exchange", [True, False])
+def test_the_former_folder_stays_until_the_new_one_is_whole(tmp_path, monkeypatch, can_exchange):
+    if not can_exchange:
+        monkeypatch.setattr(artifacts, "_renameat2", None)
+    out = tmp_path / "out"
+    for text in ("one", "two"):
+        with atomic_folder(out) as folder:
+            (folder / text).touch()
+            assert not (out / text).exists()
+    with pytest.raises(ZeroDivisionError), atomic_folder(out):
+        raise ZeroDivisionError
+    assert [path.name for path in Path(out).iterdir()] == ["two"]
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_the_former_folder_returns_if_the_new_one_cannot_take_its_place(tmp_path, monkeypatch):
+    write_text(tmp_path / "out/former", "text")
+    monkeypatch.setattr(artifacts, "_renameat2", None)
+    rename = Path.rename
+
+    def refuse(path: Path, target: Path) -> Path:
+        if path.name == "new":
+            raise OSError("a fault of the disk")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", refuse)
+    with pytest.raises(OSError, match="a fault"), atomic_folder(tmp_path / "out") as folder:
+        write_text(folder / "later", "text")
+    assert [path.name for path in tmp_path.rglob("*")] == ["out", "former"]

@@ -1,0 +1,66 @@
+"""Digests of masks: what changes them, and what they refuse."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilsplat.base.artifacts import write_index
+from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.segment.digests import digest_of, digests_in, index_entry, load_masks, require_same_masks
+from hilsplat.segment.masks import HierarchicalMasks
+
+
+def two_masks(dense: np.ndarray | None = None) -> HierarchicalMasks:
+    """A mask of the left column and one of the top row, or those given."""
+    if dense is None:
+        dense = np.zeros((2, 3, 4), bool)
+        dense[0, :, 0] = dense[1, 0] = True
+    scores = np.array([0.9, 0.8], np.float32)
+    return HierarchicalMasks.from_dense(dense, np.array([1, 2], np.uint8), scores, scores)
+
+
+def test_a_digest_depends_on_order_size_pixels_and_levels(tmp_path):
+    masks = two_masks()
+    pixels = masks.dense()
+    pixels[0, 2, 3] = True
+    others = (
+        masks.take(np.array([1, 0])),
+        masks.take(np.array([0])),
+        two_masks(masks.dense().reshape(2, 4, 3)),
+        two_masks(pixels),
+        replace(masks, level=np.array([1, 3], np.uint8)),
+        HierarchicalMasks.concatenate([], (3, 4)),
+    )
+    assert len({digest_of(each) for each in (masks, *others)}) == 7
+    masks.save(tmp_path / "v.npz")
+    assert digest_of(HierarchicalMasks.load(tmp_path / "v.npz")) == digest_of(two_masks()) == digest_of(masks)
+
+
+def test_loaded_masks_must_be_those_that_are_recorded(tmp_path):
+    two_masks().take(np.array([1, 0])).save(tmp_path / "v.npz")
+    write_index(tmp_path, {"v": index_entry(two_masks())})
+    with pytest.raises(MisalignedArtifactError, match=r"v\.npz contains other masks \(view v\)"):
+        load_masks(tmp_path, "v", digests_in(tmp_path))
+    with pytest.raises(MisalignedArtifactError, match=r"expected +no masks of this view"):
+        load_masks(tmp_path, "v", {})
+
+
+@pytest.mark.parametrize("entry", [{}, {"masks_sha256": 3}, [], None, 7])
+def test_an_index_without_digests_is_refused(tmp_path, entry):
+    write_index(tmp_path, {"v": entry})
+    with pytest.raises(ArtifactError, match=r"is of another version(.|\n)*found +none of view v"):
+        digests_in(tmp_path)
+
+
+@pytest.mark.parametrize("rows", [[1, 0], [0], None])
+def test_the_view_that_differs_is_named_whichever_side_lacks_it(tmp_path, rows):
+    same = {"u": index_entry(two_masks())}
+    more = {} if rows is None else {"v": index_entry(two_masks().take(np.array(rows)))}
+    write_index(tmp_path / "clip", {**same, **more})
+    write_index(tmp_path / "masks", {**same, "v": index_entry(two_masks())})
+    for one, other in (("clip", "masks"), ("masks", "clip")):
+        words = rf"{one} and .*{other} belong to different masks \(view v\)"
+        with pytest.raises(MisalignedArtifactError, match=words):
+            require_same_masks(tmp_path / one, tmp_path / other)
+    require_same_masks(tmp_path / "clip", tmp_path / "clip")

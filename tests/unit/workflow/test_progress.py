@@ -1,0 +1,259 @@
+"""The progress of a run: a line per stage, a last line on a terminal, the time left."""
+
+import ast
+import io
+import json
+import logging
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hilsplat.base.progress import LOG_FORMAT, last_progress, warnings_in
+from hilsplat.workflow import progress
+from hilsplat.workflow.plan import Plan
+from hilsplat.workflow.progress import LOOPS, Estimates, ProgressDisplay, RunProgress, duration
+from hilsplat.workflow.resources import JobResources
+from hilsplat.workflow.stages import STAGES
+
+ROOT = Path(__file__).resolve().parents[3]
+JOBS = {"gaussians": 1, "semantic_tree": 1, "field": 1, "all": 1, "total": 4}
+SECONDS = {"gaussians": 600.0, "semantic_tree": 120.0, "field": 120.0}
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+class FixedResources:
+    """Estimates that depend only on the rule."""
+
+    plan = SimpleNamespace(rows=(), scenes=(SimpleNamespace(dataset="photos", scene="desk"),))
+
+    def core_seconds(self, rule: str, job: object) -> float:
+        return SECONDS.get(rule, 10.0)
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def run(clock, monkeypatch) -> RunProgress:
+    """A run of three jobs of two threads each, on two cores."""
+    estimates = Estimates()
+    estimates.resources = FixedResources()
+    monkeypatch.setattr(progress, "estimates", estimates)
+    found = RunProgress(clock)
+    found.cores = 2
+    return found
+
+
+def display(run: RunProgress, stream: io.StringIO) -> ProgressDisplay:
+    return ProgressDisplay(stream, logging.Formatter().format, run)
+
+
+def tell(
+    shown: ProgressDisplay, event: str | None = None, text: str = "a block", level: int = 20, **more
+) -> None:
+    record = logging.LogRecord("snakemake", level, __file__, 1, text, None, None)
+    record.__dict__.update(more, **({"event": event} if event else {}))
+    shown.show(record)
+
+
+def start(
+    shown: ProgressDisplay, number: int, rule: str, log: Path | None = None, variant: str = "default"
+) -> None:
+    wildcards = {"dataset": "photos", "scene": "desk", "variant": variant}
+    logs = [str(log)] if log else []
+    tell(shown, "job_info", jobid=number, rule_name=rule, wildcards=wildcards, threads=2, log=logs)
+
+
+def test_a_finished_stage_is_one_plain_line(run, clock):
+    stream = io.StringIO()
+    shown = display(run, stream)
+    tell(shown, "run_info", "Job stats", stats=JOBS)
+    tell(shown, "job_started", jobs=[1])
+    tell(shown, text="Select jobs to execute...")
+    start(shown, 1, "gaussians")
+    clock.now = 290.0
+    tell(shown, "job_finished", job_id=1)
+    tell(shown, "progress", done=1, total=3)
+    assert stream.getvalue() == "Job stats\nphotos/desk gaussians: 290 s (1 of 3 done, about 2 min left)\n"
+
+
+def test_the_query_commands_are_printed_once(run):
+    stream = io.StringIO()
+    shown = display(run, stream)
+    for _ in range(2):
+        start(shown, 2, "semantic_tree")
+        tell(shown, "job_finished", job_id=2)
+    assert stream.getvalue().count("photos/desk is ready to query:") == 1
+    assert stream.getvalue().count('hilsplat query photos/desk "..."') == 1
+
+
+def test_errors_are_shown_in_full_and_a_retry_counts_once(run):
+    stream = io.StringIO()
+    shown = display(run, stream)
+    tell(shown, "run_info", "Job stats", stats=JOBS)
+    start(shown, 1, "gaussians")
+    tell(shown, "job_error", "Error in rule gaussians:\n    the whole log", logging.ERROR, jobid=1)
+    assert stream.getvalue().endswith("Error in rule gaussians:\n    the whole log\n")
+    assert run.counts() == "0 of 3 done, 1 failed, about 2 min left"
+    start(shown, 1, "gaussians")
+    assert run.counts() == "0 of 3 done, about 7 min left"
+
+
+def test_a_target_is_not_a_job(run):
+    stream = io.StringIO()
+    shown = display(run, stream)
+    tell(shown, "run_info", "", stats={"all": 1, "total": 1})
+    start(shown, 0, "all")
+    tell(shown, "job_finished", job_id=0)
+    assert stream.getvalue() == "\n" and run.counts() == "0 of 0 done"
+
+
+def test_a_terminal_has_a_last_line_below_the_others(run, clock):
+    stream = Terminal()
+    shown = display(run, stream)
+    tell(shown, "run_info", "", stats=JOBS)
+    start(shown, 1, "gaussians", variant="paper")
+    clock.now = 100.0
+    tell(shown, text="a warning", level=logging.WARNING)
+    printed = stream.getvalue()
+    shown.close()
+    line = "0 of 3 done, about 5 min left | photos/desk paper gaussians"
+    assert "a warning" in printed and line in printed[printed.index("a warning") :]
+
+
+def test_a_file_has_no_last_line(run):
+    stream = io.StringIO()
+    shown = display(run, stream)
+    tell(shown, "run_info", "Job stats", stats=JOBS)
+    start(shown, 1, "gaussians")
+    shown.close()
+    assert stream.getvalue().strip() == "Job stats"
+
+
+def log_lines(path: Path, *records: tuple[int, str, str]) -> None:
+    formatter = logging.Formatter(LOG_FORMAT)
+    lines = [
+        formatter.format(logging.LogRecord(name, level, __file__, 1, text, None, None))
+        for level, name, text in records
+    ]
+    path.write_text("\n".join([*lines, ""]))
+
+
+def test_the_progress_in_a_log_is_shown_and_counts(run, clock, tmp_path):
+    log = tmp_path / "gaussians.log"
+    shown = display(run, io.StringIO())
+    start(shown, 1, "gaussians", log)
+    clock.now = 600.0  # later than estimated
+    log_lines(log, (20, "hilsplat.base.progress", "photographs read: 3 of 4"))
+    assert run.line().endswith("photos/desk gaussians: photographs read 3 of 4")
+    assert run.seconds_left() == pytest.approx(60), "only the main loop counts"
+    log_lines(log, (20, "hilsplat.base.progress", "fit steps: 1 of 4"))
+    assert run.line().endswith("photos/desk gaussians 1 of 4")
+    assert run.seconds_left() == pytest.approx(1800)
+    log_lines(log, (20, "hilsplat.base.progress", "fit steps: 4 of 4"), (20, "x", "done"))
+    assert run.line().endswith("photos/desk gaussians")
+
+
+def test_warnings_of_a_stage_are_printed_when_it_ends(run, tmp_path):
+    log = tmp_path / "poses.log"
+    log_lines(
+        log,
+        (20, "hilsplat.a", "start"),
+        (30, "hilsplat.a", "2 photographs did not register\n  IMG_1"),
+        (20, "b", "end"),
+    )
+    assert warnings_in(log) == ["2 photographs did not register\n  IMG_1"]
+    assert last_progress(log) is None and last_progress(tmp_path / "none") is None
+    stream = io.StringIO()
+    shown = display(run, stream)
+    start(shown, 1, "poses", log)
+    tell(shown, "job_finished", job_id=1)
+    assert stream.getvalue().startswith("2 photographs did not register\n  IMG_1\nphotos/desk poses: 0 s")
+
+
+def test_estimates_follow_what_jobs_took(run):
+    estimates = progress.estimates
+    job = {"dataset": "photos", "scene": "desk"}
+    estimates.learn("gaussians", job, 1200.0)
+    assert estimates.seconds("gaussians") == 1200
+    assert estimates.seconds("field") == 240, "a slower machine makes every estimate longer"
+    estimates.learn("field", job, 60.0)
+    assert estimates.seconds("field") == 60
+
+
+def test_a_long_last_job_is_not_divided_among_the_cores(run, clock):
+    shown = display(run, io.StringIO())
+    start(shown, 1, "gaussians")
+    run.running[1] = progress.RunningJob("gaussians", {}, 1, None, 0.0)
+    assert run.seconds_left() == 600
+
+
+def test_21000_jobs_are_redrawn_in_50_ms(run):
+    run.begin({"masks": 1000, "field": 20_000})
+    shown = display(run, io.StringIO())
+    for number in range(8):
+        start(shown, number, "masks")
+    begun = time.process_time()
+    for _ in range(20):
+        run.line()
+    assert (time.process_time() - begun) / 20 < 0.05
+
+
+@pytest.mark.parametrize("rule", LOOPS)
+def test_the_loop_of_a_rule_is_one_that_its_stage_runs(rule):
+    module = STAGES[rule].partition(":")[0]
+    tree = ast.parse((ROOT / f"{module.replace('.', '/')}.py").read_text())
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    texts = [each.args[1] for each in calls if getattr(each.func, "id", "") == "track"]
+    assert LOOPS[rule] in {text.value for text in texts if isinstance(text, ast.Constant)}
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (3, "less than 10 s"),
+        (44, "about 40 s"),
+        (500, "about 8 min"),
+        (7700, "about 2 h 10 min"),
+        (10700, "about 3 h"),
+    ],
+)
+def test_a_time_is_no_more_exact_than_an_estimate(seconds, text):
+    assert duration(float(seconds)) == text
+
+
+def test_benchmark_files_of_earlier_runs_correct_the_estimates(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("scenes.tsv").write_text(
+        "dataset\tscene\tgroup\tsource\tunit\nsynthetic\tone\tbenchmark\tworld:tabletop:1\tmetre\n"
+    )
+    folder = Path("results/synthetic/one")
+    for part in ("scene", "benchmarks", "default/benchmarks"):
+        (folder / part).mkdir(parents=True)
+    np.savez(folder / "scene/cameras.npz", size_hw=np.array([(500, 1000)] * 2, np.int32))
+    (folder / "benchmarks/poses.jsonl").write_text(json.dumps({"s": 82.0, "cpu_time": 90.0}) + "\n")
+    (folder / "default/benchmarks/clip.jsonl").write_text('{"s": 5')
+    resources = JobResources(Plan({"scenes": "scenes.tsv"}))
+    estimates = Estimates(resources)
+    estimates.learn_from_benchmarks()
+    assert estimates.seconds("poses") == pytest.approx(90)
+    slower = 90 / resources.core_seconds("poses", resources.plan.rows[0])
+    assert estimates.seconds("clip") == pytest.approx(
+        slower * resources.core_seconds("clip", resources.plan.rows[0])
+    )

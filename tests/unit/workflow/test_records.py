@@ -1,0 +1,189 @@
+"""Artifacts compared with their provenance, and provenance compared with a plan."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from hilsplat.base.artifacts import lock_path, output_lock, provenance_path
+from hilsplat.base.errors import ArtifactError
+from hilsplat.base.provenance import Inputs, write_provenance
+from hilsplat.models.digests import model_digest
+from hilsplat.workflow.plan import Plan
+from hilsplat.workflow.records import Expected, Records, expected_artifacts, outdated, verify
+from hilsplat.workflow.stages import stage_code
+
+MASKS = Path("results/d/s/default/masks")
+TREE = Path("results/d/s/default/coverage_tree")
+EXPECTED = {
+    MASKS: Expected("masks"),
+    TREE: Expected("coverage_tree", {"theta": 0.9}, 7),
+}
+
+
+def write(artifact: Path, text: str = "one", stage: str = "", **inputs: Path) -> None:
+    """Write an artifact and its record as the plan makes it."""
+    expected = EXPECTED[artifact]
+    for name in ("a.npz", "b.npz"):
+        artifact.mkdir(parents=True, exist_ok=True)
+        (artifact / name).write_text(text)
+    write_provenance(
+        artifact,
+        stage=stage or expected.stage,
+        code=stage_code(stage or expected.stage),
+        command=["hilsplat"],
+        settings=expected.settings,
+        seed=expected.seed,
+        inputs=Inputs("masks", inputs),
+    )
+
+
+@pytest.fixture
+def results(tmp_path, monkeypatch) -> Path:
+    """Masks made from photographs, and coverage trees made from the masks."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos/1.jpg").write_text("x")
+    write(MASKS, scene=tmp_path / "photos")
+    write(TREE, masks=MASKS)
+    return Path("results")
+
+
+def problems(expected: dict[Path, Expected] | None = None) -> dict[str, str]:
+    records = Records(Path("results"), every_byte=False)
+    found = {path.name: records.state(path, how)[1] for path, how in (expected or EXPECTED).items()}
+    return {name: reason for name, reason in found.items() if reason}
+
+
+def test_artifacts_made_as_planned_have_no_problem(results):
+    assert problems() == {}
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"settings": {"theta": 0.6}}, "made with theta 0.9, and the configuration says 0.6"),
+        ({"settings": {"theta": 0.9, "new": 1}}, "made with new None"),
+        ({"seed": 8}, "made with seed 7, and the configuration says 8"),
+        ({"stage": "clip"}, "stage coverage_tree made it, not clip"),
+    ],
+)
+def test_other_settings_are_found(results, change, reason):
+    assert (
+        reason in problems({MASKS: EXPECTED[MASKS], TREE: replace(EXPECTED[TREE], **change)})["coverage_tree"]
+    )
+
+
+def test_other_code_is_found(results):
+    path = provenance_path(TREE)
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"code": "0" * 64}))
+    assert problems() == {"coverage_tree": "other code made it"}
+
+
+def test_missing_and_cut_files_are_found(results):
+    (MASKS / "b.npz").write_text("longer")
+    (TREE / "a.npz").unlink()
+    assert problems() == {
+        "masks": "b.npz is not as it was written",
+        "coverage_tree": "a.npz is missing in coverage_tree",
+    }
+    shutil.rmtree(MASKS)
+    assert problems()["masks"] == "masks is missing"
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"stage": 3}', "[" * 100_000])
+def test_damaged_provenance_is_found(results, text):
+    provenance_path(TREE).write_text(text)
+    assert problems() == {"coverage_tree": "its provenance is damaged"}
+
+
+def test_an_artifact_made_from_other_inputs_is_found(results):
+    write(MASKS, "two")
+    assert problems() == {"coverage_tree": f"its input masks has changed: {MASKS}"}
+
+
+def test_every_byte_is_read_after_a_writer_that_did_not_finish(results):
+    """It may have replaced one of several outputs by another of the same size."""
+    (MASKS / "a.npz").write_text("two")
+    assert problems() == {}, "sizes agree"
+    with pytest.raises(KeyboardInterrupt), output_lock(MASKS):
+        raise KeyboardInterrupt
+    assert problems()["masks"] == "masks is not as it was written"
+    (MASKS / "a.npz").write_text("one")
+    assert problems() == {}, "it had not replaced anything"
+    with output_lock(MASKS):
+        pass
+    assert lock_path(MASKS).read_text() == ""
+
+
+def test_imported_artifacts_are_not_compared_with_settings(results):
+    write(MASKS, stage="langsplat")
+    write(TREE, masks=MASKS)
+    assert problems({MASKS: replace(EXPECTED[MASKS], settings={"model": "x"}), TREE: EXPECTED[TREE]}) == {}
+    (MASKS / "a.npz").unlink()
+    assert problems() == {"masks": "a.npz is missing in masks"}
+
+
+def test_another_model_in_the_same_folder_is_found(results):
+    Path("models/m").mkdir(parents=True)
+    Path("models/m/a.onnx").write_text("1")
+    write(MASKS, model=Path("models/m"))
+    write(TREE, masks=MASKS)
+    assert problems() == {}
+    model_digest.cache_clear()  # as in another process
+    Path("models/m/a.onnx").write_text("22")
+    assert problems() == {"masks": "its input model has changed: models/m"}
+
+
+def test_a_plan_expects_what_its_rules_write(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("scenes.tsv").write_text(
+        "dataset\tscene\tgroup\tsource\tunit\nsynthetic\tone\tbenchmark\tworld:tabletop:1\tmetre\n"
+    )
+    variants = {
+        "lifted": {"method": {"name": "lifted"}},
+        "truth": {"masks": {"segmenter": "truth-perturbed"}},
+    }
+    config = {"scenes": "scenes.tsv", "main_variants": ["default", *variants], "variants": variants}
+    found = expected_artifacts(Plan(config))
+    folder = "results/synthetic/one"
+    assert found[f"{folder}/world"].output == f"{folder}/world/images"
+    assert found[f"{folder}/lifted/field.safetensors"].stage == "method"
+    assert found[f"{folder}/lifted/field.safetensors"].plugins == ("hilsplat.methods.lifted:METHOD",)
+    assert set(found[f"{folder}/truth/masks"].settings) == {"masks", "perturb"}
+    assert f"{folder}/lifted/masks" not in found, "it shares those of the default variant"
+    assert "results/tables/lerf.csv" in found
+    assert outdated(Plan(config)) == {}, "nothing has been made"
+    Path(folder, "default/masks").mkdir(parents=True)
+    assert outdated(Plan(config)) == {f"{folder}/default/masks": "it has no provenance"}
+
+
+def test_a_whole_folder_is_whole_wherever_it_is(results, tmp_path):
+    assert verify(results) == ("2 artifacts in results: 2 whole", True)
+    shutil.rmtree(tmp_path / "photos")
+    copy = shutil.copytree(results, tmp_path / "elsewhere/copy")
+    assert verify(copy) == (f"2 artifacts in {copy}: 2 whole", True)
+
+
+def test_verify_reads_every_byte_and_prints_the_repair(results):
+    (MASKS / "a.npz").write_text("two")
+    report, is_whole = verify(results)
+    assert not is_whole
+    assert report.splitlines() == [
+        f"stale    {TREE}: its input masks has changed: {MASKS}",
+        f"damaged  {MASKS}: masks is not as it was written",
+        "2 artifacts in results: 1 stale, 1 damaged",
+        f"to make them again: snakemake --cores 2 --forcerun {TREE} {MASKS}",
+    ]
+
+
+def test_verify_finds_a_missing_input_and_damaged_provenance(results):
+    shutil.rmtree(MASKS)
+    report = verify(results)[0]
+    assert "masks is missing" in report and "its input masks is missing" in report
+    provenance_path(MASKS).write_text("{")
+    assert "its provenance is damaged" in verify(results)[0]
+    with pytest.raises(ArtifactError, match="holds no artifact"):
+        verify(Path("photos"))

@@ -1,0 +1,154 @@
+"""`hilsplat run` before Snakemake starts: locks, recovery, options."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hilsplat.base.errors import HilsplatError
+from hilsplat.workflow import run as runs
+from hilsplat.workflow.run import STATE, mark_run, prepare_process
+
+HOLD = """
+import sys, time
+from hilsplat.workflow.run import prepare_process
+stream = prepare_process()
+print("held", flush=True)
+time.sleep(60)
+"""
+SHEET = "dataset\tscene\tgroup\tsource\tunit\n" + "".join(
+    f"synthetic\t{name}\tbenchmark\tworld:tabletop:{number}\tmetre\n"
+    for number, name in enumerate(["one", "two"])
+)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """A project with two scenes."""
+    monkeypatch.chdir(tmp_path)
+    Path("config").mkdir()
+    Path("config/scenes.tsv").write_text(SHEET)
+    Path("config/config.yaml").write_text("variants: {}\n")
+    Path("Snakefile").write_text("")
+    return tmp_path
+
+
+@pytest.fixture
+def started(monkeypatch) -> list[list[str]]:
+    """Command lines with which Snakemake would start."""
+    found: list[list[str]] = []
+
+    def start(*args: object, **kwargs: object) -> None:
+        found.append(list(sys.argv))
+        raise SystemExit(3)
+
+    monkeypatch.setattr(runs.runpy, "run_module", start)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(4)), raising=False)
+    monkeypatch.setattr(sys, "argv", ["hilsplat"])
+    return found
+
+
+@pytest.fixture
+def unlocked(monkeypatch) -> list[str]:
+    """Calls of `snakemake --unlock`."""
+    found: list[str] = []
+
+    def call(words: list[str], **kwargs: object) -> subprocess.CompletedProcess[str]:
+        assert "--unlock" in words
+        found.append("unlock")
+        return subprocess.CompletedProcess(words, 0, "", "")
+
+    monkeypatch.setattr(runs.subprocess, "run", call)
+    return found
+
+
+def value(command: list[str], option: str) -> str:
+    return command[command.index(option) + 1]
+
+
+def test_cores_and_threads_follow_the_machine_and_the_scenes(folder, started):
+    assert runs.run([], [], []) == 3, "Snakemake's exit status"
+    [command] = started
+    assert value(command, "--cores") == "4" and value(command, "--max-threads") == "2"
+    assert value(command, "--snakefile") == str(folder / "Snakefile")
+    assert "--set-threads" not in command, "one variant keeps all threads"
+
+
+def test_scenes_become_a_configuration_and_other_targets_stay(folder, started):
+    runs.run(["two", "tables"], [], ["--config", "seed=1", "--cores=1", "--keep-going"])
+    [command] = started
+    options = command[command.index("--config") + 1 :]
+    assert options[:2] == ["seed=1", 'only=["two"]']
+    assert command[-2:] == ["--", "tables"]
+    assert "--cores=1" in command and "--cores" not in command and "--keep-going" in command
+    assert value(command, "--max-threads") == "4"
+
+
+def test_a_cluster_sets_its_own_cores(folder, started):
+    runs.run([], [], ["--workflow-profile", "profiles/slurm"])
+    assert not {"--cores", "--max-threads"} & set(started[0])
+
+
+def test_artifacts_that_do_not_match_are_made_again(folder, started):
+    Path("results/synthetic/one/gaussians.ply").parent.mkdir(parents=True)
+    Path("results/synthetic/one/gaussians.ply").write_text("")
+    runs.run(["one"], [], [])
+    assert value(started[0], "--forcerun") == "results/synthetic/one/gaussians.ply"
+
+
+def test_a_second_run_of_the_folder_is_refused(folder, started):
+    lock = runs._locked("run.lock", runs.fcntl.LOCK_EX)
+    with pytest.raises(HilsplatError, match="another hilsplat run"):
+        runs.run([], [], [])
+    assert runs.run([], [], ["-n"]) == 3, "a dry run needs no lock"
+    lock.close()
+    assert runs.run([], [], []) == 3
+
+
+def test_the_locks_of_a_dead_run_are_removed_once(folder, started, unlocked):
+    runs.run([], [], [])
+    assert unlocked == [], "no run was killed"
+    mark_run().rename(STATE / "run-1")
+    runs.run([], [], [])
+    assert unlocked == ["unlock"]
+
+
+def test_the_locks_of_a_live_run_stay(folder, started, unlocked):
+    """A is killed while B, which never had the lock of `hilsplat run`, still works."""
+    mark_run().rename(STATE / "run-1")
+    b = subprocess.Popen([sys.executable, "-c", HOLD], stdout=subprocess.PIPE, text=True)
+    assert b.stdout.readline() == "held\n"
+    runs.run([], [], [])
+    assert unlocked == []
+    b.kill()
+    b.wait()
+    runs.run([], [], [])
+    assert unlocked == ["unlock"]
+
+
+def test_the_locks_of_another_machine_stay(folder, started, unlocked, caplog):
+    mark_run().rename(STATE / "run-1")
+    (STATE / "run-1").write_text("elsewhere")
+    runs.run([], [], [])
+    assert unlocked == [] and "a run of another machine" in caplog.text
+
+
+def test_the_process_that_unlocks_does_not_wait_for_itself(folder, monkeypatch):
+    monkeypatch.setenv(runs.UNLOCKING, "1")
+    with runs._locked("processes.lock", runs.fcntl.LOCK_EX):
+        assert prepare_process() is None
+
+
+def test_the_snakefile_is_beside_the_configuration_or_the_installed_one(
+    folder, project, started, monkeypatch
+):
+    Path("elsewhere").mkdir()
+    monkeypatch.chdir("elsewhere")
+    runs.run([], [folder / "config/config.yaml"], ["-n"])
+    runs.run([], [], ["-n"])
+    assert [value(command, "--snakefile") for command in started] == [
+        str(folder / "Snakefile"),
+        str(project / "Snakefile"),
+    ]

@@ -1,0 +1,158 @@
+"""The workflow runs from any folder, as a module, from a read-only clone, in an unactivated environment."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import PROJECT
+from tests.workflow.conftest import SCENE, Project
+
+PRIVATE = re.compile(
+    r"workflow\.(persistence|dag|is_main_process|executor_plugin|rerun_triggers|resource_settings|output_settings"
+    r"|local_exec)|logger\.(handlers|addHandler|removeHandler)|forcefiles|\.snakemake/locks|getattr\(workflow"
+)
+SCORES = "synthetic/tiny/default/scores.csv"
+
+
+def test_only_documented_interfaces_of_snakemake_are_used(project: Path) -> None:
+    parts = ("Snakefile", "rules", "workflow", "hilsplat", "profiles", "snakemake_logger_plugin_hilsplat")
+    files = [
+        file
+        for part in parts
+        for file in ((project / part).rglob("*") if (project / part).is_dir() else [project / part])
+    ]
+    texts = {
+        file: file.read_text()
+        for file in files
+        if file.suffix in (".py", ".smk", ".yaml", "") and file.is_file()
+    }
+    assert len(texts) > 300
+    assert [str(file) for file, text in texts.items() if PRIVATE.search(text)] == []
+
+
+@pytest.fixture
+def clone(fresh) -> Project:
+    """A copy of the project in a folder with a space and a non-ASCII letter."""
+    copy = fresh()
+    moved = copy.root.with_name("my scènes")
+    copy.root.rename(moved)
+    return Project(moved)
+
+
+def plan_of(project: Project, folder: Path, *words: str) -> str:
+    """Return what a dry run in another folder prints."""
+    command = [sys.executable, "-m", "snakemake", "-n", "--cores", "2", *words]
+    return Project(folder).run(*command, PYTHONPATH=str(project.root)).stdout
+
+
+def test_another_directory_takes_configuration_sheet_and_models_from_the_clone(
+    clone: Project, tmp_path: Path
+) -> None:
+    (tmp_path / "work").mkdir()
+    words = ["--snakefile", str(clone.root / "Snakefile"), "--configfile", str(clone.root / "config/ci.yaml")]
+    printed = plan_of(clone, tmp_path, "--directory", "work", *words)
+    assert "rule evaluate:" in printed and "rule figures:" in printed
+    run = [
+        sys.executable,
+        "-m",
+        "hilsplat",
+        "run",
+        "--config",
+        str(clone.root / "config/ci.yaml"),
+        "--",
+        "-n",
+    ]
+    printed = Project(tmp_path / "work").run(*run, PYTHONPATH=str(clone.root)).stdout
+    assert "rule evaluate:" in printed
+
+
+def test_the_workflow_is_a_module_with_a_prefix(finished: Project, clone: Project, tmp_path: Path) -> None:
+    outer = tmp_path / "outer"
+    outer.mkdir()
+    (outer / "Snakefile").write_text(
+        f"""
+configfile: {str(clone.root / "config/ci.yaml")!r}
+
+module hilsplat:
+    snakefile: {str(clone.root / "Snakefile")!r}
+    config: config
+    prefix: "inner"
+
+use rule * from hilsplat as hilsplat_*
+
+rule mine:
+    default_target: True
+    input: "inner/results/{SCORES}"
+"""
+    )
+    Project(outer).run(sys.executable, "-m", "snakemake", "--cores", "2", PYTHONPATH=str(clone.root))
+    made = (outer / "inner/results" / SCORES).read_bytes()
+    assert made == (finished.root / "results" / SCORES).read_bytes()
+
+
+def test_a_read_only_clone_runs_in_another_folder(clone: Project, tmp_path: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in clone.root.rglob("*")}
+    for path in [clone.root, *clone.root.rglob("*")]:
+        path.chmod(path.stat().st_mode & ~0o222)
+    try:
+        words = [
+            "--snakefile",
+            str(clone.root / "Snakefile"),
+            "--configfile",
+            str(clone.root / "config/ci.yaml"),
+        ]
+        assert "rule evaluate:" in plan_of(clone, tmp_path, *words)
+    finally:
+        for path in [clone.root, *clone.root.rglob("*")]:
+            path.chmod(path.stat().st_mode | 0o200)
+    after = {
+        path: path.stat().st_mtime_ns for path in clone.root.rglob("*") if "__pycache__" not in str(path)
+    }
+    assert {path: time for path, time in before.items() if "__pycache__" not in str(path)} == after
+
+
+def test_the_results_folder_is_one_setting(clone: Project) -> None:
+    printed = clone.snakemake("-n", "--config", "results=out put").stdout
+    assert "output: out put/" in printed and "output: results/" not in printed
+    commands = clone.snakemake("-n", "-p", "--config", "results=out put").stdout
+    assert not [
+        line for line in commands.splitlines() if "python -m hilsplat" in line and " results/" in line
+    ]
+
+
+def test_jobs_run_without_an_activated_environment(clone: Project) -> None:
+    environment = {
+        "PATH": "/usr/bin:/bin",
+        "HOME": os.environ.get("HOME", "/"),
+        "PYTHONPATH": str(clone.root),
+    }
+    images = str(SCENE / "world/images")
+    command = [sys.executable, "-m", "snakemake", "--configfile", "config/ci.yaml", "--cores", "2", images]
+    done = subprocess.run(
+        command, cwd=clone.root, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert (clone.root / images).is_dir()
+
+
+def test_the_checkout_is_where_the_package_looks_for_installed_files() -> None:
+    from hilsplat.base.files import INSTALLED, project_path
+
+    assert INSTALLED == PROJECT
+    assert project_path("config/nowhere.yaml") == Path("config/nowhere.yaml")
+
+
+def test_scenes_are_targets_of_hilsplat_run(copy_of_finished: Project) -> None:
+    project = copy_of_finished
+    shutil.rmtree(project.root / SCENE / "default/coverage_tree")
+    for target in ("tiny", "synthetic/tiny"):
+        assert "rule field:" in project.hilsplat_run(target, "--", "-n").stdout
+    printed = project.hilsplat_run("tables", "--", "-n").stdout
+    assert "rule table:" in printed and "rule figures:" not in printed
+    again = project.hilsplat_run("nowhere", check=False)
+    assert again.returncode != 0 and "nowhere" in again.stderr
