@@ -23,6 +23,6 @@ rule contributions:
         cache=CACHE,
         code=PLAN.code("contributions"),
     shell:
-        "python -m hilsplat contributions --scene {input.scene:q} --gaussians {input.gaussians:q} --masks {input.masks:q}"
+        "python -m hilsplat --log {log:q} contributions --scene {input.scene:q} --gaussians {input.gaussians:q} --masks {input.masks:q}"
         " --settings {params.settings:q} --threads {threads} --cache {params.cache:q}"
-        " --out {output.contributions:q} > {log:q} 2>&1"
+        " --out {output.contributions:q}"

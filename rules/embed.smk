@@ -22,5 +22,5 @@ rule clip:
         cache=CACHE,
         code=PLAN.code("clip"),
     shell:
-        "python -m hilsplat clip --scene {input.scene:q} --masks {input.masks:q} --settings {params.settings:q}"
-        " --threads {threads} --memory {resources.mem_mib} --cache {params.cache:q} --out {output.clip:q} > {log:q} 2>&1"
+        "python -m hilsplat --log {log:q} clip --scene {input.scene:q} --masks {input.masks:q} --settings {params.settings:q}"
+        " --threads {threads} --memory {resources.mem_mib} --cache {params.cache:q} --out {output.clip:q}"

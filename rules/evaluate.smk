@@ -29,11 +29,11 @@ rule evaluate:
         code=PLAN.code("evaluate", PLAN.data.label_readers),
         truth=PLAN.data.truth_option,
     shell:
-        "python -m hilsplat evaluate --scene {input.scene:q} {params.truth} --gaussians {input.gaussians:q}"
+        "python -m hilsplat --log {log:q} evaluate --scene {input.scene:q} {params.truth} --gaussians {input.gaussians:q}"
         " --semantic-tree {input.semantic_tree:q} --field {input.field:q}"
         " --autoencoder {input.autoencoder:q} --clip {input.clip:q} --masks {input.masks:q}"
         " --dataset {wildcards.dataset:q} --name {wildcards.scene:q} --variant {wildcards.variant:q}"
-        " --settings {params.settings:q} --threads {threads} --out {output.scores:q} > {log:q} 2>&1"
+        " --settings {params.settings:q} --threads {threads} --out {output.scores:q}"
 
 
 rule table:
@@ -70,8 +70,8 @@ rule table:
         absent=lambda wildcards: targets.absent_options(PLAN, wildcards.table),
         code=PLAN.code("table"),
     shell:
-        "python -m hilsplat table {wildcards.table:q} --published {input.published:q} --labels {params.labels:q}"
-        " {params.absent} --out {output.csv:q} {input.scores:q} > {log:q} 2>&1"
+        "python -m hilsplat --log {log:q} table {wildcards.table:q} --published {input.published:q} --labels {params.labels:q}"
+        " {params.absent} --out {output.csv:q} {input.scores:q}"
 
 
 rule tables:
@@ -97,4 +97,4 @@ rule efficiency:
         results=lambda wildcards, output: str(Path(output.csv).parent),
         code=PLAN.code("efficiency"),
     shell:
-        "python -m hilsplat efficiency --results {params.results:q} --out {output.csv:q} > {log:q} 2>&1"
+        "python -m hilsplat --log {log:q} efficiency --results {params.results:q} --out {output.csv:q}"

@@ -22,9 +22,9 @@ rule autoencoder:
         seed=PLAN.seed,
         code=PLAN.code("autoencoder"),
     shell:
-        "python -m hilsplat autoencoder --clip {input.clip:q} --semantic-tree {input.semantic_tree:q}"
+        "python -m hilsplat --log {log:q} autoencoder --clip {input.clip:q} --semantic-tree {input.semantic_tree:q}"
         " --contributions {input.contributions:q} --settings {params.settings:q} --seed {params.seed:q}"
-        " --out {output.autoencoder:q} > {log:q} 2>&1"
+        " --out {output.autoencoder:q}"
 
 
 rule field:
@@ -52,6 +52,6 @@ rule field:
         settings=PLAN.settings("field"),
         code=PLAN.code("field"),
     shell:
-        "python -m hilsplat field --contributions {input.contributions:q} --coverage-tree {input.coverage_tree:q}"
+        "python -m hilsplat --log {log:q} field --contributions {input.contributions:q} --coverage-tree {input.coverage_tree:q}"
         " --autoencoder {input.autoencoder:q} --settings {params.settings:q}"
-        " --threads {threads} --out {output.field:q} > {log:q} 2>&1"
+        " --threads {threads} --out {output.field:q}"

@@ -26,7 +26,7 @@ rule method:
         seed=PLAN.seed,
         code=PLAN.code("method", PLAN.baseline),
     shell:
-        "python -m hilsplat method --scene {input.scene:q} --gaussians {input.gaussians:q} --masks {input.masks:q}"
+        "python -m hilsplat --log {log:q} method --scene {input.scene:q} --gaussians {input.gaussians:q} --masks {input.masks:q}"
         " --contributions {input.contributions:q} --autoencoder {input.autoencoder:q}"
         " --settings {params.settings:q} --seed {params.seed:q} --threads {threads}"
-        " --out {output.field:q} > {log:q} 2>&1"
+        " --out {output.field:q}"

@@ -16,5 +16,5 @@ rule train_models:
         seed=PLAN.run.seed,
         code=PLAN.code("models"),
     shell:
-        "python -m hilsplat models train --out results/models --cache results/.cache/models"
-        " --settings {params.settings:q} --seed {params.seed:q} --threads {threads} > {log:q} 2>&1"
+        "python -m hilsplat --log {log:q} models train --out results/models --cache results/.cache/models"
+        " --settings {params.settings:q} --seed {params.seed:q} --threads {threads}"

@@ -49,12 +49,12 @@ rule figures:
         truth=PLAN.data.figure_truth_option,
         code=PLAN.code("figures", PLAN.data.label_readers),
     shell:
-        "python -m hilsplat figures --scene {input.scene:q} {params.truth} --gaussians {input.gaussians:q}"
+        "python -m hilsplat --log {log:q} figures --scene {input.scene:q} {params.truth} --gaussians {input.gaussians:q}"
         " --fit {input.fit:q} --masks {input.masks:q} --clip {input.clip:q}"
         " --semantic-tree {input.semantic_tree:q} --field {input.field:q}"
         " --autoencoder {input.autoencoder:q} --queries {params.queries:q}"
         " --settings {params.settings:q} --evaluate {params.evaluate:q}"
-        " --threads {threads} --out {output.panel:q} > {log:q} 2>&1"
+        " --threads {threads} --out {output.panel:q}"
 
 
 rule mask_truth:
@@ -85,7 +85,7 @@ rule mask_truth:
         results=lambda wildcards, input: str(Path(input.scene).parents[2]),
         code=PLAN.code("mask_truth"),
     shell:
-        "python -m hilsplat world masks {wildcards.dataset:q}/{wildcards.scene:q} --results {params.results:q} --out {output.picture:q} > {log:q} 2>&1"
+        "python -m hilsplat --log {log:q} world masks {wildcards.dataset:q}/{wildcards.scene:q} --results {params.results:q} --out {output.picture:q}"
 
 
 rule comparison:
@@ -141,10 +141,10 @@ rule comparison:
         truth=PLAN.data.figure_truth_option,
         code=PLAN.code("comparison", PLAN.data.label_readers),
     shell:
-        "python -m hilsplat comparison --folder {params.folder:q} --variants {params.variants:q}"
+        "python -m hilsplat --log {log:q} comparison --folder {params.folder:q} --variants {params.variants:q}"
         " --names {params.names:q} {params.truth} --queries {params.queries:q}"
         " --settings {params.settings:q} --evaluate {params.evaluate:q}"
-        " --threads {threads} --out {output.methods:q} > {log:q} 2>&1"
+        " --threads {threads} --out {output.methods:q}"
 
 
 rule sweep_plot:
@@ -171,4 +171,4 @@ rule sweep_plot:
     params:
         code=PLAN.code("sweep"),
     shell:
-        "python -m hilsplat sweep {wildcards.sweep:q} --table {input.table:q} --out {output.plot:q} > {log:q} 2>&1"
+        "python -m hilsplat --log {log:q} sweep {wildcards.sweep:q} --table {input.table:q} --out {output.plot:q}"

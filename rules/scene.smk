@@ -20,7 +20,7 @@ rule source:
         root=str(Path(PLAN.run.data_root)),
         code=PLAN.code("source", PLAN.data.source_reader),
     shell:
-        "python -m hilsplat datasets export {params.name:q} --data-root {params.root:q} --out {output:q} > {log:q} 2>&1"
+        "python -m hilsplat --log {log:q} datasets export {params.name:q} --data-root {params.root:q} --out {output:q}"
 
 
 rule poses:
@@ -47,6 +47,6 @@ rule poses:
         seed=PLAN.run.seed,
         code=PLAN.code("poses"),
     shell:
-        "python -m hilsplat poses --images {params.images:q} --name {wildcards.dataset:q}/{wildcards.scene:q}"
+        "python -m hilsplat --log {log:q} poses --images {params.images:q} --name {wildcards.dataset:q}/{wildcards.scene:q}"
         " --unit {params.unit:q} {params.lens} --settings {params.settings:q} --seed {params.seed:q}"
-        " --threads {threads} --out {output.scene:q} > {log:q} 2>&1"
+        " --threads {threads} --out {output.scene:q}"

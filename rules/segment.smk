@@ -23,8 +23,8 @@ rule masks:
         cache=CACHE,
         code=PLAN.code(PLAN.masks_stage),
     shell:
-        "python -m hilsplat masks --scene {input.scene:q} --settings {params.settings:q} {params.truth}"
-        " --threads {threads} --memory {resources.mem_mib} --cache {params.cache:q} --out {output.masks:q} > {log:q} 2>&1"
+        "python -m hilsplat --log {log:q} masks --scene {input.scene:q} --settings {params.settings:q} {params.truth}"
+        " --threads {threads} --memory {resources.mem_mib} --cache {params.cache:q} --out {output.masks:q}"
 
 
 rule coverage_tree:
@@ -46,5 +46,5 @@ rule coverage_tree:
         settings=PLAN.settings("coverage_tree"),
         code=PLAN.code("coverage_tree"),
     shell:
-        "python -m hilsplat coverage-tree --masks {input.masks:q} --settings {params.settings:q}"
-        " --out {output.coverage_tree:q} > {log:q} 2>&1"
+        "python -m hilsplat --log {log:q} coverage-tree --masks {input.masks:q} --settings {params.settings:q}"
+        " --out {output.coverage_tree:q}"

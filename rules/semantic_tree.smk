@@ -22,6 +22,6 @@ rule semantic_tree:
         settings=PLAN.settings("semantic_tree"),
         code=PLAN.code("semantic_tree"),
     shell:
-        "python -m hilsplat semantic-tree --contributions {input.contributions:q} --masks {input.masks:q}"
+        "python -m hilsplat --log {log:q} semantic-tree --contributions {input.contributions:q} --masks {input.masks:q}"
         " --clip {input.clip:q} --settings {params.settings:q} --threads {threads}"
-        " --out {output.semantic_tree:q} > {log:q} 2>&1"
+        " --out {output.semantic_tree:q}"

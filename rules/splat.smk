@@ -26,6 +26,6 @@ rule gaussians:
         cache=CACHE,
         code=PLAN.code("gaussians"),
     shell:
-        "python -m hilsplat gaussians --scene {input.scene:q} --settings {params.settings:q} --seed {params.seed:q}"
+        "python -m hilsplat --log {log:q} gaussians --scene {input.scene:q} --settings {params.settings:q} --seed {params.seed:q}"
         " {params.brought} --threads {threads} --cache {params.cache:q} --report {output.report:q}"
-        " --out {output.ply:q} > {log:q} 2>&1"
+        " --out {output.ply:q}"

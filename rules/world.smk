@@ -20,5 +20,5 @@ rule world:
         code=PLAN.code("world"),
         out=lambda wildcards, output: str(Path(output.images).parent),
     shell:
-        "python -m hilsplat world make --source {params.source:q} --settings {params.settings:q}"
-        " --threads {threads} --out {params.out:q} > {log:q} 2>&1"
+        "python -m hilsplat --log {log:q} world make --source {params.source:q} --settings {params.settings:q}"
+        " --threads {threads} --out {params.out:q}"

@@ -206,7 +206,7 @@ def explain_full_disk(path: Path) -> Iterator[None]:
                 fix=f"free space on the disk of {folder}, then run again; finished work is kept",
             ) from error
         if isinstance(error, OSError) and is_unfinished(Path(str(error.filename))):
-            error.filename = str(path)  # users know no temporary names
+            error.filename = str(path)  # a temporary name means nothing to a user
         raise
 
 
@@ -460,7 +460,7 @@ class ViewCache:
 
     Args:
         folder: holds the entries, such as `results/.cache/masks`.
-        compressed: compress the entries; floating-point numbers hardly shrink, and compression takes time.
+        compressed: compress the entries; floating-point numbers shrink little, and compression takes time.
     """
 
     def __init__(self, folder: Path, *, compressed: bool = True) -> None:

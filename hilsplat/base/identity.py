@@ -67,7 +67,7 @@ def _digest(roots: tuple[str, ...], root: Path) -> str:
     if key not in known:
         known[key] = _digest_of(roots, root)
         with contextlib.suppress(OSError, HilsplatError):  # the package may be read-only
-            if _read_state(root) == state:  # no module was edited meanwhile
+            if _read_state(root) == state:  # no module was edited since it was imported
                 with atomic_path(kept, durable=False) as temporary:
                     text = json.dumps({"state": state, "digests": _known(kept, state) | known})
                     temporary.write_text(text)

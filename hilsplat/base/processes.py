@@ -91,7 +91,7 @@ def unfinished_folder(parent: Path) -> Iterator[Path]:
     """Create a folder for unfinished files, and delete it at the end.
 
     A lock on a file in it shows `remove_leftovers` that the writer is alive: the system frees the lock when
-    the writer ends, however it ends. Process numbers mean nothing in other containers and after a reboot.
+    the writer ends, even by a kill. Process numbers mean nothing in other containers and after a reboot.
     The folder itself is not locked, because NFS locks only files.
     """
     is_locked = False

@@ -8,6 +8,7 @@ import gc
 import logging
 import os
 import sys
+from pathlib import Path
 from typing import Annotated
 
 # The order in which linear algebra libraries sum depends on the number of threads. Stages use several
@@ -48,11 +49,21 @@ def main() -> None:
 
 
 @app.callback(invoke_without_command=True)
-def version(
-    show: Annotated[bool, typer.Option("--version", help="print the version and exit")] = False,
+def options(
+    version: Annotated[bool, typer.Option("--version", help="print the version and exit")] = False,
+    log: Annotated[Path | None, typer.Option(help="write stdout and stderr to this file")] = None,
 ) -> None:
-    """Print the version if asked."""
-    if show:
+    """Handle the options before a command."""
+    if log is not None:
+        try:
+            log.parent.mkdir(parents=True, exist_ok=True)
+            file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+        except OSError as error:
+            raise place_error(error) or error from None
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+            os.dup2(file, stream.fileno())  # for libraries that print by themselves, too
+    if version:
         from hilsplat.base.provenance import library_versions
 
         typer.echo(f"hilsplat {library_versions()['hilsplat']}")

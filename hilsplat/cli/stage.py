@@ -42,8 +42,7 @@ def start_logging(*, timestamps: bool = False) -> None:
     """Send log records to stderr.
 
     Args:
-        timestamps: start each record with its time, level and logger, unless stderr is a terminal. Rules
-            redirect the stderr of a stage to its log.
+        timestamps: start each record with its time, level and logger, unless stderr is a terminal.
     """
     root = logging.getLogger()
     root.setLevel(logging.INFO)

@@ -1,6 +1,6 @@
 """Progress of a run: a line per finished stage, and on a terminal a last line with the time left.
 
-Only the attributes of Snakemake's log records are used here; `snakemake_logger_plugin_hilsplat` connects this
+This module reads only attributes of log records; `snakemake_logger_plugin_hilsplat` connects this
 module to Snakemake. Warnings and errors are shown in full.
 """
 
@@ -27,7 +27,7 @@ REPLACED = frozenset({"progress", "job_started", "workflow_started", "resources_
 """Events that are not printed, besides the start and end of a job."""
 
 TARGETS = ("all", "everything", "tables", "total")
-"""Entries of Snakemake's job counts that are not jobs."""
+"""Entries of the job counts that are not jobs."""
 
 SELECTING = "Select jobs to execute..."
 """A message before every job; it has no event."""
@@ -111,7 +111,7 @@ class Estimates:
                     continue
 
     def seconds(self, rule: str) -> float:
-        """Return the mean core seconds of a rule's jobs."""
+        """Return the mean core seconds of a job of this rule."""
         if rule not in self._means:
             rows = self.resources.plan.scenes if self.resources else ()
             jobs = [self._estimate(rule, row) for row in rows]
@@ -243,7 +243,7 @@ class ProgressDisplay:
         self._line.start()
 
     def show(self, record: logging.LogRecord) -> None:
-        """Update the progress from a log record of Snakemake's, and print what is worth a line."""
+        """Update the progress from a log record, and print finished jobs, warnings and errors."""
         event, facts, lines = getattr(record, "event", None), record.__dict__, []
         if event == "resources_info" and facts.get("cores"):
             self.run.cores = facts["cores"]

@@ -32,8 +32,8 @@ logger = logging.getLogger(__name__)
 STATE = Path(".hilsplat")
 """Folder of locks and markers, in the working folder."""
 
-UNLOCKING = "HILSPLAT_UNLOCKING"
-"""Environment variable of the Snakemake that removes the locks of a dead run."""
+UNREGISTERED = "HILSPLAT_UNREGISTERED"
+"""Environment variable of a Snakemake that takes no lock of ours, such as the one that unlocks."""
 
 VARIANT_RULES = ("field", "method", "evaluate", "figures", "comparison")
 """Rules with many short jobs per scene, which run side by side rather than with several threads."""
@@ -46,15 +46,15 @@ def prepare_process() -> TextIOWrapper | None:
     """Prepare a process that reads the Snakefile: the interpreter and end of its jobs, and a lock.
 
     Jobs use the interpreter that runs Snakemake, whether or not its environment is activated, and end with
-    Snakemake. The lock is shared and is taken before Snakemake's own locks, which name no owner: if nobody
-    holds it, Snakemake's locks are left from a dead run.
+    Snakemake. The lock is shared and is taken before Snakemake's own locks, which name no owner: without a
+    process that holds it, Snakemake's locks are left from a dead run.
 
     Returns:
         The locked file, to keep until the process ends; None in a folder that is read-only.
     """
     os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
     jobs_end_with_this_process()
-    if os.environ.get(UNLOCKING):
+    if os.environ.get(UNREGISTERED):
         return None
     with suppress(OSError):
         return _locked("processes.lock", fcntl.LOCK_SH)
@@ -129,18 +129,30 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
 
 
 def _start(command: list[str], plan: Plan, targets: Sequence[str], scenes: Sequence[str]) -> int:
-    """Start Snakemake in this process, and make again what doesn't match its provenance."""
+    """Start Snakemake in this process; artifacts that don't match their provenance are made again."""
+    files = [target for target in targets if target not in scenes]
+    ending = ["--", *files] if files else []
     wrong = outdated(plan)
+    if wrong:
+        summary = _snakemake(command, "--summary", *ending)
+        needed = {line.split("\t")[0] for line in summary.stdout.splitlines()}
+        wrong = {output: reason for output, reason in wrong.items() if output in needed}
     for output, reason in wrong.items():
         logger.warning("%s is made again: %s", output, reason)
     logging.getLogger().handlers.clear()  # Snakemake's records would be printed twice
-    files = [target for target in targets if target not in scenes]
-    sys.argv = [*command, *(["--forcerun", *wrong] if wrong else []), *(["--", *files] if files else [])]
+    sys.argv = [*command, *(["--forcerun", *wrong] if wrong else []), *ending]
     try:
         runpy.run_module("snakemake", run_name="__main__", alter_sys=True)
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(bool(end.code))
     return 0
+
+
+def _snakemake(command: Sequence[str], *words: str) -> subprocess.CompletedProcess[str]:
+    """Run a Snakemake that starts no job and doesn't count as a process of this folder."""
+    environment = {**os.environ, UNREGISTERED: "1"}
+    command = [sys.executable, "-m", *command, *words]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
 
 def _snakefile(configs: Sequence[Path]) -> Path:
@@ -187,10 +199,7 @@ def _recover(command: Sequence[str], results: Path) -> None:
     except BlockingIOError:
         return
     with alone:
-        words = [sys.executable, "-m", *command, "--unlock", "--quiet"]
-        done = subprocess.run(
-            words, env={**os.environ, UNLOCKING: "1"}, capture_output=True, text=True, check=False
-        )
+        done = _snakemake(command, "--unlock")
         if done.returncode != 0:
             raise HilsplatError(
                 "the locks of a killed run cannot be removed", found=done.stderr.strip()[-500:]

@@ -364,6 +364,12 @@ ROWS = [
         ("scenes.tsv is in the way",),
     ),
     Row(
+        "a log below a file",
+        nothing,
+        ("--log", "config/scenes.tsv/log", *COVERAGE),
+        ("scenes.tsv is in the way",),
+    ),
+    Row(
         "an output on a disk without room",
         nothing,
         ("coverage-tree", "--masks", str(MASKS), "--out", "/proc/none/new"),

@@ -56,8 +56,7 @@ def unlocked(monkeypatch) -> list[str]:
     found: list[str] = []
 
     def call(words: list[str], **kwargs: object) -> subprocess.CompletedProcess[str]:
-        assert "--unlock" in words
-        found.append("unlock")
+        found.extend(word.removeprefix("--") for word in words if word in ("--unlock", "--summary"))
         return subprocess.CompletedProcess(words, 0, "", "")
 
     monkeypatch.setattr(runs.subprocess, "run", call)
@@ -91,11 +90,21 @@ def test_a_cluster_sets_its_own_cores(folder, started):
     assert not {"--cores", "--max-threads"} & set(started[0])
 
 
-def test_artifacts_that_do_not_match_are_made_again(folder, started):
-    Path("results/synthetic/one/gaussians.ply").parent.mkdir(parents=True)
-    Path("results/synthetic/one/gaussians.ply").write_text("")
-    runs.run(["one"], [], [])
-    assert value(started[0], "--forcerun") == "results/synthetic/one/gaussians.ply"
+def test_what_the_targets_need_and_does_not_match_is_made_again(folder, started, monkeypatch):
+    folder = Path("results/synthetic/one")
+    folder.mkdir(parents=True)
+    (folder / "gaussians.ply").write_text("")
+    (folder / "scene").mkdir()
+    summary = f"output_file\tdate\n{folder}/gaussians.ply\t-\n"
+    answer = subprocess.CompletedProcess([], 0, summary, "")
+    monkeypatch.setattr(runs.subprocess, "run", lambda words, **kwargs: answer)
+    runs.run([f"{folder}/gaussians.ply"], [], [])
+    command = started[0]
+    assert command[command.index("--forcerun") + 1 :] == [
+        f"{folder}/gaussians.ply",
+        "--",
+        f"{folder}/gaussians.ply",
+    ]
 
 
 def test_a_second_run_of_the_folder_is_refused(folder, started):
@@ -136,7 +145,7 @@ def test_the_locks_of_another_machine_stay(folder, started, unlocked, caplog):
 
 
 def test_the_process_that_unlocks_does_not_wait_for_itself(folder, monkeypatch):
-    monkeypatch.setenv(runs.UNLOCKING, "1")
+    monkeypatch.setenv(runs.UNREGISTERED, "1")
     with runs._locked("processes.lock", runs.fcntl.LOCK_EX):
         assert prepare_process() is None
 
