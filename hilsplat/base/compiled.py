@@ -43,7 +43,7 @@ class _Stamp:
 
     @functools.cached_property
     def _digest(self) -> str:
-        # The first check avoids half-edited files, which may not parse; the second covers edits during compilation.
+        # The first check avoids half-edited files, which may not parse; the second covers later edits.
         digest = code_digest(self.function) if is_as_imported() else ""
         return digest if is_as_imported() else ""
 

@@ -261,13 +261,8 @@ def stage_of(pid: int) -> str | None:
         words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
     except OSError:
         return None
-    places = [
-        number
-        for number, word in enumerate(words)
-        if word == "-m" and words[number + 1 :][:1] == ["hilsplat"]
-    ]
-    stage = words[places[0] + 2] if places and len(words) > places[0] + 2 else None
-    return stage if stage != "run" else None
+    # a job has a log, `hilsplat run` has none
+    return words[words.index("--log") + 2] if "hilsplat" in words and "--log" in words else None
 
 
 @dataclass(frozen=True)
