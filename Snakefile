@@ -20,8 +20,8 @@ pathvars:
 
 
 wildcard_constraints:
-    dataset=PLAN.datasets(),
-    scene=PLAN.scene_names(),
+    dataset=any_of(row.dataset for row in PLAN.rows),
+    scene=any_of(row.scene for row in PLAN.rows),
     variant=PLAN.variants(),
 
 
@@ -53,4 +53,8 @@ onstart:
 
 
 onsuccess:
+    mark_run().unlink()
+
+
+onerror:
     mark_run().unlink()

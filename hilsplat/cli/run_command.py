@@ -15,7 +15,7 @@ def run_command(
     targets: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[TARGET]... [-- SNAKEMAKE OPTIONS]",
+            metavar="TARGET",
             help="scenes (photos/desk or desk), rules (tables) or files; default: everything",
             show_default=False,
         ),

@@ -99,14 +99,6 @@ class Plan:
         """Return a path in the folder of a scene."""
         return "/".join([self.run.results, job.dataset, job.scene, *parts])
 
-    def datasets(self) -> str:
-        """Return the regular expression of the wildcard `dataset`."""
-        return any_of(row.dataset for row in self.rows)
-
-    def scene_names(self) -> str:
-        """Return the regular expression of the wildcard `scene`."""
-        return any_of(row.scene for row in self.rows)
-
     def variants(self, by_baseline: bool | None = None) -> str:
         """Return the regular expression of the wildcard `variant`.
 

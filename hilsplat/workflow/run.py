@@ -5,6 +5,7 @@ Snakemake in this process. Plain `snakemake --cores 2` gives the same bytes.
 """
 
 import argparse
+import difflib
 import fcntl
 import json
 import logging
@@ -38,6 +39,9 @@ UNREGISTERED = "HILSPLAT_UNREGISTERED"
 VARIANT_RULES = ("field", "method", "evaluate", "figures", "comparison")
 """Rules with many short jobs per scene, which run side by side rather than with several threads."""
 
+TARGET_RULES = ("all", "tables", "efficiency", "train_models")
+"""Rules that can be targets: the others have wildcards."""
+
 ELSEWHERE = ("--executor", "-e", "--profile", "--workflow-profile")
 """Options of Snakemake after which cores and threads are not set here."""
 
@@ -62,7 +66,7 @@ def prepare_process() -> TextIOWrapper | None:
 
 
 def mark_run() -> Path:
-    """Write the marker of this process's run; it stays if the run fails or is killed."""
+    """Write the marker of this process's run; it stays if the run is killed."""
     STATE.mkdir(exist_ok=True)
     marker = STATE / f"run-{os.getpid()}"
     marker.write_text(socket.gethostname(), encoding="utf-8")
@@ -103,6 +107,7 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
     settings = merged_config(configs, {key: yaml.safe_load(value) for key, _, value in pairs})
     plan = Plan(settings)
     scenes = [target for target in targets if any(target in (row.name, row.scene) for row in plan.rows)]
+    _require_known([target for target in targets if target not in scenes], plan)
     if scenes:
         given.config.append(f"only={json.dumps(scenes)}")
         plan = Plan({**settings, "only": scenes})
@@ -123,9 +128,22 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
         _recover(command, plan.results)
         marker = mark_run()
         status = _start(command, plan, targets, scenes)
-        if status == 0:
-            marker.unlink(missing_ok=True)
+        if status != 0:
+            remove_leftovers(plan.results)  # of jobs that were killed
+        marker.unlink(missing_ok=True)
         return status
+
+
+def _require_known(targets: Sequence[str], plan: Plan) -> None:
+    """Refuse a target that is neither a scene nor a rule and cannot be a file of the results."""
+    known = [*TARGET_RULES, *(name for row in plan.rows for name in (row.scene, row.name))]
+    for target in targets:
+        near = difflib.get_close_matches(target, known, n=1)
+        if target not in TARGET_RULES and (near or "/" not in target):
+            raise HilsplatError(
+                f"there is no scene, rule or file {target!r}",
+                expected=f"did you mean {near[0]!r}?" if near else f"a scene of {plan.run.scenes}, or a file",
+            )
 
 
 def _start(command: list[str], plan: Plan, targets: Sequence[str], scenes: Sequence[str]) -> int:

@@ -80,7 +80,7 @@ CONF
 
 copy() { # a project of its own, with the embedded models alone
     rm -rf "${folder:?}/$1" && mkdir -p "$folder/$1/models"
-    cp -r "$project"/{Snakefile,rules,workflow,profiles,config,hilsplat} "$folder/$1"
+    cp -r "$project"/{Snakefile,rules,workflow,profiles,config,hilsplat,snakemake_logger_plugin_hilsplat} "$folder/$1"
     cp -r "$project"/models/{sam-tiny,clip-tiny} "$folder/$1/models"
 }
 

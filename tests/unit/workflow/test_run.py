@@ -85,6 +85,14 @@ def test_scenes_become_a_configuration_and_other_targets_stay(folder, started):
     assert value(command, "--max-threads") == "4"
 
 
+def test_a_misspelt_scene_is_refused(folder, started):
+    with pytest.raises(HilsplatError, match="did you mean 'three'"):
+        runs.run(["thre"], [], [])
+    with pytest.raises(HilsplatError, match="there is no scene, rule or file 'desk'"):
+        runs.run(["desk"], [], [])
+    assert started == []
+
+
 def test_a_cluster_sets_its_own_cores(folder, started):
     runs.run([], [], ["--workflow-profile", "profiles/slurm"])
     assert not {"--cores", "--max-threads"} & set(started[0])
