@@ -86,8 +86,8 @@ def test_scenes_become_a_configuration_and_other_targets_stay(folder, started):
 
 
 def test_a_misspelt_scene_is_refused(folder, started):
-    with pytest.raises(HilsplatError, match="did you mean 'three'"):
-        runs.run(["thre"], [], [])
+    with pytest.raises(HilsplatError, match="did you mean 'two'"):
+        runs.run(["twoo"], [], [])
     with pytest.raises(HilsplatError, match="there is no scene, rule or file 'desk'"):
         runs.run(["desk"], [], [])
     assert started == []
