@@ -1,4 +1,4 @@
-"""Runs of the ci configuration that are killed, frozen, doubled and starved of disk; nobody may have to help.
+"""Runs of the ci configuration that are killed, frozen, doubled and starved of disk; and must recover without manual help.
 
     make chaos                                       # 30 kills, seed 0
     python -m tests.chaos --kills 5 --seed 3 --minutes 20 --work ../chaos
@@ -83,7 +83,7 @@ class Tally:
                     f"{what} lost per kill: median {statistics.median(values):.1f}, largest {max(values):.1f}"
                 )
         lines += [f"PROBLEM {problem}" for problem in self.problems]
-        lines.append("a person was needed" if self.problems else "nobody was needed, and no table differs")
+        lines.append("manual intervention was needed" if self.problems else "no manual intervention, and no table differs")
         return "\n".join(lines)
 
 
