@@ -1,4 +1,4 @@
-"""Runs of the ci configuration that are killed, frozen, doubled and starved of disk; and must recover without manual help.
+"""Runs of the ci configuration that are killed, frozen, doubled and starved of disk must recover by themselves.
 
     make chaos                                       # 30 kills, seed 0
     python -m tests.chaos --kills 5 --seed 3 --minutes 20 --work ../chaos
