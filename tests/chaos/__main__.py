@@ -1,4 +1,4 @@
-"""Runs of the ci configuration that are killed, frozen, doubled and starved of disk must recover by themselves.
+"""Kill, freeze, double and starve runs of the ci configuration, which must recover without manual help.
 
     make chaos                                       # 30 kills, seed 0
     python -m tests.chaos --kills 5 --seed 3 --minutes 20 --work ../chaos
@@ -83,7 +83,8 @@ class Tally:
                     f"{what} lost per kill: median {statistics.median(values):.1f}, largest {max(values):.1f}"
                 )
         lines += [f"PROBLEM {problem}" for problem in self.problems]
-        lines.append("manual intervention was needed" if self.problems else "no manual intervention, and no table differs")
+        whole = "no manual intervention was needed, and no table differs"
+        lines.append("manual intervention was needed" if self.problems else whole)
         return "\n".join(lines)
 
 
