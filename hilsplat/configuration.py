@@ -354,15 +354,6 @@ def read_config(path: Path) -> dict[str, Any]:
     return found or {}
 
 
-def check_configs(paths: Sequence[Path]) -> None:
-    """Check configuration files that override the project's, in order.
-
-    Raises:
-        SettingsError: a file is not YAML, a key is unknown, or a value is of the wrong type or out of range.
-    """
-    parse_run(merged_config(paths))
-
-
 def merged_config(paths: Sequence[Path], *overrides: Mapping[str, Any]) -> dict[str, Any]:
     """Merge `config/config.yaml`, further files and settings in order, section by section as Snakemake does.
 

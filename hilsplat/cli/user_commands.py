@@ -118,18 +118,10 @@ def settings(
     schema: Annotated[
         bool, typer.Option(help="print the JSON schema of the configuration, for editors")
     ] = False,
-    check: Annotated[
-        list[Path] | None,
-        typer.Option(help="check a file for --configfile, over config/config.yaml; may be repeated"),
-    ] = None,
 ) -> None:
     """Print every setting: default, choices or range, unit, origin, meaning."""
     import json
 
-    from hilsplat.configuration import check_configs, config_schema, knob_table
+    from hilsplat.configuration import config_schema, knob_table
 
-    if check:
-        check_configs(check)
-        typer.echo(f"{', '.join(map(str, check))}: can be used")
-        return
     typer.echo(json.dumps(config_schema(), indent=1) if schema else knob_table())

@@ -42,7 +42,7 @@ LINK = (*LINK, "--clip", str(CLIP), *OUT)
 ASK = ("query", "photos/desk", "mug")
 POSES = ("poses", "--images", "photos", *OUT)
 NEW = ("new", "chair", "photos")
-CHECK = ("settings", "--check")
+CHECK = ("run", "--config")
 
 
 @dataclass(frozen=True)
@@ -502,7 +502,7 @@ ROWS = [
         (*CHECK, "my.yaml"),
         ("my.yaml cannot be read", "UTF-8"),
     ),
-    Row("a missing file for --configfile", nothing, (*CHECK, "my.yaml"), ("my.yaml is missing",)),
+    Row("a missing configuration file", nothing, (*CHECK, "my.yaml"), ("my.yaml is missing",)),
     Row(
         "a misspelt key for --configfile",
         write("my.yaml", "field: {weight_prt: 1}\n"),

@@ -95,7 +95,7 @@ def test_every_command_and_option_exists(page: Path) -> None:
 def test_every_configuration_and_forced_rule_exists(page: Path) -> None:
     rules = "".join(path.read_text() for path in sorted((PROJECT / "rules").glob("*.smk")))
     for line in shell_lines(page):
-        for name in re.findall(r"--(?:config(?:file)?(?= \S+\.yaml)|workflow-profile) (\S+)", line):
+        for name in re.findall(r"--(?:config|configfile|workflow-profile) ((?:config|profiles)/\S+)", line):
             assert (PROJECT / name).exists(), f"{line}: {name} is missing"
         for name in re.findall(r"--forcerun (\S+)", line):
             assert f"rule {name}:" in rules, f"{line}: no such rule"
