@@ -24,8 +24,10 @@ def check_models(stages: StageSettings, where: str) -> None:
     if stages.masks.segmenter == "sam":
         models.append(("masks", "sam", stages.masks.model, stages.masks.variant))
     for section, kind, folder, variant in models:
-        if problem := _model_problem(Path(folder), kind, variant):
-            raise HilsplatError(f"{section}.model of {where}: {problem}")
+        try:
+            _require_model(Path(folder), kind, variant)
+        except HilsplatError as error:
+            raise HilsplatError(f"{section}.model of {where}: {error}") from error
 
 
 def check_device(stages: StageSettings, where: str) -> None:
@@ -34,36 +36,26 @@ def check_device(stages: StageSettings, where: str) -> None:
     Raises:
         HilsplatError: the message names the setting.
     """
+    from hilsplat.splat.rasterise.device import choose_device
+
     for section, values in stages:
-        needed = getattr(values, "device", "") == "cuda" and section != "training"
-        if needed and (problem := _device_problem(rasterises=section in ("gaussians", "contributions"))):
-            raise HilsplatError(f"{section}.device of {where}: {problem}")
+        if getattr(values, "device", "") == "cuda" and section != "training":
+            try:
+                compute_device("cuda")
+                if section in ("gaussians", "contributions"):
+                    choose_device("cuda")
+            except HilsplatError as error:
+                raise HilsplatError(f"{section}.device of {where}: {error}") from error
 
 
 @functools.cache
-def _model_problem(folder: Path, kind: str, variant: str) -> str:
+def _require_model(folder: Path, kind: str, variant: str) -> None:
     from hilsplat.models.folder import open_model_folder  # onnxruntime takes a while to import
 
     released = any(folder.name == release.name for release in RELEASES)
-    fix = f"fetch it: hilsplat models get {folder.name}" if released else ""
-    try:
-        open_model_folder(folder, kind, variant=variant, fix=fix)
-    except HilsplatError as error:
-        return str(error)
-    return ""
-
-
-@functools.cache
-def _device_problem(rasterises: bool) -> str:
-    from hilsplat.splat.rasterise.device import choose_device
-
-    try:
-        if rasterises:
-            choose_device("cuda")
-        compute_device("cuda")
-    except HilsplatError as error:
-        return str(error)
-    return ""
+    open_model_folder(
+        folder, kind, variant=variant, fix=f"fetch it: hilsplat models get {folder.name}" if released else ""
+    )
 
 
 def describe_models(stages: StageSettings) -> str:

@@ -228,7 +228,7 @@ class Records:
         if code != record["code"]:
             yield "other code made it"
         for name, read in record["inputs"].items():
-            files = read.get("files") or {read["path"]: read["sha256"]}
+            files = read["files"] if "files" in read else {read["path"]: read["sha256"]}
             for file, digest in files.items():
                 recorded = Path(file)
                 inside = recorded.parts[:1] in (("results",), (self.results.name,))

@@ -126,6 +126,15 @@ def test_imported_artifacts_are_not_compared_with_settings(results):
     assert problems() == {"masks": "a.npz is missing in masks"}
 
 
+def test_lists_of_input_files_may_be_empty_and_are_compared_file_by_file(results):
+    labels = [Path("photos/1.jpg").resolve()]
+    write(MASKS, none=(), labels=labels)
+    write(TREE, masks=MASKS)
+    assert verify(results)[1]
+    labels[0].write_text("other")
+    assert f"its input labels has changed: {labels[0]}" in verify(results)[0]
+
+
 def test_another_model_in_the_same_folder_is_found(results):
     Path("models/m").mkdir(parents=True)
     Path("models/m/a.onnx").write_text("1")
