@@ -53,8 +53,8 @@ onstart:
 
 
 onsuccess:
-    mark_run().unlink()
+    unmark_run()
 
 
 onerror:
-    mark_run().unlink()
+    unmark_run()

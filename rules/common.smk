@@ -17,7 +17,7 @@ from hilsplat.workflow.jobs import any_of
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.progress import estimates
 from hilsplat.workflow.resources import JobResources
-from hilsplat.workflow.run import mark_run, prepare_process
+from hilsplat.workflow.run import mark_run, prepare_process, unmark_run
 
 # The plan of many scenes makes millions of lasting objects: collecting garbage less often saves a tenth of its time.
 gc.set_threshold(200_000, 50, 100)

@@ -103,7 +103,7 @@ def stage(
                 out,
                 stage=name,
                 code=code,
-                command=["hilsplat", *sys.argv[1:]],
+                command=_command(),
                 settings=_recorded(settings),
                 seed=seed,
                 inputs=read,
@@ -118,6 +118,12 @@ def stage(
             raise problem from error
         logging.getLogger("hilsplat").exception("%s failed on %s", name, out)
         sys.exit(1)
+
+
+def _command() -> list[str]:
+    """Return the command line without `--log`: a user who copies it reads the output on the terminal."""
+    words = ["hilsplat", *sys.argv[1:]]
+    return words[:1] + words[3:] if words[1:2] == ["--log"] else words
 
 
 def _recorded(settings: Any) -> dict[str, Any]:

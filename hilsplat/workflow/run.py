@@ -11,6 +11,7 @@ import json
 import logging
 import os
 import runpy
+import secrets
 import socket
 import subprocess
 import sys
@@ -46,6 +47,10 @@ ELSEWHERE = ("--executor", "-e", "--profile", "--workflow-profile")
 """Options of Snakemake after which cores and threads are not set here."""
 
 
+_marks: list[TextIOWrapper] = []
+"""The marker of this process's run, if one is going on."""
+
+
 def prepare_process() -> TextIOWrapper | None:
     """Prepare a process that reads the Snakefile: the interpreter and end of its jobs, and a lock.
 
@@ -65,12 +70,21 @@ def prepare_process() -> TextIOWrapper | None:
     return None
 
 
-def mark_run() -> Path:
-    """Write the marker of this process's run; it stays if the run is killed."""
-    STATE.mkdir(exist_ok=True)
-    marker = STATE / f"run-{os.getpid()}"
-    marker.write_text(socket.gethostname(), encoding="utf-8")
-    return marker
+def mark_run() -> None:
+    """Write a marker of this process's run and lock it; a run that is killed leaves it unlocked."""
+    if not _marks:  # `hilsplat run` and the Snakefile share a process
+        stream = _locked(f"run-{secrets.token_hex(4)}", fcntl.LOCK_EX)
+        stream.write(socket.gethostname())
+        stream.flush()
+        _marks.append(stream)
+
+
+def unmark_run() -> None:
+    """Remove the marker of this process's run."""
+    while _marks:
+        stream = _marks.pop()
+        Path(stream.name).unlink(missing_ok=True)
+        stream.close()
 
 
 def _locked(name: str, kind: int) -> TextIOWrapper:
@@ -126,11 +140,11 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
         ) from error
     with lock:
         _recover(command, plan.results)
-        marker = mark_run()
+        mark_run()
         status = _start(command, plan, targets, scenes)
         if status != 0:
             remove_leftovers(plan.results)  # of jobs that were killed
-        marker.unlink(missing_ok=True)
+        unmark_run()
         return status
 
 
@@ -204,10 +218,21 @@ def _local_options(plan: Plan, others: Sequence[str]) -> list[str]:
 
 
 def _recover(command: Sequence[str], results: Path) -> None:
-    """Remove what a killed run left: unfinished files and, if no process is alive, Snakemake's locks."""
+    """Remove what a killed run left: unfinished files and, if no process is alive, Snakemake's locks.
+
+    Raises:
+        HilsplatError: a run is alive. Snakemake would remove its locks at the end of this one.
+    """
     markers = sorted(STATE.glob("run-*"))
     if not markers:
         return
+    for marker in markers:
+        try:
+            _locked(marker.name, fcntl.LOCK_EX | fcntl.LOCK_NB).close()
+        except BlockingIOError as error:
+            raise HilsplatError(
+                f"another Snakemake runs in {Path.cwd()}", fix="wait until it ends, or stop it"
+            ) from error
     remove_leftovers(results)
     if any(marker.read_text(encoding="utf-8") != socket.gethostname() for marker in markers):
         logger.warning("a run of another machine may be going on here; if none is: snakemake --unlock")

@@ -81,7 +81,7 @@ class Victim:
 def kept_files(cache: Path) -> frozenset[tuple[str, int]]:
     """Finished entries of a cache, with their times."""
     found = set()
-    for path in cache.rglob("[!.]*"):
+    for path in (path for path in cache.rglob("*") if "/." not in str(path.relative_to(cache.parent))):
         try:
             found.add((str(path), path.stat().st_mtime_ns if path.is_file() else 0))
         except FileNotFoundError:

@@ -66,12 +66,12 @@ class Project:
         return self.run(*command, check=check)
 
     def planned(self, *words: str) -> set[str]:
-        """Rules that a dry run would run."""
+        """Rules that a dry run would run, except for the summary that follows every other rule."""
         return {
             line.split()[1].rstrip(":")
             for line in self.snakemake("-n", *words).stdout.splitlines()
             if line.startswith(("rule ", "localrule "))
-        } - {"all"}
+        } - {"all", "efficiency"}
 
     def edit(self, path: str, old: str, new: str) -> None:
         """Replace a text, which must be present."""

@@ -40,7 +40,7 @@ def test_get_new_run_and_query(project: Path, tmp_path: Path) -> None:
     (copy.root / "drawn/images").rename(copy.root / "photographs")
 
     without = hilsplat(copy, "new", "before", "photographs")
-    assert "words by clip-tiny" in without and "mean nothing" in without
+    assert "text queries by clip-tiny" in without and "mean nothing" in without
     with loopback_hub() as hub:
         serve(hub, project, tmp_path / "hub")
         hub.cuts["vision_encoder.onnx"] = [2_000_000]
@@ -48,10 +48,10 @@ def test_get_new_run_and_query(project: Path, tmp_path: Path) -> None:
         assert len(hub.ranges("vision_encoder.onnx")) == 2
     assert "photographs use sam-vit-base and clip-vit-base-patch16" in printed
     told = hilsplat(copy, "new", "desk", "photographs")
-    assert "masks by sam-vit-base; words by clip-vit-base-patch16" in told and "nothing" not in told
+    assert "masks by sam-vit-base; text queries by clip-vit-base-patch16" in told and "nothing" not in told
 
     run = snakemake(copy)
-    assert "photos/desk: masks by sam-vit-base; words by clip-vit-base-patch16" in run
+    assert "photos/desk: masks by sam-vit-base; text queries by clip-vit-base-patch16" in run
     for stage, name in (("masks", "sam-vit-base"), ("clip", "clip-vit-base-patch16")):
         index = json.loads((copy.root / DESK / "default" / stage / "index.json").read_text())
         assert index["model"] == f"models/{name}"

@@ -121,8 +121,8 @@ main()
 
 
 @contextmanager
-def job_of(project: Project, log: str, *words: str) -> Iterator[subprocess.Popen]:
-    """Start a run, and yield its process once the log of its job exists."""
+def job_of(project: Project, log: str, *words: str, freeze: bool = False) -> Iterator[subprocess.Popen]:
+    """Start a run, and yield its process, perhaps frozen, once the log of its job exists."""
     (project.root / log).unlink(missing_ok=True)
     process = subprocess.Popen(
         [sys.executable, *words],
@@ -135,6 +135,8 @@ def job_of(project: Project, log: str, *words: str) -> Iterator[subprocess.Popen
     deadline = time.monotonic() + 120
     while not (project.root / log).exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.02)
+    if freeze:
+        os.killpg(process.pid, signal.SIGSTOP)
     assert (project.root / log).exists() and process.poll() is None, "the job did not start"
     try:
         yield process
@@ -177,15 +179,15 @@ def test_the_locks_of_a_live_run_are_never_removed(copy_of_finished: Project) ->
     clip = [*RUN, f"{default}/clip", "--", "--forcerun", f"{default}/clip"]
     plain = [*SNAKEMAKE, masks, "--forcerun", masks]
     with (
-        job_of(project, f"{default}/logs/clip.log", *clip) as a,
-        job_of(project, "results/figures/synthetic/tiny/masks.log", *plain) as b,
+        job_of(project, f"{default}/logs/clip.log", *clip, freeze=True) as a,
+        job_of(project, "results/figures/synthetic/tiny/masks.log", *plain, freeze=True) as b,
     ):
-        os.killpg(b.pid, signal.SIGSTOP)
         held = {path.name: path.read_bytes() for path in locks.iterdir() if b"masks.png" in path.read_bytes()}
         assert held
         a.kill()
         a.wait()
-        project.hilsplat_run(f"{default}/coverage_tree", check=False)
+        refused = project.hilsplat_run(f"{default}/coverage_tree", check=False)
+        assert refused.returncode == 1 and "another Snakemake runs" in refused.stderr
         left = {path.name: path.read_bytes() for path in locks.iterdir()}
         assert held.items() <= left.items()
         os.killpg(b.pid, signal.SIGCONT)

@@ -1,6 +1,7 @@
 """`hilsplat run` before Snakemake starts: locks, recovery, options."""
 
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -9,12 +10,14 @@ import pytest
 
 from hilsplat.base.errors import HilsplatError
 from hilsplat.workflow import run as runs
-from hilsplat.workflow.run import STATE, mark_run, prepare_process
+from hilsplat.workflow.run import STATE, prepare_process
 
 HOLD = """
 import sys, time
-from hilsplat.workflow.run import prepare_process
+from hilsplat.workflow.run import mark_run, prepare_process
 stream = prepare_process()
+if "marked" in sys.argv:
+    mark_run()
 print("held", flush=True)
 time.sleep(60)
 """
@@ -127,14 +130,21 @@ def test_a_second_run_of_the_folder_is_refused(folder, started):
 def test_the_locks_of_a_dead_run_are_removed_once(folder, started, unlocked):
     runs.run([], [], [])
     assert unlocked == [], "no run was killed"
-    mark_run().rename(STATE / "run-1")
+    leave_marker()
     runs.run([], [], [])
     assert unlocked == ["unlock"]
+    assert list(STATE.glob("run-*")) == []
+
+
+def leave_marker(host: str = "") -> None:
+    """Leave the marker of a run that was killed."""
+    STATE.mkdir(exist_ok=True)
+    (STATE / "run-1").write_text(host or socket.gethostname())
 
 
 def test_the_locks_of_a_live_run_stay(folder, started, unlocked):
     """A is killed while B, which never had the lock of `hilsplat run`, still works."""
-    mark_run().rename(STATE / "run-1")
+    leave_marker()
     b = subprocess.Popen([sys.executable, "-c", HOLD], stdout=subprocess.PIPE, text=True)
     assert b.stdout.readline() == "held\n"
     runs.run([], [], [])
@@ -145,9 +155,20 @@ def test_the_locks_of_a_live_run_stay(folder, started, unlocked):
     assert unlocked == ["unlock"]
 
 
+def test_a_run_beside_a_live_one_is_refused(folder, started, unlocked):
+    """Snakemake removes all locks of the folder when a run ends, those of others included."""
+    b = subprocess.Popen([sys.executable, "-c", HOLD, "marked"], stdout=subprocess.PIPE, text=True)
+    assert b.stdout.readline() == "held\n"
+    with pytest.raises(HilsplatError, match="another Snakemake runs"):
+        runs.run([], [], [])
+    b.kill()
+    b.wait()
+    runs.run([], [], [])
+    assert unlocked == ["unlock"]
+
+
 def test_the_locks_of_another_machine_stay(folder, started, unlocked, caplog):
-    mark_run().rename(STATE / "run-1")
-    (STATE / "run-1").write_text("elsewhere")
+    leave_marker("elsewhere")
     runs.run([], [], [])
     assert unlocked == [] and "a run of another machine" in caplog.text
 
