@@ -49,6 +49,21 @@ def test_a_text_is_asked_by_keyboard_and_lights_up(opened, desk_address, scene, 
         assert grey.mean() > 0.1 and (orange | grey | (picture.max(axis=2) <= 8)).mean() > 0.9
 
 
+def test_a_query_typed_before_the_tree_is_loaded_runs_when_it_is(opened, desk_address):
+    page = opened(desk_address)
+    held = []
+    page.route("**/api/nodes/**", lambda route: held.append(route))
+    page.reload()
+    page.locator("body[data-ready=yes]").wait_for()
+    page.locator("#text").fill("mug > handle")
+    page.keyboard.press("Enter")
+    page.get_by_text("Your query runs as soon as the semantic tree is loaded").wait_for()
+    assert held and not answers(page).count()
+    held[0].continue_()
+    answers(page).first.wait_for()
+    assert page.locator("#text").input_value() == "mug > handle"
+
+
 @both
 def test_doubts_are_told(opened, desk_address, painter):
     page = opened(desk_address, painter)

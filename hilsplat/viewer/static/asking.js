@@ -52,6 +52,11 @@ export async function fillField(signal) {
 export async function ask(keepChoice = false) {
   const text = $("text").value.trim();
   if (!text) { clearAnswer(); return; }
+  if (!main()) {   // the nodes are still loading, or the run has not made them yet
+    page.waiting = true;
+    tell("Your query runs as soon as the semantic tree is loaded.");
+    return;
+  }
   const view = $("here").checked ? page.camera.view : -1;
   if ($("here").checked && view < 0) { tell("Stand at a photograph first: choose one below.", true); return; }
   if (!keepChoice && page.chosen >= 0) choose(-1);   // nothing to take back: nothing to draw before the answer

@@ -29,7 +29,8 @@ export async function useVariants() {
   for (const pane of panes) await loadVariant(variantOf(pane));
   fillVariants();
   showOutline();
-  const text = start.get("q") ?? api.texts[0];   // an exported page begins with its answer
+  const text = page.waiting ? $("text").value : start.get("q") ?? api.texts[0];   // an exported page begins with its answer
+  page.waiting = false;
   if (text) { $("text").value = text; await ask(); }
   const [node, tree] = (start.get("node") ?? "").split(".");   // a row of another tree is another node
   if (tree === main().tree && main().nodes[node]) choose(Number(node));
