@@ -231,9 +231,9 @@ def test_stage_encodes_every_mask(boxes_with_tree):
     assert index["latent"] == 3
     assert index["channels"] == 16
     assert index["decoder_cosine"] > 0.8
-    # masks of one node share its code
+    # masks of one node share its code; with some BLAS libraries, a row's last bits depend on its place
     node = SemanticTree.load(tree).node_of_mask
-    assert np.array_equal(latents[0], latents[np.flatnonzero(node == node[0])[1]])
+    np.testing.assert_allclose(latents[0], latents[np.flatnonzero(node == node[0])[1]], atol=1e-6)
     model = load_code(out)
     decoded = model.decode_array(latents)
     assert (decoded * SemanticTree.load(tree).clip[node]).sum(axis=1).mean() > 0.8
