@@ -6,7 +6,7 @@ from typing import no_type_check
 import numba
 import numpy as np
 
-from hilsplat.splat.rasterise.lanes import lane_sum, lanes
+from hilsplat.base.lanes import lane_sum, lanes
 
 CHAINS = 12
 """Independent sums in flight: enough to hide 4 to 5 cycles of latency on 2 units."""

@@ -11,7 +11,7 @@ from jaxtyping import Float32
 from numba.extending import intrinsic
 
 from hilsplat.base.compiled import compiled
-from hilsplat.splat.rasterise.lanes import LANES, WIDTH, lanes, load, store
+from hilsplat.base.lanes import LANES, WIDTH, lanes, load, store
 
 BLOCK = 2**15
 """Gaussians that products with A visit at a time, so that their features stay in the processor's cache."""

@@ -10,8 +10,8 @@ import scipy.sparse as sp
 from jaxtyping import Float, Float32, Int64, UInt8
 
 from hilsplat.base.compiled import compiled
+from hilsplat.base.lanes import WIDTH
 from hilsplat.contributions.channels import columns_below, mask_means, mask_spread
-from hilsplat.splat.rasterise.lanes import WIDTH
 
 MEDIAN_SOFTENING = 1e-4
 """Least distance of a latent to the median, so that a step never divides by zero."""

@@ -5,8 +5,8 @@ import scipy.sparse as sp
 from jaxtyping import Float32
 
 from hilsplat.base.compiled import compiled
+from hilsplat.base.lanes import WIDTH, lanes, load, store
 from hilsplat.contributions.channels import padded, plus
-from hilsplat.splat.rasterise.lanes import WIDTH, lanes, load, store
 
 MIN_LATENT_SHARE = 0.5
 """A pixel has a latent at a level if Gaussians with one make up more than this share of it."""

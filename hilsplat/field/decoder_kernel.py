@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from hilsplat.base.compiled import compiled
-from hilsplat.splat.rasterise.lanes import WIDTH, lanes, larger, load, store
+from hilsplat.base.lanes import WIDTH, lanes, larger, load, store
 
 ROWS = 4 * WIDTH
 """Rows that pass the layers together."""

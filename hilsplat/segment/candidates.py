@@ -1,11 +1,11 @@
 """What the networks predict for a view: the costly, cached half of automatic mask generation."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Int8, Int32, Int64, UInt8
+from jaxtyping import Float32, Int8, Int32, Int64, UInt8
 
 from hilsplat.base.artifacts import sha256_of_json
 from hilsplat.base.identity import code_digest
@@ -15,6 +15,7 @@ from hilsplat.segment.sam import (
     HEADS,
     Encoded,
     Frame,
+    Prompts,
     SamModel,
     Thresholds,
     full_stability,
@@ -124,6 +125,7 @@ def candidates_key(image_sha256: str, model: SamModel, settings: MasksSettings) 
             "full_size": needs_full_size(settings),
             "official": settings.generator == "official",
             "preview": uses_preview(model, settings),
+            "factored": model.factored is not None,
             "floors": floors(thresholds),
             "code": code_digest(decode_candidates),
         }
@@ -152,61 +154,61 @@ def decode_candidates(
     parts = []
     for crop, (left, top, right, bottom) in enumerate(boxes):
         encoded = model.encode(np.ascontiguousarray(image[top:bottom, left:right]))
-        points = grid * (right - left, bottom - top)
+        prompts: Prompts = {"points": grid * (right - left, bottom - top)}
         if uses_preview(model, settings):
-            points = points[distinct_prompts(encoded, points, model, settings, batch)]
-        for scores, logits in answers(model.decode, encoded, points, batch):
+            prompts = distinct_prompts(encoded, prompts, model, settings, batch)
+        for asked, number in calls(prompts, batch):
+            scores, logits = (found[:number] for found in model.finish(encoded, asked))
             parts.append(keep_candidates(scores, logits, encoded.frame, crop, settings, thresholds))
     return Candidates.concatenate(parts)
 
 
-def answers(
-    ask: Callable[[Encoded, np.ndarray], tuple[np.ndarray, np.ndarray]],
-    encoded: Encoded,
-    points: Float[np.ndarray, "P 2"],
-    batch: int,
-) -> Iterator[tuple[Float32[np.ndarray, "p 3"], Float32[np.ndarray, "p 3 h w"]]]:
-    """What `SamModel.decode` or `SamModel.preview` answers to the points, call by call."""
-    for start in range(0, len(points), batch):
-        asked = points[start : start + batch]
-        # Every call has the same number of prompts: some networks fix it, and so results
-        # cannot depend on how a batch was cut.
-        padded = np.concatenate([asked, np.repeat(asked[-1:], batch - len(asked), axis=0)])
-        scores, logits = ask(encoded, padded)
-        yield scores[: len(asked)], logits[: len(asked)]
+def calls(prompts: Prompts, batch: int) -> Iterator[tuple[Prompts, int]]:
+    """Prompts call by call, and how many of a call count.
+
+    Every call has the same number of prompts, the last one repeated: some networks fix it, and so results
+    cannot depend on how a batch was cut.
+    """
+    total = len(next(iter(prompts.values())))
+    for start in range(0, total, batch):
+        rows = np.minimum(np.arange(start, start + batch), total - 1)
+        yield {name: rows_of[rows] for name, rows_of in prompts.items()}, min(batch, total - start)
 
 
 def uses_preview(model: SamModel, settings: MasksSettings) -> bool:
     """Whether prompts that repeat others are left out: if the model can tell, and if what they give would be
     suppressed anyway."""
     may_repeat = settings.generator == "official" or settings.box_nms_iou >= REPEAT_IOU
-    return model.previewer is not None and not may_repeat
+    return model.previews and not may_repeat
 
 
 def distinct_prompts(
-    encoded: Encoded, points: Float[np.ndarray, "P 2"], model: SamModel, settings: MasksSettings, batch: int
-) -> Int64[np.ndarray, " p"]:
-    """Prompts of which some mask repeats no better one of its head, by the model's preview.
+    encoded: Encoded, prompts: Prompts, model: SamModel, settings: MasksSettings, batch: int
+) -> Prompts:
+    """Previewed prompts, without those of which each mask repeats a better one of its head.
 
-    Masks are compared by their boxes in the preview, which has every second row and column of the decoder's
-    masks (`suppression.distinct_boxes`), before any threshold that a user may change. Of a thousand prompts
-    some two hundred stay (docs/segment.md), and at least one.
+    Masks are compared by their boxes in the preview, which has every second or fourth row and column of the
+    decoder's masks (`suppression.distinct_boxes`), before any threshold that a user may change. Of a thousand
+    prompts two to three hundred stay (docs/segment.md), and at least one.
     """
     iou_floor, stability_floor = floors(model.thresholds(settings))
-    found = []
-    for scores, logits in answers(model.preview, encoded, points, batch):
-        flat = logits.reshape(-1, *logits.shape[2:])
+    found, kept = [], []
+    for asked, number in calls(prompts, batch):
+        scores, logits, rest = model.preview(encoded, asked["points"])
+        flat = logits[:number].reshape(-1, *logits.shape[2:])
         _, stability, boxes = read_logits(flat, settings.stability_offset, encoded.frame)
-        found.append((scores, stability.reshape(scores.shape), boxes.reshape(*scores.shape, 4)))
+        found.append((scores[:number], stability.reshape(number, -1), boxes.reshape(number, -1, 4)))
+        kept.append({name: rows[:number] for name, rows in rest.items()})
     predicted_iou, stability, boxes = (np.concatenate(each) for each in zip(*found, strict=True))
     likely = (predicted_iou >= iou_floor) & (stability >= stability_floor) & boxes.any(axis=2)
-    wanted = np.zeros(len(points), bool)
+    wanted = np.zeros(len(likely), bool)
     for head in range(len(HEADS)):
         rows = np.flatnonzero(likely[:, head])
         at = rows, head
-        kept = distinct_boxes(boxes[at], predicted_iou[at], stability[at], REPEAT_IOU, REPEAT_SLACK)
-        wanted[rows[kept]] = True
-    return np.flatnonzero(wanted) if wanted.any() else np.zeros(1, np.int64)
+        distinct = distinct_boxes(boxes[at], predicted_iou[at], stability[at], REPEAT_IOU, REPEAT_SLACK)
+        wanted[rows[distinct]] = True
+    wanted[0] |= not wanted.any()
+    return {name: np.concatenate([each.pop(name) for each in kept])[wanted] for name in list(kept[0])}
 
 
 def keep_candidates(

@@ -4,6 +4,7 @@ Images are resized and masks restored as by SamProcessor of the transformers lib
 exports are read here. The rounding of logits (`read_logits`) is ours.
 """
 
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -20,9 +21,13 @@ from hilsplat.base.levels import Level
 from hilsplat.models.folder import ModelFolder, open_model_folder, side_px
 from hilsplat.models.layouts import DECODER, PREVIEW
 from hilsplat.models.network import Network, require_three_heads
+from hilsplat.segment.decoder_weights import DecoderGraph
+from hilsplat.segment.factored_decoder import PROMPTS, FactoredDecoder, ImageTerms
 from hilsplat.segment.kernels import areas_and_boxes, upscaled_runs
 from hilsplat.segment.logit_kernels import quantise_logits
 from hilsplat.settings import MasksSettings
+
+logger = logging.getLogger(__name__)
 
 HEADS: tuple[Level, Level, Level] = (Level.SUBPART, Level.PART, Level.WHOLE)
 """What the decoder's three outputs mean, in its order: fine to coarse."""
@@ -57,10 +62,17 @@ class Encoded:
     Attributes:
         features: what the encoder hands to the decoder, by name, float32 (1, C, h, w).
         frame: how the image sits in the input.
+        terms: what the factored decoder computes once per image, if the model has one.
     """
 
     features: Mapping[str, np.ndarray]
     frame: Frame
+    terms: ImageTerms | None = None
+
+
+Prompts = Mapping[str, np.ndarray]
+"""Prompts of an image, arrays with a row per prompt: `points` (x, y, px of the image), or, once they are
+previewed, what the factored decoder keeps of them."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +88,9 @@ class Thresholds:
 REAL_SAM = Thresholds(predicted_iou_min=0.7, stability_min=0.85, nms_score=0.7, points_per_batch=8)
 """LangSplat's thresholds for a released SAM. A call of ViT-B takes 60 MB per prompt, and calls of more than 8
 prompts are no faster."""
+
+CHECKED_PROMPTS, AGREEMENT = 2, 1e-4
+"""Prompts by which the factored decoder is compared with the network, and the largest difference allowed."""
 
 OWN = "mask_generation"
 """Key of `config.json` under which a model names its own `Thresholds`."""
@@ -104,11 +119,13 @@ class SamModel:
         own: thresholds that come with the model.
         stretches: whether pictures are stretched to a square, as for SAM 2, or padded, as for SAM.
         previewer: the decoder at half the resolution (`layouts.PREVIEW`), if the model has one.
+        factored: the decoder with the same results in a fraction of the time, if the model allows it.
     """
 
     own: Thresholds = REAL_SAM
     stretches: bool = False
     previewer: Network | None = None
+    factored: FactoredDecoder | None = None
 
     def __init__(self, model: ModelFolder) -> None:
         self.model = model
@@ -131,6 +148,26 @@ class SamModel:
         self.mean = np.array(preprocessing.get("image_mean", (0.485, 0.456, 0.406)), dtype=np.float32)
         self.std = np.array(preprocessing.get("image_std", (0.229, 0.224, 0.225)), dtype=np.float32)
         self.rescale = np.float32(preprocessing.get("rescale_factor", 1 / 255))
+        if self.previewer is None and self.decoder.providers[0] == "CPUExecutionProvider":
+            self.factored = self._factor()
+
+    def _factor(self) -> FactoredDecoder | None:
+        """Factor the decoder and check it against the network; None if its graph is a different one."""
+        heads = self.model.config.get("mask_decoder_config", {}).get("num_attention_heads", 8)
+        try:
+            factored = FactoredDecoder(DecoderGraph(self.model.networks[DECODER]), heads)
+            apart = largest_difference(factored, self.decoder, self.padded_hw[0])
+        except ModelError as error:
+            logger.info("the decoder of %s runs in onnxruntime: %s", self.model.folder, error)
+            return None
+        if apart > AGREEMENT:
+            logger.warning(
+                "the decoder of %s runs in onnxruntime, slower: factored, it differs by %.2g",
+                self.model.folder,
+                apart,
+            )
+            return None
+        return factored
 
     @staticmethod
     def load(folder: Path, variant: str = "") -> "SamModel":
@@ -174,10 +211,13 @@ class SamModel:
         """Run the vision encoder."""
         pixels, frame = self.prepare(image)
         names = self.encoder.spec.outputs
-        return Encoded(dict(zip(names, self.encoder(pixel_values=pixels), strict=True)), frame)
+        features = dict(zip(names, self.encoder(pixel_values=pixels), strict=True))
+        return Encoded(features, frame, self.factored.image(features) if self.factored else None)
 
     def prompts_per_call(self, wanted: int, asked: int) -> int:
         """Prompts of one decoder call: the number the network fixes, if any, else at most `asked`."""
+        if self.factored:
+            return PROMPTS
         return self.decoder.fixed_axis("input_points", 1) or min(wanted, asked)
 
     def decode(
@@ -188,34 +228,85 @@ class SamModel:
         Returns:
             predicted IoUs and low-resolution logits; heads as in `HEADS`.
         """
-        return self._answer(self.decoder, encoded, points_xy)
+        if self.factored and encoded.terms:
+            iou, logits, _ = self.factored.decode(
+                encoded.terms, in_input(points_xy, encoded.frame), fine=True
+            )
+            return iou, logits
+        return ask_network(self.decoder, encoded.features, in_input(points_xy, encoded.frame))
+
+    @property
+    def previews(self) -> bool:
+        """Whether the model can tell at a lower resolution which masks a prompt gives."""
+        return self.previewer is not None or self.factored is not None
 
     def preview(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]
-    ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 half_h half_w"]]:
-        """`decode` with every second row and column of the logits; for models that have a `previewer`."""
+    ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 low_h low_w"], Prompts]:
+        """Decode prompts at a lower resolution; `finish` takes the third result. Only if `previews`."""
+        points = in_input(points_xy, encoded.frame)
+        if self.factored and encoded.terms:
+            iou, logits, kept = self.factored.decode(encoded.terms, points, fine=False)
+            return iou, logits, {"iou": iou, **kept}
         assert self.previewer is not None
-        return self._answer(self.previewer, encoded, points_xy)
+        return *ask_network(self.previewer, encoded.features, points), {"points": points_xy}
 
-    def _answer(
-        self, decoder: Network, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Predicted IoUs and logits of one of the two decoders."""
-        frame = encoded.frame
-        scale = np.array(
-            [
-                frame.resized_hw[1] / frame.original_hw[1],
-                frame.resized_hw[0] / frame.original_hw[0],
-            ]
-        )
-        scores, logits = decoder(
-            input_points=(points_xy * scale)[None, :, None, :],
-            input_labels=np.ones((1, len(points_xy), 1)),
-            input_boxes=np.zeros((1, 0, 4)),
-            **encoded.features,
-        )
-        require_three_heads(decoder.path, scores, logits)
-        return scores[0], logits[0]
+    def finish(
+        self, encoded: Encoded, prompts: Prompts
+    ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"]]:
+        """`decode` prompts that may have been previewed."""
+        if "points" in prompts:
+            return self.decode(encoded, prompts["points"])
+        assert self.factored is not None and encoded.terms is not None
+        return prompts["iou"], self.factored.logits(encoded.terms, prompts)
+
+
+def in_input(points_xy: Float[np.ndarray, "P 2"], frame: Frame) -> Float[np.ndarray, "P 2"]:
+    """Points of an image in the network's input, px."""
+    (height, width), (resized_h, resized_w) = frame.original_hw, frame.resized_hw
+    return points_xy * np.array([resized_w / width, resized_h / height])
+
+
+def ask_network(
+    decoder: Network, features: Mapping[str, np.ndarray], points_xy: Float[np.ndarray, "P 2"]
+) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"]]:
+    """Predicted IoUs and logits of a decoder network for points of its input."""
+    scores, logits = decoder(
+        input_points=points_xy[None, :, None, :],
+        input_labels=np.ones((1, len(points_xy), 1)),
+        input_boxes=np.zeros((1, 0, 4)),
+        **features,
+    )
+    require_three_heads(decoder.path, scores, logits)
+    return scores[0], logits[0]
+
+
+def largest_difference(factored: FactoredDecoder, decoder: Network, side_px: int) -> float:
+    """Compare the factored decoder with the network on an image and prompts drawn at random.
+
+    Args:
+        factored, decoder: of the same model.
+        side_px: of the network's input.
+
+    Returns:
+        the largest difference of predicted IoUs, and of logits relative to the largest logit above 1.
+
+    Raises:
+        ModelError: the network doesn't declare the shapes of its inputs.
+    """
+    rng = np.random.default_rng(0)
+    features = {}
+    for name in decoder.spec.inputs:
+        if name.startswith("image_"):
+            shape = [decoder.fixed_axis(name, axis) for axis in (1, 2, 3)]
+            if None in shape:
+                raise ModelError(f"{decoder.path.name} declares no shape of {name}")
+            features[name] = rng.standard_normal((1, *shape), np.float32)  # type: ignore[arg-type]
+    points = rng.uniform(0, side_px, (CHECKED_PROMPTS, 2))
+    iou, logits = ask_network(decoder, features, points)
+    own_iou, own_logits, _ = factored.decode(factored.image(features), points, fine=True)
+    off = np.abs(own_logits - logits).max() / max(1, np.abs(logits).max())
+    return float(max(off, np.abs(own_iou - iou).max()))
 
 
 def own_thresholds(model: ModelFolder) -> Thresholds:

@@ -6,10 +6,10 @@ from typing import no_type_check
 import numpy as np
 
 from hilsplat.base.compiled import compiled
+from hilsplat.base.lanes import WIDTH, lanes, load, root, store
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise.cpu import Gradients, over_ranges
-from hilsplat.splat.rasterise.lanes import WIDTH, lanes, load, root, store
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15  # 3DGS
 

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from hilsplat.base.compiled import compiled
+from hilsplat.base.lanes import lanes, load, reciprocal, store
 from hilsplat.splat.rasterise.cpu import over_ranges
-from hilsplat.splat.rasterise.lanes import lanes, load, reciprocal, store
 
 RADIUS = 5
 SIGMA_PX = 1.5

@@ -1,6 +1,6 @@
 """Four float32 channels of a Gaussian as one numba value, for loops over the entries of a sparse matrix.
 
-`hilsplat.splat.rasterise.lanes` has sixteen lanes; codes of three channels would leave thirteen empty.
+`hilsplat.base.lanes` has sixteen lanes; codes of three channels would leave thirteen empty.
 Nothing is fused or reordered: the bytes are those of plain loops over the channels.
 """
 

@@ -23,8 +23,7 @@ from typing import no_type_check
 import numpy as np
 
 from hilsplat.base.compiled import compiled
-from hilsplat.splat.rasterise.binning import TILE
-from hilsplat.splat.rasterise.lanes import (
+from hilsplat.base.lanes import (
     any_ge,
     bits_ge,
     exp2_negative,
@@ -41,6 +40,7 @@ from hilsplat.splat.rasterise.lanes import (
     store,
     store_sums,
 )
+from hilsplat.splat.rasterise.binning import TILE
 from hilsplat.splat.rasterise.project import MIN_ALPHA, MOMENTS
 
 MAX_ALPHA = 0.999

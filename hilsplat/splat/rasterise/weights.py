@@ -9,6 +9,7 @@ from typing import no_type_check
 import numpy as np
 
 from hilsplat.base.compiled import compiled
+from hilsplat.base.lanes import keep_gt, lanes, load, store
 from hilsplat.splat.rasterise.blend import (
     BLOCKS,
     CHUNK,
@@ -21,7 +22,6 @@ from hilsplat.splat.rasterise.blend import (
     unfinished,
     weigh,
 )
-from hilsplat.splat.rasterise.lanes import keep_gt, lanes, load, store
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 

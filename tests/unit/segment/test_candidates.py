@@ -7,7 +7,7 @@ import pytest
 
 from hilsplat.segment.candidates import Candidates, distinct_prompts, keep_candidates
 from hilsplat.segment.generate import masks_from_candidates
-from hilsplat.segment.sam import Encoded, Frame, SamModel, Thresholds, resized_size
+from hilsplat.segment.sam import Encoded, Frame, Prompts, SamModel, Thresholds, resized_size
 from hilsplat.settings import MasksSettings
 from tests.unit.segment.plain import flatten_far, quantise, restore, smooth_logits, unpacked
 
@@ -71,17 +71,18 @@ class Previewed(SamModel):
     def __init__(self, scores: list[list[float]], discs: list[list[tuple[float, float]]]) -> None:
         self.scores, self.discs = np.array(scores, np.float32), np.array(discs, np.float32)
 
-    def preview(self, encoded: Encoded, points_xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def preview(self, encoded: Encoded, points_xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, Prompts]:
         rows = points_xy[:, 0].astype(int)
         y, x = np.mgrid[:16, :16].astype(np.float32)
         centre, radius = (self.discs[rows, :, number, None, None] for number in (0, 1))
-        return self.scores[rows], 4 * (radius - np.hypot(x - centre, y - 8))
+        return self.scores[rows], 4 * (radius - np.hypot(x - centre, y - 8)), {"points": points_xy}
 
 
 def prompts_of(model: Previewed) -> list[int]:
     points = np.stack([np.arange(len(model.scores))] * 2, axis=1).astype(np.float64)
     encoded = Encoded({}, Frame((64, 64), (64, 64), (64, 64)))
-    return distinct_prompts(encoded, points, model, MasksSettings(), batch=2).tolist()
+    kept = distinct_prompts(encoded, {"points": points}, model, MasksSettings(), batch=2)
+    return kept["points"][:, 0].astype(int).tolist()
 
 
 def test_prompts_stay_that_have_a_mask_which_repeats_no_better_one() -> None:

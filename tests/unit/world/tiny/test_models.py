@@ -103,7 +103,7 @@ def test_the_committed_preview_is_that_of_the_committed_decoder(unseen):
     encoded = model.encode(unseen.images[0])
     points = point_grid(6) * FRAME_PX
     scores, logits = model.decode(encoded, points)
-    seen, few = model.preview(encoded, points)
+    seen, few, _ = model.preview(encoded, points)
     np.testing.assert_allclose(seen, scores, atol=1e-6)
     np.testing.assert_allclose(few, logits[..., ::2, ::2], atol=1e-3)  # logits of up to some hundreds
 

@@ -107,6 +107,19 @@ def load(typingctx, array, index):
 
 
 @intrinsic
+def load_same(typingctx, array, index):
+    """All lanes equal one number of a flat float32 array; the index must not be negative."""
+    if not (isinstance(array, types.Array) and array.dtype == types.float32 and array.ndim == 1):
+        return None
+
+    def codegen(context, builder, sig, args):
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        return _splat(builder, builder.load(builder.gep(data, [args[1]])))
+
+    return LANES(array, types.intp), codegen
+
+
+@intrinsic
 def store(typingctx, array, index, value):
     """Write sixteen consecutive numbers of a flat float32 array."""
     if not (isinstance(array, types.Array) and array.dtype == types.float32 and array.ndim == 1):
@@ -287,6 +300,52 @@ def lane_sum(typingctx, value):
         return builder.extract_element(vector, ir.Constant(_INT, 0))
 
     return types.float32(LANES), codegen
+
+
+@intrinsic
+def lane_max(typingctx, value):
+    """Largest lane."""
+
+    def codegen(context, builder, sig, args):
+        vector, width = args[0], WIDTH
+        while width > 1:
+            width //= 2
+            undefined = ir.Constant(vector.type, ir.Undefined)
+            half = ir.VectorType(_INT, width)
+            low = builder.shuffle_vector(vector, undefined, ir.Constant(half, list(range(width))))
+            high = builder.shuffle_vector(vector, undefined, ir.Constant(half, list(range(width, 2 * width))))
+            vector = builder.select(builder.fcmp_ordered(">", low, high), low, high)
+        return builder.extract_element(vector, ir.Constant(_INT, 0))
+
+    return types.float32(LANES), codegen
+
+
+@intrinsic
+def transpose(typingctx, source, source_index, source_step, target, target_index, target_step):
+    """Copy a 16 x 16 block between flat float32 arrays and exchange its rows and columns.
+
+    Each array comes with the place of the block's first number and the step from row to row.
+    """
+
+    def codegen(context, builder, sig, args):
+        def place(array, index, step, row):
+            row_index = builder.add(args[index], builder.mul(args[step], ir.Constant(args[step].type, row)))
+            return _pointer(context, builder, sig.args[array], args[array], row_index)
+
+        rows = [builder.load(place(0, 1, 2, r), align=4) for r in range(WIDTH)]
+        for bit in (1, 2, 4, 8):  # exchange the off-diagonal blocks of each size
+            for r in range(WIDTH):
+                if not r & bit:
+                    one, other = rows[r], rows[r | bit]
+                    low = [k if not k & bit else WIDTH + (k ^ bit) for k in range(WIDTH)]
+                    high = [k | bit if not k & bit else WIDTH + k for k in range(WIDTH)]
+                    rows[r] = builder.shuffle_vector(one, other, ir.Constant(_INTS, low))
+                    rows[r | bit] = builder.shuffle_vector(one, other, ir.Constant(_INTS, high))
+        for r in range(WIDTH):
+            builder.store(rows[r], place(3, 4, 5, r), align=4)
+        return context.get_dummy_value()
+
+    return types.void(source, types.intp, types.intp, target, types.intp, types.intp), codegen
 
 
 @intrinsic

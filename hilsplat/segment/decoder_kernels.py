@@ -1,0 +1,616 @@
+"""Compiled loops of the factored decoder (`factored_decoder`), a block of pixels at a time.
+
+Arrays are flat float32. Those of an image are stored block by block, each block as (rows, BLOCK) with pixels
+last, or pixels first where a sum runs over pixels. H heads, T tokens, D channels of a head, P pixels of a
+block. A prompt has R factors per layer: the softmax weights of all tokens of a head but the last.
+"""
+
+from typing import no_type_check
+
+import numpy as np
+
+from hilsplat.base.compiled import compiled
+from hilsplat.base.lanes import (
+    WIDTH,
+    exp2_negative,
+    lane_max,
+    lane_sum,
+    lanes,
+    larger,
+    load,
+    load_same,
+    reciprocal,
+    root,
+    store,
+    transpose,
+)
+
+LEAST = np.float32(-126)
+"""Lowest exponent of a normal float32."""
+
+ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
+
+
+@compiled
+@no_type_check
+def multiply(y, y0, y_step, a, a0, a_step, x, x0, x_step, rows, inner, columns, begin):
+    """y[r, c] = sum over k of a[r, k] x[k, c], in addition to what y holds if not `begin`.
+
+    Args:
+        y, a, x: flat arrays, each with the place of its first number and the step from row to row.
+        rows, inner, columns: sizes; columns are a multiple of 16.
+    """
+    for c in range(0, columns, WIDTH):
+        r = 0
+        while r + 6 <= rows:
+            to, of = y0 + r * y_step + c, a0 + r * a_step
+            if begin:
+                s0 = s1 = s2 = s3 = s4 = s5 = lanes(ZERO)
+            else:
+                s0, s1, s2 = load(y, to), load(y, to + y_step), load(y, to + 2 * y_step)
+                s3, s4, s5 = load(y, to + 3 * y_step), load(y, to + 4 * y_step), load(y, to + 5 * y_step)
+            for k in range(inner):
+                v = load(x, x0 + k * x_step + c)
+                s0 = s0 + load_same(a, of + k) * v
+                s1 = s1 + load_same(a, of + a_step + k) * v
+                s2 = s2 + load_same(a, of + 2 * a_step + k) * v
+                s3 = s3 + load_same(a, of + 3 * a_step + k) * v
+                s4 = s4 + load_same(a, of + 4 * a_step + k) * v
+                s5 = s5 + load_same(a, of + 5 * a_step + k) * v
+            store(y, to, s0)
+            store(y, to + y_step, s1)
+            store(y, to + 2 * y_step, s2)
+            store(y, to + 3 * y_step, s3)
+            store(y, to + 4 * y_step, s4)
+            store(y, to + 5 * y_step, s5)
+            r += 6
+        while r + 4 <= rows:
+            to, of = y0 + r * y_step + c, a0 + r * a_step
+            if begin:
+                s0 = s1 = s2 = s3 = lanes(ZERO)
+            else:
+                s0, s1 = load(y, to), load(y, to + y_step)
+                s2, s3 = load(y, to + 2 * y_step), load(y, to + 3 * y_step)
+            for k in range(inner):
+                v = load(x, x0 + k * x_step + c)
+                s0 = s0 + load_same(a, of + k) * v
+                s1 = s1 + load_same(a, of + a_step + k) * v
+                s2 = s2 + load_same(a, of + 2 * a_step + k) * v
+                s3 = s3 + load_same(a, of + 3 * a_step + k) * v
+            store(y, to, s0)
+            store(y, to + y_step, s1)
+            store(y, to + 2 * y_step, s2)
+            store(y, to + 3 * y_step, s3)
+            r += 4
+        while r < rows:
+            to, of = y0 + r * y_step + c, a0 + r * a_step
+            s0 = lanes(ZERO) if begin else load(y, to)
+            for k in range(inner):
+                s0 = s0 + load_same(a, of + k) * load(x, x0 + k * x_step + c)
+            store(y, to, s0)
+            r += 1
+
+
+@compiled
+@no_type_check
+def linear(x, weights, bias, rows, inner, y):
+    """y = x W + bias.
+
+    Args:
+        x: (rows, inner).
+        weights: W by panels of 16 columns, each (inner, 16).
+        y: (rows, outer); outer is a multiple of 16.
+    """
+    outer = len(bias)
+    for r in range(rows):
+        for c in range(0, outer, WIDTH):
+            store(y, r * outer + c, load(bias, c))
+    for c in range(0, outer, WIDTH):
+        multiply(y, c, outer, x, 0, inner, weights, c * inner, WIDTH, rows, inner, WIDTH, False)
+
+
+@compiled
+@no_type_check
+def by_head(y, y0, a, a0, x, x0, heads, rows, inner, columns, x_step, x_head, y_step, y_head):
+    """`multiply` for each head: rows of `a` follow each other, `x` and `y` have a step from head to head."""
+    for h in range(heads):
+        multiply(
+            y, y0 + h * y_head, y_step, a, a0 + h * rows * inner, inner, x, x0 + h * x_head, x_step,
+            rows, inner, columns, True,
+        )  # fmt: skip
+
+
+@compiled
+@no_type_check
+def multiply_below(y, y_step, a, a0, x, rows, columns):
+    """`multiply` with the lower triangle of a square matrix, added to `y`."""
+    for r in range(0, rows, 6):
+        many = min(6, rows - r)
+        multiply(y, r * y_step, y_step, a, a0 + r * rows, rows, x, 0, y_step, many, r + many, columns, False)
+
+
+@compiled
+@no_type_check
+def scale_and_shift(y, x, x0, scale, shift, shift0, rows, pixels):
+    """y = scale * x + shift for rows of pixels; `scale` is one row."""
+    for c in range(0, pixels, WIDTH):
+        factor = load(scale, c)
+        for r in range(rows):
+            at = r * pixels + c
+            store(y, at, factor * load(x, x0 + at) + load(shift, shift0 + at))
+
+
+@compiled
+@no_type_check
+def token_shares(s, offset, offset0, scale, heads, tokens, pixels, e, e0):
+    """Softmax over the tokens of each head at each pixel; the share of a head's last token is left out.
+
+    Args:
+        s: scores (H, T, P) to the base 2, overwritten.
+        offset, scale: `offset[h, t] * scale[p]` is added to the scores.
+        e: shares (H, T - 1, P).
+    """
+    for h in range(heads):
+        for c in range(0, pixels, WIDTH):
+            factor = load(scale, c)
+            most = lanes(np.float32(-1e30))
+            for t in range(tokens):
+                at = (h * tokens + t) * pixels + c
+                value = load(s, at) + load_same(offset, offset0 + h * tokens + t) * factor
+                store(s, at, value)
+                most = larger(most, value)
+            total = lanes(ZERO)
+            for t in range(tokens):
+                at = (h * tokens + t) * pixels + c
+                value = exp2_negative(larger(load(s, at) - most, lanes(LEAST)))
+                store(s, at, value)
+                total = total + value
+            total = reciprocal(total)
+            for t in range(tokens - 1):
+                value = load(s, (h * tokens + t) * pixels + c) * total
+                store(e, e0 + (h * (tokens - 1) + t) * pixels + c, value)
+
+
+@compiled
+@no_type_check
+def pixel_weights(s, scaled, offset, offset0, u, v, top, top0, sums, sums0, width, rows, pixels):
+    """Weights of a block's pixels in softmaxes over all pixels, and their sums so far.
+
+    A softmax over all blocks needs its largest score only at the end: what was summed before a larger one is
+    scaled down when it is met.
+
+    Args:
+        s: scores (rows, P) to the base 2, overwritten by weights.
+        scaled: weights times `u`.
+        offset: (rows, 2); `offset[r, 0] * u[p] + offset[r, 1] * v[p]` is added to the scores.
+        top: largest score of each row so far.
+        sums: (rows, width); the last 16 columns begin with the sums of weights, and of weights by u and v.
+    """
+    for r in range(rows):
+        first, second = load_same(offset, offset0 + 2 * r), load_same(offset, offset0 + 2 * r + 1)
+        most = lanes(np.float32(-1e30))
+        for c in range(r * pixels, (r + 1) * pixels, WIDTH):
+            p = c - r * pixels
+            value = load(s, c) + first * load(u, p) + second * load(v, p)
+            store(s, c, value)
+            most = larger(most, value)
+        highest = lane_max(most)
+        end = sums0 + (r + 1) * width
+        before = top[top0 + r]
+        if highest > before:
+            shrink = lanes(np.float32(2.0 ** max(before - highest, LEAST)))
+            for c in range(sums0 + r * width, end, WIDTH):
+                store(sums, c, load(sums, c) * shrink)
+            top[top0 + r] = highest
+        else:
+            highest = before
+        total = by_u = by_v = lanes(ZERO)
+        for c in range(r * pixels, (r + 1) * pixels, WIDTH):
+            p = c - r * pixels
+            value = exp2_negative(larger(load(s, c) - lanes(highest), lanes(LEAST)))
+            store(s, c, value)
+            total = total + value
+            with_u = value * load(u, p)
+            store(scaled, c, with_u)
+            by_u = by_u + with_u
+            by_v = by_v + value * load(v, p)
+        sums[end - WIDTH] += lane_sum(total)
+        sums[end - WIDTH + 1] += lane_sum(by_u)
+        sums[end - WIDTH + 2] += lane_sum(by_v)
+
+
+@compiled
+@no_type_check
+def weighted_sums(sums, sums0, width, w, scaled, values, values0, e_t, factors, heads, tokens, pixels, depth):
+    """Add a block to the sums over pixels: of values by head, and of factors.
+
+    Args:
+        sums: (H * T, width): values, factors, and the columns of `pixel_weights`.
+        w, scaled: weights (H * T, P), and weights for the values.
+        values: (H, P, depth).
+        e_t: (P, factors).
+    """
+    for h in range(heads):
+        multiply(
+            sums, sums0 + h * tokens * width, width, scaled, h * tokens * pixels, pixels,
+            values, values0 + h * pixels * depth, depth, tokens, pixels, depth, False,
+        )  # fmt: skip
+    if factors:
+        multiply(
+            sums, sums0 + depth, width, w, 0, pixels, e_t, 0, factors, heads * tokens, pixels, factors, False
+        )
+
+
+@compiled
+@no_type_check
+def pixels_first(e, e_t, rows, padded, pixels):
+    """Transpose factors (rows, P), with zeros in the columns that only fill up."""
+    for r in range(0, padded, WIDTH):
+        for p in range(0, pixels, WIDTH):
+            transpose(e, r * pixels + p, pixels, e_t, p * padded + r, padded)
+
+
+@compiled
+@no_type_check
+def read_image(sizes, rows, keys, values, top, sums):
+    """First attention of tokens to pixels, which are those of the image.
+
+    Args:
+        sizes: prompts, blocks, H, T, D, P, depth.
+        rows: queries of tokens (prompts, H, T, D), times log2(e).
+        keys: (blocks, H, D, P).
+        values: (blocks, H, P, depth).
+        top, sums: as in `pixel_weights`, (prompts, H * T) and (prompts, H * T, depth + 16); overwritten.
+    """
+    number, blocks, heads, tokens, dim, pixels, depth = sizes
+    all_rows, width = heads * tokens, depth + WIDTH
+    s, scaled = np.empty(all_rows * pixels, np.float32), np.empty(all_rows * pixels, np.float32)
+    ones, none = np.ones(pixels, np.float32), np.zeros(2 * all_rows, np.float32)
+    zeros = np.zeros(pixels, np.float32)
+    top[:], sums[:] = np.float32(-1e30), ZERO
+    for b in range(blocks):
+        for i in range(number):
+            by_head(
+                s, 0, rows, i * all_rows * dim, keys, b * heads * dim * pixels, heads, tokens, dim, pixels,
+                pixels, dim * pixels, pixels, tokens * pixels,
+            )  # fmt: skip
+            at = i * all_rows * width
+            pixel_weights(
+                s, scaled, none, 0, ones, zeros, top, i * all_rows, sums, at, width, all_rows, pixels
+            )
+            weighted_sums(
+                sums, at, width, s, s, values, b * heads * pixels * depth, s, 0, heads, tokens, pixels, depth
+            )
+
+
+@compiled
+@no_type_check
+def first_factors(sizes, b, i, rows, queries, s, e, none, ones):
+    """Shares of the tokens in each pixel at the first layer (H, T - 1, P)."""
+    _, _, heads, tokens, dim, pixels, _ = sizes
+    by_head(
+        s, 0, rows, i * heads * tokens * dim, queries, b * heads * dim * pixels, heads, tokens, dim, pixels,
+        pixels, dim * pixels, pixels, tokens * pixels,
+    )  # fmt: skip
+    token_shares(s, none, 0, ones, heads, tokens, pixels, e, 0)
+
+
+@compiled
+@no_type_check
+def second_factors(sizes, b, i, rows, low, offset, scaled_q, fixed_q, s1, q, s, e):
+    """Shares at the second layer, in the rows of `e` after those of the first layer."""
+    _, _, heads, tokens, dim, pixels, _ = sizes
+    all_rows, factors = heads * tokens, heads * (tokens - 1)
+    base = b * heads * dim * pixels
+    scale_and_shift(q, scaled_q, base, s1, fixed_q, base, heads * dim, pixels)
+    by_head(
+        s, 0, rows, i * all_rows * dim, q, 0, heads, tokens, dim, pixels,
+        pixels, dim * pixels, pixels, tokens * pixels,
+    )  # fmt: skip
+    multiply(
+        s, 0, pixels, low, i * all_rows * factors, factors, e, 0, pixels, all_rows, factors, pixels, False
+    )
+    token_shares(s, offset, i * all_rows, s1, heads, tokens, pixels, e, factors * pixels)
+
+
+@compiled
+@no_type_check
+def update_and_read_first(sizes, channels, eps, image, prompt, top, sums, s1_out, e_out):
+    """Attention of pixels to tokens at the first layer, its layer norm, and the second attention of tokens.
+
+    Args:
+        sizes: as in `read_image`.
+        channels, eps: of the layer norm.
+        image: `FirstLayer`.
+        prompt: `FirstPrompts`.
+        top, sums: as in `pixel_weights`; sums (prompts, H * T, depth + padded + 16); overwritten.
+        s1_out: scale of each pixel by the layer norm (prompts, blocks, P).
+        e_out: factors times that scale (prompts, blocks, padded, P).
+    """
+    number, blocks, heads, tokens, dim, pixels, depth = sizes
+    all_rows, factors = heads * tokens, heads * (tokens - 1)
+    padded = (factors + WIDTH - 1) // WIDTH * WIDTH
+    width = depth + padded + WIDTH
+    s, scaled = np.empty(all_rows * pixels, np.float32), np.empty(all_rows * pixels, np.float32)
+    e, e_t = np.zeros(padded * pixels, np.float32), np.empty(padded * pixels, np.float32)
+    y, k = np.empty(factors * pixels, np.float32), np.empty(heads * dim * pixels, np.float32)
+    last, s1 = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
+    ones, zeros = np.ones(pixels, np.float32), np.zeros(pixels, np.float32)
+    none = np.zeros(all_rows, np.float32)
+    top[:], sums[:] = np.float32(-1e30), ZERO
+    share, small = lanes(np.float32(1 / channels)), lanes(np.float32(eps))
+    for b in range(blocks):
+        base = b * heads * dim * pixels
+        for i in range(number):
+            first_factors(sizes, b, i, prompt.update_keys, image.queries, s, e, none, ones)
+            by_head(
+                y, 0, prompt.twice_changes, i * factors * dim, image.before, base, heads, tokens - 1, dim,
+                pixels, pixels, dim * pixels, pixels, (tokens - 1) * pixels,
+            )  # fmt: skip
+            multiply_below(y, pixels, prompt.gram, i * factors * factors, e, factors, pixels)
+            multiply(
+                last, 0, pixels, prompt.last, i * heads * dim, 0, image.before, base, pixels,
+                1, heads * dim, pixels, True,
+            )  # fmt: skip
+            for c in range(0, pixels, WIDTH):
+                p = b * pixels + c
+                total = load(image.square, p) + load_same(prompt.square, i)
+                total = total + lanes(TWO) * (load(image.cross, p) + load(last, c))
+                for f in range(factors):
+                    own = load(y, f * pixels + c) + load_same(prompt.linear, i * factors + f)
+                    total = total + load(e, f * pixels + c) * own
+                scale = lanes(ONE) / root(total * share + small)
+                store(s1, c, scale)
+                store(s1_out, (i * blocks + b) * pixels + c, scale)
+                for f in range(factors):
+                    value = load(e, f * pixels + c) * scale
+                    store(e, f * pixels + c, value)
+                    store(e_out, ((i * blocks + b) * padded + f) * pixels + c, value)
+            scale_and_shift(k, image.scaled_keys, base, s1, image.fixed_keys, base, heads * dim, pixels)
+            by_head(
+                s, 0, prompt.queries, i * all_rows * dim, k, 0, heads, tokens, dim, pixels,
+                pixels, dim * pixels, pixels, tokens * pixels,
+            )  # fmt: skip
+            multiply(
+                s, 0, pixels, prompt.low, i * all_rows * factors, factors, e, 0, pixels,
+                all_rows, factors, pixels, False,
+            )  # fmt: skip
+            at = i * all_rows * width
+            pixel_weights(
+                s, scaled, prompt.offset, 2 * i * all_rows, s1, zeros, top, i * all_rows, sums, at, width,
+                all_rows, pixels,
+            )  # fmt: skip
+            pixels_first(e, e_t, factors, padded, pixels)
+            weighted_sums(
+                sums, at, width, s, scaled, image.values, b * heads * pixels * depth, e_t, padded,
+                heads, tokens, pixels, depth,
+            )  # fmt: skip
+
+
+@compiled
+@no_type_check
+def update_and_read_second(sizes, channels, eps, image, prompt, s1_in, e_in, top, sums, s2_out, e_out):
+    """The same at the second layer, and the final attention of tokens.
+
+    Args:
+        image: `SecondLayer`.
+        prompt: `SecondPrompts`.
+        s1_in, e_in: what `update_and_read_first` returns.
+        s2_out: scale by this layer norm (prompts, blocks, P).
+        e_out: factors of both layers times this scale (prompts, blocks, padded, P).
+    """
+    number, blocks, heads, tokens, dim, pixels, depth = sizes
+    all_rows, factors = heads * tokens, heads * (tokens - 1)
+    padded_in = (factors + WIDTH - 1) // WIDTH * WIDTH
+    both = 2 * factors
+    padded = (both + WIDTH - 1) // WIDTH * WIDTH
+    width = depth + padded + WIDTH
+    s, scaled = np.empty(all_rows * pixels, np.float32), np.empty(all_rows * pixels, np.float32)
+    e, e_t = np.zeros(padded * pixels, np.float32), np.empty(padded * pixels, np.float32)
+    y, k = np.empty(both * pixels, np.float32), np.empty(heads * dim * pixels, np.float32)
+    last, late = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
+    s1, s2, s12 = (
+        np.empty(pixels, np.float32),
+        np.empty(pixels, np.float32),
+        np.empty(pixels, np.float32),
+    )
+    top[:], sums[:] = np.float32(-1e30), ZERO
+    share, small, two = lanes(np.float32(1 / channels)), lanes(np.float32(eps)), lanes(TWO)
+    for b in range(blocks):
+        base = b * heads * dim * pixels
+        for i in range(number):
+            at = (i * blocks + b) * pixels
+            s1[:] = s1_in[at : at + pixels]
+            e[: factors * pixels] = e_in[at * padded_in : at * padded_in + factors * pixels]
+            second_factors(
+                sizes, b, i, prompt.update_keys, prompt.update_low, prompt.update_offset,
+                image.scaled_queries, image.fixed_queries, s1, k, s, e,
+            )  # fmt: skip
+            by_head(
+                y, 0, prompt.twice_changes, i * both * dim, image.before_first, base, heads, tokens - 1, dim,
+                pixels, pixels, dim * pixels, pixels, (tokens - 1) * pixels,
+            )  # fmt: skip
+            by_head(
+                y, factors * pixels, prompt.twice_changes, (i * both + factors) * dim, image.before_second,
+                base, heads, tokens - 1, dim, pixels, pixels, dim * pixels, pixels, (tokens - 1) * pixels,
+            )  # fmt: skip
+            for c in range(0, pixels, WIDTH):
+                scale = load(s1, c)
+                for f in range(both):
+                    own = load(y, f * pixels + c) + load_same(prompt.linear, 2 * (i * both + f))
+                    store(y, f * pixels + c, scale * own + load_same(prompt.linear, 2 * (i * both + f) + 1))
+            multiply_below(y, pixels, prompt.gram, i * both * both, e, both, pixels)
+            multiply(
+                last, 0, pixels, prompt.last, 2 * i * heads * dim, 0, image.before_first, base, pixels,
+                1, heads * dim, pixels, True,
+            )  # fmt: skip
+            multiply(
+                late, 0, pixels, prompt.last, (2 * i + 1) * heads * dim, 0, image.before_second, base, pixels,
+                1, heads * dim, pixels, True,
+            )  # fmt: skip
+            for c in range(0, pixels, WIDTH):
+                p = b * pixels + c
+                scale = load(s1, c)
+                # square[i]: of the part that the first scale multiplies, of both parts, of the other part
+                total = load(image.square, p) + load_same(prompt.square, 3 * i)
+                total = total + two * (load(image.cross_first, p) + load(last, c))
+                total = total * scale
+                mixed = load(image.cross_second, p) + load(late, c) + load_same(prompt.square, 3 * i + 1)
+                total = (total + two * mixed) * scale + load_same(prompt.square, 3 * i + 2)
+                for f in range(both):
+                    total = total + load(e, f * pixels + c) * load(y, f * pixels + c)
+                second = lanes(ONE) / root(total * share + small)
+                store(s2, c, second)
+                store(s12, c, second * scale)
+                store(s2_out, at + c, second)
+                for f in range(both):
+                    value = load(e, f * pixels + c) * second
+                    store(e, f * pixels + c, value)
+                    store(e_out, at * padded + f * pixels + c, value)
+            scale_and_shift(k, image.scaled_keys, base, s12, image.fixed_keys, base, heads * dim, pixels)
+            by_head(
+                s, 0, prompt.queries, i * all_rows * dim, k, 0, heads, tokens, dim, pixels,
+                pixels, dim * pixels, pixels, tokens * pixels,
+            )  # fmt: skip
+            multiply(
+                s, 0, pixels, prompt.low, i * all_rows * both, both, e, 0, pixels,
+                all_rows, both, pixels, False,
+            )  # fmt: skip
+            to = i * all_rows * width
+            pixel_weights(
+                s, scaled, prompt.offset, 2 * i * all_rows, s12, s2, top, i * all_rows, sums, to, width,
+                all_rows, pixels,
+            )  # fmt: skip
+            pixels_first(e, e_t, both, padded, pixels)
+            weighted_sums(
+                sums, to, width, s, scaled, image.values, b * heads * pixels * depth, e_t, padded,
+                heads, tokens, pixels, depth,
+            )  # fmt: skip
+
+
+@compiled
+@no_type_check
+def gelu(x):
+    """x times the normal distribution's integral up to x, within 1e-6 (Abramowitz and Stegun 7.1.26)."""
+    size = larger(x, lanes(ZERO) - x)
+    t = reciprocal(lanes(ONE) + lanes(np.float32(0.3275911 / 2**0.5)) * size)
+    tail = lanes(np.float32(0.5 * 1.061405429)) * t + lanes(np.float32(0.5 * -1.453152027))
+    tail = tail * t + lanes(np.float32(0.5 * 1.421413741))
+    tail = tail * t + lanes(np.float32(0.5 * -0.284496736))
+    tail = tail * t + lanes(np.float32(0.5 * 0.254829592))
+    power = larger(size * size * lanes(np.float32(-0.5 / np.log(2))), lanes(LEAST))
+    return larger(x, lanes(ZERO)) - size * tail * t * exp2_negative(power)
+
+
+@compiled
+@no_type_check
+def rebuild_factors(
+    sizes, queries, scaled_queries, fixed_queries, keys0, keys1, low, offset, s1_in, s2_in, e_out
+):
+    """Compute `e_out` of `update_and_read_second` again, from the scales that it returned."""
+    number, blocks, heads, tokens, dim, pixels, _ = sizes
+    all_rows, factors = heads * tokens, heads * (tokens - 1)
+    both = 2 * factors
+    padded = (both + WIDTH - 1) // WIDTH * WIDTH
+    s, e = np.empty(all_rows * pixels, np.float32), np.empty(padded * pixels, np.float32)
+    q, ones = np.empty(heads * dim * pixels, np.float32), np.ones(pixels, np.float32)
+    none = np.zeros(all_rows, np.float32)
+    for b in range(blocks):
+        for i in range(number):
+            at = (i * blocks + b) * pixels
+            s1, s2 = s1_in[at : at + pixels], s2_in[at : at + pixels]
+            first_factors(sizes, b, i, keys0, queries, s, e, none, ones)
+            for f in range(factors):
+                for c in range(0, pixels, WIDTH):
+                    store(e, f * pixels + c, load(e, f * pixels + c) * load(s1, c))
+            second_factors(sizes, b, i, keys1, low, offset, scaled_queries, fixed_queries, s1, q, s, e)
+            for f in range(both):
+                for c in range(0, pixels, WIDTH):
+                    value = load(e, f * pixels + c) * load(s2, c)
+                    store(e_out, at * padded + f * pixels + c, value)
+
+
+@compiled
+@no_type_check
+def mask_logits(sizes, fine, eps, weights, image, prompt, s1_in, s2_in, e_in, padded, grid_width, out):
+    """Logits of masks, from the factors of both layers.
+
+    Args:
+        fine: all logits, four by four for each pixel of the image side; else the first of them only.
+        eps: of the layer norm between the two upscalings.
+        weights: `Upscaling`.
+        image: `MaskImage`.
+        prompt: `MaskPrompts`.
+        e_in, padded: factors times their scales (prompts, blocks, padded, P).
+        grid_width: pixels of a row of the image side.
+        out: (prompts, masks, rows, columns), flat.
+    """
+    number, blocks, heads, tokens, _, pixels, _ = sizes
+    both = 2 * heads * (tokens - 1)
+    wide, narrow, masks = len(weights.norm_scale), len(weights.bias), prompt.masks
+    parts = 4 if fine else 1
+    step = 4 if fine else 1
+    out_width = grid_width * step
+    out_size = blocks * pixels * step * step
+    x, y = np.empty(wide * pixels, np.float32), np.empty(narrow * pixels, np.float32)
+    found = np.empty(masks * pixels, np.float32)
+    s12, s2 = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
+    share, small = lanes(np.float32(1 / wide)), lanes(np.float32(eps))
+    for b in range(blocks):
+        for i in range(number):
+            at = (i * blocks + b) * pixels
+            s2[:] = s2_in[at : at + pixels]
+            s12[:] = s2 * s1_in[at : at + pixels]
+            for big in range(parts):
+                row = big * wide
+                for c in range(0, pixels, WIDTH):
+                    scale, second = load(s12, c), load(s2, c)
+                    for f in range(wide):
+                        k = i * 4 * wide + row + f
+                        place = (b * 4 * wide + row + f) * pixels + c
+                        value = scale * (load(image.scaled, place) + load_same(prompt.both_scales, k))
+                        value = (
+                            value
+                            + second * load_same(prompt.second_scale, k)
+                            + load_same(weights.fixed, row + f)
+                        )
+                        if len(image.detail):
+                            value = value + load(image.detail, place)
+                        store(x, f * pixels + c, value)
+                multiply(
+                    x, 0, pixels, prompt.factors, (i * 4 * wide + row) * both, both,
+                    e_in, at * padded, pixels, wide, both, pixels, False,
+                )  # fmt: skip
+                for c in range(0, pixels, WIDTH):
+                    square = lanes(ZERO)
+                    for f in range(wide):
+                        value = load(x, f * pixels + c)
+                        square = square + value * value
+                    scale = lanes(ONE) / root(square * share + small)
+                    for f in range(wide):
+                        value = load(x, f * pixels + c) * scale
+                        value = value * load_same(weights.norm_scale, f) + load_same(weights.norm_shift, f)
+                        store(x, f * pixels + c, gelu(value))
+                for little in range(parts):
+                    multiply(
+                        y, 0, pixels, weights.second, little * narrow * wide, wide, x, 0, pixels,
+                        narrow, wide, pixels, True,
+                    )  # fmt: skip
+                    for f in range(narrow):
+                        for c in range(0, pixels, WIDTH):
+                            value = load(y, f * pixels + c) + load_same(weights.bias, f)
+                            if len(image.finest):
+                                place = ((b * 4 + big) * 4 + little) * narrow + f
+                                value = value + load(image.finest, place * pixels + c)
+                            store(y, f * pixels + c, gelu(value))
+                    multiply(
+                        found, 0, pixels, prompt.combine, i * masks * narrow, narrow, y, 0, pixels,
+                        masks, narrow, pixels, True,
+                    )  # fmt: skip
+                    shift = (2 * (big // 2) + little // 2) * out_width + 2 * (big % 2) + little % 2
+                    for m in range(masks):
+                        to = (i * masks + m) * out_size + shift
+                        for p in range(pixels):
+                            q = b * pixels + p
+                            place = to + (q // grid_width) * step * out_width + (q % grid_width) * step
+                            out[place] = found[m * pixels + p]

@@ -1,0 +1,608 @@
+"""SAM's mask decoder for many prompts on one image: the same numbers in a fifth of the time.
+
+The plain decoder projects every pixel of the image side ten times per prompt. But prompts differ only in a
+few tokens. Before its layer norm, the image side after layer 1 is
+
+    X + b + F^T B        X: of the image alone, channels x pixels
+                         F: softmax weights of H heads x T tokens in each pixel, H (T - 1) rows
+                         B: values of the tokens through the output projection, H (T - 1) x channels
+
+since the weights of a head sum to 1, so that its last token goes into the vector b and the others count by
+their difference from it. A layer norm of that is one scale per pixel, which follows from |X|^2, from products
+of X that all prompts share, and from B's Gram matrix. Every later projection of the image side thus splits
+into one of X, made once per image, and one of few factors. After layer 2 there are 2 H (T - 1) factors.
+Nothing of the size channels x pixels is made until a mask is wanted. All of it is exact up to rounding;
+`SamModel` compares a few prompts with the plain network before it uses this.
+
+The two attentions of a layer, its layer norm and the next attention run block by block of pixels, for several
+prompts (`decoder_kernels`). What concerns tokens alone is plain numpy here.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import onnxruntime
+from jaxtyping import Float, Float32, Float64
+
+from hilsplat.base.lanes import WIDTH
+from hilsplat.segment import decoder_kernels as kernels
+from hilsplat.segment.decoder_weights import IMAGE_SIDE, TOKENS, DecoderGraph, Linear
+
+LOG2_E = np.float32(1 / np.log(2))
+"""Scores are to the base 2."""
+
+BLOCK = 64
+"""Pixels of a block at most: the factors of a block then stay in a core's second cache."""
+
+PROMPTS = 16
+"""Prompts that visit a block one after the other, so that the image's arrays are read a quarter as often."""
+
+HEADS = 8
+"""Heads of an attention if the model's configuration names no number."""
+
+
+class FirstLayer(NamedTuple):
+    """What the first layer's update reads of an image, block by block (see `decoder_kernels`)."""
+
+    queries: np.ndarray
+    before: np.ndarray
+    square: np.ndarray
+    cross: np.ndarray
+    scaled_keys: np.ndarray
+    fixed_keys: np.ndarray
+    values: np.ndarray
+
+
+class FirstPrompts(NamedTuple):
+    """What the first layer's update, and the attention after it, read of prompts."""
+
+    update_keys: np.ndarray
+    twice_changes: np.ndarray
+    gram: np.ndarray
+    last: np.ndarray
+    square: np.ndarray
+    linear: np.ndarray
+    queries: np.ndarray
+    low: np.ndarray
+    offset: np.ndarray
+
+
+class SecondLayer(NamedTuple):
+    """What the second layer's update reads of an image."""
+
+    scaled_queries: np.ndarray
+    fixed_queries: np.ndarray
+    before_first: np.ndarray
+    before_second: np.ndarray
+    square: np.ndarray
+    cross_first: np.ndarray
+    cross_second: np.ndarray
+    scaled_keys: np.ndarray
+    fixed_keys: np.ndarray
+    values: np.ndarray
+
+
+class SecondPrompts(NamedTuple):
+    """What the second layer's update, and the final attention, read of prompts."""
+
+    update_keys: np.ndarray
+    update_low: np.ndarray
+    update_offset: np.ndarray
+    twice_changes: np.ndarray
+    linear: np.ndarray
+    gram: np.ndarray
+    last: np.ndarray
+    square: np.ndarray
+    queries: np.ndarray
+    low: np.ndarray
+    offset: np.ndarray
+
+
+class Upscaling(NamedTuple):
+    """Weights of the two upscalings."""
+
+    norm_scale: np.ndarray
+    norm_shift: np.ndarray
+    fixed: np.ndarray
+    second: np.ndarray
+    bias: np.ndarray
+
+
+class MaskImage(NamedTuple):
+    """What masks read of an image; the last two are empty unless the model has finer features (SAM 2)."""
+
+    scaled: np.ndarray
+    detail: np.ndarray
+    finest: np.ndarray
+
+
+class MaskPrompts(NamedTuple):
+    """What masks read of prompts."""
+
+    masks: int
+    factors: np.ndarray
+    both_scales: np.ndarray
+    second_scale: np.ndarray
+    combine: np.ndarray
+
+
+@dataclass(frozen=True)
+class ImageTerms:
+    """What the decoder computes once per image.
+
+    Attributes:
+        grid_hw: height and width of the image side.
+        keys, values: of the first attention of tokens to pixels (see `decoder_kernels.read_image`).
+        first, second, masks: see there.
+    """
+
+    grid_hw: tuple[int, int]
+    keys: np.ndarray
+    values: np.ndarray
+    first: FirstLayer
+    second: SecondLayer
+    masks: MaskImage
+
+
+Kept = Mapping[str, np.ndarray]
+"""What all logits of previewed prompts are computed from, arrays with a row per prompt."""
+
+
+class FactoredDecoder:
+    """The mask decoder of a SAM or SAM 2.
+
+    Args:
+        graph: the exported decoder.
+        heads: of every attention.
+
+    Raises:
+        ModelError: the decoder is built otherwise.
+    """
+
+    def __init__(self, graph: DecoderGraph, heads: int = HEADS) -> None:
+        self.heads = heads
+        base = "mask_decoder/transformer"
+        layers = [f"{base}/layers.{number}" for number in (0, 1)]
+        self._self = [graph.attention(f"{layer}/self_attn") for layer in layers]
+        self._norms = [[graph.norm(f"{layer}/layer_norm{k}") for k in (1, 2, 3)] for layer in layers]
+        self._mlps = [graph.perceptron(f"{layer}/mlp") for layer in layers]
+        self._reads = [graph.attention(f"{layer}/cross_attn_token_to_image") for layer in layers]
+        self._reads.append(graph.attention(f"{base}/final_attn_token_to_image"))
+        self._updates = [graph.attention(f"{layer}/cross_attn_image_to_token") for layer in layers]
+        self._last_norm = graph.norm(f"{base}/layer_norm_final_attn")
+        self._iou_head = graph.perceptron("mask_decoder/iou_prediction_head")
+        self._iou_sigmoid = graph.has("mask_decoder/iou_prediction_head", "Sigmoid")
+        self._mask_heads = [
+            graph.perceptron(f"mask_decoder/output_hypernetworks_mlps.{k}") for k in (1, 2, 3)
+        ]
+        self._tokens, self._image_side = _session(graph.until(TOKENS)), _session(graph.until(*IMAGE_SIDE))
+        self.inner = len(self._reads[0].q.bias)
+        # tokens depend on the shapes of features only
+        self._blank = {
+            each.name: np.zeros([side if isinstance(side, int) else 1 for side in each.shape], np.float32)
+            for each in self._tokens.get_inputs()
+            if not each.name.startswith("input_")
+        }
+        one, other = (_run(self._tokens, self._blank, np.full((1, 2), place))[0] for place in (0.0, 9.0))
+        same = (one == other).all(axis=-1).reshape(-1)
+        self._iou_token = int(np.argmin(same)) - 5  # SAM 2 has a token before it, for the object's score
+        self.dim = self.inner // heads
+        self._fold(graph, layers)
+
+    def _fold(self, graph: DecoderGraph, layers: list[str]) -> None:
+        """Multiply weights with each other, in float64."""
+        norms = [graph.norm(f"{layer}/layer_norm4") for layer in layers]
+        self._eps = self._upscale_eps = norms[0].eps
+        (g1, b1), (g2, b2) = ((wide(norm.scale), wide(norm.shift)) for norm in norms)
+        # values' way to the image side (inner, channels): as they come there, and after the next layer norm
+        out0, out1 = (centred(wide(each.out.weight).T, 1) for each in self._updates)
+        scaled = out0 * g1
+        both = np.concatenate([centred(scaled, 1), out1])
+        finer = both * g2
+        self._g1, self._b1, self._g2, self._b2 = (single(each) for each in (g1, b1, g2, b2))
+        self._out0, self._out1, self._both = single(out0), single(out1), single(both)
+        self._bias0 = single(centred(wide(self._updates[0].out.bias)))
+        self._bias1 = single(centred(b1 + wide(self._updates[1].out.bias)))
+        self._gram0, self._gram1 = single(out0 @ out0.T), single(both @ both.T)
+        read1, read2, update1 = self._reads[1], self._reads[2], self._updates[1]
+        self._low_read1, self._values1 = (
+            single(wide(read1.k.weight) @ scaled.T),
+            single(scaled @ read1.v.weight.T),
+        )
+        self._low_update1 = single(wide(update1.q.weight) @ scaled.T)
+        self._low_read2, self._values2 = (
+            single(wide(read2.k.weight) @ finer.T),
+            single(finer @ read2.v.weight.T),
+        )
+        # the upscalings; rows (dy, dx, channel), centred, so that the mean of their layer norm is 0
+        weight = wide(graph.parameter("mask_decoder/upscale_conv1/weight"))
+        bias = np.tile(centred(wide(graph.parameter("mask_decoder/upscale_conv1/bias"))), 4)
+        upscale = centred(weight.transpose(2, 3, 1, 0), 2).reshape(-1, len(weight))
+        self._upscale, self._factor_masks = single(upscale), single(finer @ upscale.T)
+        second = graph.parameter("mask_decoder/upscale_conv2/weight")
+        self._upscaling = Upscaling(
+            norm_scale=graph.parameter("mask_decoder/upscale_layer_norm/weight"),
+            norm_shift=graph.parameter("mask_decoder/upscale_layer_norm/bias"),
+            fixed=single(upscale @ b2 + bias),
+            second=np.ascontiguousarray(second.transpose(2, 3, 1, 0)).reshape(-1),
+            bias=graph.parameter("mask_decoder/upscale_conv2/bias"),
+        )
+
+    def image(self, features: Mapping[str, np.ndarray]) -> ImageTerms:
+        """Compute what all prompts of an image share.
+
+        Args:
+            features: what the encoder returns, by name, float32.
+        """
+        sides = _run(self._image_side, features, np.zeros((1, 2)))
+        x, with_positions = (wide(side.reshape(side.shape[-2:]).T) for side in sides)  # (channels, pixels)
+        pe = with_positions - x
+        side = features.get("image_embeddings", features.get("image_embeddings.2"))
+        assert side is not None
+        pixels = min(BLOCK, x.shape[1])
+        read0, read1, read2 = self._reads
+        update0, update1 = self._updates
+        xc = centred(x, 0)
+        gx = xc * self._g1[:, None]
+        x1 = centred(gx, 0)
+        gx1 = x1 * self._g2[:, None]
+        b1, b2 = self._b1[:, None], self._b2[:, None]
+
+        def blocks(rows: np.ndarray) -> np.ndarray:
+            shape = (len(rows), -1, pixels)
+            return np.ascontiguousarray(single(rows).reshape(shape).transpose(1, 0, 2)).reshape(-1)
+
+        def by_pixel(rows: np.ndarray) -> np.ndarray:
+            found = single(rows).reshape(self.heads, self.dim, -1, pixels).transpose(2, 0, 3, 1)
+            return filled(found).reshape(-1)
+
+        def projected(layer: Linear, rows: np.ndarray) -> np.ndarray:
+            return wide(layer.weight) @ rows
+
+        def offset(layer: Linear, rows: np.ndarray) -> np.ndarray:
+            return projected(layer, rows) + wide(layer.bias)[:, None]
+
+        first = FirstLayer(
+            queries=blocks(offset(update0.q, x + pe)),
+            before=blocks(self._out0 @ xc),
+            square=single(np.square(xc).sum(axis=0)),
+            cross=single(self._bias0 @ xc),
+            scaled_keys=blocks(projected(read1.k, gx)),
+            fixed_keys=blocks(offset(read1.k, pe + b1)),
+            values=by_pixel(projected(read1.v, gx)),
+        )
+        second = SecondLayer(
+            scaled_queries=blocks(projected(update1.q, gx)),
+            fixed_queries=blocks(offset(update1.q, pe + b1)),
+            before_first=blocks(self._both[: self.inner] @ x1),
+            before_second=blocks(self._both[self.inner :] @ x1),
+            square=single(np.square(x1).sum(axis=0)),
+            cross_first=single(centred(self._g1 * self._bias0) @ x1),
+            cross_second=single(self._bias1 @ x1),
+            scaled_keys=blocks(projected(read2.k, gx1)),
+            fixed_keys=blocks(offset(read2.k, pe + b2)),
+            values=by_pixel(projected(read2.v, gx1)),
+        )
+        detail = finest = np.zeros(0, np.float32)
+        height, width = side.shape[2:]
+        if "image_embeddings.0" in features:  # SAM 2
+            half = features["image_embeddings.1"][0].reshape(-1, height, 2, width, 2).transpose(2, 4, 0, 1, 3)
+            detail = blocks(centred(wide(half), 2).reshape(-1, height * width))
+            whole = features["image_embeddings.0"][0].reshape(-1, height, 2, 2, width, 2, 2)
+            finest = blocks(whole.transpose(2, 5, 3, 6, 0, 1, 4).reshape(-1, height * width))
+        return ImageTerms(
+            grid_hw=(height, width),
+            keys=blocks(offset(read0.k, x + pe)),
+            values=by_pixel(offset(read0.v, x)),
+            first=first,
+            second=second,
+            masks=MaskImage(blocks(self._upscale @ gx1), detail, finest),
+        )
+
+    def decode(
+        self, image: ImageTerms, points_xy: Float[np.ndarray, "P 2"], *, fine: bool
+    ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"], Kept]:
+        """Decode prompts.
+
+        Args:
+            image: of `image`.
+            points_xy: one foreground point per prompt, px of the network's input.
+            fine: all logits, four by four for each pixel of the image side; else the first of each.
+
+        Returns:
+            predicted IoUs, logits, and what `logits` needs.
+        """
+        pe = _run(self._tokens, self._blank, points_xy)[0]
+        pe = pe.reshape(len(points_xy), *pe.shape[-2:])
+        number, tokens, channels = pe.shape
+        sizes, factors = self._sizes(image, number, tokens), self.heads * (tokens - 1)
+        pixels = image.grid_hw[0] * image.grid_hw[1]
+        s1, s2 = (np.empty(number * pixels, np.float32) for _ in range(2))
+        read0, read1, read2 = self._reads
+        update0, update1 = self._updates
+
+        q = self._attend_tokens(0, pe, pe)
+        rows = self._scores(read0.q(q + pe))
+        sums = PixelSums.empty(sizes, 0)
+        kernels.read_image(sizes, flat(rows), image.keys, image.values, sums.top, sums.sums)
+        q = self._think(0, q + read0.out(joined(sums.values())))
+
+        keys0, (change0, last0) = self._scores(update0.k(q + pe)), self._token_values(update0.v(q))
+        c0 = self._bias0 + last0 @ self._out0
+        d0 = c0 * self._g1
+        d0c = centred(d0)
+        q = self._attend_tokens(1, q, pe)
+        rows = self._scores(read1.q(q + pe))
+        first = FirstPrompts(
+            update_keys=flat(keys0),
+            twice_changes=flat(2 * change0),
+            gram=flat(doubled_below(_between(change0, self._gram0))),
+            last=flat(last0),
+            square=flat(np.square(c0).sum(axis=1)),
+            linear=flat(2 * _along(change0, c0 @ self._out0.T)),
+            queries=flat(rows),
+            low=flat(_low(rows, self._low_read1, change0)),
+            offset=flat(_offsets(rows, read1.k, [d0, np.zeros_like(d0)])),
+        )
+        sums = PixelSums.empty(sizes, factors)
+        e = np.empty(s1.size * up(factors), np.float32)
+        kernels.update_and_read_first(
+            sizes, channels, self._eps, image.first, first, sums.top, sums.sums, s1, e
+        )
+        found = sums.values(_through(change0, self._values1, self.heads), self._split(d0 @ read1.v.weight.T))
+        q = self._think(1, q + read1.out(joined(found + self._split(read1.v(self._b1)))))
+
+        keys1, (change1, last1) = self._scores(update1.k(q + pe)), self._token_values(update1.v(q))
+        kc = self._bias1 + last1 @ self._out1
+        changes = np.concatenate([change0, change1], axis=1)
+        d0g, kg = d0c * self._g2, kc * self._g2
+        rows = self._scores(read2.q(q + pe))
+        second = SecondPrompts(
+            update_keys=flat(keys1),
+            update_low=flat(_low(keys1, self._low_update1, change0)),
+            update_offset=flat(_offsets(keys1, update1.q, [d0])),
+            twice_changes=flat(2 * changes),
+            linear=flat(2 * np.stack([_along(changes, each @ self._both.T) for each in (d0c, kc)], axis=-1)),
+            gram=flat(doubled_below(_between(changes, self._gram1))),
+            last=flat(np.stack([last0, last1], axis=1)),
+            square=flat(
+                np.stack([(x * y).sum(axis=1) for x, y in ((d0c, d0c), (d0c, kc), (kc, kc))], axis=1)
+            ),
+            queries=flat(rows),
+            low=flat(_low(rows, self._low_read2, changes)),
+            offset=flat(_offsets(rows, read2.k, [d0g, kg])),
+        )
+        sums = PixelSums.empty(sizes, 2 * factors)
+        e2 = np.empty(s2.size * up(2 * factors), np.float32)
+        kernels.update_and_read_second(
+            sizes, channels, self._eps, image.second, second, s1, e, sums.top, sums.sums, s2, e2
+        )
+        found = sums.values(
+            _through(changes, self._values2, self.heads),
+            *(self._split(each @ read2.v.weight.T) for each in (d0g, kg)),
+        )
+        q = self._last_norm(q + read2.out(joined(found + self._split(read2.v(self._b2)))))
+
+        iou = _layers(self._iou_head, q[:, self._iou_token])[:, 1:]
+        if self._iou_sigmoid:
+            iou = 1 / (1 + np.exp(-iou))
+        first_mask = self._iou_token + 2  # the first of four masks is for prompts without ambiguity
+        kept = {
+            "keys0": keys0,
+            "keys1": keys1,
+            "low": second.update_low.reshape(number, -1),
+            "offset": second.update_offset.reshape(number, -1),
+            "s1": s1.reshape(number, -1),
+            "s2": s2.reshape(number, -1),
+            "changes": changes,
+            "both_scales": d0g @ self._upscale.T,
+            "second_scale": kg @ self._upscale.T,
+            "combine": np.stack(
+                [_layers(head, q[:, first_mask + k]) for k, head in enumerate(self._mask_heads)], 1
+            ),
+        }
+        return single(iou), self._logits(image, kept, e2, fine=fine), kept
+
+    def logits(self, image: ImageTerms, kept: Kept) -> Float32[np.ndarray, "P 3 h w"]:
+        """Return all logits of prompts that were previewed."""
+        number, _, tokens, _ = kept["keys0"].shape
+        sizes = self._sizes(image, number, tokens)
+        e = np.empty(kept["s1"].size * up(2 * self.heads * (tokens - 1)), np.float32)
+        flats = (flat(kept[name]) for name in ("keys0", "keys1", "low", "offset", "s1", "s2"))
+        kernels.rebuild_factors(
+            sizes, image.first.queries, image.second.scaled_queries, image.second.fixed_queries, *flats, e
+        )
+        return self._logits(image, kept, e, fine=True)
+
+    def _logits(self, image: ImageTerms, kept: Kept, e: np.ndarray, *, fine: bool) -> np.ndarray:
+        """Logits from the factors of the image side times their scales."""
+        changes = kept["changes"]
+        number, _, others, _ = changes.shape
+        through = changes @ self._factor_masks.reshape(2 * self.heads, self.dim, -1)
+        factors = flat(through.reshape(number, 2 * self.heads * others, -1).swapaxes(1, 2))
+        height, width = (side * (4 if fine else 1) for side in image.grid_hw)
+        out = np.empty((number, kept["combine"].shape[1], height, width), np.float32)
+        prompts = MaskPrompts(out.shape[1], factors, *(flat(kept[each]) for each in MaskPrompts._fields[2:]))
+        kernels.mask_logits(
+            self._sizes(image, number, others + 1), fine, self._upscale_eps, self._upscaling, image.masks,
+            prompts, flat(kept["s1"]), flat(kept["s2"]), e, up(2 * self.heads * others), image.grid_hw[1],
+            out.reshape(-1),
+        )  # fmt: skip
+        return out
+
+    def _sizes(self, image: ImageTerms, number: int, tokens: int) -> tuple[int, ...]:
+        """Return the sizes that `decoder_kernels.read_image` documents."""
+        pixels = image.grid_hw[0] * image.grid_hw[1]
+        block = min(BLOCK, pixels)
+        return number, pixels // block, self.heads, tokens, self.dim, block, up(self.dim)
+
+    def _attend_tokens(self, layer: int, q: np.ndarray, pe: np.ndarray) -> np.ndarray:
+        """The self-attention of a layer; the first one has neither positions nor a residual."""
+        attention, norm = self._self[layer], self._norms[layer][0]
+        x = q + pe if layer else q
+        queries, keys, values = (
+            self._split(each) for each in (attention.q(x), attention.k(x), attention.v(q))
+        )
+        scores = queries @ keys.swapaxes(2, 3) / np.float32(queries.shape[3] ** 0.5)
+        weights = np.exp(scores - scores.max(axis=3, keepdims=True))
+        found = attention.out(joined(weights / weights.sum(axis=3, keepdims=True) @ values))
+        return norm(q + found if layer else found)
+
+    def _think(self, layer: int, q: np.ndarray) -> np.ndarray:
+        """The norms of a layer after its attention to the image, and the perceptron between them."""
+        _, norm, last_norm = self._norms[layer]
+        q = norm(q)
+        return last_norm(q + _layers(self._mlps[layer], q))
+
+    def _split(self, x: Float32[np.ndarray, "*n i"]) -> Float32[np.ndarray, "n H T D"]:
+        """Take heads apart: (n, T, H D) -> (n, H, T, D); a vector per prompt (n, H D) counts as one token."""
+        if x.ndim < 3:
+            x = x.reshape(-1, 1, x.shape[-1])
+        return x.reshape(*x.shape[:2], self.heads, -1).swapaxes(1, 2)
+
+    def _scores(self, x: Float32[np.ndarray, "n T i"]) -> Float32[np.ndarray, "n H T D"]:
+        """Queries or keys of tokens, scaled so that their products with pixels are scores to the base 2."""
+        return self._split(x) * (LOG2_E / np.float32(self.dim**0.5))
+
+    def _token_values(self, x: Float32[np.ndarray, "n T i"]) -> tuple[np.ndarray, np.ndarray]:
+        """Values of tokens minus the last token's (n, H, T - 1, D), and the last token's (n, H D)."""
+        values = self._split(x)
+        return values[:, :, :-1] - values[:, :, -1:], np.ascontiguousarray(x[:, -1])
+
+
+@dataclass(frozen=True)
+class PixelSums:
+    """Sums of an attention of tokens to pixels (`decoder_kernels.pixel_weights`)."""
+
+    sizes: tuple[int, ...]
+    factors: int
+    top: np.ndarray
+    sums: np.ndarray
+
+    @staticmethod
+    def empty(sizes: tuple[int, ...], factors: int) -> "PixelSums":
+        rows = sizes[0] * sizes[2] * sizes[3]
+        width = sizes[6] + up(factors) + WIDTH
+        return PixelSums(sizes, factors, np.empty(rows, np.float32), np.empty(rows * width, np.float32))
+
+    def values(
+        self, factor_values: np.ndarray | None = None, *scale_values: np.ndarray
+    ) -> Float32[np.ndarray, "n H T D"]:
+        """Return the weighted mean of the pixels' values.
+
+        Args:
+            factor_values: values of the factors (n, H, F, D).
+            scale_values: of what the pixels' scales multiply (n, H, 1, D).
+        """
+        number, _, heads, tokens, dim, _, depth = self.sizes
+        sums = self.sums.reshape(number, heads, tokens, -1)
+        found = sums[..., :dim]
+        if factor_values is not None:
+            found = found + sums[..., depth : depth + self.factors] @ factor_values
+        total, *scales = (sums[..., k, None] for k in range(-WIDTH, -WIDTH + 3))
+        for scale, value in zip(scales, scale_values, strict=False):
+            found = found + scale * value
+        return found / total
+
+
+def _session(network: bytes) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    return onnxruntime.InferenceSession(network, options, providers=["CPUExecutionProvider"])
+
+
+def _run(
+    session: onnxruntime.InferenceSession,
+    features: Mapping[str, np.ndarray],
+    points: Float[np.ndarray, "P 2"],
+) -> list[np.ndarray]:
+    """Outputs of a part of the decoder."""
+    feeds = {
+        "input_points": points[None, :, None].astype(np.float32),
+        "input_labels": np.ones((1, len(points), 1), np.int64),
+        "input_boxes": np.zeros((1, 0, 4), np.float32),
+        **features,
+    }
+    return session.run(None, {each.name: feeds[each.name] for each in session.get_inputs()})
+
+
+def _layers(layers: list[Linear], x: np.ndarray) -> np.ndarray:
+    """Linear layers with rectifiers between them."""
+    for layer in layers[:-1]:
+        x = np.maximum(layer(x), 0)
+    return layers[-1](x)
+
+
+def _along(changes: Float32[np.ndarray, "n K J D"], vectors: Float32[np.ndarray, "n KD"]) -> np.ndarray:
+    """Product of each change with its head's part of a vector, (n, K, J)."""
+    number, heads, _, dim = changes.shape
+    return (changes @ vectors.reshape(number, heads, dim, 1))[..., 0]
+
+
+def _low(rows: np.ndarray, base: Float32[np.ndarray, "HD KD"], changes: np.ndarray) -> np.ndarray:
+    """Products of rows with changes, a matrix between them: (n, H, T, D), (n, K, J, D) -> (n, H, T, K, J)."""
+    number, heads, tokens, dim = rows.shape
+    kinds = changes.shape[1]
+    left = (rows @ base.reshape(heads, dim, -1)).reshape(number, heads, tokens, kinds, dim)
+    right = changes[:, None].swapaxes(3, 4)  # (n, 1, K, D, J)
+    return (left.transpose(0, 1, 3, 2, 4) @ right).transpose(0, 1, 3, 2, 4)
+
+
+def _between(changes: Float32[np.ndarray, "n K J D"], base: Float32[np.ndarray, "KD KD"]) -> np.ndarray:
+    """Products of changes with each other, a matrix between them, (n, K J, K J)."""
+    number, heads, others, _ = changes.shape
+    return _low(changes, base, changes).reshape(number, heads * others, -1)
+
+
+def _through(changes: np.ndarray, base: Float32[np.ndarray, "KD HD"], heads: int) -> np.ndarray:
+    """Changes times a matrix, taken apart by heads: (n, K, J, D) -> (n, H, K J, D)."""
+    number, kinds, others, dim = changes.shape
+    found = changes @ base.reshape(kinds, dim, -1)
+    return found.reshape(number, kinds * others, heads, -1).swapaxes(1, 2)
+
+
+def _offsets(rows: np.ndarray, layer: Linear, vectors: list[np.ndarray]) -> np.ndarray:
+    """Products of rows with projections of vectors (n, C): (n, H, T, D) -> (n, H, T, vectors)."""
+    number, heads, _, dim = rows.shape
+    projected = [(each @ layer.weight.T).reshape(number, heads, dim, 1) for each in vectors]
+    return np.concatenate([rows @ each for each in projected], axis=-1)
+
+
+def doubled_below(gram: Float32[np.ndarray, "n F F"]) -> Float32[np.ndarray, "n F F"]:
+    """The lower triangle of symmetric matrices that gives the same quadratic forms."""
+    return 2 * np.tril(gram, -1) + gram * np.eye(gram.shape[-1], dtype=np.float32)
+
+
+def joined(x: Float32[np.ndarray, "n H T D"]) -> Float32[np.ndarray, "n T HD"]:
+    """Put heads side by side."""
+    return x.swapaxes(1, 2).reshape(x.shape[0], x.shape[2], -1)
+
+
+def wide(x: np.ndarray) -> Float64[np.ndarray, "..."]:
+    return x.astype(np.float64)
+
+
+def single(x: np.ndarray) -> Float32[np.ndarray, "..."]:
+    return x.astype(np.float32)
+
+
+def centred(x: np.ndarray, axis: int = -1) -> np.ndarray:
+    """Subtract the mean along an axis."""
+    return x - x.mean(axis=axis, keepdims=True)
+
+
+def flat(x: np.ndarray) -> Float32[np.ndarray, " n"]:
+    return np.ascontiguousarray(x, np.float32).reshape(-1)
+
+
+def up(number: int) -> int:
+    """The next multiple of the lanes."""
+    return -(-number // WIDTH) * WIDTH
+
+
+def filled(x: np.ndarray) -> np.ndarray:
+    """Append zeros to the last axis up to a multiple of the lanes."""
+    return np.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, up(x.shape[-1]) - x.shape[-1])])
