@@ -7,8 +7,8 @@ import numpy as np
 
 from hilsplat.embed.clip import ClipModel
 from hilsplat.models.folder import input_side_px, open_model_folder
-from hilsplat.models.network import require_one_space, require_three_heads
-from hilsplat.segment.sam import own_thresholds
+from hilsplat.models.network import require_one_space
+from hilsplat.segment.sam import SamModel
 
 
 def check_model(folder: Path, variant: str = "") -> str:
@@ -26,32 +26,31 @@ def check_model(folder: Path, variant: str = "") -> str:
     """
     model = open_model_folder(folder, variant=variant)
     side = input_side_px(model)
-    pixels = np.zeros((1, 3, side, side), dtype=np.float32)
     lines = [f"folder     {model.folder}", f"kind       {model.layout}", f"image      {side} x {side} px"]
     if model.kind == "sam":
-        own = own_thresholds(model)
-        encoder, decoder, *_ = (model.network(name) for name in model.networks)
+        sam = SamModel(model)
         start = time.perf_counter()
-        features = dict(zip(encoder.spec.outputs, encoder(pixel_values=pixels), strict=True))
+        encoded = sam.encode(np.zeros((side, side, 3), np.uint8))
         encode_s = time.perf_counter() - start
-        prompts = decoder.fixed_axis("input_points", 1) or 1
+        prompts = sam.prompts_per_call(1, 1)
+        points = np.full((prompts, 2), side / 2)
         start = time.perf_counter()
-        scores, masks = decoder(
-            input_points=np.full((1, prompts, 1, 2), side / 2),
-            input_labels=np.ones((1, prompts, 1)),
-            input_boxes=np.zeros((1, 0, 4)),
-            **features,
-        )
-        decode_s = time.perf_counter() - start
-        require_three_heads(decoder.path, scores, masks)
+        _, masks = sam.decode(encoded, points)
+        per_prompt = f"{(time.perf_counter() - start) / prompts:.4f} s for the masks of one prompt"
+        if sam.previews:
+            start = time.perf_counter()
+            sam.preview(encoded, points)
+            per_prompt += f", {(time.perf_counter() - start) / prompts:.4f} s for its preview"
+        sizes = (" x ".join(map(str, value.shape[1:])) for value in encoded.features.values())
         lines += [
-            f"embedding  {', '.join(' x '.join(map(str, value.shape[1:])) for value in features.values())}",
-            f"thresholds predicted IoU {own.predicted_iou_min}, stability {own.stability_min}, "
-            f"score {own.nms_score}",
+            f"embedding  {', '.join(sizes)}",
+            f"thresholds predicted IoU {sam.own.predicted_iou_min}, stability {sam.own.stability_min}, "
+            f"score {sam.own.nms_score}",
             f"masks      3 heads (subpart, part, whole) of {masks.shape[-2]} x {masks.shape[-1]} px",
-            f"time       {encode_s:.3f} s for one image, {decode_s / prompts:.4f} s for one prompt",
+            f"decoder    {'factored' if sam.factored else 'onnxruntime'}",
+            f"time       {encode_s:.3f} s for one image, {per_prompt}",
         ]
-        providers = encoder.providers
+        providers = sam.encoder.providers
     else:
         clip = ClipModel(model)
         vision = clip.vision

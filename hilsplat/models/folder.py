@@ -68,13 +68,9 @@ class ModelFolder:
             [(path.relative_to(self.folder).as_posix(), sha256_of_file(path)) for path in self.files]
         )
 
-    def network(self, name: str, threads: int = 1) -> Network:
-        """Open one of the model's networks and check its inputs and outputs.
-
-        Raises:
-            ModelError: it cannot be read, or its inputs or outputs have other names or axes than expected.
-        """
-        return Network(self.networks[name], LAYOUTS[self.layout].usable[name], threads)
+    def network(self, name: str, threads: int = 1, graph: bytes | None = None) -> Network:
+        """Open one of the model's networks and check its inputs and outputs (see `Network`)."""
+        return Network(self.networks[name], LAYOUTS[self.layout].usable[name], threads, graph)
 
 
 def open_model_folder(

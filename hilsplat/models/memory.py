@@ -15,8 +15,15 @@ ATTENTION_COPIES = 3.5
 """Arrays as large as all attention weights of a layer that are alive at once. Measured: 2615 MiB for a
 picture in SAM ViT-B, whose weights of attention take 768 MiB."""
 
+ACTIVATIONS = 35
+"""Arrays of all patches' features that a picture takes in SAM if attention goes row by row. Measured: 475 MiB
+in ViT-B, whose features of all patches take 12 MiB."""
+
 PROMPT_MIB = 64
-"""Memory of a prompt in SAM's decoder at a picture of 1024 px. Measured: 507 MiB for 8 prompts of ViT-B."""
+"""Memory of a prompt in SAM's exported decoder at a picture of 1024 px. Measured: 507 MiB for 8 of ViT-B."""
+
+FACTORED_MIB = 250
+"""Memory of all prompts of a picture of 1024 px in the factored decoder."""
 
 UNKNOWN_BYTES_PER_PX = 400
 """Memory of a picture's encoding per pixel, if the configuration does not describe the network (sam-tiny)."""
@@ -44,26 +51,32 @@ class Needs:
         return max(1, min(threads, fitting))
 
 
-def needs_of(model: ModelFolder, batch: int) -> Needs:
+def needs_of(model: ModelFolder, batch: int, *, as_exported: bool = False) -> Needs:
     """Memory of a model, from its configuration and the size of its files.
 
     Args:
         model: the folder.
         batch: prompts (SAM) or crops (CLIP) per call.
+        as_exported: SAM's networks run as they are (see `segment.sam.SamModel.as_exported`).
     """
     files = {*model.networks.values(), *(path for path in model.files if "onnx" in path.name)}
     weights = 1.2 * sum(path.stat().st_size for path in files) / MIB
     side = input_side_px(model)
     vision = model.config.get("vision_config", model.config.get("vision_cfg"))
     if not isinstance(vision, dict):
-        picture = side * side * UNKNOWN_BYTES_PER_PX / MIB
+        picture, as_exported = side * side * UNKNOWN_BYTES_PER_PX / MIB, True
     elif model.kind == "clip":
         picture = _crop_mib(vision, side)
+    elif model.layout == "sam" and not as_exported:
+        patches = side / _patch_px(vision)
+        features = patches**2 * vision.get("hidden_size", 768) * 4 / MIB
+        picture = ACTIVATIONS * features + ATTENTION_COPIES * _attention_mib(vision, side) / patches
     else:
         picture = ATTENTION_COPIES * _attention_mib(vision, side)
     if model.kind == "clip":
         return Needs(weights, batch * picture)
-    return Needs(weights, picture + batch * PROMPT_MIB * (side / 1024) ** 2)
+    decoder = batch * PROMPT_MIB if as_exported else FACTORED_MIB
+    return Needs(weights, picture + decoder * (side / 1024) ** 2)
 
 
 def _attention_mib(vision: dict[str, Any], side_px: int) -> float:

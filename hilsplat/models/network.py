@@ -39,7 +39,18 @@ class Network:
     sums inside a call then do not depend on the number of threads. Several threads may call it.
     """
 
-    def __init__(self, path: Path, spec: NetworkSpec, threads: int = 1) -> None:
+    def __init__(self, path: Path, spec: NetworkSpec, threads: int = 1, graph: bytes | None = None) -> None:
+        """Open a network.
+
+        Args:
+            path: the `.onnx` file.
+            spec: its inputs and outputs.
+            threads: of one call.
+            graph: a changed graph that takes the file's place (`onnx_graph`).
+
+        Raises:
+            ModelError: it cannot be read, or its inputs or outputs have other names or axes than expected.
+        """
         self.path = path
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
@@ -53,7 +64,9 @@ class Network:
                 fix="fetch the file itself: git lfs pull, or download it from the model's page",
             )
         try:
-            self.session = onnxruntime.InferenceSession(str(path), options, providers=execution_providers())
+            self.session = onnxruntime.InferenceSession(
+                graph or str(path), options, providers=execution_providers()
+            )
         except Exception as error:  # onnxruntime's errors share no public base class
             raise ModelError(
                 f"network {path} cannot be opened: {error}",

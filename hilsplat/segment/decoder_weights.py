@@ -10,6 +10,7 @@ from jaxtyping import Float32
 
 from hilsplat.base.errors import ModelError
 from hilsplat.base.lanes import WIDTH
+from hilsplat.models.onnx_graph import keep_only
 from hilsplat.segment import decoder_kernels as kernels
 
 LAYER = "mask_decoder/transformer/layers.0"
@@ -136,30 +137,10 @@ class DecoderGraph:
         """Return the part of the network, serialised, whose outputs are the inputs of modules."""
         import onnx
 
-        outputs = [self._node(f"{module}/MatMul").input[0] for module in modules]
-        makers = {name: node for node in self.model.graph.node for name in node.output}
-        needed, waiting = set[str](), list(outputs)
-        while waiting:
-            name = waiting.pop()
-            if name in makers and name not in needed:
-                waiting += makers[name].input
-            needed.add(name)
         part = onnx.ModelProto()
         part.CopyFrom(self.model)
-        nodes = [node for node in part.graph.node if needed & set(node.output)]
-        constants = [each for each in part.graph.initializer if each.name in needed]
-        inputs = [each for each in part.graph.input if each.name in needed]
-        for field, kept in (
-            (part.graph.node, nodes),
-            (part.graph.initializer, constants),
-            (part.graph.input, inputs),
-        ):
-            del field[:]
-            field.extend(kept)
-        del part.graph.output[:]
-        for name in outputs:
-            part.graph.output.append(onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, None))
-        return part.SerializeToString()
+        keep_only(part, [self._node(f"{module}/MatMul").input[0] for module in modules])
+        return bytes(part.SerializeToString())
 
     def _find(self, ending: str) -> Any:
         matches = [node for name, node in self._nodes.items() if name.endswith(f"/{ending}")]

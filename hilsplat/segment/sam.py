@@ -20,7 +20,8 @@ from hilsplat.base.errors import ModelError
 from hilsplat.base.levels import Level
 from hilsplat.models.folder import ModelFolder, open_model_folder, side_px
 from hilsplat.models.layouts import DECODER, PREVIEW
-from hilsplat.models.network import Network, require_three_heads
+from hilsplat.models.network import Network, execution_providers, require_three_heads
+from hilsplat.models.onnx_graph import with_rowwise_attention
 from hilsplat.segment.decoder_weights import DecoderGraph
 from hilsplat.segment.factored_decoder import PROMPTS, FactoredDecoder, ImageTerms
 from hilsplat.segment.kernels import areas_and_boxes, upscaled_runs
@@ -120,19 +121,22 @@ class SamModel:
         stretches: whether pictures are stretched to a square, as for SAM 2, or padded, as for SAM.
         previewer: the decoder at half the resolution (`layouts.PREVIEW`), if the model has one.
         factored: the decoder with the same results in a fraction of the time, if the model allows it.
+        as_exported: whether the encoder or the decoder runs as it was exported, which takes more memory.
     """
 
     own: Thresholds = REAL_SAM
     stretches: bool = False
     previewer: Network | None = None
     factored: FactoredDecoder | None = None
+    as_exported: bool = True
 
     def __init__(self, model: ModelFolder) -> None:
         self.model = model
         self.own = own_thresholds(model)
         self.stretches = model.layout == "sam2"
         self.digest = model.digest
-        self.encoder = model.network("vision_encoder")
+        graph = self._rowwise_encoder()
+        self.encoder = model.network("vision_encoder", graph=graph)
         self.decoder = model.network(DECODER)
         if PREVIEW in model.networks:
             self.previewer = model.network(PREVIEW)
@@ -150,6 +154,23 @@ class SamModel:
         self.rescale = np.float32(preprocessing.get("rescale_factor", 1 / 255))
         if self.previewer is None and self.decoder.providers[0] == "CPUExecutionProvider":
             self.factored = self._factor()
+        self.as_exported = self.factored is None or (graph is None and not self.stretches)
+
+    def _rowwise_encoder(self) -> bytes | None:
+        """Change a ViT's global attentions for the CPU; None if the encoder is another, or a GPU runs it."""
+        vision = self.model.config.get("vision_config")
+        if (
+            self.stretches
+            or not isinstance(vision, dict)
+            or execution_providers()[0] != "CPUExecutionProvider"
+        ):
+            return None
+        return with_rowwise_attention(
+            self.model.networks["vision_encoder"],
+            vision.get("global_attn_indexes", (2, 5, 8, 11)),
+            vision.get("num_attention_heads", 12),
+            vision.get("image_size", 1024) // vision.get("patch_size", 16),
+        )
 
     def _factor(self) -> FactoredDecoder | None:
         """Factor the decoder and check it against the network; None if its graph is a different one."""

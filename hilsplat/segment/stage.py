@@ -76,7 +76,7 @@ def run_masks(
             batch = model.prompts_per_call(
                 model.thresholds(settings).points_per_batch, settings.points_per_side**2
             )
-            needs = needs_of(model.model, batch)
+            needs = needs_of(model.model, batch, as_exported=model.as_exported)
             threads = needs.views_at_once(threads, min(memory_mib or math.inf, available_mib()))
             logger.info("masks %s: %d views at once, %.0f MiB each", scene.name, threads, needs.view_mib)
 

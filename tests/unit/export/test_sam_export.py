@@ -1,9 +1,11 @@
 """A SAM exported by optimum gives through our code what transformers gives through its own."""
 
 import numpy as np
+import onnx
 import pytest
 
 from hilsplat.embed.model_check import check_model
+from hilsplat.models.onnx_graph import with_rowwise_attention
 from hilsplat.segment.candidates import crop_boxes, decode_candidates
 from hilsplat.segment.generate import masks_from_candidates
 from hilsplat.segment.masks import HierarchicalMasks
@@ -71,6 +73,23 @@ def test_embeddings_agree(ours, sam_parts, theirs, photograph):
         positional.numpy().reshape(16, 8, 8),
         atol=TOLERANCE,
     )
+
+
+def test_global_attention_goes_row_by_row_with_the_same_result(ours, photograph):
+    assert not ours.as_exported
+    path = ours.model.networks["vision_encoder"]
+    graph = onnx.load_from_string(with_rowwise_attention(path, [1], 2, 8)).graph
+    assert [node.name for node in graph.node if node.op_type == "Softmax"] == [
+        "/vision_encoder/layers.0/attn/Softmax"
+    ]
+    pixels, _ = ours.prepare(photograph)
+    for found, expected in zip(
+        ours.encoder(pixel_values=pixels),
+        ours.model.network("vision_encoder")(pixel_values=pixels),
+        strict=True,
+    ):
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert with_rowwise_attention(path, [0, 7], 2, 8) is None  # there is no layer 7
 
 
 def test_scores_and_low_resolution_masks_agree(ours, theirs, photograph):

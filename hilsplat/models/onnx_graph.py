@@ -1,0 +1,164 @@
+"""Changes to ONNX graphs: parts of a network, and attention among all patches row by row."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def keep_only(model: Any, outputs: Sequence[str]) -> None:
+    """Reduce a model to what leads to the given values, which become its outputs if they are others."""
+    import onnx
+
+    graph = model.graph
+    makers = {name: node for node in graph.node for name in node.output}
+    needed, waiting = set[str](), list(outputs)
+    while waiting:
+        name = waiting.pop()
+        if name in makers and name not in needed:
+            waiting += _inputs(makers[name])
+        needed.add(name)
+    kept = {
+        "node": [node for node in graph.node if needed & set(node.output)],
+        "initializer": [each for each in graph.initializer if each.name in needed],
+        "input": [each for each in graph.input if each.name in needed],
+    }
+    if list(outputs) != [each.name for each in graph.output]:
+        unknown = onnx.TensorProto.FLOAT, None
+        kept["output"] = [onnx.helper.make_tensor_value_info(name, *unknown) for name in outputs]
+    for field, values in kept.items():
+        target = getattr(graph, field)
+        del target[:]
+        target.extend(values)
+
+
+def _inputs(node: Any) -> list[str]:
+    """Names that a node reads, also in its inner graphs."""
+    inner = [each for attribute in node.attribute for each in (attribute.g, *attribute.graphs)]
+    return [*node.input, *(name for graph in inner for part in graph.node for name in _inputs(part))]
+
+
+def with_rowwise_attention(path: Path, layers: Iterable[int], heads: int, side: int) -> bytes | None:
+    """Return SAM's encoder with global attentions that take one row of patches at a time.
+
+    As exported, such a layer writes the weights of every two patches, 800 MB, and reads them four times.
+    Those of a row fit into the processor's cache. onnxruntime loops over rows (operator Scan); results differ
+    by rounding at most.
+
+    Args:
+        path: the `.onnx` file of a ViT encoder exported from transformers.
+        layers: layers with global attention.
+        heads: of an attention.
+        side: patches per side of the picture.
+
+    Returns:
+        the graph, serialised; None if a layer has another form, weights are in another file, or have 16 bits.
+    """
+    import onnx
+
+    model = onnx.load(str(path), load_external_data=False)
+    graph = model.graph
+    if any(
+        each.data_location == onnx.TensorProto.EXTERNAL or each.data_type == onnx.TensorProto.FLOAT16
+        for each in graph.initializer
+    ):
+        return None
+    makers = {name: node for node in graph.node for name in node.output}
+    for layer in layers:
+        ending = f"/layers.{layer}/attn/Softmax"
+        found = [node for node in graph.node if node.name.endswith(ending)]
+        sums = _scores(found[0], makers) if len(found) == 1 else None
+        readers = [node for node in graph.node if found and found[0].output[0] in node.input]
+        if sums is None or len(readers) != 1 or readers[0].op_type != "MatMul":
+            return None
+        (queries, keys), positions = sums
+        nodes = _row_loop(
+            f"rowwise.{layer}",
+            queries,
+            keys,
+            readers[0].input[1],
+            positions,
+            readers[0].output[0],
+            heads,
+            side,
+        )
+        place = list(graph.node).index(readers[0])
+        graph.node.remove(readers[0])
+        for offset, node in enumerate(nodes):
+            graph.node.insert(place + offset, node)
+    keep_only(model, [each.name for each in graph.output])
+    return bytes(model.SerializeToString())
+
+
+def _scores(softmax: Any, makers: dict[str, Any]) -> tuple[list[str], list[str]] | None:
+    """Inputs of the product, and terms by position, whose sum a softmax reads."""
+    product, positions, waiting = None, [], [softmax.input[0]]
+    while waiting:
+        node = makers.get(waiting.pop())
+        if node is None:
+            return None
+        if node.op_type == "MatMul":
+            product = list(node.input)
+        elif node.op_type == "Unsqueeze":
+            positions.append(node.output[0])
+        elif node.op_type in ("Add", "Reshape"):
+            waiting += node.input if node.op_type == "Add" else node.input[:1]
+        else:
+            return None
+    return (product, positions) if product and len(positions) == 2 else None
+
+
+def _row_loop(
+    name: str,
+    queries: str,
+    keys: str,
+    values: str,
+    positions: Sequence[str],
+    output: str,
+    heads: int,
+    side: int,
+) -> list[Any]:
+    """Nodes of an attention with a loop over rows of queries; positions have rows on axis 1."""
+    from onnx import TensorProto, helper, numpy_helper
+
+    def shape(of: str, *sides: int) -> Any:
+        value = numpy_helper.from_array(np.array(sides, np.int64))
+        return helper.make_node("Constant", [], [f"{name}.{of}"], value=value)
+
+    def inside(of: str) -> Any:
+        return helper.make_tensor_value_info(f"{name}.{of}", TensorProto.FLOAT, None)
+
+    body = helper.make_graph(
+        [
+            helper.make_node("MatMul", [f"{name}.row", f"{name}.k"], [f"{name}.product"]),
+            helper.make_node("Add", [f"{name}.row_y", f"{name}.row_x"], [f"{name}.position"]),
+            shape("row_shape", heads, side, side * side),
+            helper.make_node("Reshape", [f"{name}.position", f"{name}.row_shape"], [f"{name}.bias"]),
+            helper.make_node("Add", [f"{name}.product", f"{name}.bias"], [f"{name}.score"]),
+            helper.make_node("Softmax", [f"{name}.score"], [f"{name}.weight"], axis=-1),
+            helper.make_node("MatMul", [f"{name}.weight", f"{name}.v"], [f"{name}.mean"]),
+        ],
+        f"{name}.body",
+        [inside("row"), inside("row_y"), inside("row_x")],
+        [inside("mean")],
+    )
+    return [
+        shape("q_shape", heads, side, side, -1),
+        shape("k_shape", heads, -1, side * side),
+        shape("v_shape", heads, side * side, -1),
+        helper.make_node("Reshape", [queries, f"{name}.q_shape"], [f"{name}.q"]),
+        helper.make_node("Reshape", [keys, f"{name}.k_shape"], [f"{name}.k"]),
+        helper.make_node("Reshape", [values, f"{name}.v_shape"], [f"{name}.v"]),
+        helper.make_node(
+            "Scan",
+            [f"{name}.q", *positions],
+            [f"{name}.rows"],
+            body=body,
+            num_scan_inputs=3,
+            scan_input_axes=[1, 1, 1],
+            scan_output_axes=[1],
+        ),
+        helper.make_node("Shape", [queries], [f"{name}.whole_shape"]),
+        helper.make_node("Reshape", [f"{name}.rows", f"{name}.whole_shape"], [output]),
+    ]
