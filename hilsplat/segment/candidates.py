@@ -185,7 +185,7 @@ def uses_preview(model: SamModel, settings: MasksSettings) -> bool:
 def distinct_prompts(
     encoded: Encoded, prompts: Prompts, model: SamModel, settings: MasksSettings, batch: int
 ) -> Prompts:
-    """Previewed prompts, without those of which each mask repeats a better one of its head.
+    """Preview prompts and drop each one whose masks all repeat a better mask of the same head.
 
     Masks are compared by their boxes in the preview, which has every second or fourth row and column of the
     decoder's masks (`suppression.distinct_boxes`), before any threshold that a user may change. Of a thousand

@@ -1,4 +1,4 @@
-"""SAM's mask decoder for many prompts on one image: the same numbers in a fifth of the time.
+"""SAM's mask decoder for many prompts on one image, with exact algebra (docs/benchmarks.md has the times).
 
 The plain decoder projects every pixel of the image side ten times per prompt. But prompts differ only in a
 few tokens. Before its layer norm, the image side after layer 1 is
@@ -11,8 +11,8 @@ since the weights of a head sum to 1, so that its last token goes into the vecto
 their difference from it. A layer norm of that is one scale per pixel, which follows from |X|^2, from products
 of X that all prompts share, and from B's Gram matrix. Every later projection of the image side thus splits
 into one of X, made once per image, and one of few factors. After layer 2 there are 2 H (T - 1) factors.
-Nothing of the size channels x pixels is made until a mask is wanted. All of it is exact up to rounding;
-`SamModel` compares a few prompts with the plain network before it uses this.
+No array of channels x pixels is computed before a mask is. Results differ from the network's by rounding;
+`SamModel` compares a few prompts before it uses this class.
 
 The two attentions of a layer, its layer norm and the next attention run block by block of pixels, for several
 prompts (`decoder_kernels`). What concerns tokens alone is plain numpy here.
@@ -26,6 +26,7 @@ import numpy as np
 import onnxruntime
 from jaxtyping import Float, Float32, Float64
 
+from hilsplat.base.errors import ModelError
 from hilsplat.base.lanes import WIDTH
 from hilsplat.segment import decoder_kernels as kernels
 from hilsplat.segment.decoder_weights import IMAGE_SIDE, TOKENS, DecoderGraph, Linear
@@ -34,17 +35,26 @@ LOG2_E = np.float32(1 / np.log(2))
 """Scores are to the base 2."""
 
 BLOCK = 64
-"""Pixels of a block at most: the factors of a block then stay in a core's second cache."""
+"""Pixels of a block at most. Its arrays fit into a core's second-level cache; 128 and 256 are 2 % slower."""
 
 PROMPTS = 16
-"""Prompts that visit a block one after the other, so that the image's arrays are read a quarter as often."""
+"""Prompts of a call. They visit a block one after the other, which then is in the cache."""
 
 HEADS = 8
 """Heads of an attention if the model's configuration names no number."""
 
 
 class FirstLayer(NamedTuple):
-    """What the first layer's update reads of an image, block by block (see `decoder_kernels`)."""
+    """What the kernels read of an image at the first layer, block by block.
+
+    Attributes:
+        queries: of the attention of pixels to tokens.
+        before: products of the image side with the output projection of a value.
+        square: squared length of each pixel's features.
+        cross: products of the pixels' features with the constant that is added to them.
+        scaled_keys, fixed_keys: keys of the attention of tokens to pixels; the layer norm scales the first.
+        values: of that attention, before the scale.
+    """
 
     queries: np.ndarray
     before: np.ndarray
@@ -56,7 +66,18 @@ class FirstLayer(NamedTuple):
 
 
 class FirstPrompts(NamedTuple):
-    """What the first layer's update, and the attention after it, read of prompts."""
+    """What the kernels read of prompts at the first layer.
+
+    Attributes:
+        update_keys: keys of the attention of pixels to tokens.
+        twice_changes: twice the values of its tokens, as differences from the last token's.
+        gram: products of the differences after the output projection (`doubled_below`).
+        last: values of the last token.
+        square: squared length of what the last token adds to every pixel.
+        linear: twice the products of that with the differences.
+        queries: of the attention of tokens to pixels.
+        low, offset: products of these with the keys' part of the factors, and of what every pixel gets.
+    """
 
     update_keys: np.ndarray
     twice_changes: np.ndarray
@@ -70,7 +91,10 @@ class FirstPrompts(NamedTuple):
 
 
 class SecondLayer(NamedTuple):
-    """What the second layer's update reads of an image."""
+    """What the kernels read of an image at the second layer; names as in `FirstLayer`.
+
+    Queries and products come in two parts, for the values of the first and of the second layer.
+    """
 
     scaled_queries: np.ndarray
     fixed_queries: np.ndarray
@@ -85,7 +109,7 @@ class SecondLayer(NamedTuple):
 
 
 class SecondPrompts(NamedTuple):
-    """What the second layer's update, and the final attention, read of prompts."""
+    """What the kernels read of prompts at the second layer; names as in `FirstPrompts`."""
 
     update_keys: np.ndarray
     update_low: np.ndarray
@@ -101,7 +125,7 @@ class SecondPrompts(NamedTuple):
 
 
 class Upscaling(NamedTuple):
-    """Weights of the two upscalings."""
+    """Weights of the two upscalings: layer norm between them, bias of the first, the second."""
 
     norm_scale: np.ndarray
     norm_shift: np.ndarray
@@ -111,7 +135,7 @@ class Upscaling(NamedTuple):
 
 
 class MaskImage(NamedTuple):
-    """What masks read of an image; the last two are empty unless the model has finer features (SAM 2)."""
+    """What masks read of an image: the image side upscaled once, and the finer features of a SAM 2."""
 
     scaled: np.ndarray
     detail: np.ndarray
@@ -119,7 +143,14 @@ class MaskImage(NamedTuple):
 
 
 class MaskPrompts(NamedTuple):
-    """What masks read of prompts."""
+    """What masks read of prompts.
+
+    Attributes:
+        masks: number per prompt.
+        factors: the factors' way through the first upscaling.
+        both_scales, second_scale: the same of what every pixel gets at the first and second layer.
+        combine: weights of the channels in each mask.
+    """
 
     masks: int
     factors: np.ndarray
@@ -135,7 +166,7 @@ class ImageTerms:
     Attributes:
         grid_hw: height and width of the image side.
         keys, values: of the first attention of tokens to pixels (see `decoder_kernels.read_image`).
-        first, second, masks: see there.
+        first, second, masks: for later attentions and for masks.
     """
 
     grid_hw: tuple[int, int]
@@ -235,6 +266,9 @@ class FactoredDecoder:
 
         Args:
             features: what the encoder returns, by name, float32.
+
+        Raises:
+            ModelError: the image side cannot be cut into blocks.
         """
         sides = _run(self._image_side, features, np.zeros((1, 2)))
         x, with_positions = (wide(side.reshape(side.shape[-2:]).T) for side in sides)  # (channels, pixels)
@@ -242,6 +276,8 @@ class FactoredDecoder:
         side = features.get("image_embeddings", features.get("image_embeddings.2"))
         assert side is not None
         pixels = min(BLOCK, x.shape[1])
+        if x.shape[1] % pixels or pixels % WIDTH:
+            raise ModelError(f"the decoder cannot be factored: an image of {side.shape[2:]} features")
         read0, read1, read2 = self._reads
         update0, update1 = self._updates
         xc = centred(x, 0)
@@ -483,6 +519,7 @@ class PixelSums:
 
     @staticmethod
     def empty(sizes: tuple[int, ...], factors: int) -> "PixelSums":
+        """Sums of an attention whose pixels have so many factors."""
         rows = sizes[0] * sizes[2] * sizes[3]
         width = sizes[6] + up(factors) + WIDTH
         return PixelSums(sizes, factors, np.empty(rows, np.float32), np.empty(rows * width, np.float32))
@@ -508,6 +545,7 @@ class PixelSums:
 
 
 def _session(network: bytes) -> onnxruntime.InferenceSession:
+    """Open a part of the decoder; a call takes one thread."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3
@@ -582,10 +620,12 @@ def joined(x: Float32[np.ndarray, "n H T D"]) -> Float32[np.ndarray, "n T HD"]:
 
 
 def wide(x: np.ndarray) -> Float64[np.ndarray, "..."]:
+    """Convert to float64."""
     return x.astype(np.float64)
 
 
 def single(x: np.ndarray) -> Float32[np.ndarray, "..."]:
+    """Convert to float32."""
     return x.astype(np.float32)
 
 
@@ -595,6 +635,7 @@ def centred(x: np.ndarray, axis: int = -1) -> np.ndarray:
 
 
 def flat(x: np.ndarray) -> Float32[np.ndarray, " n"]:
+    """Return the numbers as the kernels take them."""
     return np.ascontiguousarray(x, np.float32).reshape(-1)
 
 

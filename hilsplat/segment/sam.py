@@ -258,7 +258,7 @@ class SamModel:
 
     @property
     def previews(self) -> bool:
-        """Whether the model can tell at a lower resolution which masks a prompt gives."""
+        """Whether the model has masks at a lower resolution, in less time."""
         return self.previewer is not None or self.factored is not None
 
     def preview(
