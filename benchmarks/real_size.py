@@ -1,7 +1,7 @@
 """What a released SAM and CLIP cost per photograph, measured with random weights at their real size. By hand:
 
-    python -m benchmarks.real_size                      # SAM ViT-B and CLIP B/16 on three photographs
-    python -m benchmarks.real_size --huge PHOTOGRAPHS   # SAM ViT-H; a folder of your own
+    python -m benchmarks.real_size                              # SAM ViT-B and CLIP B/16 on three photographs
+    python -m benchmarks.real_size --sam sam2.1-small PHOTOS    # another SAM; a folder of your own
 
 Networks of random weights cost what trained ones cost. They are exported once into --models (extra
 export; ViT-B needs 8 GB for that, ViT-H more). A random SAM is sure of no mask, so the work on masks
@@ -57,6 +57,65 @@ def export_sam(size: str, out: Path) -> None:
     model.save_pretrained(out / "torch")
     transformers.SamImageProcessor().save_pretrained(out / "torch")
     main_export(str(out / "torch"), output=out, task="feature-extraction", do_validation=False)
+
+
+def export_sam2(out: Path) -> None:
+    """A SAM 2.1 small of random weights in the layout of the published ONNX exports."""
+    import torch
+    import transformers
+
+    torch.manual_seed(0)
+    backbone = transformers.Sam2HieraDetConfig(
+        blocks_per_stage=[1, 2, 11, 2],
+        global_attention_blocks=[7, 10, 13],
+        window_positional_embedding_background_size=[7, 7],
+    )
+    model = transformers.Sam2Model(transformers.Sam2Config(transformers.Sam2VisionConfig(backbone))).eval()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            if not parameter.any():
+                parameter.normal_(0, 0.02)
+    names = [f"image_embeddings.{level}" for level in range(3)]
+    pixels = torch.zeros(1, 3, 1024, 1024)
+
+    class Part(torch.nn.Module):
+        def __init__(self, decode: bool) -> None:
+            super().__init__()
+            self.model, self.decode = model, decode
+
+        def forward(self, *inputs):
+            if not self.decode:
+                return tuple(self.model.get_image_embeddings(*inputs))
+            points, labels, boxes, *features = inputs
+            found = self.model(input_points=points, input_labels=labels, image_embeddings=features)
+            return found.iou_scores + boxes.sum(), found.pred_masks
+
+    out.mkdir(parents=True, exist_ok=True)
+    prompts = {1: "prompts", 2: "points"}
+    asked = {
+        "input_points": torch.full((1, 3, 2, 2), 32.0),
+        "input_labels": torch.ones((1, 3, 2), dtype=torch.int64),
+        "input_boxes": torch.zeros(1, 0, 4),
+        **dict(zip(names, model.get_image_embeddings(pixels), strict=True)),
+    }
+    dynamic = {"input_points": prompts, "input_labels": prompts, "input_boxes": {1: "boxes"}}
+    for network, inputs, outputs, axes in (
+        ("vision_encoder", {"pixel_values": pixels}, names, {}),
+        ("prompt_encoder_mask_decoder", asked, ["iou_scores", "pred_masks"], dynamic),
+    ):
+        torch.onnx.export(
+            Part(len(inputs) > 1),
+            tuple(inputs.values()),
+            str(out / f"{network}.onnx"),
+            input_names=list(inputs),
+            output_names=outputs,
+            dynamic_axes=axes,
+            opset_version=18,
+            dynamo=False,
+        )
+    model.config.save_pretrained(out)
+    square = {"size": {"height": 1024, "width": 1024}, "pad_size": None, "resample": 2}
+    (out / "preprocessor_config.json").write_text(json.dumps(square))
 
 
 def export_clip(out: Path) -> None:
@@ -171,7 +230,7 @@ def main() -> None:
     """Export what is missing, then measure every photograph, each step in a process of its own."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("photographs", type=Path, nargs="?", default=PHOTOGRAPHS)
-    parser.add_argument("--huge", action="store_true", help="SAM ViT-H instead of ViT-B")
+    parser.add_argument("--sam", choices=[*SIZES, "sam2.1-small"], default="base", help="SAM's encoder")
     parser.add_argument("--views", type=int, default=3, help="number of photographs")
     parser.add_argument("--points", type=int, default=32, help="prompts per image side")
     parser.add_argument("--models", type=Path, default=Path("results/.cache/real-size"))
@@ -179,6 +238,9 @@ def main() -> None:
     asked = parser.parse_args()
     if asked.step == "export-clip":
         export_clip(asked.models)
+        return
+    if asked.step == "export-sam2.1-small":
+        export_sam2(asked.models)
         return
     if asked.step and asked.step.startswith("export-"):
         export_sam(asked.step.removeprefix("export-"), asked.models)
@@ -191,10 +253,9 @@ def main() -> None:
         return
     if not asked.photographs.is_dir():
         sys.exit(f"skipped: there are no photographs in {asked.photographs}; name a folder")
-    size = "huge" if asked.huge else "base"
-    places = {"sam": asked.models / f"sam-{size}", "clip": asked.models / "clip"}
+    places = {"sam": asked.models / f"sam-{asked.sam}", "clip": asked.models / "clip"}
     for kind, step, done in (
-        ("sam", f"export-{size}", "vision_encoder.onnx"),
+        ("sam", f"export-{asked.sam}", "vision_encoder.onnx"),
         ("clip", "export-clip", "vision_model.onnx"),
     ):
         if not (places[kind] / done).is_file():
