@@ -12,8 +12,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.base.files import project_path
-from hilsplat.base.names import NAME_RULE, name_problem
+from hilsplat.base.files import NAME_RULE, name_problem, project_path
 from hilsplat.models.store import AUTO, EMBEDDED, read_model, real_model
 from hilsplat.settings import (
     LARGEST,

@@ -190,8 +190,8 @@ class MasksSettings(Section):
     points_per_side: int = knob(32, "point prompts per image side", ge=1, le=128, origin="LangSplat: 32")
     points_per_batch: Annotated[int, Field(ge=1, le=4096)] | Auto = knob(
         "auto",
-        "prompts per call of a decoder that runs in onnxruntime; auto: the number in the model folder, else 8, "
-        "since a real SAM takes 60 MB for each",
+        "prompts per call of a decoder in onnxruntime; auto: the number in the model folder, else 8, since a "
+        "real SAM takes 60 MB for each",
         origin="LangSplat: 64",
     )
     crop_layers: int = knob(

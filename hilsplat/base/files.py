@@ -1,5 +1,6 @@
-"""Find files: images of a folder, and files of the installed project."""
+"""Names that folders are made from, images of a folder, and files of the installed project."""
 
+import re
 from collections.abc import Collection
 from pathlib import Path
 
@@ -10,6 +11,12 @@ VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi"})
 
 INSTALLED = Path(__file__).resolve().parents[2]
 """Folder of the installed project: Snakefile, rules, config, models."""
+
+MAX_NAME = 100
+"""Length of a name of a data set, scene, group or variant: folders, files and commands are made from them."""
+
+NAME_RULE = "letters a-z A-Z, digits, dot, dash and underscore, beginning with a letter or digit"
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
 def project_path(path: str | Path) -> Path:
@@ -37,3 +44,19 @@ def _with_suffix(folder: Path, suffixes: Collection[str]) -> list[Path]:
         for path in Path(folder).iterdir()
         if path.is_file() and path.suffix.lower() in suffixes and not path.name.startswith(".")
     )
+
+
+def name_problem(name: str) -> str | None:
+    """What is wrong with a name, or None."""
+    if not name:
+        return "it is empty"
+    if len(name) > MAX_NAME:
+        return f"it is longer than {MAX_NAME} characters"
+    if ".." in name:
+        return 'it contains ".."'
+    if NAME.fullmatch(name):
+        return None
+    if not re.fullmatch("[A-Za-z0-9]", name[0]):
+        return f"it begins with {name[0]!r}"
+    bad = sorted({letter for letter in name if not re.fullmatch("[A-Za-z0-9._-]", letter)})
+    return f"it contains {', '.join(repr(letter) for letter in bad)}"

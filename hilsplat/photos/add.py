@@ -8,9 +8,8 @@ from pathlib import Path
 import cv2
 
 from hilsplat.base.errors import ImageError, SceneError
-from hilsplat.base.files import list_images
+from hilsplat.base.files import NAME_RULE, list_images, name_problem
 from hilsplat.base.images import open_image, read_image, resize_to_fit
-from hilsplat.base.names import NAME_RULE, name_problem
 from hilsplat.base.progress import track
 from hilsplat.photos.check import CHECK_SIDE_PX, CheckedPhoto, photo_doubts
 from hilsplat.photos.intake import brought_photographs

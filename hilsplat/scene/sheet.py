@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
-from hilsplat.base.files import IMAGE_SUFFIXES, list_images
-from hilsplat.base.names import NAME_RULE, name_problem
+from hilsplat.base.files import IMAGE_SUFFIXES, NAME_RULE, list_images, name_problem
 from hilsplat.scene.layouts import has_known_poses, photo_folder
 
 COLUMNS = ("dataset", "scene", "group", "source", "unit")

@@ -108,8 +108,8 @@ def test_memory_grows_with_the_model_and_with_views_at_once(tmp_path):
     def masks(threads: int) -> int:
         return JobResources(chosen).memory_mb("masks")(wildcards(), threads, attempt=1)
 
-    # 64 x 64 patches and 12 heads: 2688 MiB; 16 prompts at 384 px: 144 MiB
-    assert masks(2) - masks(1) == pytest.approx((2688 + 144) * 2**20 / 1e6, abs=100)
+    # 35 arrays of 64 x 64 patches with 768 channels, 12 MiB each; attention of a row 42; decoder at 384 px 35
+    assert masks(2) - masks(1) == pytest.approx((35 * 12 + 42 + 35) * 2**20 / 1e6, abs=100)
     graph = plan(tmp_path, masks={"segmenter": "graph", "model": str(folder)})
     assert JobResources(graph).memory_mb("masks")(wildcards(), 32, 1) < 1000 + RUNNER_MB
 
