@@ -33,6 +33,11 @@ def runs_here():
         return False
 
 
+def cache_folder(wildcards, input):
+    """Parameter: the cache in the results folder, which a module may prefix."""
+    return str(Path(input.scene).parents[2] / ".cache")
+
+
 try:
     PLAN = Plan(merged_config([], config))
     PLAN.require_usable(devices=runs_here())
@@ -42,6 +47,5 @@ for name, reason in PLAN.absent.items():
     logger.warning(f"{name} is skipped: {reason}")
 
 ENVIRONMENT = "../workflow/envs/hilsplat.yaml"
-CACHE = f"{PLAN.run.results}/.cache"
 RESOURCES = JobResources(PLAN)
 estimates.resources = RESOURCES

@@ -20,7 +20,7 @@ rule contributions:
         gpu=RESOURCES.gpus("contributions"),
     params:
         settings=PLAN.settings("contributions"),
-        cache=CACHE,
+        cache=cache_folder,
         code=PLAN.code("contributions"),
     shell:
         "python -m hilsplat --log {log:q} contributions --scene {input.scene:q} --gaussians {input.gaussians:q} --masks {input.masks:q}"

@@ -19,7 +19,7 @@ rule clip:
     params:
         settings=PLAN.settings("clip"),
         model=PLAN.model("clip"),
-        cache=CACHE,
+        cache=cache_folder,
         code=PLAN.code("clip"),
     shell:
         "python -m hilsplat --log {log:q} clip --scene {input.scene:q} --masks {input.masks:q} --settings {params.settings:q}"

@@ -15,6 +15,8 @@ rule train_models:
         settings=PLAN.run.training.model_dump_json(),
         seed=PLAN.run.seed,
         code=PLAN.code("models"),
+        out=lambda wildcards, output: str(Path(output[0]).parent),
+        cache=lambda wildcards, output: str(Path(output[0]).parents[1] / ".cache/models"),
     shell:
-        "python -m hilsplat --log {log:q} models train --out results/models --cache results/.cache/models"
+        "python -m hilsplat --log {log:q} models train --out {params.out:q} --cache {params.cache:q}"
         " --settings {params.settings:q} --seed {params.seed:q} --threads {threads}"

@@ -20,7 +20,7 @@ rule masks:
         settings=PLAN.settings("masks"),
         model=PLAN.model("masks"),
         truth=PLAN.masks_truth_option,
-        cache=CACHE,
+        cache=cache_folder,
         code=PLAN.code(PLAN.masks_stage),
     shell:
         "python -m hilsplat --log {log:q} masks --scene {input.scene:q} --settings {params.settings:q} {params.truth}"

@@ -23,7 +23,7 @@ rule gaussians:
         settings=PLAN.settings("gaussians"),
         brought=PLAN.data.brought_option,
         seed=PLAN.run.seed,
-        cache=CACHE,
+        cache=cache_folder,
         code=PLAN.code("gaussians"),
     shell:
         "python -m hilsplat --log {log:q} gaussians --scene {input.scene:q} --settings {params.settings:q} --seed {params.seed:q}"
