@@ -16,7 +16,9 @@ rule train_models:
         seed=PLAN.run.seed,
         code=PLAN.code("models"),
         out=lambda wildcards, output: str(Path(output[0]).parent),
-        cache=lambda wildcards, output: str(Path(output[0]).parents[1] / ".cache/models"),
+        cache=lambda wildcards, output: str(
+            Path(output[0]).parents[1] / ".cache/models"
+        ),
     shell:
         "python -m hilsplat --log {log:q} models train --out {params.out:q} --cache {params.cache:q}"
         " --settings {params.settings:q} --seed {params.seed:q} --threads {threads}"
