@@ -284,22 +284,23 @@ def store_sums(typingctx, array, index, vectors):
     return types.void(array, types.intp, vectors), codegen
 
 
+def _halved(builder: ir.IRBuilder, vector: ir.Value, combine: Any) -> ir.Value:
+    """Combine the lower with the upper half of a vector until one number is left: the order is fixed."""
+    width = WIDTH
+    while width > 1:
+        width //= 2
+        undefined = ir.Constant(vector.type, ir.Undefined)
+        half = ir.VectorType(_INT, width)
+        low = builder.shuffle_vector(vector, undefined, ir.Constant(half, list(range(width))))
+        high = builder.shuffle_vector(vector, undefined, ir.Constant(half, list(range(width, 2 * width))))
+        vector = combine(low, high)
+    return builder.extract_element(vector, ir.Constant(_INT, 0))
+
+
 @intrinsic
 def lane_sum(typingctx, value):
-    """Sum of the lanes: halves are added to halves, so the order is fixed."""
-
-    def codegen(context, builder, sig, args):
-        vector, width = args[0], WIDTH
-        while width > 1:
-            width //= 2
-            undefined = ir.Constant(vector.type, ir.Undefined)
-            half = ir.VectorType(_INT, width)
-            low = builder.shuffle_vector(vector, undefined, ir.Constant(half, list(range(width))))
-            high = builder.shuffle_vector(vector, undefined, ir.Constant(half, list(range(width, 2 * width))))
-            vector = builder.fadd(low, high)
-        return builder.extract_element(vector, ir.Constant(_INT, 0))
-
-    return types.float32(LANES), codegen
+    """Sum of the lanes."""
+    return types.float32(LANES), lambda context, builder, sig, args: _halved(builder, args[0], builder.fadd)
 
 
 @intrinsic
@@ -307,15 +308,11 @@ def lane_max(typingctx, value):
     """Largest lane."""
 
     def codegen(context, builder, sig, args):
-        vector, width = args[0], WIDTH
-        while width > 1:
-            width //= 2
-            undefined = ir.Constant(vector.type, ir.Undefined)
-            half = ir.VectorType(_INT, width)
-            low = builder.shuffle_vector(vector, undefined, ir.Constant(half, list(range(width))))
-            high = builder.shuffle_vector(vector, undefined, ir.Constant(half, list(range(width, 2 * width))))
-            vector = builder.select(builder.fcmp_ordered(">", low, high), low, high)
-        return builder.extract_element(vector, ir.Constant(_INT, 0))
+        return _halved(
+            builder,
+            args[0],
+            lambda low, high: builder.select(builder.fcmp_ordered(">", low, high), low, high),
+        )
 
     return types.float32(LANES), codegen
 

@@ -7,14 +7,18 @@ from hilsplat.base.lanes import (
     bits_ge,
     exp2_negative,
     first_bit,
+    lane_max,
+    lane_sum,
     lanes,
     larger,
     load,
+    load_same,
     reciprocal,
     root,
     smaller,
     store,
     store_sums,
+    transpose,
 )
 
 MANY = np.exp(np.random.default_rng(0).uniform(-20, 10, 16 * 4000)).astype(np.float32)
@@ -107,3 +111,29 @@ def test_a_number_fills_all_lanes():
     out = np.empty(16, np.float32)
     numba.njit(lambda out: store(out, 0, lanes(np.float32(2.5))))(out)
     assert (out == 2.5).all()
+
+
+@numba.njit
+def _reduced(values):
+    row = load(values, 16)
+    return lane_sum(row), lane_max(row), lane_sum(load_same(values, 18))
+
+
+def test_a_row_is_summed_and_its_largest_and_a_repeated_number_are_found():
+    values = np.random.default_rng(1).permutation(64).astype(np.float32)
+    row = values[16:32]
+    assert _reduced(values) == (row.sum(), row.max(), 16 * values[18])
+
+
+@numba.njit
+def _transposed(source, target):
+    transpose(source, 5, 20, target, 3, 18)
+
+
+def test_a_block_is_transposed_between_rows_of_other_lengths():
+    source = np.arange(5 + 16 * 20, dtype=np.float32)
+    target = np.full(3 + 16 * 18, -1, np.float32)
+    _transposed(source, target)
+    written = target[3:].reshape(16, 18)
+    np.testing.assert_array_equal(written[:, :16], source[5:].reshape(16, 20)[:, :16].T)
+    assert (written[:, 16:] == -1).all() and (target[:3] == -1).all()
