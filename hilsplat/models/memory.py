@@ -23,7 +23,8 @@ PROMPT_MIB = 64
 """Memory of a prompt in SAM's exported decoder at a picture of 1024 px. Measured: 507 MiB for 8 of ViT-B."""
 
 FACTORED_MIB = 250
-"""Memory of all prompts of a picture of 1024 px in the factored decoder."""
+"""Memory of all prompts of a picture of 1024 px in the factored decoder. Measured: 104 MiB while 1024 prompts
+are previewed; masks of the prompts that are kept come on top."""
 
 UNKNOWN_BYTES_PER_PX = 400
 """Memory of a picture's encoding per pixel, if the configuration does not describe the network (sam-tiny)."""

@@ -315,6 +315,44 @@ def second_factors(sizes, b, i, rows, low, offset, scaled_q, fixed_q, s1, q, s, 
 
 @compiled
 @no_type_check
+def read_by_factors(sizes, b, i, image, prompt, u, v, factors, padded, e, e_t, k, s, scaled, top, sums):
+    """Add a block to an attention of tokens to pixels whose keys and values are sums of factors.
+
+    Args:
+        sizes: as in `read_image`.
+        b, i: block and prompt.
+        image: `FirstLayer` or `SecondLayer`; `u` scales its keys and values.
+        prompt: `FirstPrompts` or `SecondPrompts`.
+        u, v: scales of the pixels (P), as in `pixel_weights`.
+        e: factors (padded, P), of which the first `factors` rows count.
+        e_t, k, s, scaled: room for transposed factors, keys, scores and weights; overwritten.
+        top, sums: as in `pixel_weights`.
+    """
+    _, _, heads, tokens, dim, pixels, depth = sizes
+    all_rows, base = heads * tokens, b * heads * dim * pixels
+    width = depth + padded + WIDTH
+    at = i * all_rows * width
+    scale_and_shift(k, image.scaled_keys, base, u, image.fixed_keys, base, heads * dim, pixels)
+    by_head(
+        s, 0, prompt.queries, i * all_rows * dim, k, 0, heads, tokens, dim, pixels,
+        pixels, dim * pixels, pixels, tokens * pixels,
+    )  # fmt: skip
+    multiply(
+        s, 0, pixels, prompt.low, i * all_rows * factors, factors, e, 0, pixels,
+        all_rows, factors, pixels, False,
+    )  # fmt: skip
+    pixel_weights(
+        s, scaled, prompt.offset, 2 * i * all_rows, u, v, top, i * all_rows, sums, at, width, all_rows, pixels
+    )
+    pixels_first(e, e_t, factors, padded, pixels)
+    weighted_sums(
+        sums, at, width, s, scaled, image.values, b * heads * pixels * depth, e_t, padded,
+        heads, tokens, pixels, depth,
+    )  # fmt: skip
+
+
+@compiled
+@no_type_check
 def update_and_read_first(sizes, channels, eps, image, prompt, top, sums, s1_out, e_out):
     """Attention of pixels to tokens at the first layer, its layer norm, and the second attention of tokens.
 
@@ -327,10 +365,9 @@ def update_and_read_first(sizes, channels, eps, image, prompt, top, sums, s1_out
         s1_out: scale of each pixel by the layer norm (prompts, blocks, P).
         e_out: factors times that scale (prompts, blocks, padded, P).
     """
-    number, blocks, heads, tokens, dim, pixels, depth = sizes
+    number, blocks, heads, tokens, dim, pixels, _ = sizes
     all_rows, factors = heads * tokens, heads * (tokens - 1)
     padded = (factors + WIDTH - 1) // WIDTH * WIDTH
-    width = depth + padded + WIDTH
     s, scaled = np.empty(all_rows * pixels, np.float32), np.empty(all_rows * pixels, np.float32)
     e, e_t = np.zeros(padded * pixels, np.float32), np.empty(padded * pixels, np.float32)
     y, k = np.empty(factors * pixels, np.float32), np.empty(heads * dim * pixels, np.float32)
@@ -366,25 +403,9 @@ def update_and_read_first(sizes, channels, eps, image, prompt, top, sums, s1_out
                     value = load(e, f * pixels + c) * scale
                     store(e, f * pixels + c, value)
                     store(e_out, ((i * blocks + b) * padded + f) * pixels + c, value)
-            scale_and_shift(k, image.scaled_keys, base, s1, image.fixed_keys, base, heads * dim, pixels)
-            by_head(
-                s, 0, prompt.queries, i * all_rows * dim, k, 0, heads, tokens, dim, pixels,
-                pixels, dim * pixels, pixels, tokens * pixels,
-            )  # fmt: skip
-            multiply(
-                s, 0, pixels, prompt.low, i * all_rows * factors, factors, e, 0, pixels,
-                all_rows, factors, pixels, False,
-            )  # fmt: skip
-            at = i * all_rows * width
-            pixel_weights(
-                s, scaled, prompt.offset, 2 * i * all_rows, s1, zeros, top, i * all_rows, sums, at, width,
-                all_rows, pixels,
-            )  # fmt: skip
-            pixels_first(e, e_t, factors, padded, pixels)
-            weighted_sums(
-                sums, at, width, s, scaled, image.values, b * heads * pixels * depth, e_t, padded,
-                heads, tokens, pixels, depth,
-            )  # fmt: skip
+            read_by_factors(
+                sizes, b, i, image, prompt, s1, zeros, factors, padded, e, e_t, k, s, scaled, top, sums
+            )
 
 
 @compiled
@@ -399,12 +420,11 @@ def update_and_read_second(sizes, channels, eps, image, prompt, s1_in, e_in, top
         s2_out: scale by this layer norm (prompts, blocks, P).
         e_out: factors of both layers times this scale (prompts, blocks, padded, P).
     """
-    number, blocks, heads, tokens, dim, pixels, depth = sizes
+    number, blocks, heads, tokens, dim, pixels, _ = sizes
     all_rows, factors = heads * tokens, heads * (tokens - 1)
     padded_in = (factors + WIDTH - 1) // WIDTH * WIDTH
     both = 2 * factors
     padded = (both + WIDTH - 1) // WIDTH * WIDTH
-    width = depth + padded + WIDTH
     s, scaled = np.empty(all_rows * pixels, np.float32), np.empty(all_rows * pixels, np.float32)
     e, e_t = np.zeros(padded * pixels, np.float32), np.empty(padded * pixels, np.float32)
     y, k = np.empty(both * pixels, np.float32), np.empty(heads * dim * pixels, np.float32)
@@ -467,25 +487,9 @@ def update_and_read_second(sizes, channels, eps, image, prompt, s1_in, e_in, top
                     value = load(e, f * pixels + c) * second
                     store(e, f * pixels + c, value)
                     store(e_out, at * padded + f * pixels + c, value)
-            scale_and_shift(k, image.scaled_keys, base, s12, image.fixed_keys, base, heads * dim, pixels)
-            by_head(
-                s, 0, prompt.queries, i * all_rows * dim, k, 0, heads, tokens, dim, pixels,
-                pixels, dim * pixels, pixels, tokens * pixels,
-            )  # fmt: skip
-            multiply(
-                s, 0, pixels, prompt.low, i * all_rows * both, both, e, 0, pixels,
-                all_rows, both, pixels, False,
-            )  # fmt: skip
-            to = i * all_rows * width
-            pixel_weights(
-                s, scaled, prompt.offset, 2 * i * all_rows, s12, s2, top, i * all_rows, sums, to, width,
-                all_rows, pixels,
-            )  # fmt: skip
-            pixels_first(e, e_t, both, padded, pixels)
-            weighted_sums(
-                sums, to, width, s, scaled, image.values, b * heads * pixels * depth, e_t, padded,
-                heads, tokens, pixels, depth,
-            )  # fmt: skip
+            read_by_factors(
+                sizes, b, i, image, prompt, s12, s2, both, padded, e, e_t, k, s, scaled, top, sums
+            )
 
 
 @compiled

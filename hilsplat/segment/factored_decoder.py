@@ -40,7 +40,7 @@ BLOCK = 64
 PROMPTS = 16
 """Prompts of a call. They visit a block one after the other, which then is in the cache."""
 
-HEADS = 8
+HEADS_PER_ATTENTION = 8
 """Heads of an attention if the model's configuration names no number."""
 
 
@@ -192,7 +192,7 @@ class FactoredDecoder:
         ModelError: the decoder is built otherwise.
     """
 
-    def __init__(self, graph: DecoderGraph, heads: int = HEADS) -> None:
+    def __init__(self, graph: DecoderGraph, heads: int = HEADS_PER_ATTENTION) -> None:
         self.heads = heads
         base = "mask_decoder/transformer"
         layers = [f"{base}/layers.{number}" for number in (0, 1)]

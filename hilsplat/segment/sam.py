@@ -23,7 +23,7 @@ from hilsplat.models.layouts import DECODER, PREVIEW
 from hilsplat.models.network import Network, execution_providers, require_three_heads
 from hilsplat.models.onnx_graph import with_rowwise_attention
 from hilsplat.segment.decoder_weights import DecoderGraph
-from hilsplat.segment.factored_decoder import PROMPTS, FactoredDecoder, ImageTerms
+from hilsplat.segment.factored_decoder import HEADS_PER_ATTENTION, PROMPTS, FactoredDecoder, ImageTerms
 from hilsplat.segment.kernels import areas_and_boxes, upscaled_runs
 from hilsplat.segment.logit_kernels import quantise_logits
 from hilsplat.settings import MasksSettings
@@ -165,16 +165,21 @@ class SamModel:
             or execution_providers()[0] != "CPUExecutionProvider"
         ):
             return None
-        return with_rowwise_attention(
+        graph = with_rowwise_attention(
             self.model.networks["vision_encoder"],
             vision.get("global_attn_indexes", (2, 5, 8, 11)),
             vision.get("num_attention_heads", 12),
             vision.get("image_size", 1024) // vision.get("patch_size", 16),
         )
+        if graph is None:
+            logger.info("the encoder of %s runs as exported, in more memory", self.model.folder)
+        return graph
 
     def _factor(self) -> FactoredDecoder | None:
         """Factor the decoder and check it against the network; None if its graph is a different one."""
-        heads = self.model.config.get("mask_decoder_config", {}).get("num_attention_heads", 8)
+        heads = self.model.config.get("mask_decoder_config", {}).get(
+            "num_attention_heads", HEADS_PER_ATTENTION
+        )
         try:
             factored = FactoredDecoder(DecoderGraph(self.model.networks[DECODER]), heads)
             apart = largest_difference(factored, self.decoder, self.padded_hw[0])

@@ -20,7 +20,7 @@ def test_every_room_runs():
         "benchmarks",
         "--benchmark-disable",
     ]
-    heavy = "not (two_threads or suppression or linkage or memory or network or 100k or 800x600)"
+    heavy = "not (two_threads or suppression or linkage or memory or 100k or 800x600)"
     done = subprocess.run([*command, "-k", heavy], cwd=ROOT, stdout=subprocess.PIPE, text=True)
     assert done.returncode == 0, done.stdout
 

@@ -46,6 +46,15 @@ def test_candidates_are_those_of_the_network(model, photograph):
     assert np.mean(same) > 0.9  # a logit within 1e-5 of a rounding step may fall to the other side
 
 
+def test_previewed_candidates_are_some_of_all(model, photograph):
+    settings = {"points_per_side": 6, "predicted_iou_min": 0, "stability_min": 0.1}
+    some = decode_candidates(photograph, model, MasksSettings(**settings))  # previews first
+    everything = decode_candidates(photograph, model, MasksSettings(**settings, box_nms_iou=1))
+    known = {(head, each.tobytes()) for head, each in zip(everything.head, windows(everything), strict=True)}
+    found = {(head, each.tobytes()) for head, each in zip(some.head, windows(some), strict=True)}
+    assert found <= known and 0 < len(some) < len(everything)
+
+
 def windows(candidates) -> list[np.ndarray]:
     return np.split(candidates.logits, candidates.offsets[1:-1])
 
