@@ -96,7 +96,9 @@ rule mine:
     paths = [word for line in commands for word in line.split() if "results" in word]
     assert [path for path in paths if not path.startswith("inner/results/")] == []
     Project(outer).run(sys.executable, "-m", "snakemake", "--cores", "2", PYTHONPATH=str(clone.root))
-    assert not (outer / "results").exists()
+    # the plan, which no prefix reaches, keeps digests of models there
+    beside = [path.name for path in (outer / "results").rglob("*") if path.is_file()]
+    assert beside == ["digests.json"]
     made = (outer / "inner/results" / SCORES).read_bytes()
     assert made == (finished.root / "results" / SCORES).read_bytes()
 
