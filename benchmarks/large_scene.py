@@ -176,7 +176,6 @@ def stages(out: Path, threads: int) -> dict[str, Callable[[], None]]:
         "semantic_tree": lambda: run_semantic_tree(
             out / "contributions",
             out / "masks",
-            out / "clip",
             out / "semantic_tree",
             SemanticTreeSettings(),
             threads,

@@ -61,8 +61,12 @@ class StageSettings(Section):
     training: TrainingSettings = TrainingSettings()
 
     def with_models(self) -> "StageSettings":
-        """All sections with the models that are there: see the function of this name."""
-        return self.model_copy(update={"masks": with_models(self.masks), "clip": with_models(self.clip)})
+        """All sections with the models that are there, and the crops that the field's targets need."""
+        clip = with_models(self.clip)
+        if clip.crops == AUTO:
+            crops = "masks" if self.autoencoder.targets == "mask" else "nodes"
+            clip = clip.model_copy(update={"crops": crops})
+        return self.model_copy(update={"masks": with_models(self.masks), "clip": clip})
 
     def depends_on_seed(self, stage: str) -> bool:
         """Whether the result of a stage, or of one that it reads, depends on the variant's seed."""
@@ -149,10 +153,10 @@ VARIANT_SECTIONS = (
 UPSTREAM: dict[str, tuple[str, ...]] = {
     "masks": ("masks", "perturb"),
     "coverage_tree": ("masks", "perturb", "coverage_tree"),
-    "clip": ("masks", "perturb", "clip"),
     "contributions": ("masks", "perturb", "contributions"),
-    "semantic_tree": ("masks", "perturb", "clip", "contributions", "semantic_tree"),
-    "autoencoder": ("masks", "perturb", "clip", "contributions", "semantic_tree", "autoencoder"),
+    "semantic_tree": ("masks", "perturb", "contributions", "semantic_tree"),
+    "clip": ("masks", "perturb", "contributions", "semantic_tree", "clip"),
+    "autoencoder": ("masks", "perturb", "contributions", "semantic_tree", "clip", "autoencoder"),
     "field": VARIANT_SECTIONS[:-1],
     "evaluate": VARIANT_SECTIONS,
 }

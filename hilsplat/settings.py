@@ -312,7 +312,15 @@ class CoverageTreeSettings(Section):
 
 
 class ClipSettings(Section):
-    """CLIP vectors of masks."""
+    """CLIP vectors of masks, and of the nodes that they show."""
+
+    crops: Literal["auto", "nodes", "masks"] = knob(
+        "auto",
+        "which masks get a vector; nodes: the crops that show each node best; masks: all; auto: all if "
+        "autoencoder.targets is mask, else nodes",
+        origin="paper, LangSplat: masks",
+    )
+    crops_per_node: int = knob(5, "nodes: the most crops that a node's vector is averaged from", ge=1)
 
     model: str = knob(
         "models/clip-tiny",
@@ -333,7 +341,7 @@ class ClipSettings(Section):
     background: Literal["black", "keep"] = knob(
         "black", "pixels of a crop outside its mask: painted black, or kept", origin="LangSplat: black"
     )
-    batch: int = knob(64, "crops per network call", ge=1, le=4096)
+    batch: int = knob(1, "crops per network call; more pay on a GPU alone", ge=1, le=4096)
 
 
 class ContributionsSettings(Section):
@@ -380,7 +388,7 @@ class AutoencoderSettings(Section):
     latent: int = knob(16, "size d of a latent", ge=1, le=64, origin="paper, LangSplat: 3")
     targets: Literal["node", "mask"] = knob(
         "node",
-        "vector that a mask is given; node: the average of the node that it fits, if any; mask: its own",
+        "vector that a mask is given; node: that of the node that it fits best; mask: its own",
         origin="paper: mask",
     )
     epochs: int = knob(100, "network: passes over all vectors", ge=1, origin="LangSplat: 100")

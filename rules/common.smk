@@ -1,8 +1,8 @@
 # Shared by all rules: the plan of the run (hilsplat/workflow/plan.py), resources, and the environment of the jobs.
 #
-# Priorities lead to a scene's first answer: the job nearest to a semantic tree goes first; fields, scores and
-# pictures come after all trees. Gaussians come before masks because they can be viewed. After the trees, the
-# longest chain goes first: a trained code, a baseline's field, our fields, scores.
+# Priorities lead to a scene's first answer: the job nearest to the CLIP vectors of a semantic tree goes first;
+# fields, scores and pictures come after all of them. Gaussians come before masks because they can be viewed. After
+# the vectors, the longest chain goes first: a trained code, a baseline's field, our fields, scores.
 import gc
 from pathlib import Path
 

@@ -1,15 +1,16 @@
-# One CLIP vector per mask.
+# CLIP vectors of the crops that show each node best, or of every mask.
 rule clip:
     input:
         scene="<results>/{dataset}/{scene}/scene",
         masks=PLAN.shared("masks", "masks"),
+        semantic_tree=PLAN.crops_tree,  # empty if every mask is embedded
     output:
         clip=directory("<results>/{dataset}/{scene}/{variant}/clip"),
     log:
         "<results>/{dataset}/{scene}/{variant}/logs/clip.log",
     benchmark:
         "<results>/{dataset}/{scene}/{variant}/benchmarks/clip.jsonl"
-    priority: 50
+    priority: 80
     conda:
         ENVIRONMENT
     threads: RESOURCES.threads
@@ -19,8 +20,9 @@ rule clip:
     params:
         settings=PLAN.settings("clip"),
         model=PLAN.model("clip"),
+        semantic_tree=PLAN.crops_tree_option,
         cache=cache_folder,
         code=PLAN.code("clip"),
     shell:
-        "python -m hilsplat --log {log:q} clip --scene {input.scene:q} --masks {input.masks:q} --settings {params.settings:q}"
+        "python -m hilsplat --log {log:q} clip --scene {input.scene:q} --masks {input.masks:q} {params.semantic_tree} --settings {params.settings:q}"
         " --threads {threads} --memory {resources.mem_mib} --cache {params.cache:q} --out {output.clip:q}"

@@ -3,7 +3,6 @@ rule semantic_tree:
     input:
         contributions=PLAN.shared("contributions", "contributions"),
         masks=PLAN.shared("masks", "masks"),
-        clip=PLAN.shared("clip", "clip"),
     output:
         semantic_tree=directory("<results>/{dataset}/{scene}/{variant}/semantic_tree"),
     log:
@@ -23,5 +22,4 @@ rule semantic_tree:
         code=PLAN.code("semantic_tree"),
     shell:
         "python -m hilsplat --log {log:q} semantic-tree --contributions {input.contributions:q} --masks {input.masks:q}"
-        " --clip {input.clip:q} --settings {params.settings:q} --threads {threads}"
-        " --out {output.semantic_tree:q}"
+        " --settings {params.settings:q} --threads {threads} --out {output.semantic_tree:q}"

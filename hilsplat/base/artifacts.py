@@ -475,20 +475,31 @@ class ViewCache:
 
     def get(self, key: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
         """Return the entry, computing and storing it if it is missing or damaged."""
+        found = self.find(key)
+        if found is not None:
+            self.hits += 1
+            return found
+        arrays = compute()
+        self.put(key, arrays)
+        self.misses += 1
+        return arrays
+
+    def find(self, key: str) -> dict[str, np.ndarray] | None:
+        """Return the entry, or None if it is missing or damaged."""
         path = self.path(key)
         if path.is_file():
             with suppress(ArtifactError):
                 if arrays := read_npz(path):  # a file whose end is zeros may pass for an empty archive
-                    self.hits += 1
                     with suppress(OSError):  # another process may have pruned it
                         os.utime(path)  # last use, for pruning
                     return arrays
-        arrays = compute()
+        return None
+
+    def put(self, key: str, arrays: dict[str, np.ndarray]) -> None:
+        """Store an entry in place of any that there is."""
         # A power failure may cut entries or fill them with zeros. Reading detects this by checksums and
         # computes the entry again, so entries are not written through to the disk (milliseconds each).
-        _write_zip(path, arrays, self._method, durable=False)
-        self.misses += 1
-        return arrays
+        _write_zip(self.path(key), arrays, self._method, durable=False)
 
 
 @contextmanager

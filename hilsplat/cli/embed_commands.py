@@ -25,18 +25,22 @@ def clip(
     scene: PathIn,
     masks: PathIn,
     out: PathOut,
+    semantic_tree: Annotated[
+        Path | None, typer.Option(help="embed only the crops that show its nodes best; default: every mask")
+    ] = None,
     settings: Settings = "{}",
     cache: Cache = DEFAULT_CACHE,
     threads: Threads = 1,
     memory: Memory = None,
 ) -> None:
-    """Embed each mask with CLIP."""
+    """Embed the crops that show each node best, or every mask, with CLIP."""
     section = section_of("clip", settings)
     inputs = {"scene": scene, "masks": masks, **model_input(section)}
+    inputs |= {"semantic_tree": semantic_tree} if semantic_tree else {}
     with stage("clip", out, settings=section, threads=threads, inputs=inputs):
         from hilsplat.embed.stage import run_clip
 
-        run_clip(scene, masks, out, cache, section, threads, memory)
+        run_clip(scene, masks, semantic_tree, out, cache, section, threads, memory)
 
 
 @langsplat_app.command("read")

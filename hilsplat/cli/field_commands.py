@@ -41,18 +41,17 @@ def contributions(
 def semantic_tree(
     contributions: PathIn,
     masks: PathIn,
-    clip: PathIn,
     out: PathOut,
     settings: Settings = "{}",
     threads: Threads = 1,
 ) -> None:
     """Link the masks of all views into nodes at three levels."""
     section = section_of("semantic_tree", settings)
-    inputs = {"contributions": contributions, "masks": masks, "clip": clip}
+    inputs = {"contributions": contributions, "masks": masks}
     with stage("semantic_tree", out, settings=section, threads=threads, inputs=inputs):
         from hilsplat.semantic_tree.tree import run_semantic_tree
 
-        run_semantic_tree(contributions, masks, clip, out, section, threads)
+        run_semantic_tree(contributions, masks, out, section, threads)
 
 
 @app.command()

@@ -94,12 +94,12 @@ class Contributions:
         )
 
 
-def mask_embeddings(clip_folder: Path, contributions: Contributions) -> Float32[np.ndarray, "M C"]:
-    """CLIP vectors of all masks, in the contributions' row order.
+def mask_embeddings(clip_folder: Path, folder: Path) -> Float32[np.ndarray, "M C"]:
+    """CLIP vectors of all masks in the row order of an artifact of theirs; zero where none was computed.
 
     Raises:
         MisalignedArtifactError: the vectors were computed from other masks.
     """
-    require_same_masks(clip_folder, contributions.folder)
-    parts = [read_npy(Path(clip_folder) / f"{view}.npy") for view in contributions.views]
+    views = require_same_masks(clip_folder, folder)
+    parts = [read_npy(Path(clip_folder) / f"{view}.npy") for view in views]
     return np.concatenate(parts, dtype=np.float32)

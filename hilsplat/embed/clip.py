@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float16, Float32, UInt8
+from jaxtyping import Float16, Float32, Int64, UInt8
 from tokenizers import Tokenizer
 
 from hilsplat.base.artifacts import read_full_index, read_json
@@ -154,19 +154,22 @@ class ClipModel:
         image: UInt8[np.ndarray, "H W 3"],
         masks: HierarchicalMasks,
         settings: ClipSettings | None = None,
-    ) -> Float16[np.ndarray, "M C"]:
-        """A unit vector per mask of a view, from its crop (`base.crops`), rows as in the masks.
+        rows: Int64[np.ndarray, " m"] | None = None,
+    ) -> Float16[np.ndarray, "m C"]:
+        """Return a unit vector for each mask of a view, computed from its crop (`base.crops`).
 
         Args:
             image: the view.
             masks: its masks.
             settings: what fills the crop outside the mask, and crops per network call; None: defaults.
+            rows: the masks to embed; None: all.
         """
         settings = settings or ClipSettings()
+        chosen = range(len(masks)) if rows is None else rows.tolist()
 
         def embed(start: int) -> np.ndarray:
             crops = []
-            for row in range(start, min(len(masks), start + settings.batch)):
+            for row in chosen[start : start + settings.batch]:
                 # Only the box is unpacked: a photograph may have 40 million pixels.
                 x0, y0, x1, y1 = box = tuple(masks.box_xyxy[row].tolist())
                 inside = masks.window(row, box)
@@ -176,7 +179,7 @@ class ClipModel:
                 )
             return self.embed_crops(np.stack(crops))
 
-        parts = list(in_order(embed, range(0, len(masks), settings.batch), self.threads))
+        parts = list(in_order(embed, range(0, len(chosen), settings.batch), self.threads))
         if not parts:
             return np.zeros((0, self.width), dtype=np.float16)
         return np.concatenate(parts).astype(np.float16)

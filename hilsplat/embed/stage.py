@@ -1,14 +1,17 @@
-"""The stage `clip`: one CLIP vector per mask of every training view."""
+"""The stage `clip`: CLIP vectors of the crops that show each node best, or of all masks."""
 
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int64
 
 from hilsplat.base.artifacts import (
     ViewCache,
     atomic_folder,
+    read_index,
+    read_npz,
     sha256_of_file,
     sha256_of_json,
     write_index,
@@ -21,27 +24,30 @@ from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel
 from hilsplat.models.memory import available_mib, needs_of
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks
+from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks, require_same_masks
 from hilsplat.settings import ClipSettings
 
 
 def run_clip(
     scene_folder: Path,
     masks_folder: Path,
+    semantic_tree_folder: Path | None,
     out: Path,
     cache: Path,
     settings: ClipSettings,
     threads: int,
     memory_mib: float | None = None,
 ) -> None:
-    """Embed every mask of every training view.
+    """Embed the crops that the settings choose.
 
     Args:
         scene_folder: the `Scene` artifact.
         masks_folder: output of the masks stage.
-        out: folder to write: `<view>.npy`, float16 (M, C) unit vectors with rows as the masks, and
-            `index.json` with the number C and the model.
-        cache: folder of the view cache.
+        semantic_tree_folder: nodes, and how well each mask shows its node; None: every mask is embedded.
+        out: folder to write: `<view>.npy`, float16 (M, C) unit vectors with rows as the masks, zero for masks
+            that were not chosen, and `index.json` with the number C and the model.
+        cache: folder of the view cache. Its entries grow: a run that chooses other masks embeds only those
+            that no run embedded before.
         settings: model and cropping.
         threads: views embedded at once, if they fit into the memory; the result does not depend on it.
         memory_mib: memory that the stage may use; None: what is free.
@@ -53,6 +59,10 @@ def run_clip(
     scene = Scene.load(scene_folder)
     digests = digests_in(masks_folder)
     views = list(digests)
+    chosen = None
+    if semantic_tree_folder is not None:
+        require_same_masks(semantic_tree_folder, masks_folder)
+        chosen = chosen_masks(semantic_tree_folder, settings.crops_per_node)
     model = ClipModel.load(Path(settings.model), variant=settings.variant)
     needs = needs_of(model.model, settings.batch)
     threads = needs.views_at_once(threads, min(memory_mib or math.inf, available_mib()))
@@ -65,23 +75,30 @@ def run_clip(
                 "masks": digests[view],
                 "model": model.digest,
                 "providers": model.vision.providers,
-                "settings": settings.model_dump(exclude={"model", "variant"}),
+                "settings": settings.model_dump(include={"crop", "background", "batch"}),
                 "code": code_digest(ClipModel),
             }
         )
-
-        def compute() -> dict[str, np.ndarray]:
-            masks = load_masks(masks_folder, view, digests)
-            if masks.size_hw != scene.cameras[view].size_hw:
-                raise MisalignedArtifactError(
-                    f"masks of view {view} of {scene.name} do not fit its camera",
-                    expected=f"{scene.cameras[view].size_hw} (height, width)",
-                    found=f"{masks.size_hw}",
-                    fix="run the masks stage again for this scene",
-                )
-            return {"clip": model.embed_masks(scene.image(view), masks, settings)}
-
-        return view_cache.get(key, compute)["clip"]
+        masks = load_masks(masks_folder, view, digests)
+        if masks.size_hw != scene.cameras[view].size_hw:
+            raise MisalignedArtifactError(
+                f"masks of view {view} of {scene.name} do not fit its camera",
+                expected=f"{scene.cameras[view].size_hw} (height, width)",
+                found=f"{masks.size_hw}",
+                fix="run the masks stage again for this scene",
+            )
+        rows = np.arange(len(masks)) if chosen is None else chosen[view]
+        found = view_cache.find(key)
+        known = found["clip"] if found is not None else np.zeros((len(masks), model.width), np.float16)
+        missing = rows[~known[rows].any(axis=1)]
+        if len(missing):
+            known[missing] = model.embed_masks(scene.image(view), masks, settings, missing)
+            view_cache.put(key, {"clip": known})
+        else:
+            view_cache.hits += 1
+        vectors = np.zeros_like(known)
+        vectors[rows] = known[rows]
+        return vectors
 
     strangers = sorted(set(views) - set(scene.views("train")))
     if strangers:
@@ -93,17 +110,16 @@ def run_clip(
         )
     with stage_log("clip", scene.name) as counts, atomic_folder(out) as folder:
         index: dict[str, dict[str, Any]] = {}
-        found = in_order(embed, views, threads)
-        dimensions = 0
-        for view, vectors in zip(views, track(found, "CLIP of views", len(views)), strict=True):
+        made = in_order(embed, views, threads)
+        for view, vectors in zip(views, track(made, "CLIP of views", len(views)), strict=True):
             write_npy(folder / f"{view}.npy", vectors)
-            index[view] = {MASKS_SHA256: digests[view], "masks": len(vectors)}
-            dimensions = vectors.shape[1]
+            crops = int(vectors.any(axis=1).sum())
+            index[view] = {MASKS_SHA256: digests[view], "masks": len(vectors), "crops": crops}
         write_index(
             folder,
             index,
             scene=scene.name,
-            dim=dimensions,
+            dim=model.width,
             model=settings.model,
             model_variant=settings.variant,
             model_sha256=model.digest,
@@ -112,6 +128,30 @@ def run_clip(
         counts.update(
             views=len(views),
             masks=sum(entry["masks"] for entry in index.values()),
-            dim=dimensions,
+            crops=sum(entry["crops"] for entry in index.values()),
+            dim=model.width,
             from_cache=view_cache.hits,
         )
+
+
+def chosen_masks(semantic_tree_folder: Path, per_node: int) -> dict[str, Int64[np.ndarray, " m"]]:
+    """Return the masks of each view whose crops show some node best; all masks if the tree has no node.
+
+    Args:
+        semantic_tree_folder: output of the semantic tree's stage.
+        per_node: the most crops of a node, by `crop_score`.
+    """
+    path = Path(semantic_tree_folder) / "tree.npz"
+    arrays = read_npz(path, "linked_node", "crop_score")
+    node, score = arrays["linked_node"], arrays["crop_score"]
+    order = np.lexsort((-score, node))
+    first = np.searchsorted(node[order], node[order])
+    best = order[(np.arange(len(order)) - first < per_node) & (node[order] >= 0)]
+    is_chosen = np.zeros(len(node), np.bool_)
+    is_chosen[best if len(best) else slice(None)] = True
+    counts = {view: entry["masks"] for view, entry in read_index(semantic_tree_folder)["views"].items()}
+    ends = np.cumsum(list(counts.values()))
+    return {
+        view: np.flatnonzero(is_chosen[end - count : end])
+        for (view, count), end in zip(counts.items(), ends.tolist(), strict=True)
+    }

@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Float32
 
 from hilsplat.base.artifacts import atomic_folder, read_index, sha256_of_file, write_index, write_npz
+from hilsplat.base.errors import ArtifactError
 from hilsplat.base.progress import stage_log
-from hilsplat.contributions.rows import Contributions, mask_embeddings
+from hilsplat.contributions.rows import mask_embeddings
 from hilsplat.field.code import Code, autoencoder_file
 from hilsplat.field.linear_code import LinearCode
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, require_same_masks
@@ -18,20 +19,26 @@ from hilsplat.settings import AutoencoderSettings
 def mask_targets(
     clip: Float32[np.ndarray, "M C"], tree: SemanticTree, targets: str
 ) -> tuple[Float32[np.ndarray, "M C"], Float32[np.ndarray, "B C"]]:
-    """The target vector of each mask, and the distinct vectors to train on.
+    """Return the target vector of each mask, and the distinct vectors to train on.
 
     Args:
-        clip: each mask's own vector.
-        tree: nodes, and the node each mask fits.
-        targets: "node": the node's averaged vector if the mask fits a node, else its own (averaged in CLIP
-            space before encoding); "mask": always its own, as in the paper.
+        clip: each mask's own vector; zero where it has none.
+        tree: nodes with their vectors, and the node that each mask fits best.
+        targets: "node": the vector of that node, or the mean of all nodes for a mask that shares no Gaussian
+            with any; "mask": always its own, as in the paper. A tree without nodes gives masks their own.
+
+    Raises:
+        ArtifactError: a mask needs its own vector and has none.
     """
-    if targets == "mask":
-        return clip, clip
-    fits = tree.node_of_mask >= 0
-    target = clip.copy()
-    target[fits] = tree.clip[tree.node_of_mask[fits]]
-    return target, np.concatenate([tree.clip, clip[~fits]])
+    if targets == "node" and len(tree):
+        or_mean = np.append(tree.clip, tree.clip.mean(axis=0, keepdims=True), axis=0)
+        return or_mean[tree.node_of_mask], tree.clip
+    if without := int((~clip.any(axis=1)).sum()):
+        raise ArtifactError(
+            f"{without} of {len(clip)} masks have no CLIP vector, and targets: {targets} needs all",
+            fix="set clip.crops to auto or masks, and rerun the clip stage",
+        )
+    return clip, clip
 
 
 def run_autoencoder(
@@ -48,11 +55,11 @@ def run_autoencoder(
 
     Raises:
         MisalignedArtifactError: the semantic tree or the CLIP vectors belong to other masks.
+        ArtifactError: a mask needs its own vector and has none.
     """
-    contributions = Contributions.load(contributions_folder)
-    tree = SemanticTree.load(semantic_tree_folder)
     require_same_masks(semantic_tree_folder, contributions_folder)
-    clip = mask_embeddings(clip_folder, contributions)
+    tree = SemanticTree.load(semantic_tree_folder, clip_folder)
+    clip = mask_embeddings(clip_folder, contributions_folder)
     target, train = mask_targets(clip, tree, settings.targets)
     with stage_log("autoencoder", read_index(contributions_folder)["scene"]) as counts:
         model: Code
@@ -65,7 +72,8 @@ def run_autoencoder(
         latents = model.encode_array(target)
         decoded = model.decode_array(model.encode_array(train))
         cosine = float((decoded * train).sum(axis=1).mean())
-        own = float((model.decode_array(latents) * clip).sum(axis=1).mean())
+        embedded = np.flatnonzero(clip.any(axis=1))
+        own = float((model.decode_array(latents[embedded]) * clip[embedded]).sum(axis=1).mean())
         counts |= {"vectors": len(train), "mean decoder cosine": round(cosine, 4)}
         with atomic_folder(out) as folder:
             model.save(autoencoder_file(folder))

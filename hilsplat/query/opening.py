@@ -74,7 +74,7 @@ class OpenedParts:
 
         scene = opened.get(Scene.load, parts.scene)
         gaussians = opened.get(load_ply, parts.gaussians)
-        tree = opened.get(SemanticTree.load, parts.semantic_tree)
+        tree = opened.get(SemanticTree.load, parts.semantic_tree, parts.clip)
         made_for = {"semantic tree": tree.gaussians_sha256}
         clip = opened.get(open_clip_of, parts.clip, threads, template)
         language = code = None

@@ -60,7 +60,7 @@ class FinishedScene:
 
         Provenance names what a stage read; without it, a part is expected beside the artifact made from it.
         A variant that has no field was scored with another variant's, named in the provenance of its scores.
-        While the run goes on, a tree of the variant's own is enough.
+        While the run goes on, CLIP vectors of the variant's own are enough.
 
         Raises:
             ArtifactError: the folder, the variant or a part is missing.
@@ -83,14 +83,14 @@ class FinishedScene:
         field = folder / variant / "field.safetensors"
         if not field.exists():
             field = _recorded_input(folder / variant / "scores.csv", "field", folder) or field
-        tree = folder / variant / "semantic_tree"
+        clip = folder / variant / "clip"
         autoencoder = None
         if field.exists():
             autoencoder = _input_of(field, "autoencoder", folder)
-            tree = _input_of(autoencoder, "semantic_tree", folder)
-        elif not tree.exists():  # `default` has a tree of its own; others may share it
-            raise _unfinished(folder, tree if variant == "default" else field)
-        clip = _input_of(autoencoder or tree, "clip", folder)
+            clip = _input_of(autoencoder, "clip", folder)
+        elif not clip.exists():  # `default` has vectors of its own; others may share them
+            raise _unfinished(folder, clip if variant == "default" else field)
+        tree = _input_of(autoencoder or clip, "semantic_tree", folder)
         parts = SceneParts(
             scene=folder / "scene",
             gaussians=folder / "gaussians.ply",
@@ -145,8 +145,8 @@ def _section(section: type[Section], found: dict[str, Any]) -> Any:
 
 
 def finished_variants(folder: Path) -> list[str]:
-    """Variants of a scene that answer: they have a field or a semantic tree of their own."""
-    made = [path for name in ("field.safetensors", "semantic_tree") for path in folder.glob(f"*/{name}")]
+    """Variants of a scene that answer: they have a field or CLIP vectors of their own."""
+    made = [path for name in ("field.safetensors", "clip") for path in folder.glob(f"*/{name}")]
     return sorted({path.parent.name for path in made})
 
 

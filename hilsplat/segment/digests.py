@@ -70,8 +70,11 @@ def load_masks(folder: Path, view: str, digests: Mapping[str, str]) -> Hierarchi
     return masks
 
 
-def require_same_masks(folder: Path, other: Path) -> None:
+def require_same_masks(folder: Path, other: Path) -> list[str]:
     """Refuse two artifacts that were computed from different masks; one of them may be the masks artifact.
+
+    Returns:
+        The views in the order of `other`.
 
     Raises:
         MisalignedArtifactError: the digests of a view differ, or only one of the artifacts has the view.
@@ -82,6 +85,7 @@ def require_same_masks(folder: Path, other: Path) -> None:
     fix = f"rerun the stage that writes {folder}; if the error remains, also the one that writes {other}"
     for view in {**expected, **found}:
         _require_same(view, expected.get(view), found.get(view), what, fix)
+    return list(expected)
 
 
 def _require_same(view: str, expected: str | None, found: str | None, what: str, fix: str) -> None:

@@ -10,7 +10,7 @@ from hilsplat.base.device import compute_device
 from hilsplat.base.levels import NONE
 from hilsplat.semantic_tree.evidence import mask_evidence
 from hilsplat.semantic_tree.linkage import pooled_linkage
-from hilsplat.semantic_tree.nodes import gaussian_nodes, level_fits
+from hilsplat.semantic_tree.nodes import best_fits, gaussian_nodes, level_ious
 from hilsplat.settings import SemanticTreeSettings
 
 MIN_COVISIBLE = 0.2
@@ -104,8 +104,8 @@ def level_nodes(
             of_cluster[cluster], len(kept), weights, view, mass, total_mass, MIN_MEMBER_SHARE
         )
 
-    fits = level_fits(winners(kept)[1], len(kept), weights, mass, view, MIN_FIT)
-    kept = kept[np.bincount(fits[fits >= 0], minlength=len(kept)) >= settings.min_views]
+    fits, iou = best_fits(level_ious(winners(kept)[1], weights, mass, view))
+    kept = kept[np.bincount(fits[iou > MIN_FIT], minlength=len(kept)) >= settings.min_views]
     of_cluster, node, share = winners(kept)
     # A node that wins no Gaussian selects nothing, so it is dropped.
     used = np.unique(node[node >= 0])

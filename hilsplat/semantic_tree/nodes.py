@@ -89,61 +89,70 @@ def node_parents(
 
 def mask_fits(
     node_of_gaussian: Int32[np.ndarray, "N 3"],
-    num_nodes: int,
     S: sp.csr_matrix,
     mass: Float32[np.ndarray, "V N"],
     view: Int32[np.ndarray, " M"],
     level: UInt8[np.ndarray, " M"],
-    min_fit: float,
-) -> Int32[np.ndarray, " M"]:
+    linked: Int32[np.ndarray, " M"],
+) -> tuple[Int32[np.ndarray, " M"], Float64[np.ndarray, " M"]]:
     """Node that each mask shows: the one whose Gaussians have the best soft IoU with it, in its view.
 
+    Args:
+        node_of_gaussian: node of each Gaussian at each level.
+        S: weight of each Gaussian in each mask, px.
+        mass: visible mass of each Gaussian in each view, px.
+        view: of each mask.
+        level: of each mask.
+        linked: node that each mask was linked into, -1 for none.
+
     Returns:
-        node of the mask's level, -1 if no IoU is above `min_fit`.
+        best node of the mask's level, -1 if it shares no Gaussian with any; IoU with the linked node, 0 for
+        none.
     """
-    fits = np.full(len(view), NONE, np.int32)
+    fits, of_linked = np.full(len(view), NONE, np.int32), np.zeros(len(view))
     for each in LEVELS:
         rows = np.flatnonzero(level == int(each))
-        own = node_of_gaussian[:, each.index]
-        fits[rows] = level_fits(own, num_nodes, S[rows], mass, view[rows], min_fit)
-    return fits
+        iou = level_ious(node_of_gaussian[:, each.index], S[rows], mass, view[rows])
+        fits[rows], _ = best_fits(iou)
+        inside = linked[rows] != NONE
+        of_linked[rows[inside]] = np.asarray(iou[np.flatnonzero(inside), linked[rows[inside]]]).ravel()
+    return fits, of_linked
 
 
-def level_fits(
+def level_ious(
     node_of_gaussian: Int32[np.ndarray, " N"],
-    num_nodes: int,
     weights: sp.csr_matrix,
     mass: Float32[np.ndarray, "V N"],
     view: Int32[np.ndarray, " m"],
-    min_fit: float,
-) -> Int32[np.ndarray, " m"]:
-    """`mask_fits` of one level.
+) -> sp.csr_matrix:
+    """Soft IoU of each mask of a level with each node (m x nodes) that it shares Gaussians with, in its view.
 
     Args:
         node_of_gaussian: node of each Gaussian at the level.
-        num_nodes: number of nodes; ids are smaller.
         weights: S of the level's masks.
         mass: visible mass of each Gaussian in each view, px.
         view: of each mask.
-        min_fit: the IoU must be above this.
     """
     has = np.flatnonzero(node_of_gaussian >= 0)
     node = node_of_gaussian[has]
+    num_nodes = int(node.max(initial=NONE)) + 1
     member = sp.csr_matrix((np.ones(len(has)), (has, node)), shape=(len(node_of_gaussian), num_nodes))
     inter = (weights.astype(np.float64) @ member).tocsr()
     area = np.asarray(weights.sum(axis=1, dtype=np.float64)).ravel()
     size = np.stack([np.bincount(node, seen[has], num_nodes) for seen in mass])  # [view, node]
-    fits = np.full(len(view), NONE, np.int32)
-    for row in range(len(view)):
-        span = slice(inter.indptr[row], inter.indptr[row + 1])
-        if span.start == span.stop:
-            continue
-        nodes, shared = inter.indices[span], inter.data[span]
-        iou = shared / (area[row] + size[view[row], nodes] - shared)
-        best = np.lexsort((nodes, -iou))[0]
-        if iou[best] > min_fit:
-            fits[row] = nodes[best]
-    return fits
+    row = np.repeat(np.arange(len(view)), np.diff(inter.indptr))
+    inter.data /= area[row] + size[view[row], inter.indices] - inter.data
+    return inter
+
+
+def best_fits(iou: sp.csr_matrix) -> tuple[Int32[np.ndarray, " m"], Float64[np.ndarray, " m"]]:
+    """Column of the largest value of each row, the lower one of a tie, and the value; -1 and 0 for none."""
+    best, value = np.full(iou.shape[0], NONE, np.int32), np.zeros(iou.shape[0])
+    row = np.repeat(np.arange(iou.shape[0]), np.diff(iou.indptr))
+    order = np.lexsort((iou.indices, -iou.data, row))
+    first = order[np.flatnonzero(np.diff(row[order], prepend=NONE))]
+    best[row[first]], value[row[first]] = iou.indices[first], iou.data[first]
+    return best, value
 
 
 def nest_nodes(

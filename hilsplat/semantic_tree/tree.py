@@ -2,12 +2,13 @@
 
 No mask has an identity across views. Masks of one level in different views are linked by how far they agree
 on the Gaussians that both views see. Clusters of masks become nodes and take their Gaussians; a coarser node
-that holds most of a finer one becomes its parent; every node gets the average of its masks' full CLIP
-vectors. A query ranks the nodes.
+that holds most of a finer one becomes its parent. None of this needs CLIP: the tree only scores the crops
+that show each node. The clip stage embeds the best of them, and their average is the node's vector. A query
+ranks the nodes.
 """
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,17 +20,19 @@ from hilsplat.base.artifacts import (
     read_full_index,
     read_index,
     read_into,
+    remake,
     write_index,
     write_json,
     write_npz,
 )
+from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log
 from hilsplat.contributions.rows import Contributions, mask_embeddings
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, require_same_masks
 from hilsplat.semantic_tree.boxes import node_boxes
 from hilsplat.semantic_tree.export import readable_nodes
-from hilsplat.semantic_tree.level_nodes import MIN_FIT, level_nodes
+from hilsplat.semantic_tree.level_nodes import level_nodes
 from hilsplat.semantic_tree.nodes import (
     mask_fits,
     nest_nodes,
@@ -42,6 +45,9 @@ from hilsplat.settings import SemanticTreeSettings
 MIN_VISIBLE_PX = 0.3
 """A Gaussian counts as visible in a view if its mass there exceeds this."""
 
+LEAST_IOU = 1e-3
+"""Of a mask with the node that it was linked into, in its `crop_score`."""
+
 logger = logging.getLogger(__name__)
 
 
@@ -52,7 +58,7 @@ class SemanticTree:
     Attributes:
         level: `Level` of each node.
         parent: row of the coarser node that holds it, -1 for none.
-        clip: unit CLIP vector: the average of its masks' vectors, weighted by the root of their areas.
+        clip: unit CLIP vector of each node; empty (C = 0) as the stage writes the tree.
         centroid: mean of its Gaussians' centres weighted by visible mass, scene units.
         box: axis-aligned box, lower and upper corner, scene units.
         oriented_box: centre, three axes and sizes (see `OrientedBox`), scene units.
@@ -61,7 +67,11 @@ class SemanticTree:
         node_of_gaussian: node of each Gaussian at each level, -1 for none.
         membership: share of the Gaussian's visible weight that lies in its node's masks, in [0, 1]; 0 without
             a node, and for a Gaussian that joined only because a child of the node holds it.
-        node_of_mask: node that each mask (row of the contributions) fits, -1 for none.
+        node_of_mask: node of its level that each mask (row of the contributions) fits best; -1 if it shares
+            no Gaussian with any.
+        linked_node: node that each mask was linked into, -1 for none.
+        crop_score: how well the crop of each mask shows the node that it was linked into: the root of its
+            area times its IoU with the node in its view, px; 0 without a node.
         view_area_px: pixels of its masks in each view.
         view_names: the columns of `view_area_px`.
         gaussians_sha256: digest of the PLY the tree belongs to.
@@ -79,6 +89,8 @@ class SemanticTree:
     node_of_gaussian: Int32[np.ndarray, "N 3"]
     membership: Float32[np.ndarray, "N 3"]
     node_of_mask: Int32[np.ndarray, " M"]
+    linked_node: Int32[np.ndarray, " M"]
+    crop_score: Float32[np.ndarray, " M"]
     view_area_px: Float32[np.ndarray, "T V"]
     view_names: tuple[str, ...]
     gaussians_sha256: str
@@ -105,41 +117,69 @@ class SemanticTree:
             rows, above = rows[above != NONE], above[above != NONE]
         return found
 
+    def with_vectors(self, vectors: Float32[np.ndarray, "M C"]) -> "SemanticTree":
+        """Return the tree with the vectors of its nodes.
+
+        A node's vector is the average of those of its masks that have one, weighted by their `crop_score`.
+
+        Args:
+            vectors: CLIP vector of each mask, zero where its crop was not embedded.
+        """
+        sums = np.zeros((len(self), vectors.shape[1]))
+        linked = np.flatnonzero(self.linked_node != NONE)
+        np.add.at(sums, self.linked_node[linked], self.crop_score[linked, None] * vectors[linked])
+        sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
+        return replace(self, clip=sums.astype(np.float32))
+
     @staticmethod
-    def load(folder: Path) -> "SemanticTree":
+    def load(folder: Path, clip_folder: Path | None = None) -> "SemanticTree":
         """Read a finished semantic tree.
+
+        Args:
+            folder: output of the stage.
+            clip_folder: CLIP vectors of the masks; None: the tree's nodes get no vectors.
 
         Raises:
             ArtifactError: it is missing, damaged or of another version.
+            MisalignedArtifactError: the vectors belong to other masks, or to another tree of these masks.
         """
         folder = Path(folder)
         index = read_full_index(folder, "gaussians_sha256", "min_weight")
-        return read_into(
+        tree = read_into(
             SemanticTree,
             folder / "tree.npz",
             view_names=tuple(index["views"]),
             gaussians_sha256=index["gaussians_sha256"],
             min_weight=index["min_weight"],
         )
+        if clip_folder is None:
+            return tree
+        tree = tree.with_vectors(mask_embeddings(clip_folder, folder))
+        if not tree.clip.any(axis=1).all():
+            raise MisalignedArtifactError(
+                f"{clip_folder} has no vector for some nodes of {folder}",
+                expected="vectors of the masks that show each node",
+                found=f"none for {int((~tree.clip.any(axis=1)).sum())} of {len(tree)} nodes",
+                fix=remake(Path(clip_folder)),
+            )
+        return tree
 
 
 def build_tree(
     contributions: Contributions,
     S: sp.csr_matrix,
     mass: Float32[np.ndarray, "V N"],
-    clip: Float32[np.ndarray, "M C"],
     means: Float[np.ndarray, "N 3"],
     settings: SemanticTreeSettings,
     threads: int = 1,
     join_wholes: bool = False,
 ) -> SemanticTree:
-    """Link masks into nodes, and give the nodes Gaussians, parents, vectors and boxes.
+    """Link masks into nodes, give the nodes Gaussians, parents and boxes, and score the crops that show them.
 
     Args:
         contributions: rows of the masks.
         S: weight of each Gaussian in each raw mask, px.
         mass: visible mass of each Gaussian in each view, px.
-        clip: CLIP vector of each mask.
         means: centres of the Gaussians, scene units.
         settings: thresholds.
         threads: number of threads for the evidence; results do not depend on it.
@@ -184,19 +224,19 @@ def build_tree(
     view_area = np.zeros((num, len(contributions.views)), np.float64)
     own = np.flatnonzero(cluster_of_mask >= 0)
     np.add.at(view_area, (cluster_of_mask[own], contributions.view[own]), contributions.area_px[own])
-    vectors = np.zeros((num, clip.shape[1]), np.float64)
-    root_area = np.sqrt(contributions.area_px[own].astype(np.float64))
-    np.add.at(vectors, cluster_of_mask[own], root_area[:, None] * clip[own])
-    vectors /= np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
     centroid, box, oriented = node_boxes(node_of_gaussian, levels, means, total_mass)
-    fits = mask_fits(node_of_gaussian, num, S, mass, contributions.view, contributions.level, MIN_FIT)
-    if join_wholes:  # a mask of a piece fits no whole, but shows it
+    fits, iou = mask_fits(node_of_gaussian, S, mass, contributions.view, contributions.level, cluster_of_mask)
+    # Nesting may leave a node without the Gaussians that its masks show; it still needs a crop.
+    score = np.sqrt(contributions.area_px) * np.where(
+        cluster_of_mask == NONE, 0.0, np.maximum(iou, LEAST_IOU)
+    )
+    if join_wholes:  # a mask of a piece fits no whole well, but shows it
         pieces = contributions.rows_of(Level.WHOLE)
         fits[pieces] = cluster_of_mask[pieces]
     return SemanticTree(
         level=levels,
         parent=parent,
-        clip=vectors.astype(np.float32),
+        clip=np.zeros((num, 0), np.float32),
         centroid=centroid,
         box=box,
         oriented_box=oriented,
@@ -205,6 +245,8 @@ def build_tree(
         node_of_gaussian=node_of_gaussian,
         membership=membership,
         node_of_mask=fits,
+        linked_node=cluster_of_mask.astype(np.int32),
+        crop_score=score.astype(np.float32),
         view_area_px=view_area.astype(np.float32),
         view_names=contributions.views,
         gaussians_sha256=contributions.gaussians_sha256,
@@ -215,7 +257,6 @@ def build_tree(
 def run_semantic_tree(
     contributions_folder: Path,
     masks_folder: Path,
-    clip_folder: Path,
     out: Path,
     settings: SemanticTreeSettings,
     threads: int = 1,
@@ -223,7 +264,7 @@ def run_semantic_tree(
     """Write the 3D semantic tree of a scene: `tree.npz`, the readable `tree.json`, `index.json`.
 
     Raises:
-        MisalignedArtifactError: contributions or CLIP vectors belong to other masks.
+        MisalignedArtifactError: the contributions belong to other masks.
         ArtifactError: the masks do not say what made them.
     """
     contributions = Contributions.load(contributions_folder)
@@ -234,7 +275,6 @@ def run_semantic_tree(
             contributions,
             contributions.matrix("S"),
             contributions.mass(),
-            mask_embeddings(clip_folder, contributions),
             contributions.means(),
             settings,
             threads,
@@ -267,7 +307,7 @@ def run_semantic_tree(
                 scene=scene,
                 nodes=per_level,
                 orphans=orphans,
-                masks_with_node=int((tree.node_of_mask >= 0).sum()),
+                masks_with_node=int((tree.linked_node >= 0).sum()),
                 masks=len(contributions),
                 gaussians_sha256=contributions.gaussians_sha256,
                 min_weight=contributions.min_weight,

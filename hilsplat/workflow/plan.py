@@ -244,6 +244,15 @@ class Plan:
         faults = self.stages(job).perturb.model_dump_json()
         return f"{truth_argument(input)} --perturb {shlex.quote(faults)}"
 
+    def crops_tree(self, job: VariantJob) -> list[str]:
+        """Input of clip: the semantic tree whose nodes choose the crops; empty if every mask is embedded."""
+        by_node = self.stages(job).clip.crops == "nodes"
+        return [self.shared("semantic_tree", "semantic_tree")(job)] if by_node else []
+
+    def crops_tree_option(self, job: VariantJob, input: Any) -> str:
+        """Option of clip for `crops_tree`."""
+        return f"--semantic-tree {shlex.quote(str(input.semantic_tree))}" if input.semantic_tree else ""
+
     def baseline(self, job: VariantJob) -> tuple[str, ...]:
         """The baseline that computes a variant's field."""
         return (METHODS.places[self.stages(job).method.name],)

@@ -209,8 +209,8 @@ class RunProgress:
         return max(estimates.seconds(job.rule) / job.threads - elapsed, 0.1 * elapsed)
 
     def _hint(self, job: RunningJob) -> list[str]:
-        """Return the query commands when a scene's tree is done; once in a run."""
-        if self._hint_given or job.rule != "semantic_tree" or job.wildcards.get("variant") != "default":
+        """Return the query commands when the nodes of a scene's tree have vectors; once in a run."""
+        if self._hint_given or job.rule != "clip" or job.wildcards.get("variant") != "default":
             return []
         self._hint_given = True
         scene = f"{job.wildcards['dataset']}/{job.wildcards['scene']}"

@@ -38,7 +38,7 @@ CONTRIBUTE = (*CONTRIBUTE, "--masks", str(MASKS), *OUT)
 SOLVE = ("field", "--contributions", str(CONTRIBUTIONS), "--coverage-tree", str(TREE))
 SOLVE = (*SOLVE, "--autoencoder", str(CODE), *OUT)
 LINK = ("semantic-tree", "--contributions", str(CONTRIBUTIONS), "--masks", str(MASKS))
-LINK = (*LINK, "--clip", str(CLIP), *OUT)
+LINK = (*LINK, *OUT)
 ASK = ("query", "photos/desk", "mug")
 POSES = ("poses", "--images", "photos", *OUT)
 NEW = ("new", "chair", "photos")
@@ -242,11 +242,11 @@ ROWS = [
         "vectors that are text",
         lambda: np.save(CLIP / "000.png.npy", np.array(["a"] * 5)),
         (
-            "semantic-tree",
+            "autoencoder",
             "--contributions",
             str(CONTRIBUTIONS),
-            "--masks",
-            str(MASKS),
+            "--semantic-tree",
+            str(SCENE / "default/semantic_tree"),
             "--clip",
             str(CLIP),
             *OUT,

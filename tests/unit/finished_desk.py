@@ -167,7 +167,7 @@ def _run_stages() -> None:
     run("coverage-tree", places["coverage_tree"], "masks")
     run("clip", places["clip"], "scene", "masks", settings=model, more=cache)
     run("contributions", places["contributions"], "scene", "gaussians", "masks", more=cache)
-    run("semantic-tree", places["semantic_tree"], "contributions", "masks", "clip")
+    run("semantic-tree", places["semantic_tree"], "contributions", "masks")
     code = {"code": "pca", "latent": 2}
     inputs = ("clip", "semantic_tree", "contributions")
     run("autoencoder", places["autoencoder"], *inputs, settings=code)

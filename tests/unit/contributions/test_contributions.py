@@ -229,7 +229,7 @@ def test_stage_writes_rows_in_view_order_and_masses(two_boxes_contributions):
     weights = normalised_weights(two_boxes_weights(0))
     corner = weights.toarray().reshape(HEIGHT, WIDTH, -1)[6:8, 6:9].reshape(6, -1).mean(axis=0)
     assert A[5] == pytest.approx(corner, abs=1e-6)
-    assert mask_embeddings(world.clip, found).shape == (24, 16)
+    assert mask_embeddings(world.clip, found.folder).shape == (24, 16)
 
 
 def test_a_resumed_run_writes_the_same_bytes(two_boxes_contributions):
@@ -347,4 +347,4 @@ def test_views_without_clip_vectors_are_named(two_boxes_contributions):
     views = read_index(world.clip)["views"]
     write_index(world.clip, {view: entry for view, entry in views.items() if view != "002.png"})
     with pytest.raises(MisalignedArtifactError, match=r"view 002\.png(.|\n)*found +no masks"):
-        mask_embeddings(world.clip, Contributions.load(out))
+        mask_embeddings(world.clip, out)

@@ -9,13 +9,13 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 from tokenizers import Tokenizer, models, pre_tokenizers
 
-from hilsplat.base.artifacts import read_index, read_npy, sha256_of_path, write_index
+from hilsplat.base.artifacts import read_index, read_npy, sha256_of_path, write_index, write_npz
 from hilsplat.base.errors import MisalignedArtifactError, ModelError, SettingsError
 from hilsplat.base.images import write_png
 from hilsplat.configuration import parse_section
 from hilsplat.embed.clip import ClipModel, open_clip_of, unit
 from hilsplat.embed.model_check import check_model
-from hilsplat.embed.stage import run_clip
+from hilsplat.embed.stage import chosen_masks, run_clip
 from hilsplat.models.network import Network
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
@@ -244,7 +244,7 @@ def red_scene(tmp_path) -> tuple[Path, Path]:
 def test_stage_writes_a_row_per_mask_and_reuses_finished_views(red_scene, colour_clip, tmp_path, monkeypatch):
     scene, masks = red_scene
     settings = ClipSettings(model=str(colour_clip))
-    run_clip(scene, masks, tmp_path / "first", tmp_path / "cache", settings, threads=2)
+    run_clip(scene, masks, None, tmp_path / "first", tmp_path / "cache", settings, threads=2)
     np.testing.assert_array_equal(read_npy(tmp_path / "first" / "0.png.npy"), [[1, 0, 0], [0, 1, 0]])
     assert read_index(tmp_path / "first")["dim"] == 3
     assert digests_in(tmp_path / "first") == digests_in(masks)
@@ -253,15 +253,55 @@ def test_stage_writes_a_row_per_mask_and_reuses_finished_views(red_scene, colour
         raise AssertionError("the network ran again")
 
     monkeypatch.setattr(Network, "__call__", refuse)
-    run_clip(scene, masks, tmp_path / "second", tmp_path / "cache", settings, threads=1)
+    run_clip(scene, masks, None, tmp_path / "second", tmp_path / "cache", settings, threads=1)
     assert sha256_of_path(tmp_path / "first") == sha256_of_path(tmp_path / "second")
+
+
+def test_only_the_best_crops_of_each_node_are_embedded_and_never_twice(red_scene, colour_clip, tmp_path):
+    scene, masks = red_scene
+    tree = tmp_path / "semantic_tree"
+    # Two views of two masks: the first masks show node 0, better in the second view; no node has the others.
+    write_npz(
+        tree / "tree.npz",
+        linked_node=np.array([0, -1, 0, -1], np.int32),
+        crop_score=np.array([1.0, 0, 2, 0], np.float32),
+    )
+    write_index(tree, {view: {**entry, "masks": 2} for view, entry in read_index(masks)["views"].items()})
+    settings, cache = ClipSettings(model=str(colour_clip), crops_per_node=1), tmp_path / "cache"
+    run_clip(scene, masks, tree, tmp_path / "best", cache, settings, threads=1)
+    found = [read_npy(tmp_path / "best" / f"{view}.png.npy").tolist() for view in (0, 1)]
+    assert found == [[[0, 0, 0], [0, 0, 0]], [[1, 0, 0], [0, 0, 0]]]
+
+    embedded = []
+    embed_crops = ClipModel.embed_crops
+
+    def counted(model: ClipModel, crops: np.ndarray) -> np.ndarray:
+        embedded.append(len(crops))
+        return embed_crops(model, crops)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ClipModel, "embed_crops", counted)
+        run_clip(scene, masks, None, tmp_path / "all", cache, settings, threads=1)
+    assert sum(embedded) == 1  # both views are one picture with the same masks
+    run_clip(scene, masks, None, tmp_path / "fresh", tmp_path / "other", settings, threads=1)
+    assert sha256_of_path(tmp_path / "all") == sha256_of_path(tmp_path / "fresh")
+
+
+def test_a_tree_without_nodes_chooses_every_mask(red_scene, tmp_path):
+    _, masks = red_scene
+    tree = tmp_path / "semantic_tree"
+    write_npz(tree / "tree.npz", linked_node=np.full(4, -1, np.int32), crop_score=np.zeros(4, np.float32))
+    write_index(tree, {view: {"masks": 2} for view in read_index(masks)["views"]})
+    assert [rows.tolist() for rows in chosen_masks(tree, 5).values()] == [[0, 1], [0, 1]]
 
 
 def test_masks_of_other_views_are_refused(red_scene, colour_clip, tmp_path):
     scene, masks = red_scene
     write_index(masks, {"7.png": read_index(masks)["views"]["0.png"]}, scene="set/scene")
     with pytest.raises(MisalignedArtifactError, match=r"7\.png"):
-        run_clip(scene, masks, tmp_path / "out", tmp_path / "cache", ClipSettings(model=str(colour_clip)), 1)
+        run_clip(
+            scene, masks, None, tmp_path / "out", tmp_path / "cache", ClipSettings(model=str(colour_clip)), 1
+        )
 
 
 def test_masks_that_their_index_does_not_record_are_refused(red_scene, colour_clip, tmp_path):
@@ -269,7 +309,9 @@ def test_masks_that_their_index_does_not_record_are_refused(red_scene, colour_cl
     found = HierarchicalMasks.load(masks / "0.png.npz")
     found.take(np.array([1, 0])).save(masks / "0.png.npz")
     with pytest.raises(MisalignedArtifactError, match=r"contains other masks \(view 0\.png\)"):
-        run_clip(scene, masks, tmp_path / "out", tmp_path / "cache", ClipSettings(model=str(colour_clip)), 1)
+        run_clip(
+            scene, masks, None, tmp_path / "out", tmp_path / "cache", ClipSettings(model=str(colour_clip)), 1
+        )
 
 
 def test_the_clip_of_an_artifact_is_found_with_its_variant(red_scene, colour_clip, tmp_path):
@@ -277,7 +319,7 @@ def test_the_clip_of_an_artifact_is_found_with_its_variant(red_scene, colour_cli
     for name in ("vision_model", "text_model"):
         (colour_clip / f"{name}.onnx").rename(colour_clip / f"{name}_fp16.onnx")
     settings = ClipSettings(model=str(colour_clip), variant="fp16")
-    run_clip(scene, masks, tmp_path / "vectors", tmp_path / "cache", settings, threads=1)
+    run_clip(scene, masks, None, tmp_path / "vectors", tmp_path / "cache", settings, threads=1)
     assert open_clip_of(tmp_path / "vectors").text.path.name == "text_model_fp16.onnx"
 
 

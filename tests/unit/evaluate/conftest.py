@@ -139,6 +139,8 @@ def block_world(tmp_path_factory) -> BlockWorld:
         node_of_gaussian=node_of_gaussian.astype(np.int32),
         membership=(node_of_gaussian >= 0).astype(np.float32),
         node_of_mask=np.arange(len(NODES), dtype=np.int32),
+        linked_node=np.arange(len(NODES), dtype=np.int32),
+        crop_score=np.ones(len(NODES), np.float32),
         view_area_px=np.array([[region(row).sum()] for row in range(len(NODES))], np.float32),
         view_names=("000.png",),
         gaussians_sha256="0",

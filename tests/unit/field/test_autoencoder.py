@@ -196,20 +196,28 @@ def test_a_missing_file_is_named(tmp_path):
 def boxes_with_tree(two_boxes_contributions):
     world, contributions = two_boxes_contributions
     tree = world.folder / "semantic_tree"
-    run_semantic_tree(contributions, world.masks, world.clip, tree, SemanticTreeSettings())
+    run_semantic_tree(contributions, world.masks, tree, SemanticTreeSettings())
     return world, contributions, tree
 
 
-def test_targets_are_node_vectors_where_a_mask_fits_one(boxes_with_tree):
-    _, _, folder = boxes_with_tree
-    tree = SemanticTree.load(folder)
-    tree.node_of_mask[3] = -1
+def test_targets_are_the_vectors_of_the_nodes_that_masks_fit_best(boxes_with_tree):
+    world, _, folder = boxes_with_tree
+    tree = SemanticTree.load(folder, world.clip)
+    tree.node_of_mask[3] = -1  # shares no Gaussian with a node
     own = unit_vectors(len(tree.node_of_mask), 16)
     target, train = mask_targets(own, tree, "node")
-    assert np.array_equal(target[3], own[3])
+    np.testing.assert_allclose(target[3], tree.clip.mean(axis=0))
     assert np.array_equal(target[0], tree.clip[tree.node_of_mask[0]])
-    assert len(train) == len(tree) + 1
+    assert train is tree.clip
     assert mask_targets(own, tree, "mask")[0] is own
+
+
+def test_targets_of_masks_without_vectors_are_refused(boxes_with_tree):
+    world, _, folder = boxes_with_tree
+    own = unit_vectors(24, 16)
+    own[5] = 0
+    with pytest.raises(ArtifactError, match=r"1 of 24 masks have no CLIP vector(.|\n)*clip\.crops"):
+        mask_targets(own, SemanticTree.load(folder, world.clip), "mask")
 
 
 def test_a_tree_of_masks_in_another_order_is_refused(boxes_with_tree):
@@ -236,4 +244,4 @@ def test_stage_encodes_every_mask(boxes_with_tree):
     np.testing.assert_allclose(latents[0], latents[np.flatnonzero(node == node[0])[1]], atol=1e-6)
     model = load_code(out)
     decoded = model.decode_array(latents)
-    assert (decoded * SemanticTree.load(tree).clip[node]).sum(axis=1).mean() > 0.8
+    assert (decoded * SemanticTree.load(tree, world.clip).clip[node]).sum(axis=1).mean() > 0.8

@@ -266,7 +266,7 @@ def test_the_reference_loss_is_the_solver_s_language_loss():
 def boxes_with_latents(two_boxes_contributions):
     world, contributions = two_boxes_contributions
     tree, autoencoder = world.folder / "semantic_tree", world.folder / "autoencoder"
-    run_semantic_tree(contributions, world.masks, world.clip, tree, SemanticTreeSettings())
+    run_semantic_tree(contributions, world.masks, tree, SemanticTreeSettings())
     quick = AutoencoderSettings(code="network", latent=3, epochs=1, min_steps=100)
     run_autoencoder(world.clip, tree, contributions, autoencoder, quick, 0)
     return world, contributions, autoencoder

@@ -43,7 +43,7 @@ def scene(tmp_path_factory) -> LanguageScene:
     with pytest.MonkeyPatch.context() as monkeypatch:
         world = build_two_boxes(folder, monkeypatch)
         contributions = build_contributions(world)
-    run_semantic_tree(contributions, world.masks, world.clip, folder / "st", SemanticTreeSettings())
+    run_semantic_tree(contributions, world.masks, folder / "st", SemanticTreeSettings())
     settings = AutoencoderSettings(code="network", latent=4, epochs=1, min_steps=400, learning_rate=2e-3)
     run_autoencoder(world.clip, folder / "st", contributions, folder / "ae", settings, 0)
     run_field(
@@ -60,7 +60,7 @@ def scene(tmp_path_factory) -> LanguageScene:
     return LanguageScene(
         Scene.load(world.scene),
         round_gaussians(np.zeros((NUM_GAUSSIANS, 3))),
-        SemanticTree.load(folder / "st"),
+        SemanticTree.load(folder / "st", world.clip),
         LanguageField.load(folder / "field.safetensors"),
         load_code(folder / "ae"),
         encode,

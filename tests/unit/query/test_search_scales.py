@@ -36,6 +36,8 @@ def tree_of(levels: list[int], parents: list[int]) -> SemanticTree:
         node_of_gaussian=np.full((1, 3), -1, np.int32),
         membership=np.zeros((1, 3), np.float32),
         node_of_mask=np.zeros(0, np.int32),
+        linked_node=np.zeros(0, np.int32),
+        crop_score=np.zeros(0, np.float32),
         view_area_px=np.ones((n, 1), np.float32),
         view_names=("a.png",),
         gaussians_sha256="",

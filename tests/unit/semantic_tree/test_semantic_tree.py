@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from hilsplat.base.artifacts import read_index, read_json, sha256_of_path, write_index
+from hilsplat.base.artifacts import read_index, read_json, read_npy, sha256_of_path, write_index, write_npy
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.semantic_tree.level_nodes import level_nodes
@@ -18,7 +18,6 @@ from tests.unit.two_boxes_world import (
     NUM_GAUSSIANS,
     REGIONS,
     WIDTH,
-    build_contributions,
     region_mask,
     reverse_masks,
 )
@@ -83,13 +82,13 @@ def test_subpart_may_hang_directly_under_a_whole():
 def tree_of_boxes(two_boxes_contributions):
     world, contributions = two_boxes_contributions
     out = world.folder / "semantic_tree"
-    run_semantic_tree(contributions, world.masks, world.clip, out, SemanticTreeSettings())
+    run_semantic_tree(contributions, world.masks, out, SemanticTreeSettings())
     return world, out
 
 
 def test_two_boxes_give_exactly_their_regions(tree_of_boxes):
     world, out = tree_of_boxes
-    tree = SemanticTree.load(out)
+    tree = SemanticTree.load(out, world.clip)
     # Nodes follow the first mask of each: view 0 misses "A bottom", so it comes after "B top".
     order = [0, 1, 2, 4, 3, 5, 6]
     assert tree.level.tolist() == [REGIONS[row][1] for row in order]
@@ -133,36 +132,66 @@ def test_readable_tree_and_counts(tree_of_boxes):
 def test_second_run_writes_the_same_bytes(tree_of_boxes):
     world, out = tree_of_boxes
     before = sha256_of_path(out)
-    run_semantic_tree(world.folder / "contributions", world.masks, world.clip, out, SemanticTreeSettings())
+    run_semantic_tree(world.folder / "contributions", world.masks, out, SemanticTreeSettings())
     assert sha256_of_path(out) == before
 
 
 def test_more_views_asked_for_than_there_are_leave_an_empty_tree(two_boxes_contributions, caplog):
     world, contributions = two_boxes_contributions
     out = world.folder / "empty"
-    run_semantic_tree(contributions, world.masks, world.clip, out, SemanticTreeSettings(min_views=5))
+    run_semantic_tree(contributions, world.masks, out, SemanticTreeSettings(min_views=5))
     assert len(SemanticTree.load(out)) == 0
     assert "has no node" in caplog.text
 
 
-@pytest.mark.parametrize("rerun", ["nothing", "contributions"])
-def test_masks_in_another_order_are_refused(two_boxes_contributions, rerun):
+def test_masks_in_another_order_are_refused(two_boxes_contributions):
     world, contributions = two_boxes_contributions
     reverse_masks(world, "002.png")
-    stale = contributions
-    if rerun == "contributions":  # the CLIP vectors are the only old part, as many as there are masks
-        build_contributions(world)
-        stale = world.clip
-    with pytest.raises(MisalignedArtifactError, match=rf"{stale} .*different masks \(view 002\.png\)"):
-        run_semantic_tree(
-            contributions, world.masks, world.clip, world.folder / "out", SemanticTreeSettings()
-        )
+    with pytest.raises(
+        MisalignedArtifactError, match=rf"{contributions} .*different masks \(view 002\.png\)"
+    ):
+        run_semantic_tree(contributions, world.masks, world.folder / "out", SemanticTreeSettings())
+
+
+def test_vectors_of_masks_in_another_order_are_refused(tree_of_boxes):
+    world, out = tree_of_boxes
+    index = read_index(world.clip)
+    index["views"]["002.png"]["masks_sha256"] = "0" * 64
+    write_index(world.clip, index.pop("views"), **index)
+    with pytest.raises(MisalignedArtifactError, match=rf"{world.clip} .*different masks \(view 002\.png\)"):
+        SemanticTree.load(out, world.clip)
+
+
+def test_a_node_has_the_mean_of_the_crops_that_have_vectors(tree_of_boxes):
+    _, out = tree_of_boxes
+    tree = SemanticTree.load(out)
+    assert tree.clip.shape == (7, 0)
+    rows = np.flatnonzero(tree.linked_node == 0)
+    vectors = np.zeros((len(tree.linked_node), 2), np.float32)
+    vectors[rows[0]], vectors[rows[1]] = (1, 0), (0, 1)  # the other masks of the node have none
+    weighted = tree.crop_score[rows[:2]].astype(np.float64)
+    assert tree.with_vectors(vectors).clip[0] == pytest.approx(weighted / np.linalg.norm(weighted))
+
+
+def test_crops_score_the_root_of_their_area_times_their_fit(tree_of_boxes):
+    tree = SemanticTree.load(tree_of_boxes[1])
+    assert (tree.linked_node >= 0).all()
+    whole = np.flatnonzero(tree.linked_node == 0)[0]  # 6 x 8 px; weights leak a little
+    assert 0.8 * np.sqrt(48) < tree.crop_score[whole] < np.sqrt(48)
+
+
+def test_vectors_of_another_tree_are_refused(tree_of_boxes):
+    world, out = tree_of_boxes
+    for view in world.regions:
+        vectors = read_npy(world.clip / f"{view}.npy")
+        write_npy(world.clip / f"{view}.npy", np.zeros_like(vectors))
+    with pytest.raises(MisalignedArtifactError, match=r"has no vector for some nodes of (.|\n)*7 of 7"):
+        SemanticTree.load(out, world.clip)
 
 
 def test_an_artifact_without_digests_is_refused(two_boxes_contributions):
     world, contributions = two_boxes_contributions
-    write_index(world.clip, {view: {"masks": 6} for view in world.views}, model="models/clip-tiny")
-    with pytest.raises(ArtifactError, match=r"clip is of another version\n *expected +masks_sha256 of every"):
-        run_semantic_tree(
-            contributions, world.masks, world.clip, world.folder / "out", SemanticTreeSettings()
-        )
+    index = read_index(contributions)
+    write_index(contributions, {view: {"masks": 6} for view in index.pop("views")}, **index)
+    with pytest.raises(ArtifactError, match=r"is of another version\n *expected +masks_sha256 of every"):
+        run_semantic_tree(contributions, world.masks, world.folder / "out", SemanticTreeSettings())

@@ -140,9 +140,7 @@ def test_only_wholes_of_the_graph_segmenter_are_joined(two_boxes, segmenter, mos
     run_contributions(
         two_boxes.scene, two_boxes.ply, two_boxes.masks, folder / "c", folder / "cache", settings, 1
     )
-    run_semantic_tree(
-        folder / "c", two_boxes.masks, two_boxes.clip, folder / "t", SemanticTreeSettings(whole_side=most)
-    )
+    run_semantic_tree(folder / "c", two_boxes.masks, folder / "t", SemanticTreeSettings(whole_side=most))
     tree = SemanticTree.load(folder / "t")
     assert [len(tree.nodes_of(level)) for level in Level] == [wholes, 3, 2]
     if wholes == 1:
