@@ -85,6 +85,7 @@ def open_scene(code_name: str, threads: int = 1) -> LanguageScene:
         node_of_mask=np.zeros(0, np.int32),
         linked_node=np.zeros(0, np.int32),
         crop_score=np.zeros(0, np.float32),
+        crop_rank=np.zeros(0, np.int32),
         view_area_px=np.ones((num, 1), np.float32),
         view_names=(VIEW,),
         gaussians_sha256="",

@@ -187,6 +187,12 @@ class MasksSettings(Section):
         "ending of the networks' names, such as fp16 for vision_encoder_fp16.onnx; empty: the plain names",
         pattern=r"^[A-Za-z0-9_.-]*$",
     )
+    key_views: float = knob(
+        1.0,
+        "share of the training views that get masks; below 1, those that together see most of the Gaussians",
+        gt=0,
+        le=1,
+    )
     points_per_side: int = knob(32, "point prompts per image side", ge=1, le=128, origin="LangSplat: 32")
     points_per_batch: Annotated[int, Field(ge=1, le=4096)] | Auto = knob(
         "auto",
@@ -320,7 +326,7 @@ class ClipSettings(Section):
         "autoencoder.targets is mask, else nodes",
         origin="paper, LangSplat: masks",
     )
-    crops_per_node: int = knob(5, "nodes: the most crops that a node's vector is averaged from", ge=1)
+    crops_per_node: int = knob(8, "nodes: the most crops that a node's vector is averaged from", ge=1, le=32)
 
     model: str = knob(
         "models/clip-tiny",
@@ -348,10 +354,10 @@ class ContributionsSettings(Section):
     """How much each Gaussian weighs in each mask, with frozen geometry."""
 
     min_weight: float = knob(1 / 255, "smaller weights of a Gaussian at a pixel are dropped", ge=0, lt=1)
-    keep: Literal["auto", "gram", "weights"] = knob(
+    keep: Literal["auto", "gram", "weights", "none"] = knob(
         "auto",
         "what is kept; gram: pairs of Gaussians; weights: pixel weights of all views; auto: the one with "
-        "fewer non-zeros",
+        "fewer non-zeros; none: neither, enough for a semantic tree without a field",
     )
     device: Literal["auto", "cpu", "cuda"] = knob(
         "auto", "rasteriser; auto: cuda if torch finds a device and gsplat is installed, else cpu"

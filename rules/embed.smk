@@ -20,9 +20,9 @@ rule clip:
     params:
         settings=PLAN.settings("clip"),
         model=PLAN.model("clip"),
-        semantic_tree=PLAN.crops_tree_option,
+        option=PLAN.crops_tree_option,
         cache=cache_folder,
         code=PLAN.code("clip"),
     shell:
-        "python -m hilsplat --log {log:q} clip --scene {input.scene:q} --masks {input.masks:q} {params.semantic_tree} --settings {params.settings:q}"
+        "python -m hilsplat --log {log:q} clip --scene {input.scene:q} --masks {input.masks:q} {params.option} --settings {params.settings:q}"
         " --threads {threads} --memory {resources.mem_mib} --cache {params.cache:q} --out {output.clip:q}"

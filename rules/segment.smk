@@ -3,6 +3,8 @@ rule masks:
     input:
         scene="<results>/{dataset}/{scene}/scene",
         truth=PLAN.masks_truth,  # empty, except for the diagnostic segmenter
+        gaussians=PLAN.key_gaussians,  # empty, except for key views
+        first=ancient(PLAN.first_answer),  # not read
     output:
         masks=directory("<results>/{dataset}/{scene}/{variant}/masks"),
     log:
@@ -19,11 +21,11 @@ rule masks:
     params:
         settings=PLAN.settings("masks"),
         model=PLAN.model("masks"),
-        truth=PLAN.masks_truth_option,
+        option=PLAN.masks_option,
         cache=cache_folder,
         code=PLAN.code(PLAN.masks_stage),
     shell:
-        "python -m hilsplat --log {log:q} masks --scene {input.scene:q} --settings {params.settings:q} {params.truth}"
+        "python -m hilsplat --log {log:q} masks --scene {input.scene:q} --settings {params.settings:q} {params.option}"
         " --threads {threads} --memory {resources.mem_mib} --cache {params.cache:q} --out {output.masks:q}"
 
 

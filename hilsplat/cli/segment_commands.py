@@ -30,6 +30,9 @@ def masks(
     truth: Annotated[
         Path | None, typer.Option(help="truth folder, for the segmenter truth-perturbed only")
     ] = None,
+    gaussians: Annotated[
+        Path | None, typer.Option(help="PLY that chooses the views, for masks.key_views below 1 only")
+    ] = None,
     perturb: Annotated[str, typer.Option(help="faults of truth-perturbed, as JSON")] = "{}",
     cache: Cache = DEFAULT_CACHE,
     threads: Threads = 1,
@@ -47,6 +50,19 @@ def masks(
             fix="leave out --truth, or set masks.segmenter: truth-perturbed, a diagnostic",
         )
     inputs = {"scene": scene, **(model_input(section) if section.segmenter == "sam" else {})}
+    if section.key_views < 1:
+        if gaussians is None:
+            raise HilsplatError(
+                "masks: the Gaussians choose the key views",
+                expected="--gaussians results/<dataset>/<scene>/gaussians.ply",
+                fix="name the PLY, or set masks.key_views: 1",
+            )
+        inputs |= {"gaussians": gaussians}
+        with stage("key_masks", out, settings=section, threads=threads, inputs=inputs):
+            from hilsplat.contributions.key_views import run_key_masks
+
+            run_key_masks(scene, gaussians, out, cache, section, threads, memory)
+        return
     with stage("masks", out, settings=section, threads=threads, inputs=inputs):
         from hilsplat.segment.stage import run_masks
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float32, Int32, Int64, UInt8
+from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 
 from hilsplat.base.artifacts import read_full_index, read_into, read_npy
 from hilsplat.base.levels import Level
@@ -69,6 +69,10 @@ class Contributions:
     def means(self) -> Float32[np.ndarray, "N 3"]:
         """Centres of the Gaussians, scene units."""
         return read_npy(self.folder / "means.npy")
+
+    def centres(self) -> Float64[np.ndarray, "V 3"]:
+        """Centres of the cameras, scene units."""
+        return read_npy(self.folder / "centres.npy")
 
     def quadratic(self, threads: int = 1) -> Quadratic:
         """Map G, or the stacked weights if those are smaller."""

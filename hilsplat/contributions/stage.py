@@ -24,6 +24,7 @@ import scipy.sparse as sp
 from hilsplat.base.artifacts import (
     ViewCache,
     atomic_folder,
+    read_index,
     sha256_of_bytes,
     sha256_of_file,
     sha256_of_json,
@@ -35,7 +36,7 @@ from hilsplat.base.identity import code_digest
 from hilsplat.base.parallel import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.contributions.quadratic import Gram, StackedWeights
+from hilsplat.contributions.quadratic import Gram, Quadratic, StackedWeights
 from hilsplat.contributions.quadratic_builder import QuadraticBuilder, QuadraticCheckpoint
 from hilsplat.contributions.streams import ArrayStream, MatrixStream
 from hilsplat.contributions.view_matrices import MATRICES, label_maps, labelled_rows, view_contributions
@@ -104,7 +105,8 @@ def run_contributions(
         "gaussians": gaussians_sha256,
         "min_weight": settings.min_weight,
     }
-    cameras = [scene.cameras[name] for name in scene.views("train")]
+    names = digests if read_index(masks_folder).get("key_views") else scene.views("train")
+    cameras = [scene.cameras[name] for name in names]
     keys = [_key(camera, digests, about) for camera in cameras]
     store = ViewCache(Path(cache) / "contributions", compressed=False)
     checkpoint = QuadraticCheckpoint(store.folder / "partial", keys, settings.keep)
@@ -138,7 +140,8 @@ def run_contributions(
                 part = store.get(
                     keys[number], lambda: view_contributions(camera.name, weights(), masks, threads_each)
                 )
-                rows_of_W = labelled_rows(weights(), label_maps(masks)) if number >= summed else None
+                wanted = settings.keep != "none" and number >= summed
+                rows_of_W = labelled_rows(weights(), label_maps(masks)) if wanted else None
                 return _Prepared(masks, part, rows_of_W)
 
             prepared = in_order(prepare, range(len(cameras)), together)
@@ -164,18 +167,16 @@ def run_contributions(
                 fix="loosen masks.predicted_iou_min or masks.stability_min, then run the masks stage again",
             )
         np.save(folder / "means.npy", gaussians.means)
+        np.save(folder / "centres.npy", np.stack([camera.centre for camera in cameras]))
         write_npz(folder / "rows.npz", **{name: np.concatenate(values) for name, values in rows.items()})
-        quadratic = builder.finish()
-        kept = "G" if isinstance(quadratic, Gram) else "W"
-        quadratic.save(folder)
-        counts |= {
-            "views": len(cameras),
-            "masks": sum(len(part) for part in rows["view"]),
-            "kept": kept,
-            "nonzeros": quadratic.nonzeros,
-            "nonzeros of W": builder.weights_nonzeros,
-            "from_cache": store.hits,
-        }
+        counts |= {"views": len(cameras), "masks": sum(len(part) for part in rows["view"])}
+        nonzeros = {name: matrix.nonzeros for name, matrix in matrices.items()}
+        if settings.keep != "none":
+            quadratic = builder.finish()
+            quadratic.save(folder)
+            nonzeros |= {"W": builder.weights_nonzeros, _name(quadratic): quadratic.nonzeros}
+            counts |= {"kept": _name(quadratic), "nonzeros": quadratic.nonzeros}
+        counts["from_cache"] = store.hits
         write_index(
             folder,
             {
@@ -187,14 +188,14 @@ def run_contributions(
             gaussians_sha256=gaussians_sha256,
             min_weight=settings.min_weight,
             num_masks=counts["masks"],
-            quadratic=kept,
-            nonzeros={
-                **{name: matrix.nonzeros for name, matrix in matrices.items()},
-                "W": builder.weights_nonzeros,
-                kept: quadratic.nonzeros,
-            },
+            nonzeros=nonzeros,
         )
     checkpoint.forget()
+
+
+def _name(quadratic: Quadratic) -> str:
+    """Return the name of what was kept."""
+    return "G" if isinstance(quadratic, Gram) else "W"
 
 
 def _key(camera: Camera, digests: Mapping[str, str], about: dict) -> str:

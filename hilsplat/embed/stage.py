@@ -139,16 +139,13 @@ def chosen_masks(semantic_tree_folder: Path, per_node: int) -> dict[str, Int64[n
 
     Args:
         semantic_tree_folder: output of the semantic tree's stage.
-        per_node: the most crops of a node, by `crop_score`.
+        per_node: the most crops of a node, by rank.
     """
     path = Path(semantic_tree_folder) / "tree.npz"
-    arrays = read_npz(path, "linked_node", "crop_score")
-    node, score = arrays["linked_node"], arrays["crop_score"]
-    order = np.lexsort((-score, node))
-    first = np.searchsorted(node[order], node[order])
-    best = order[(np.arange(len(order)) - first < per_node) & (node[order] >= 0)]
-    is_chosen = np.zeros(len(node), np.bool_)
-    is_chosen[best if len(best) else slice(None)] = True
+    rank = read_npz(path, "crop_rank")["crop_rank"]
+    is_chosen = (rank >= 0) & (rank < per_node)
+    if not is_chosen.any():
+        is_chosen[:] = True
     counts = {view: entry["masks"] for view, entry in read_index(semantic_tree_folder)["views"].items()}
     ends = np.cumsum(list(counts.values()))
     return {

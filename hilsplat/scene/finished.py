@@ -5,9 +5,12 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from hilsplat.base.artifacts import provenance_path, read_json, sha256_of_file
+from hilsplat.base.artifacts import provenance_path, read_index, read_json, sha256_of_file
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.settings import EvaluateSettings, Section
+
+KEY_VIEWS = "key-views"
+"""Variant whose nodes answer while those of `default` are computed: masks of a part of the views."""
 
 logger = logging.getLogger(__name__)
 
@@ -60,7 +63,8 @@ class FinishedScene:
 
         Provenance names what a stage read; without it, a part is expected beside the artifact made from it.
         A variant that has no field was scored with another variant's, named in the provenance of its scores.
-        While the run goes on, CLIP vectors of the variant's own are enough.
+        While the run goes on, CLIP vectors of the variant's own are enough, and `default` falls back to those
+        of the key views, with a warning.
 
         Raises:
             ArtifactError: the folder, the variant or a part is missing.
@@ -84,6 +88,11 @@ class FinishedScene:
         if not field.exists():
             field = _recorded_input(folder / variant / "scores.csv", "field", folder) or field
         clip = folder / variant / "clip"
+        if variant == "default" and not (clip.exists() or field.exists()):
+            early = folder / KEY_VIEWS / "clip"
+            if early.exists():
+                clip = early
+                logger.warning("%s", refining(folder))
         autoencoder = None
         if field.exists():
             autoencoder = _input_of(field, "autoencoder", folder)
@@ -122,6 +131,13 @@ class FinishedScene:
                 self.folder,
             )
         return _section(EvaluateSettings, _recorded_settings(panel).get("evaluate", {}))
+
+
+def refining(folder: Path) -> str:
+    """Say how many photographs the answers of the key views come from."""
+    used = len(read_index(folder / KEY_VIEWS / "masks")["views"])
+    train = sum(entry["split"] == "train" for entry in read_index(folder / "scene")["views"].values())
+    return f"{folder.parent.name}/{folder.name} answers from {used} of {train} photographs until the run ends"
 
 
 def is_drawn(scene: Path) -> bool:

@@ -2,6 +2,7 @@
 
 import logging
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,8 +50,9 @@ def run_masks(
     settings: MasksSettings,
     threads: int,
     memory_mib: float | None = None,
+    key_views: Sequence[str] | None = None,
 ) -> None:
-    """Segment every training view at three levels.
+    """Segment training views at three levels.
 
     Args:
         scene_folder: the `Scene` artifact.
@@ -60,9 +62,10 @@ def run_masks(
         settings: which segmenter, and how.
         threads: views worked on at once, if they fit into the memory; the result does not depend on it.
         memory_mib: memory that the stage may use; None: what is free.
+        key_views: the views to segment; None: every training view.
     """
     scene = Scene.load(scene_folder)
-    views = train_views(scene)
+    views = train_views(scene) if key_views is None else list(key_views)
     view_cache = ViewCache(Path(cache) / "masks")
     with stage_log("masks", scene.name) as counts:
         if settings.segmenter == "sam":
@@ -96,7 +99,7 @@ def run_masks(
             for view, masks in zip(views, track(found, "masks of views", len(views)), strict=True):
                 masks.save(folder / f"{view}.npz")
                 index[view] = index_entry(masks)
-            write_index(folder, index, scene=scene.name, **identity)
+            write_index(folder, index, scene=scene.name, key_views=key_views is not None, **identity)
         total = {level.label: sum(entry[level.label] for entry in index.values()) for level in LEVELS}
         for level, number in total.items():
             if not number:

@@ -31,6 +31,7 @@ from hilsplat.base.progress import stage_log
 from hilsplat.contributions.rows import Contributions, mask_embeddings
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, require_same_masks
 from hilsplat.semantic_tree.boxes import node_boxes
+from hilsplat.semantic_tree.crops import crop_ranks
 from hilsplat.semantic_tree.export import readable_nodes
 from hilsplat.semantic_tree.level_nodes import level_nodes
 from hilsplat.semantic_tree.nodes import (
@@ -72,6 +73,7 @@ class SemanticTree:
         linked_node: node that each mask was linked into, -1 for none.
         crop_score: how well the crop of each mask shows the node that it was linked into: the root of its
             area times its IoU with the node in its view, px; 0 without a node.
+        crop_rank: order in which the crops of a node are embedded (`crops.crop_ranks`), -1 for none.
         view_area_px: pixels of its masks in each view.
         view_names: the columns of `view_area_px`.
         gaussians_sha256: digest of the PLY the tree belongs to.
@@ -91,6 +93,7 @@ class SemanticTree:
     node_of_mask: Int32[np.ndarray, " M"]
     linked_node: Int32[np.ndarray, " M"]
     crop_score: Float32[np.ndarray, " M"]
+    crop_rank: Int32[np.ndarray, " M"]
     view_area_px: Float32[np.ndarray, "T V"]
     view_names: tuple[str, ...]
     gaussians_sha256: str
@@ -170,6 +173,7 @@ def build_tree(
     S: sp.csr_matrix,
     mass: Float32[np.ndarray, "V N"],
     means: Float[np.ndarray, "N 3"],
+    centres: Float[np.ndarray, "V 3"],
     settings: SemanticTreeSettings,
     threads: int = 1,
     join_wholes: bool = False,
@@ -181,6 +185,7 @@ def build_tree(
         S: weight of each Gaussian in each raw mask, px.
         mass: visible mass of each Gaussian in each view, px.
         means: centres of the Gaussians, scene units.
+        centres: centres of the cameras, scene units.
         settings: thresholds.
         threads: number of threads for the evidence; results do not depend on it.
         join_wholes: the masks know no things: wholes are joined from nodes that touch in 3D.
@@ -233,6 +238,10 @@ def build_tree(
     if join_wholes:  # a mask of a piece fits no whole well, but shows it
         pieces = contributions.rows_of(Level.WHOLE)
         fits[pieces] = cluster_of_mask[pieces]
+    linked = cluster_of_mask.astype(np.int32)
+    towards = centres[contributions.view] - centroid[linked] if num else np.zeros((len(linked), 3))
+    towards = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+    score = score.astype(np.float32)
     return SemanticTree(
         level=levels,
         parent=parent,
@@ -245,8 +254,9 @@ def build_tree(
         node_of_gaussian=node_of_gaussian,
         membership=membership,
         node_of_mask=fits,
-        linked_node=cluster_of_mask.astype(np.int32),
-        crop_score=score.astype(np.float32),
+        linked_node=linked,
+        crop_score=score,
+        crop_rank=crop_ranks(linked, score, towards),
         view_area_px=view_area.astype(np.float32),
         view_names=contributions.views,
         gaussians_sha256=contributions.gaussians_sha256,
@@ -276,6 +286,7 @@ def run_semantic_tree(
             contributions.matrix("S"),
             contributions.mass(),
             contributions.means(),
+            contributions.centres(),
             settings,
             threads,
             join_wholes=read_full_index(masks_folder, "segmenter")["segmenter"] == "graph",

@@ -18,11 +18,16 @@ from hilsplat.base.files import project_path
 from hilsplat.configuration import SECTIONS, UPSTREAM, RunSettings, StageSettings, parse_run, require_known
 from hilsplat.methods.registry import METHODS, OURS, require_method
 from hilsplat.models.digests import model_digest
+from hilsplat.models.store import read_model
+from hilsplat.scene.finished import KEY_VIEWS
 from hilsplat.scene.sheet import GROUPS, PHOTOS, SceneRow, choose_scenes, read_sheet
 from hilsplat.workflow.jobs import Job, VariantJob, any_of, inert
 from hilsplat.workflow.models import check_device, check_models, describe_models, doubt_about_photographs
 from hilsplat.workflow.scene_data import SceneData, truth_argument
 from hilsplat.workflow.stages import stage_code
+
+LEAST_PHOTOGRAPHS = 16
+"""Scenes of fewer photographs have no key views: half of them would link few masks."""
 
 
 class Plan:
@@ -216,9 +221,30 @@ class Plan:
         return tuple(scope for scope in scopes_of(row) if scope in self.run.overrides)
 
     def masks_stage(self, job: VariantJob) -> str:
-        """Return the stage that makes the masks: the diagnostic segmenter is a separate one."""
-        diagnostic = self.stages(job).masks.segmenter == "truth-perturbed"
-        return "truth_masks" if diagnostic else "masks"
+        """Return the stage that makes the masks: the diagnostic segmenter and key views have their own."""
+        masks = self.stages(job).masks
+        if masks.segmenter == "truth-perturbed":
+            return "truth_masks"
+        return "key_masks" if masks.key_views < 1 else "masks"
+
+    def key_gaussians(self, job: VariantJob) -> list[str]:
+        """Input of masks: the Gaussians that choose the key views; empty if all views are segmented."""
+        return [self.path(job, "gaussians.ply")] if self.masks_stage(job) == "key_masks" else []
+
+    def first_answer(self, job: VariantJob) -> list[str]:
+        """Input of masks that is not read: what must answer before the masks of all views are computed.
+
+        It is the variant `key-views` of a scene of photographs whose masks take a real SAM minutes.
+        """
+        row, masks = self.row(job), self.stages(job).masks
+        if job.variant != "default" or row.group != PHOTOS or KEY_VIEWS not in self.run.variants:
+            return []
+        model = read_model(Path(masks.model)) if masks.segmenter == "sam" else None
+        files = self.data.image_files(job)
+        if model is None or model.embedded or len(files) < LEAST_PHOTOGRAPHS:
+            return []
+        own = SimpleNamespace(dataset=row.dataset, scene=row.scene, variant=KEY_VIEWS)
+        return [self.shared("clip", "clip")(own)]
 
     def masks_truth(self, job: VariantJob) -> list[str]:
         """Input of masks: the true labels, for the diagnostic segmenter only.
@@ -226,7 +252,7 @@ class Plan:
         Raises:
             SettingsError: it is chosen for a scene without true labels.
         """
-        if self.masks_stage(job) == "masks":
+        if self.masks_stage(job) != "truth_masks":
             return []
         row = self.row(job)
         if not row.world:
@@ -237,9 +263,11 @@ class Plan:
             )
         return self.data.truth(job)
 
-    def masks_truth_option(self, job: VariantJob, input: Any) -> str:
-        """Options of the diagnostic segmenter, if it is chosen."""
-        if self.masks_stage(job) == "masks":
+    def masks_option(self, job: VariantJob, input: Any) -> str:
+        """Options of key views or of the diagnostic segmenter, if they are chosen."""
+        if input.gaussians:
+            return f"--gaussians {shlex.quote(str(input.gaussians))}"
+        if self.masks_stage(job) != "truth_masks":
             return ""
         faults = self.stages(job).perturb.model_dump_json()
         return f"{truth_argument(input)} --perturb {shlex.quote(faults)}"

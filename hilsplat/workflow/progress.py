@@ -20,6 +20,7 @@ from rich.text import Text
 
 from hilsplat.base.artifacts import parse_json
 from hilsplat.base.progress import last_progress, warnings_in
+from hilsplat.scene.finished import KEY_VIEWS, refining
 from hilsplat.workflow.jobs import Job
 from hilsplat.workflow.resources import START_S, JobResources
 
@@ -143,6 +144,7 @@ class RunProgress:
         self.waiting = Counter[str]()
         self.running: dict[int, RunningJob] = {}
         self._hint_given = False
+        self._refined: set[str] = set()
 
     def begin(self, jobs: Mapping[str, int]) -> None:
         """Start a run with so many jobs of each rule."""
@@ -209,12 +211,24 @@ class RunProgress:
         return max(estimates.seconds(job.rule) / job.threads - elapsed, 0.1 * elapsed)
 
     def _hint(self, job: RunningJob) -> list[str]:
-        """Return the query commands when the nodes of a scene's tree have vectors; once in a run."""
-        if self._hint_given or job.rule != "clip" or job.wildcards.get("variant") != "default":
+        """Return the query commands when the nodes of a scene's tree have vectors; once in a run.
+
+        Key views answer first; the line after the rest is shorter.
+        """
+        variant = job.wildcards.get("variant")
+        if job.rule != "clip" or variant not in ("default", KEY_VIEWS):
+            return []
+        scene = f"{job.wildcards['dataset']}/{job.wildcards['scene']}"
+        commands = [] if self._hint_given else [f'  hilsplat query {scene} "..."', f"  hilsplat view {scene}"]
+        if variant == KEY_VIEWS and job.log is not None:
+            self._refined.add(scene)
+            commands = [refining(job.log.parents[2]), *commands]
+        elif scene in self._refined:
+            return [f"{scene} answers from all photographs"]
+        elif self._hint_given:
             return []
         self._hint_given = True
-        scene = f"{job.wildcards['dataset']}/{job.wildcards['scene']}"
-        return [f"{scene} is ready to query:", f'  hilsplat query {scene} "..."', f"  hilsplat view {scene}"]
+        return [f"{scene} is ready to query:", *commands]
 
 
 class ProgressDisplay:

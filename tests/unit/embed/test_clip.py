@@ -261,11 +261,7 @@ def test_only_the_best_crops_of_each_node_are_embedded_and_never_twice(red_scene
     scene, masks = red_scene
     tree = tmp_path / "semantic_tree"
     # Two views of two masks: the first masks show node 0, better in the second view; no node has the others.
-    write_npz(
-        tree / "tree.npz",
-        linked_node=np.array([0, -1, 0, -1], np.int32),
-        crop_score=np.array([1.0, 0, 2, 0], np.float32),
-    )
+    write_npz(tree / "tree.npz", crop_rank=np.array([1, -1, 0, -1], np.int32))
     write_index(tree, {view: {**entry, "masks": 2} for view, entry in read_index(masks)["views"].items()})
     settings, cache = ClipSettings(model=str(colour_clip), crops_per_node=1), tmp_path / "cache"
     run_clip(scene, masks, tree, tmp_path / "best", cache, settings, threads=1)
@@ -290,7 +286,7 @@ def test_only_the_best_crops_of_each_node_are_embedded_and_never_twice(red_scene
 def test_a_tree_without_nodes_chooses_every_mask(red_scene, tmp_path):
     _, masks = red_scene
     tree = tmp_path / "semantic_tree"
-    write_npz(tree / "tree.npz", linked_node=np.full(4, -1, np.int32), crop_score=np.zeros(4, np.float32))
+    write_npz(tree / "tree.npz", crop_rank=np.full(4, -1, np.int32))
     write_index(tree, {view: {"masks": 2} for view in read_index(masks)["views"]})
     assert [rows.tolist() for rows in chosen_masks(tree, 5).values()] == [[0, 1], [0, 1]]
 

@@ -141,6 +141,7 @@ def block_world(tmp_path_factory) -> BlockWorld:
         node_of_mask=np.arange(len(NODES), dtype=np.int32),
         linked_node=np.arange(len(NODES), dtype=np.int32),
         crop_score=np.ones(len(NODES), np.float32),
+        crop_rank=np.zeros(len(NODES), np.int32),
         view_area_px=np.array([[region(row).sum()] for row in range(len(NODES))], np.float32),
         view_names=("000.png",),
         gaussians_sha256="0",

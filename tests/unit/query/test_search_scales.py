@@ -38,6 +38,7 @@ def tree_of(levels: list[int], parents: list[int]) -> SemanticTree:
         node_of_mask=np.zeros(0, np.int32),
         linked_node=np.zeros(0, np.int32),
         crop_score=np.zeros(0, np.float32),
+        crop_rank=np.zeros(0, np.int32),
         view_area_px=np.ones((n, 1), np.float32),
         view_names=("a.png",),
         gaussians_sha256="",

@@ -152,11 +152,41 @@ def test_true_labels_reach_masks_of_the_diagnostic_segmenter_alone(tmp_path):
     truth = Job("synthetic", "one", "truth")
     assert found.masks_truth(Job("synthetic", "one")) == [] and found.masks_stage(truth) == "truth_masks"
     assert found.masks_truth(truth) == ["results/synthetic/one/world/truth"]
-    inputs = SimpleNamespace(truth=["inner/results/synthetic/one/world/truth"])
-    option = found.masks_truth_option(truth, inputs)
+    inputs = SimpleNamespace(truth=["inner/results/synthetic/one/world/truth"], gaussians=[])
+    option = found.masks_option(truth, inputs)
     assert option.startswith("--truth inner/results/synthetic/one/world/truth --perturb '{")
     with pytest.raises(SettingsError, match="photos/desk, variant truth: masks"):
         found.masks_truth(Job("photos", "desk", "truth"))
+
+
+def test_key_views_of_photographs_answer_before_a_real_sam_segments_the_others(tmp_path, monkeypatch):
+    for number in range(16):
+        (tmp_path / "desk").mkdir(exist_ok=True)
+        (tmp_path / f"desk/{number}.jpg").touch()
+    variants = {"key-views": {"masks": {"key_views": 0.5}}, "paper": {"autoencoder": {"targets": "mask"}}}
+    config = {"groups": ["photos", "benchmark"], "variants": variants, "main_variants": ["default"]}
+    found = plan(tmp_path, **config)
+    desk, key, one = Job("photos", "desk"), Job("photos", "desk", "key-views"), Job("synthetic", "one")
+    assert found.first_answer(desk) == []  # sam-tiny takes seconds
+
+    monkeypatch.setattr("hilsplat.workflow.plan.read_model", lambda folder: SimpleNamespace(embedded=False))
+    assert found.first_answer(desk) == ["results/photos/desk/key-views/clip"]
+    assert found.first_answer(key) == found.first_answer(one) == []
+    assert found.masks_stage(key) == "key_masks" and found.masks_stage(desk) == "masks"
+    assert found.key_gaussians(key) == ["results/photos/desk/gaussians.ply"]
+    assert found.key_gaussians(desk) == []
+    option = found.masks_option(key, SimpleNamespace(gaussians="inner/gaussians.ply", truth=[]))
+    assert option == "--gaussians inner/gaussians.ply"
+    assert plan(tmp_path, **(config | {"variants": {}})).first_answer(desk) == []
+
+
+def test_a_vector_per_mask_is_made_only_for_variants_whose_targets_are_masks(tmp_path):
+    found = plan(tmp_path, variants={"own": {"autoencoder": {"targets": "mask"}}}, main_variants=["default"])
+    default, own = Job("synthetic", "one"), Job("synthetic", "one", "own")
+    assert found.crops_tree(default) == ["results/synthetic/one/default/semantic_tree"]
+    assert found.crops_tree(own) == []
+    assert found.shared_variant("semantic_tree", own) == "default"
+    assert found.shared_variant("clip", own) == "own"
 
 
 def test_each_photograph_is_an_input_and_hidden_files_are_not(tmp_path):
@@ -313,7 +343,8 @@ def test_names_match_themselves_alone():
     assert some(["a", "b", "c", "d", "e"]) == "a, b, c and 2 more"
 
 
-READY = {"params.truth", "params.brought", "params.absent", "params.lens", "resources.mem_mib", "threads"}
+READY = {"params.truth", "params.option", "params.brought", "params.absent", "params.lens"}
+READY |= {"resources.mem_mib", "threads"}
 """What commands take unquoted: options that the plan has quoted, and numbers."""
 
 

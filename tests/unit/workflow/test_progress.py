@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from hilsplat.base.artifacts import write_index
 from hilsplat.base.progress import LOG_FORMAT, last_progress, warnings_in
 from hilsplat.workflow import progress
 from hilsplat.workflow.plan import Plan
@@ -96,10 +97,29 @@ def test_the_query_commands_are_printed_once(run):
     stream = io.StringIO()
     shown = display(run, stream)
     for _ in range(2):
-        start(shown, 2, "semantic_tree")
+        start(shown, 2, "clip")
         tell(shown, "job_finished", job_id=2)
     assert stream.getvalue().count("photos/desk is ready to query:") == 1
     assert stream.getvalue().count('hilsplat query photos/desk "..."') == 1
+
+
+def test_answers_of_key_views_are_announced_and_then_those_of_all(run, tmp_path):
+    scene = tmp_path / "photos/desk"
+    write_index(scene / "scene", {name: {"split": "test" if name == "c" else "train"} for name in "abc"})
+    write_index(scene / "key-views/masks", {"a": {}})
+    stream = io.StringIO()
+    shown = display(run, stream)
+    for number, variant in enumerate(("key-views", "default")):
+        start(shown, number, "clip", scene / variant / "logs/clip.log", variant)
+        tell(shown, "job_finished", job_id=number)
+    lines = stream.getvalue().splitlines()
+    assert lines[1:5] == [
+        "photos/desk is ready to query:",
+        "photos/desk answers from 1 of 2 photographs until the run ends",
+        '  hilsplat query photos/desk "..."',
+        "  hilsplat view photos/desk",
+    ]
+    assert lines[6:] == ["photos/desk answers from all photographs"]
 
 
 def test_errors_are_shown_in_full_and_a_retry_counts_once(run):

@@ -43,6 +43,7 @@ def tree_of(node_of_gaussian, level, parent) -> SemanticTree:
         node_of_mask=np.zeros(0, np.int32),
         linked_node=np.zeros(0, np.int32),
         crop_score=np.zeros(0, np.float32),
+        crop_rank=np.zeros(0, np.int32),
         view_area_px=np.ones((num, 1), np.float32),
         view_names=("000.png",),
         gaussians_sha256="",

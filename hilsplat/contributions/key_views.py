@@ -1,0 +1,92 @@
+"""Key views: training views that together see most of the scene. Their masks come first, and answer first."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from hilsplat.base.parallel import in_order
+from hilsplat.contributions.compositing import visible_mass
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.stage import run_masks, train_views
+from hilsplat.settings import MasksSettings
+from hilsplat.splat.ply import load_ply
+from hilsplat.splat.rasterise.api import pixel_weights
+
+SIDE_PX = 200
+"""Longer side of the pictures that visibility is measured in."""
+
+MIN_WEIGHT = 1 / 255
+"""Smaller weights of a Gaussian at a pixel don't count."""
+
+MIN_VISIBLE_PX = 0.02
+"""A view sees a Gaussian whose visible mass there exceeds this: 0.3 px in a view of 800 px."""
+
+
+def run_key_masks(
+    scene_folder: Path,
+    gaussians_ply: Path,
+    out: Path,
+    cache: Path,
+    settings: MasksSettings,
+    threads: int,
+    memory_mib: float | None = None,
+) -> None:
+    """Segment the key views alone; see `segment.stage.run_masks`.
+
+    Args:
+        gaussians_ply: the scene's Gaussians, which choose the views.
+    """
+    views = key_views(Scene.load(scene_folder), gaussians_ply, settings.key_views, threads)
+    run_masks(scene_folder, out, cache, settings, threads, memory_mib, views)
+
+
+def key_views(scene: Scene, gaussians_ply: Path, share: float, threads: int = 1) -> list[str]:
+    """Choose training views one by one, each for the Gaussians that it adds.
+
+    A Gaussian counts by its mean visible mass, and half as much with each chosen view that sees it, so views
+    cover the scene before they repeat.
+
+    Args:
+        scene: its cameras; images are not read.
+        gaussians_ply: the scene's Gaussians.
+        share: of the training views, rounded up.
+        threads: views rendered at once; the result does not depend on it.
+
+    Returns:
+        The chosen views in camera order.
+
+    Raises:
+        SceneError: there is no training view.
+    """
+    names, gaussians = train_views(scene), load_ply(gaussians_ply)
+
+    def mass(name: str) -> np.ndarray:
+        camera = scene.cameras[name]
+        scale = min(1.0, SIDE_PX / max(camera.size_hw))
+        height, width = (max(1, round(side * scale)) for side in camera.size_hw)
+        return visible_mass(pixel_weights(gaussians, camera.scaled((height, width)), min_weight=MIN_WEIGHT))
+
+    masses = np.stack(list(in_order(mass, names, threads)))
+    seen = masses > MIN_VISIBLE_PX
+    importance = np.where(seen, masses, 0).sum(axis=0, dtype=np.float64) / np.maximum(seen.sum(axis=0), 1)
+    chosen = most_covering(seen, importance, math.ceil(share * len(names)))
+    return [names[number] for number in sorted(chosen)]
+
+
+def most_covering(seen: Bool[np.ndarray, "V N"], worth: Float64[np.ndarray, " N"], number: int) -> list[int]:
+    """Choose rows greedily by the worth of what they see; each sighting halves what a column is worth.
+
+    Returns:
+        The rows in the order of their choice; the first of equal ones.
+    """
+    worth = worth.copy()
+    chosen: list[int] = []
+    for _ in range(number):
+        gains = seen @ worth
+        gains[chosen] = -1
+        best = int(gains.argmax())
+        chosen.append(best)
+        worth[seen[best]] /= 2
+    return chosen
