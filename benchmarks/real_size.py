@@ -119,27 +119,37 @@ def export_sam2(out: Path) -> None:
 
 
 def export_clip(out: Path) -> None:
-    """The picture network of a CLIP B/16 of random weights."""
+    """A CLIP B/16 of random weights in the layout of the Hugging Face ONNX exports.
+
+    Its tokenizer knows letters alone; the table of tokens has its real size.
+    """
     import torch
     import transformers
+    from optimum.exporters.onnx import main_export
+    from transformers.models.clip.tokenization_clip import bytes_to_unicode
+
+    from hilsplat.models.clip_split import split_whole
 
     torch.manual_seed(0)
+    torch_folder = out / "torch"
+    torch_folder.mkdir(parents=True)
+    letters = list(bytes_to_unicode().values())
+    words = [*letters, *(f"{letter}</w>" for letter in letters), "<|startoftext|>", "<|endoftext|>"]
+    files = [torch_folder / name for name in ("vocab.json", "merges.txt")]
+    files[0].write_text(json.dumps({word: number for number, word in enumerate(words)}))
+    files[1].write_text("#version: 0.2\n")
+    tokenizer = transformers.CLIPTokenizerFast(*map(str, files), model_max_length=77)
+    first, last = len(words) - 2, len(words) - 1
+    tokens = {"bos_token_id": first, "eos_token_id": last, "pad_token_id": last}
+    text = transformers.CLIPTextConfig(**tokens)
     vision = transformers.CLIPVisionConfig(
         hidden_size=768, intermediate_size=3072, num_hidden_layers=12, num_attention_heads=12, patch_size=16
     )
-    model = transformers.CLIPVisionModelWithProjection(vision).eval()
-    out.mkdir(parents=True, exist_ok=True)
-    batch = {"pixel_values": {0: "batch"}, "image_embeds": {0: "batch"}}
-    torch.onnx.export(
-        model,
-        (torch.zeros(2, 3, 224, 224),),
-        str(out / "vision_model.onnx"),
-        input_names=["pixel_values"],
-        output_names=["image_embeds", "last_hidden_state"],
-        dynamic_axes=batch,
-        opset_version=18,
-        dynamo=False,
-    )
+    model = transformers.CLIPModel(transformers.CLIPConfig(text.to_dict(), vision.to_dict())).eval()
+    model.save_pretrained(torch_folder)
+    transformers.CLIPProcessor(transformers.CLIPImageProcessor(), tokenizer).save_pretrained(torch_folder)
+    main_export(str(torch_folder), output=out, task="feature-extraction", do_validation=False)
+    split_whole(out)
 
 
 def measure(step: str, models: Path, photograph: Path, points: int) -> dict[str, float]:

@@ -10,6 +10,7 @@ from typing import no_type_check
 import numpy as np
 
 from hilsplat.base.compiled import compiled
+from hilsplat.base.lane_products import MOST_ROWS, WIDE_COLUMNS, rows_of_products
 from hilsplat.base.lanes import (
     WIDTH,
     exp2_negative,
@@ -28,6 +29,8 @@ from hilsplat.base.lanes import (
 LEAST = np.float32(-126)
 """Lowest exponent of a normal float32."""
 
+one_row, three_rows, four_rows, six_rows, seven_rows, eight_rows = map(rows_of_products, (1, 3, 4, 6, 7, 8))
+
 ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 
 
@@ -40,55 +43,32 @@ def multiply(y, y0, y_step, a, a0, a_step, x, x0, x_step, rows, inner, columns, 
         y, a, x: flat arrays, each with the place of its first number and the step from row to row.
         rows, inner, columns: sizes; columns are a multiple of 16.
     """
-    for c in range(0, columns, WIDTH):
+    c = 0
+    while c < columns:
+        wide = c + WIDE_COLUMNS <= columns
         r = 0
-        while r + 6 <= rows:
-            to, of = y0 + r * y_step + c, a0 + r * a_step
-            if begin:
-                s0 = s1 = s2 = s3 = s4 = s5 = lanes(ZERO)
-            else:
-                s0, s1, s2 = load(y, to), load(y, to + y_step), load(y, to + 2 * y_step)
-                s3, s4, s5 = load(y, to + 3 * y_step), load(y, to + 4 * y_step), load(y, to + 5 * y_step)
-            for k in range(inner):
-                v = load(x, x0 + k * x_step + c)
-                s0 = s0 + load_same(a, of + k) * v
-                s1 = s1 + load_same(a, of + a_step + k) * v
-                s2 = s2 + load_same(a, of + 2 * a_step + k) * v
-                s3 = s3 + load_same(a, of + 3 * a_step + k) * v
-                s4 = s4 + load_same(a, of + 4 * a_step + k) * v
-                s5 = s5 + load_same(a, of + 5 * a_step + k) * v
-            store(y, to, s0)
-            store(y, to + y_step, s1)
-            store(y, to + 2 * y_step, s2)
-            store(y, to + 3 * y_step, s3)
-            store(y, to + 4 * y_step, s4)
-            store(y, to + 5 * y_step, s5)
-            r += 6
-        while r + 4 <= rows:
-            to, of = y0 + r * y_step + c, a0 + r * a_step
-            if begin:
-                s0 = s1 = s2 = s3 = lanes(ZERO)
-            else:
-                s0, s1 = load(y, to), load(y, to + y_step)
-                s2, s3 = load(y, to + 2 * y_step), load(y, to + 3 * y_step)
-            for k in range(inner):
-                v = load(x, x0 + k * x_step + c)
-                s0 = s0 + load_same(a, of + k) * v
-                s1 = s1 + load_same(a, of + a_step + k) * v
-                s2 = s2 + load_same(a, of + 2 * a_step + k) * v
-                s3 = s3 + load_same(a, of + 3 * a_step + k) * v
-            store(y, to, s0)
-            store(y, to + y_step, s1)
-            store(y, to + 2 * y_step, s2)
-            store(y, to + 3 * y_step, s3)
-            r += 4
         while r < rows:
-            to, of = y0 + r * y_step + c, a0 + r * a_step
-            s0 = lanes(ZERO) if begin else load(y, to)
-            for k in range(inner):
-                s0 = s0 + load_same(a, of + k) * load(x, x0 + k * x_step + c)
-            store(y, to, s0)
-            r += 1
+            left = rows - r
+            to, of, at = y0 + r * y_step + c, a0 + r * a_step, x0 + c
+            if left >= 8 and MOST_ROWS == 8:
+                eight_rows(y, to, y_step, a, of, a_step, x, at, x_step, inner, begin, wide)
+                r += 8
+            elif left == 7 and MOST_ROWS == 8:
+                seven_rows(y, to, y_step, a, of, a_step, x, at, x_step, inner, begin, wide)
+                r += 7
+            elif left == 6 or left > 8:
+                six_rows(y, to, y_step, a, of, a_step, x, at, x_step, inner, begin, wide)
+                r += 6
+            elif left >= 4:
+                four_rows(y, to, y_step, a, of, a_step, x, at, x_step, inner, begin, wide)
+                r += 4
+            elif left == 3:
+                three_rows(y, to, y_step, a, of, a_step, x, at, x_step, inner, begin, wide)
+                r += 3
+            else:
+                one_row(y, to, y_step, a, of, a_step, x, at, x_step, inner, begin, wide)
+                r += 1
+        c += WIDE_COLUMNS if wide else WIDTH
 
 
 @compiled
@@ -124,8 +104,8 @@ def by_head(y, y0, a, a0, x, x0, heads, rows, inner, columns, x_step, x_head, y_
 @no_type_check
 def multiply_below(y, y_step, a, a0, x, rows, columns):
     """`multiply` with the lower triangle of a square matrix, added to `y`."""
-    for r in range(0, rows, 6):
-        many = min(6, rows - r)
+    for r in range(0, rows, MOST_ROWS):
+        many = min(MOST_ROWS, rows - r)
         multiply(y, r * y_step, y_step, a, a0 + r * rows, rows, x, 0, y_step, many, r + many, columns, False)
 
 

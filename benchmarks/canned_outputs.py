@@ -1,0 +1,87 @@
+"""Masks of the graph segmenter in place of what a SAM of random weights returns, after its networks ran."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+
+from hilsplat.base.levels import Level
+from hilsplat.segment.graph import segment_graph
+from hilsplat.segment.sam import HEADS, Encoded, SamModel, in_input
+
+SCALES = (0.1, 0.03, 0.006)
+"""Segments of about 300 masks per photograph."""
+
+LOW_PX, SLOPE, REACH_PX = 256, 5.0, 8.0
+"""Side of SAM's masks, slope of the logits at a border per pixel, and where they level off."""
+
+
+class Regions:
+    """Logits of the regions of one image, in the frame of the network's masks."""
+
+    def __init__(self, image: np.ndarray, encoded: Encoded) -> None:
+        masks, frame = segment_graph(image, SCALES, 16), encoded.frame
+        height, width = (side * LOW_PX // frame.padded_hw[0] for side in frame.resized_hw)
+        self.scale = LOW_PX / frame.padded_hw[0]
+        self.labels = []
+        for level in HEADS:
+            low = np.full((LOW_PX, LOW_PX), -1, np.int32)
+            whole = masks.label_map(Level(level)).astype(np.float32)
+            low[:height, :width] = cv2.resize(whole, (width, height), interpolation=cv2.INTER_NEAREST)
+            self.labels.append(low)
+        self._known: dict[tuple[int, int], np.ndarray] = {}
+
+    def logits(self, points: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
+        """Predicted IoUs (P, 3) and logits (P, 3, h, w) of the regions at points of the network's input."""
+        at = np.minimum((points * self.scale).astype(int), LOW_PX - 1)
+        out = np.empty((len(points), len(HEADS), LOW_PX // step, LOW_PX // step), np.float32)
+        score = np.full((len(points), len(HEADS)), 0.05, np.float32)
+        for row, (x, y) in enumerate(at):
+            for head, labels in enumerate(self.labels):
+                label = int(labels[y, x])
+                # a prompt in the middle of its region is surest of it
+                field = self._field(head, label)
+                out[row, head] = field[::step, ::step]
+                if label >= 0:
+                    score[row, head] = 0.9 + 0.05 * np.tanh(field[y, x] / (SLOPE * REACH_PX))
+        return score, out
+
+    def _field(self, head: int, label: int) -> np.ndarray:
+        if (head, label) not in self._known:
+            inside = (self.labels[head] == label).astype(np.uint8)
+            if label < 0:
+                self._known[head, label] = np.full(inside.shape, -SLOPE * REACH_PX, np.float32)
+            else:
+                near = cv2.distanceTransform(inside, cv2.DIST_L2, 3)
+                far = cv2.distanceTransform(1 - inside, cv2.DIST_L2, 3)
+                self._known[head, label] = SLOPE * np.clip(near - far, -REACH_PX, REACH_PX)
+        return self._known[head, label]
+
+
+def replace_outputs(model: type[SamModel]) -> None:
+    """Let a `SamModel` run its networks and return canned masks."""
+    encode, decode, preview, finish = model.encode, model.decode, model.preview, model.finish
+
+    def canned_encode(self: Any, image: np.ndarray) -> Encoded:
+        encoded = encode(self, image)
+        encoded.features["canned"] = Regions(image, encoded)  # type: ignore[index]
+        return encoded
+
+    def canned_decode(self: Any, encoded: Encoded, points_xy: np.ndarray) -> Any:
+        decode(self, encoded, points_xy)
+        return encoded.features["canned"].logits(in_input(points_xy, encoded.frame), 1)  # type: ignore[attr-defined]
+
+    def canned_preview(self: Any, encoded: Encoded, points_xy: np.ndarray) -> Any:
+        _, _, kept = preview(self, encoded, points_xy)
+        points = in_input(points_xy, encoded.frame)
+        return *encoded.features["canned"].logits(points, 4), {**kept, "canned": points}  # type: ignore[attr-defined]
+
+    def canned_finish(self: Any, encoded: Encoded, prompts: Any) -> Any:
+        if "canned" not in prompts:
+            return canned_decode(self, encoded, prompts["points"])
+        finish(self, encoded, prompts)
+        return encoded.features["canned"].logits(prompts["canned"], 1)  # type: ignore[attr-defined]
+
+    changed = {"encode": canned_encode, "decode": canned_decode}
+    for name, function in (changed | {"preview": canned_preview, "finish": canned_finish}).items():
+        setattr(model, name, function)

@@ -1,0 +1,150 @@
+"""Seconds from photographs to answers with a real SAM and CLIP, by a complete run on two cores. By hand:
+
+    python -m benchmarks.rehearsal FOLDER                          # SAM 2.1 small, CLIP B/16, settings of a user
+    python -m benchmarks.rehearsal FOLDER --sam base --precision fp32
+
+Networks of random weights at their real size (`real_size`) cost what trained ones cost, but a random SAM is
+sure of no mask. Its networks run in full, and their masks are then replaced by regions of the graph segmenter
+at each prompt (`canned_outputs`), so that everything after them does real work. FOLDER becomes a project with
+one scene; a FOLDER of an earlier rehearsal is refused, since its caches would answer.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from benchmarks.real_size import PHOTOGRAPHS, SIZES, export_clip, export_sam, export_sam2
+
+PROJECT = Path(__file__).resolve().parents[1]
+SCENE = "photos/rehearsal"
+READY, COMPLETE = "is ready to query", "answers from all photographs"
+
+PATCH = """
+import importlib.abc, importlib.util, sys
+
+class Finder(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name != "hilsplat.segment.sam":
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.util.find_spec(name)
+        load = spec.loader.exec_module
+        def exec_module(module):
+            load(module)
+            from benchmarks.canned_outputs import replace_outputs
+            replace_outputs(module.SamModel)
+        spec.loader.exec_module = exec_module
+        return spec
+
+sys.meta_path.insert(0, Finder())
+"""
+"""`sitecustomize.py` of every process of the run: SAM gets canned outputs when it is imported."""
+
+
+def make_models(store: Path, sam: str) -> dict[str, Path]:
+    """Export the networks that are missing, each in a process of its own: exporters keep gigabytes."""
+    wanted = {f"sam-{sam}": "sam", "clip": "clip"}
+    for name in wanted:
+        if not (store / name / "config.json").is_file():
+            words = [sys.executable, "-m", "benchmarks.rehearsal", str(store), "--export", name]
+            subprocess.run(words, env={**os.environ, "HF_HUB_OFFLINE": "1"}, check=True)
+    return {kind: store / name for name, kind in wanted.items()}
+
+
+def export(store: Path, name: str) -> None:
+    """Export one model into a store."""
+    if name == "clip":
+        export_clip(store / name)
+    elif name == "sam-sam2.1-small":
+        export_sam2(store / name)
+    else:
+        export_sam(name.removeprefix("sam-"), store / name)
+
+
+def make_project(folder: Path, models: dict[str, Path], precision: str) -> list[str]:
+    """A project with links to the code and the models; returns the options of its run."""
+    for name in ("Snakefile", "workflow", "rules", "profiles"):
+        (folder / name).symlink_to(PROJECT / name)
+    shutil.copytree(PROJECT / "config", folder / "config")
+    (folder / "models").mkdir()
+    for name in ("sam-tiny", "clip-tiny"):
+        (folder / "models" / name).symlink_to(PROJECT / "models" / name)
+    for kind, place in models.items():
+        (folder / "models" / f"rehearsal-{kind}").symlink_to(place.resolve())
+    (folder / "patch").mkdir()
+    (folder / "patch/sitecustomize.py").write_text(PATCH)
+    if precision == "auto":
+        return []
+    fixed = {"overrides": {"photos": {kind: {"precision": precision} for kind in ("masks", "clip")}}}
+    (folder / "precision.yaml").write_text(json.dumps(fixed))
+    return ["--config", "precision.yaml"]
+
+
+def rehearse(folder: Path, photographs: Path, options: list[str], cores: int) -> dict[str, float]:
+    """Run the project; seconds from `hilsplat new` to each announcement, and to the end."""
+    environment = {**os.environ, "PYTHONPATH": f"{folder / 'patch'}:{PROJECT}"}
+    begin, found = time.monotonic(), {}
+    command = [sys.executable, "-m", "hilsplat"]
+    name = SCENE.partition("/")[2]
+    subprocess.run([*command, "new", name, str(photographs)], cwd=folder, env=environment, check=True)
+    run = [*command, "run", SCENE, *options, "--", "--cores", str(cores)]
+    with subprocess.Popen(
+        run, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            now = time.monotonic() - begin
+            print(f"{now:6.0f} s  {line}", end="", flush=True)
+            for what, words in (("first answer", READY), ("final tree", COMPLETE)):
+                if words in line:
+                    found.setdefault(what, now)
+    found["end"] = time.monotonic() - begin
+    if process.returncode:
+        sys.exit("the run failed")
+    return found
+
+
+def stage_table(folder: Path) -> str:
+    """Seconds, processor seconds and peak memory of every job, from Snakemake's benchmark files."""
+    lines = [f"{'job':32} {'s':>6} {'core s':>7} {'peak MiB':>9}"]
+    for path in sorted((folder / "results" / SCENE).rglob("benchmarks/*.jsonl"), key=os.path.getmtime):
+        row = json.loads(path.read_text().splitlines()[-1])
+        job = "/".join([*path.relative_to(folder / "results" / SCENE).parts[:-2], path.stem])
+        lines.append(f"{job:32} {row['s']:6.0f} {row['cpu_time']:7.0f} {row['max_rss']:9.0f}")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Export, lay the project out, run it, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("folder", type=Path, help="folder to make")
+    parser.add_argument("photographs", type=Path, nargs="?", default=PHOTOGRAPHS)
+    parser.add_argument("--sam", choices=[*SIZES, "sam2.1-small"], default="sam2.1-small")
+    parser.add_argument("--precision", choices=["auto", "fp32"], default="auto")
+    parser.add_argument(
+        "--models", type=Path, default=Path("results/.cache/real-size"), help="exported models"
+    )
+    parser.add_argument("--cores", type=int, default=2)
+    parser.add_argument("--export", help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    if asked.export:
+        export(asked.folder, asked.export)
+        return
+    if asked.folder.exists():
+        sys.exit(f"{asked.folder} exists; name a new folder, since its caches would answer")
+    models = make_models(asked.models.resolve(), asked.sam)
+    asked.folder.mkdir(parents=True)
+    folder = asked.folder.resolve()
+    options = make_project(folder, models, asked.precision)
+    found = rehearse(folder, asked.photographs.resolve(), options, asked.cores)
+    print(stage_table(folder))
+    print(", ".join(f"{what} after {seconds:.0f} s" for what, seconds in found.items()))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,86 @@
+"""Products of a few rows with sixteen or thirty-two columns, all sums in registers."""
+
+from typing import Any
+
+from llvmlite import binding, ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from hilsplat.base.lanes import WIDTH
+
+_VECTOR = ir.VectorType(ir.FloatType(), WIDTH)
+_ZERO = ir.Constant(_VECTOR, [ir.Constant(ir.FloatType(), 0.0)] * WIDTH)
+_FIRST = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
+
+_HAS_AVX512 = bool(binding.get_host_cpu_features().get("avx512f"))
+"""Then a core has 32 registers of 16 numbers, otherwise 16 of 8 or fewer."""
+
+MOST_ROWS = 8 if _HAS_AVX512 else 6
+WIDE_COLUMNS = 2 * WIDTH if _HAS_AVX512 else WIDTH
+"""Rows and columns whose sums fit into the registers."""
+
+
+def rows_of_products(rows: int) -> Any:
+    """Make the function that computes y[r, c] = sum over k of a[r, k] x[k, c] for a fixed number of rows.
+
+    A number of `x` is loaded once for all rows, and one of `a` once for all columns. Sums run in the order of
+    k. A loop in numba spills sums to memory if there are as many as this.
+
+    Returns:
+        a function of (y, y0, y_step, a, a0, a_step, x, x0, x_step, inner, begin, wide) for numba: flat
+        float32 arrays, each with the place of its first number and the step from row to row; the number of
+        products; whether y starts at zero; whether there are `WIDE_COLUMNS` columns or `WIDTH`.
+    """
+
+    @intrinsic
+    def add_products(typingctx, y, y0, y_step, a, a0, a_step, x, x0, x_step, inner, begin, wide):
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            y_data, a_data, x_data = (
+                context.make_array(sig.args[k])(context, builder, args[k]).data for k in (0, 3, 6)
+            )
+            (y_first, y_next), (a_first, a_next), (x_first, x_next) = args[1:3], args[4:6], args[7:9]
+            many, from_zero, both = args[9:]
+
+            def vectors(data: Any, start: Any, count: int) -> list[Any]:
+                places = [builder.add(start, ir.Constant(start.type, k * WIDTH)) for k in range(count)]
+                return [builder.bitcast(builder.gep(data, [at]), _VECTOR.as_pointer()) for at in places]
+
+            def emit(count: int) -> None:
+                starts, row = [a_first], y_first
+                sums: list[Any] = []
+                targets: list[Any] = []
+                for _ in range(rows):
+                    targets += vectors(y_data, row, count)
+                    row = builder.add(row, y_next)
+                    starts.append(builder.add(starts[-1], a_next))
+                for target in targets:
+                    before = builder.select(from_zero, _ZERO, builder.load(target, align=4))
+                    sums.append(cgutils.alloca_once_value(builder, before))
+                with cgutils.for_range(builder, many) as loop:
+                    at = builder.add(x_first, builder.mul(loop.index, x_next))
+                    loaded = [builder.load(each, align=4) for each in vectors(x_data, at, count)]
+                    for number, total in enumerate(sums):
+                        place = builder.add(starts[number // count], loop.index)
+                        factor = builder.load(builder.gep(a_data, [place]))
+                        undefined = ir.Constant(_VECTOR, ir.Undefined)
+                        one = builder.insert_element(undefined, factor, ir.Constant(ir.IntType(32), 0))
+                        same = builder.shuffle_vector(one, undefined, _FIRST)
+                        product = builder.fmul(same, loaded[number % count], flags=("contract",))
+                        added = builder.fadd(builder.load(total), product, flags=("contract",))
+                        builder.store(added, total)
+                for target, total in zip(targets, sums, strict=True):
+                    builder.store(builder.load(total), target, align=4)
+
+            with builder.if_else(both) as (then, otherwise):
+                with then:
+                    emit(WIDE_COLUMNS // WIDTH)
+                with otherwise:
+                    emit(1)
+            return context.get_dummy_value()
+
+        arguments = (y, y0, y_step, a, a0, a_step, x, x0, x_step, inner)
+        numbers = (types.intp if isinstance(each, types.Integer) else each for each in arguments)
+        return types.void(*numbers, types.boolean, types.boolean), codegen
+
+    return add_products
