@@ -1,6 +1,6 @@
 """Seconds from photographs to answers with a real SAM and CLIP, by a complete run on two cores. By hand:
 
-    python -m benchmarks.rehearsal FOLDER                          # SAM 2.1 small, CLIP B/16, settings of a user
+    python -m benchmarks.rehearsal FOLDER                       # SAM 2.1 small, CLIP B/16, settings of a user
     python -m benchmarks.rehearsal FOLDER --sam base --precision fp32
 
 Networks of random weights at their real size (`real_size`) cost what trained ones cost, but a random SAM is
