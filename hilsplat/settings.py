@@ -193,6 +193,12 @@ class MasksSettings(Section):
         gt=0,
         le=1,
     )
+    prompts: Literal["grid", "guided"] = knob(
+        "grid",
+        "points of views after the key views; grid: as everywhere; guided: the nodes of the key views, and "
+        "grid points that none explains",
+        origin="SAM, LangSplat: grid",
+    )
     points_per_side: int = knob(32, "point prompts per image side", ge=1, le=128, origin="LangSplat: 32")
     points_per_batch: Annotated[int, Field(ge=1, le=4096)] | Auto = knob(
         "auto",

@@ -3,7 +3,9 @@ rule masks:
     input:
         scene="<results>/{dataset}/{scene}/scene",
         truth=PLAN.masks_truth,  # empty, except for the diagnostic segmenter
-        gaussians=PLAN.key_gaussians,  # empty, except for key views
+        gaussians=PLAN.key_gaussians,  # empty, except for key views and guided prompts
+        key_masks=lambda wildcards: PLAN.key_parts(wildcards, "masks"),
+        key_tree=lambda wildcards: PLAN.key_parts(wildcards, "semantic_tree"),
         first=ancient(PLAN.first_answer),  # not read
     output:
         masks=directory("<results>/{dataset}/{scene}/{variant}/masks"),

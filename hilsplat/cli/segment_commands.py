@@ -31,7 +31,13 @@ def masks(
         Path | None, typer.Option(help="truth folder, for the segmenter truth-perturbed only")
     ] = None,
     gaussians: Annotated[
-        Path | None, typer.Option(help="PLY that chooses the views, for masks.key_views below 1 only")
+        Path | None, typer.Option(help="PLY for key views (masks.key_views below 1) or guided prompts")
+    ] = None,
+    key_masks: Annotated[
+        Path | None, typer.Option(help="masks of the key views, for masks.prompts: guided")
+    ] = None,
+    semantic_tree: Annotated[
+        Path | None, typer.Option(help="tree of the key views, for masks.prompts: guided")
     ] = None,
     perturb: Annotated[str, typer.Option(help="faults of truth-perturbed, as JSON")] = "{}",
     cache: Cache = DEFAULT_CACHE,
@@ -62,6 +68,13 @@ def masks(
             from hilsplat.contributions.key_views import run_key_masks
 
             run_key_masks(scene, gaussians, out, cache, section, threads, memory)
+        return
+    if gaussians and key_masks and semantic_tree:
+        inputs |= {"gaussians": gaussians, "key_masks": key_masks, "semantic_tree": semantic_tree}
+        with stage("guided_masks", out, settings=section, threads=threads, inputs=inputs):
+            from hilsplat.semantic_tree.guided_masks import run_guided_masks
+
+            run_guided_masks(scene, gaussians, key_masks, semantic_tree, out, cache, section, threads, memory)
         return
     with stage("masks", out, settings=section, threads=threads, inputs=inputs):
         from hilsplat.segment.stage import run_masks

@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.query.view_nodes import ViewNodes
 from hilsplat.query.view_store import ViewStore
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree
+from hilsplat.semantic_tree.view_nodes import ViewNodes
 
 MIN_SHOWN_SHARE = 1e-4
 """Least share of a view that shows a node: 14 px of 384 x 384 show nothing."""

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Int8, Int32, Int64, UInt8
+from jaxtyping import Float, Float32, Int8, Int32, Int64, UInt8
 
-from hilsplat.base.artifacts import sha256_of_json
+from hilsplat.base.artifacts import sha256_of_bytes, sha256_of_json
 from hilsplat.base.identity import code_digest
 from hilsplat.segment.logit_kernels import edge_windows
 from hilsplat.segment.masks import join_rows
@@ -108,7 +108,12 @@ def crop_boxes(
     return np.array(boxes, dtype=np.int32), np.array(layer_of, dtype=np.uint8)
 
 
-def candidates_key(image_sha256: str, model: SamModel, settings: MasksSettings) -> str:
+def candidates_key(
+    image_sha256: str,
+    model: SamModel,
+    settings: MasksSettings,
+    points: Float[np.ndarray, "P 2"] | None = None,
+) -> str:
     """Cache key of a view's candidates: everything that `decode_candidates` depends on."""
     thresholds = model.thresholds(settings)
     return sha256_of_json(
@@ -117,6 +122,7 @@ def candidates_key(image_sha256: str, model: SamModel, settings: MasksSettings) 
             "model": model.digest,
             "providers": model.encoder.providers,
             "points_per_side": settings.points_per_side,
+            "points": None if points is None else sha256_of_bytes(points.tobytes()),
             "points_per_batch": model.prompts_per_call(
                 thresholds.points_per_batch, settings.points_per_side**2
             ),
@@ -144,9 +150,18 @@ def needs_full_size(settings: MasksSettings) -> bool:
 
 
 def decode_candidates(
-    image: UInt8[np.ndarray, "H W 3"], model: SamModel, settings: MasksSettings
+    image: UInt8[np.ndarray, "H W 3"],
+    model: SamModel,
+    settings: MasksSettings,
+    points: Float[np.ndarray, "P 2"] | None = None,
 ) -> Candidates:
-    """Prompt the network at every grid point of the image and of its crops, or at those worth it."""
+    """Prompt the network at every grid point of the image and of its crops, or at those worth it.
+
+    Args:
+        image: the view.
+        model, settings: what decodes it, and how.
+        points: at least one point (x, y, px) in place of the grid on the whole image; crops keep the grid.
+    """
     boxes, _ = crop_boxes((image.shape[0], image.shape[1]), settings.crop_layers)
     grid = point_grid(settings.points_per_side)
     thresholds = model.thresholds(settings)
@@ -154,7 +169,8 @@ def decode_candidates(
     parts = []
     for crop, (left, top, right, bottom) in enumerate(boxes):
         encoded = model.encode(np.ascontiguousarray(image[top:bottom, left:right]))
-        prompts: Prompts = {"points": grid * (right - left, bottom - top)}
+        own = grid * (right - left, bottom - top) if points is None or crop else points
+        prompts: Prompts = {"points": own}
         if uses_preview(model, settings):
             prompts = distinct_prompts(encoded, prompts, model, settings, batch)
         for asked, number in calls(prompts, batch):

@@ -2,9 +2,12 @@
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from jaxtyping import Float
 
 from hilsplat.base.artifacts import (
     ViewCache,
@@ -51,6 +54,7 @@ def run_masks(
     threads: int,
     memory_mib: float | None = None,
     key_views: Sequence[str] | None = None,
+    prompts: Callable[[str], np.ndarray | None] = lambda view: None,
 ) -> None:
     """Segment training views at three levels.
 
@@ -63,6 +67,7 @@ def run_masks(
         threads: views worked on at once, if they fit into the memory; the result does not depend on it.
         memory_mib: memory that the stage may use; None: what is free.
         key_views: the views to segment; None: every training view.
+        prompts: points (x, y, px) that SAM is prompted at in a view; None: the grid of the settings.
     """
     scene = Scene.load(scene_folder)
     views = train_views(scene) if key_views is None else list(key_views)
@@ -84,7 +89,7 @@ def run_masks(
             logger.info("masks %s: %d views at once, %.0f MiB each", scene.name, threads, needs.view_mib)
 
             def segment(view: str) -> HierarchicalMasks:
-                return sam_masks(scene, view, model, view_cache, settings)
+                return sam_masks(scene, view, model, view_cache, settings, prompts(view))
 
         else:
             logger.info("masks %s: graph segmenter, without a model; levels are three scales", scene.name)
@@ -108,11 +113,16 @@ def run_masks(
 
 
 def sam_masks(
-    scene: Scene, view: str, model: SamModel, cache: ViewCache, settings: MasksSettings
+    scene: Scene,
+    view: str,
+    model: SamModel,
+    cache: ViewCache,
+    settings: MasksSettings,
+    points: Float[np.ndarray, "P 2"] | None = None,
 ) -> HierarchicalMasks:
     """One view's masks by SAM; the networks run only if the view is not in the cache."""
-    key = candidates_key(sha256_of_file(scene.image_path(view)), model, settings)
-    arrays = cache.get(key, lambda: decode_candidates(scene.image(view), model, settings).arrays())
+    key = candidates_key(sha256_of_file(scene.image_path(view)), model, settings, points)
+    arrays = cache.get(key, lambda: decode_candidates(scene.image(view), model, settings, points).arrays())
     return masks_from_candidates(Candidates(**arrays), scene.cameras[view].size_hw, model, settings)
 
 

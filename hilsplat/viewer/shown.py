@@ -222,7 +222,7 @@ class ShownScene:
     def warm_up(self) -> None:
         """Compile the loops of drawing, picking and masks: nobody waits for them once the page is open."""
         from hilsplat.contributions.compositing import normalised_weights
-        from hilsplat.query.view_nodes import ViewNodes
+        from hilsplat.semantic_tree.view_nodes import ViewNodes
         from hilsplat.splat.rasterise.api import pixel_weights
         from hilsplat.viewer.frames import painted
         from hilsplat.viewer.picking import pick

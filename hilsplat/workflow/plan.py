@@ -225,11 +225,19 @@ class Plan:
         masks = self.stages(job).masks
         if masks.segmenter == "truth-perturbed":
             return "truth_masks"
-        return "key_masks" if masks.key_views < 1 else "masks"
+        if masks.key_views < 1:
+            return "key_masks"
+        return "guided_masks" if masks.prompts == "guided" and self.first_answer(job) else "masks"
 
     def key_gaussians(self, job: VariantJob) -> list[str]:
-        """Input of masks: the Gaussians that choose the key views; empty if all views are segmented."""
-        return [self.path(job, "gaussians.ply")] if self.masks_stage(job) == "key_masks" else []
+        """Input of masks: the Gaussians that choose the key views, or that prompts are projected by."""
+        needed = self.masks_stage(job) in ("key_masks", "guided_masks")
+        return [self.path(job, "gaussians.ply")] if needed else []
+
+    def key_parts(self, job: VariantJob, stage: str) -> list[str]:
+        """Input of masks: masks or semantic tree of the key views, if they guide the prompts."""
+        own = SimpleNamespace(dataset=job.dataset, scene=job.scene, variant=KEY_VIEWS)
+        return [self.shared(stage, stage)(own)] if self.masks_stage(job) == "guided_masks" else []
 
     def first_answer(self, job: VariantJob) -> list[str]:
         """Input of masks that is not read: what must answer before the masks of all views are computed.
@@ -266,7 +274,12 @@ class Plan:
     def masks_option(self, job: VariantJob, input: Any) -> str:
         """Options of key views or of the diagnostic segmenter, if they are chosen."""
         if input.gaussians:
-            return f"--gaussians {shlex.quote(str(input.gaussians))}"
+            named = {
+                "gaussians": input.gaussians,
+                "key-masks": input.key_masks,
+                "semantic-tree": input.key_tree,
+            }
+            return " ".join(f"--{name} {shlex.quote(str(path))}" for name, path in named.items() if path)
         if self.masks_stage(job) != "truth_masks":
             return ""
         faults = self.stages(job).perturb.model_dump_json()

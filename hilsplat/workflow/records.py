@@ -85,6 +85,8 @@ def expected_artifacts(plan: Plan) -> dict[str, Expected]:
                 if stage == "masks" and plan.masks_stage(job) == "truth_masks":
                     both = {name: plan.values(name, job) for name in ("masks", "perturb")}
                     add("masks", "truth_masks", job, seed=settings.perturb.seed, settings=both)
+                elif stage == "masks":
+                    add("masks", plan.masks_stage(job), job, settings=plan.values("masks", job))
                 elif stage == "field" and settings.method.name != OURS:
                     add("field.safetensors", "method", job, seed=seed, plugins=plan.baseline(job))
                 elif stage == "field":

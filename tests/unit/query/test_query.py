@@ -15,11 +15,11 @@ from hilsplat.field.language_field import LanguageField
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.look_up_kernels import fill_maps
 from hilsplat.query.node_search import ancestor_margins, automatic_level, best_nodes, search
-from hilsplat.query.view_nodes import ViewNodes
 from hilsplat.query.view_store import ViewStore
 from hilsplat.scene.finished import FinishedScene, require_same
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree, run_semantic_tree
+from hilsplat.semantic_tree.view_nodes import ViewNodes
 from hilsplat.settings import AutoencoderSettings, EvaluateSettings, FieldSettings, SemanticTreeSettings
 from tests.unit.round_gaussians import round_gaussians
 from tests.unit.two_boxes_world import (

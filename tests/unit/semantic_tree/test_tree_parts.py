@@ -7,10 +7,10 @@ from plyfile import PlyData
 
 from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import MisalignedArtifactError
-from hilsplat.query.view_nodes import ViewNodes
 from hilsplat.semantic_tree.boxes import OrientedBox, oriented_box
 from hilsplat.semantic_tree.export import write_selection_ply, write_tree_ply
 from hilsplat.semantic_tree.nodes import nest_nodes, renumbered_without_empty
+from hilsplat.semantic_tree.view_nodes import ViewNodes
 from hilsplat.splat.ply import load_ply, save_ply
 from tests.unit.round_gaussians import round_gaussians
 

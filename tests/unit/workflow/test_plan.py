@@ -175,8 +175,13 @@ def test_key_views_of_photographs_answer_before_a_real_sam_segments_the_others(t
     assert found.masks_stage(key) == "key_masks" and found.masks_stage(desk) == "masks"
     assert found.key_gaussians(key) == ["results/photos/desk/gaussians.ply"]
     assert found.key_gaussians(desk) == []
-    option = found.masks_option(key, SimpleNamespace(gaussians="inner/gaussians.ply", truth=[]))
-    assert option == "--gaussians inner/gaussians.ply"
+    inputs = SimpleNamespace(gaussians="inner/gaussians.ply", key_masks=[], key_tree=[], truth=[])
+    assert found.masks_option(key, inputs) == "--gaussians inner/gaussians.ply"
+    guided = plan(tmp_path, **config, masks={"prompts": "guided"})
+    assert guided.masks_stage(desk) == "guided_masks" and guided.masks_stage(one) == "masks"
+    assert guided.key_parts(desk, "masks") == ["results/photos/desk/key-views/masks"]
+    assert guided.key_parts(desk, "semantic_tree") == ["results/photos/desk/key-views/semantic_tree"]
+    assert guided.key_parts(one, "masks") == found.key_parts(desk, "masks") == []
     assert plan(tmp_path, **(config | {"variants": {}})).first_answer(desk) == []
 
 

@@ -12,6 +12,7 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float32, Int32, Int64
 
 from hilsplat.base.compiled import compiled
+from hilsplat.base.levels import NONE
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,13 @@ class ViewNodes:
         out = np.zeros(len(self.covered), np.bool_)
         _mask(self.indptr, self.nodes, self.shares, chosen, out)
         return out
+
+    def labels(self, size_hw: tuple[int, int]) -> Int32[np.ndarray, "H W"]:
+        """Node that makes up more than half of each pixel, -1 for none."""
+        out = np.full(len(self.covered), NONE, np.int32)
+        most = np.flatnonzero(self.shares > 0.5)
+        out[np.searchsorted(self.indptr, most, side="right") - 1] = self.nodes[most]
+        return out.reshape(size_hw)
 
 
 @compiled

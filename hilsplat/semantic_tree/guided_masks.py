@@ -1,0 +1,99 @@
+"""Masks of the views after the key views, prompted once at each node and on the grid only elsewhere."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int32
+from scipy.ndimage import find_objects
+
+from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.contributions.compositing import normalised_weights
+from hilsplat.scene.finished import require_same
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.digests import digests_in
+from hilsplat.segment.sam import point_grid
+from hilsplat.segment.stage import run_masks
+from hilsplat.semantic_tree.tree import SemanticTree
+from hilsplat.semantic_tree.view_nodes import ViewNodes
+from hilsplat.settings import MasksSettings
+from hilsplat.splat.ply import load_ply
+from hilsplat.splat.rasterise.api import pixel_weights
+
+
+def run_guided_masks(
+    scene_folder: Path,
+    gaussians_ply: Path,
+    key_masks_folder: Path,
+    semantic_tree_folder: Path,
+    out: Path,
+    cache: Path,
+    settings: MasksSettings,
+    threads: int,
+    memory_mib: float | None = None,
+) -> None:
+    """Segment every training view (`segment.stage.run_masks`), all but the key views with guided prompts.
+
+    Departs: SAM and LangSplat prompt a grid in every view (docs/experiments.md has what that gains).
+
+    Args:
+        gaussians_ply: the scene's Gaussians.
+        key_masks_folder: masks of the key views, which were prompted on the grid.
+        semantic_tree_folder: the tree of those masks.
+
+    Raises:
+        MisalignedArtifactError: the tree was made for other Gaussians.
+    """
+    scene, tree, gaussians = (
+        Scene.load(scene_folder),
+        SemanticTree.load(semantic_tree_folder),
+        load_ply(gaussians_ply),
+    )
+    require_same("semantic tree", scene.name, gaussians_ply, tree.gaussians_sha256)
+    key_views = digests_in(key_masks_folder)
+    grid = point_grid(settings.points_per_side)
+
+    def points(view: str) -> np.ndarray | None:
+        if view in key_views:
+            return None
+        camera = scene.cameras[view]
+        weights = normalised_weights(pixel_weights(gaussians, camera, min_weight=tree.min_weight))
+        labels = {
+            level: ViewNodes.of(weights, tree.node_of_gaussian[:, level.index]).labels(camera.size_hw)
+            for level in LEVELS
+        }
+        return guided_points(labels, grid, settings.min_area_px)
+
+    run_masks(scene_folder, out, cache, settings, threads, memory_mib, prompts=points)
+
+
+def guided_points(
+    labels: dict[Level, Int32[np.ndarray, "H W"]], grid: Float[np.ndarray, "G 2"], min_area_px: int
+) -> Float[np.ndarray, "P 2"]:
+    """Return a prompt in the middle of each node, and the grid points that no part or subpart explains.
+
+    Args:
+        labels: node that each pixel shows at each level, -1 for none.
+        grid: points of the unit square (x, y).
+        min_area_px: smaller regions get no prompt.
+
+    Returns:
+        points (x, y), px; the middle is the pixel farthest from the region's border.
+    """
+    found = []
+    for node_of_pixel in labels.values():
+        for number, place in enumerate(find_objects(node_of_pixel + 1)):
+            if place is None:
+                continue
+            region = node_of_pixel[place] == number
+            if region.sum() < min_area_px:
+                continue
+            depth = cv2.distanceTransform(np.pad(region, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+            y, x = np.unravel_index(depth.argmax(), depth.shape)
+            found.append((place[1].start + x + 0.5, place[0].start + y + 0.5))
+    height, width = labels[Level.WHOLE].shape
+    on_grid = grid * (width, height)
+    x, y = on_grid.astype(np.int64).T
+    unexplained = (labels[Level.PART][y, x] == NONE) & (labels[Level.SUBPART][y, x] == NONE)
+    points = np.concatenate([np.array(found, np.float64).reshape(-1, 2), on_grid[unexplained]])
+    return points if len(points) else on_grid
