@@ -125,7 +125,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="folder to make")
     parser.add_argument("photographs", type=Path, nargs="?", default=PHOTOGRAPHS)
     parser.add_argument("--sam", choices=[*SIZES, "sam2.1-small"], default="sam2.1-small")
-    parser.add_argument("--precision", choices=["auto", "fp32"], default="auto")
+    parser.add_argument("--precision", choices=["auto", "fp32", "int8"], default="auto")
     parser.add_argument(
         "--models", type=Path, default=Path("results/.cache/real-size"), help="exported models"
     )

@@ -187,6 +187,11 @@ class MasksSettings(Section):
         "ending of the networks' names, such as fp16 for vision_encoder_fp16.onnx; empty: the plain names",
         pattern=r"^[A-Za-z0-9_.-]*$",
     )
+    precision: Literal["auto", "fp32", "int8"] = knob(
+        "auto",
+        "arithmetic of the encoder; auto: int8 on a CPU if it agrees with fp32 on the scene's photographs, "
+        "never for the embedded model",
+    )
     key_views: float = knob(
         1.0,
         "share of the training views that get masks; below 1, those that together see most of the Gaussians",
@@ -326,6 +331,11 @@ class CoverageTreeSettings(Section):
 class ClipSettings(Section):
     """CLIP vectors of masks, and of the nodes that they show."""
 
+    precision: Literal["auto", "fp32", "int8"] = knob(
+        "auto",
+        "arithmetic of the network of pictures; auto: int8 on a CPU if it agrees with fp32 on crops of the "
+        "scene, never for the embedded model",
+    )
     crops: Literal["auto", "nodes", "masks"] = knob(
         "auto",
         "which masks get a vector; nodes: the crops that show each node best; masks: all; auto: all if "

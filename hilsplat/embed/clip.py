@@ -35,7 +35,10 @@ class ClipModel:
         digest: SHA-256 of the model's files.
         side_px: side of the square crops the vision network takes.
         max_tokens: longest text the text network takes; None if the folder names no limit.
+        precision: "fp32" or "int8", of pictures.
     """
+
+    precision: str = "fp32"
 
     def __init__(self, model: ModelFolder, threads: int = 1, template: str = "{}") -> None:
         self.model = model
@@ -83,6 +86,10 @@ class ClipModel:
         numbers = opened.declared_axis(vector, 1), self.text.declared_axis(self.words, 1)
         require_one_space(self.model.folder, *numbers)
         return opened
+
+    def use_int8(self, network: Network) -> None:
+        """Embed pictures by the int8 version of their network from now on."""
+        self.__dict__["vision"], self.precision = network, "int8"
 
     def _pad_id(self, text_config: dict[str, Any]) -> int:
         """Token that fills a text up: what the tokenizer names, else its configuration, else the model's."""
@@ -168,21 +175,22 @@ class ClipModel:
         chosen = range(len(masks)) if rows is None else rows.tolist()
 
         def embed(start: int) -> np.ndarray:
-            crops = []
-            for row in chosen[start : start + settings.batch]:
-                # Only the box is unpacked: a photograph may have 40 million pixels.
-                x0, y0, x1, y1 = box = tuple(masks.box_xyxy[row].tolist())
-                inside = masks.window(row, box)
-                box_image, as_langsplat = image[y0:y1, x0:x1], settings.crop == "langsplat"
-                crops.append(
-                    crop_to_square(box_image, inside, settings.background, self.side_px, as_langsplat)
-                )
-            return self.embed_crops(np.stack(crops))
+            batch = chosen[start : start + settings.batch]
+            return self.embed_crops(np.stack([self.crop(image, masks, row, settings) for row in batch]))
 
         parts = list(in_order(embed, range(0, len(chosen), settings.batch), self.threads))
         if not parts:
             return np.zeros((0, self.width), dtype=np.float16)
         return np.concatenate(parts).astype(np.float16)
+
+    def crop(
+        self, image: UInt8[np.ndarray, "H W 3"], masks: HierarchicalMasks, row: int, settings: ClipSettings
+    ) -> UInt8[np.ndarray, "side side 3"]:
+        """Cut out a mask; only its box is unpacked, since a photograph may have 40 million pixels."""
+        x0, y0, x1, y1 = box = tuple(masks.box_xyxy[row].tolist())
+        as_langsplat = settings.crop == "langsplat"
+        inside = masks.window(row, box)
+        return crop_to_square(image[y0:y1, x0:x1], inside, settings.background, self.side_px, as_langsplat)
 
     def embed_texts(self, texts: list[str]) -> Float32[np.ndarray, "T C"]:
         """Unit vectors of texts, in order, each inserted into the template.

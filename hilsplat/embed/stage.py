@@ -1,6 +1,7 @@
 """The stage `clip`: CLIP vectors of the crops that show each node best, or of all masks."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from hilsplat.base.artifacts import (
     atomic_folder,
     read_index,
     read_npz,
+    sha256_of_bytes,
     sha256_of_file,
     sha256_of_json,
     write_index,
@@ -21,7 +23,15 @@ from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.identity import code_digest
 from hilsplat.base.parallel import in_order
 from hilsplat.base.progress import stage_log, track
-from hilsplat.embed.clip import ClipModel
+from hilsplat.embed.clip import ClipModel, unit
+from hilsplat.models.int8 import (
+    CHECKED_CROPS,
+    WORDS,
+    Agreement,
+    agreement_of_vectors,
+    int8_network,
+    may_be_int8,
+)
 from hilsplat.models.memory import available_mib, needs_of
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks, require_same_masks
@@ -59,11 +69,20 @@ def run_clip(
     scene = Scene.load(scene_folder)
     digests = digests_in(masks_folder)
     views = list(digests)
+    strangers = sorted(set(views) - set(scene.views("train")))
+    if strangers:
+        raise MisalignedArtifactError(
+            f"masks in {masks_folder} do not belong to the training views of {scene.name}",
+            expected=f"only masks of its {len(scene.views('train'))} training views",
+            found=", ".join(strangers[:5]),
+            fix="run the masks stage again for this scene",
+        )
     chosen = None
     if semantic_tree_folder is not None:
         require_same_masks(semantic_tree_folder, masks_folder)
         chosen = chosen_masks(semantic_tree_folder, settings.crops_per_node)
     model = ClipModel.load(Path(settings.model), variant=settings.variant)
+    _choose_precision(model, scene, masks_folder, chosen, Path(cache) / "int8", settings, threads)
     needs = needs_of(model.model, settings.batch)
     threads = needs.views_at_once(threads, min(memory_mib or math.inf, available_mib()))
     view_cache = ViewCache(Path(cache) / "clip")
@@ -74,6 +93,7 @@ def run_clip(
                 "image": sha256_of_file(scene.image_path(view)),
                 "masks": digests[view],
                 "model": model.digest,
+                "precision": model.precision,
                 "providers": model.vision.providers,
                 "settings": settings.model_dump(include={"crop", "background", "batch"}),
                 "code": code_digest(ClipModel),
@@ -100,14 +120,6 @@ def run_clip(
         vectors[rows] = known[rows]
         return vectors
 
-    strangers = sorted(set(views) - set(scene.views("train")))
-    if strangers:
-        raise MisalignedArtifactError(
-            f"masks in {masks_folder} do not belong to the training views of {scene.name}",
-            expected=f"only masks of its {len(scene.views('train'))} training views",
-            found=", ".join(strangers[:5]),
-            fix="run the masks stage again for this scene",
-        )
     with stage_log("clip", scene.name) as counts, atomic_folder(out) as folder:
         index: dict[str, dict[str, Any]] = {}
         made = in_order(embed, views, threads)
@@ -123,6 +135,7 @@ def run_clip(
             model=settings.model,
             model_variant=settings.variant,
             model_sha256=model.digest,
+            precision=model.precision,
             background=settings.background,
         )
         counts.update(
@@ -132,6 +145,49 @@ def run_clip(
             dim=model.width,
             from_cache=view_cache.hits,
         )
+
+
+def _choose_precision(
+    model: ClipModel,
+    scene: Scene,
+    masks_folder: Path,
+    chosen: Mapping[str, Int64[np.ndarray, " m"]] | None,
+    cache: Path,
+    settings: ClipSettings,
+    threads: int,
+) -> None:
+    """Let the model use int8 if the settings say so, or if it agrees with float32 on crops of the scene."""
+    if settings.precision == "fp32" or not may_be_int8(model.model):
+        return
+    digests = digests_in(masks_folder)
+    entries = read_index(masks_folder)["views"]
+    rows = chosen or {view: np.arange(entries[view]["whole"]) for view in digests}
+    places = [(view, row) for view in digests for row in rows[view].tolist()]
+    places = places[:: max(1, len(places) // CHECKED_CROPS)][:CHECKED_CROPS]
+    if not places:
+        return
+
+    def crop(place: tuple[str, int]) -> np.ndarray:
+        view, row = place
+        return model.crop(scene.image(view), load_masks(masks_folder, view, digests), row, settings)
+
+    crops = np.stack([crop(place) for place in places])
+    quantised = int8_network(model.model, "vision_model", cache)
+
+    def measure() -> Agreement:
+        pixels = next(iter(model.vision.spec.inputs))
+
+        def both(one: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return model.embed_crops(one[None]), unit(quantised(**{pixels: model.prepare(one[None])})[0])
+
+        full, found = (
+            np.concatenate(each) for each in zip(*in_order(both, list(crops), threads), strict=True)
+        )
+        return agreement_of_vectors(full, found, model.embed_texts(list(WORDS)))
+
+    inputs = {"model": model.digest, "crops": sha256_of_bytes(crops.tobytes()), "words": WORDS}
+    if Agreement.remembered(cache, inputs, measure).decide(settings.precision, "CLIP"):
+        model.use_int8(quantised)
 
 
 def chosen_masks(semantic_tree_folder: Path, per_node: int) -> dict[str, Int64[np.ndarray, " m"]]:

@@ -120,6 +120,7 @@ def candidates_key(
         {
             "image": image_sha256,
             "model": model.digest,
+            "precision": model.precision,
             "providers": model.encoder.providers,
             "points_per_side": settings.points_per_side,
             "points": None if points is None else sha256_of_bytes(points.tobytes()),

@@ -6,7 +6,7 @@ exports are read here. The rounding of logits (`read_logits`) is ours.
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -16,9 +16,12 @@ import numpy as np
 from jaxtyping import Float, Float32, Int8, Int32, Int64, UInt8
 from PIL import Image
 
+from hilsplat.base.artifacts import sha256_of_bytes
 from hilsplat.base.errors import ModelError
 from hilsplat.base.levels import Level
+from hilsplat.base.parallel import in_order
 from hilsplat.models.folder import ModelFolder, open_model_folder, side_px
+from hilsplat.models.int8 import CHECKED_GRID, Agreement, agreement_of_masks, int8_network, may_be_int8
 from hilsplat.models.layouts import DECODER, PREVIEW
 from hilsplat.models.network import Network, execution_providers, require_three_heads
 from hilsplat.models.onnx_graph import with_rowwise_attention
@@ -122,7 +125,10 @@ class SamModel:
         previewer: the decoder at half the resolution (`layouts.PREVIEW`), if the model has one.
         factored: the decoder with the same results in a fraction of the time, if the model allows it.
         as_exported: whether the encoder or the decoder runs as it was exported, which takes more memory.
+        precision: "fp32" or "int8", of the encoder.
     """
+
+    precision: str = "fp32"
 
     own: Thresholds = REAL_SAM
     stretches: bool = False
@@ -135,7 +141,7 @@ class SamModel:
         self.own = own_thresholds(model)
         self.stretches = model.layout == "sam2"
         self.digest = model.digest
-        graph = self._rowwise_encoder()
+        self._graph = graph = self._rowwise_encoder()
         self.encoder = model.network("vision_encoder", graph=graph)
         self.decoder = model.network(DECODER)
         if PREVIEW in model.networks:
@@ -155,6 +161,41 @@ class SamModel:
         if self.previewer is None and self.decoder.providers[0] == "CPUExecutionProvider":
             self.factored = self._factor()
         self.as_exported = self.factored is None or (graph is None and not self.stretches)
+
+    def choose_precision(
+        self, precision: str, images: Sequence[UInt8[np.ndarray, "H W 3"]], cache: Path, threads: int = 1
+    ) -> None:
+        """Use int8 if the settings say so, or if masks of these images agree with those by float32.
+
+        Args:
+            precision: `masks.precision`.
+            images: photographs of the scene.
+            cache: folder of int8 networks.
+            threads: images at once.
+        """
+        if precision == "fp32" or not may_be_int8(self.model):
+            return
+        exact = [name for name in self.encoder.outputs if name == "image_positional_embeddings"]
+        quantised = int8_network(self.model, "vision_encoder", cache, self._graph, exact)
+        grid = point_grid(CHECKED_GRID)
+        batch = self.prompts_per_call(self.own.points_per_batch, len(grid))
+
+        def masks(work: tuple[np.ndarray, Network]) -> np.ndarray:
+            image, encoder = work
+            encoded, points = self.encode(image, encoder), grid * (image.shape[1], image.shape[0])
+            starts = range(0, len(grid), batch)
+            logits = [self.decode(encoded, points[start : start + batch])[1] for start in starts]
+            return np.concatenate([each.reshape(-1, *each.shape[2:]) > 0 for each in logits])
+
+        def measure() -> Agreement:
+            work = [(image, encoder) for encoder in (self.encoder, quantised) for image in images]
+            found = list(in_order(masks, work, threads))
+            halves = found[: len(images)], found[len(images) :]
+            return agreement_of_masks(*(np.concatenate(half) for half in halves))
+
+        inputs = {"model": self.digest, "images": [sha256_of_bytes(image.tobytes()) for image in images]}
+        if Agreement.remembered(cache, inputs, measure).decide(precision, "SAM's encoder"):
+            self.encoder, self.precision = quantised, "int8"
 
     def _rowwise_encoder(self) -> bytes | None:
         """Change a ViT's global attentions for the CPU; None if the encoder is another, or a GPU runs it."""
@@ -233,11 +274,11 @@ class SamModel:
         padded[0, :, : resized[0], : resized[1]] = values.transpose(2, 0, 1)
         return padded, frame
 
-    def encode(self, image: UInt8[np.ndarray, "H W 3"]) -> Encoded:
-        """Run the vision encoder."""
+    def encode(self, image: UInt8[np.ndarray, "H W 3"], encoder: Network | None = None) -> Encoded:
+        """Run the vision encoder, or a version of it."""
         pixels, frame = self.prepare(image)
         names = self.encoder.spec.outputs
-        features = dict(zip(names, self.encoder(pixel_values=pixels), strict=True))
+        features = dict(zip(names, (encoder or self.encoder)(pixel_values=pixels), strict=True))
         return Encoded(features, frame, self.factored.image(features) if self.factored else None)
 
     def prompts_per_call(self, wanted: int, asked: int) -> int:

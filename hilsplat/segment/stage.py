@@ -21,6 +21,7 @@ from hilsplat.base.identity import code_digest
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.parallel import in_order
 from hilsplat.base.progress import stage_log, track
+from hilsplat.models.int8 import CHECKED_VIEWS
 from hilsplat.models.memory import available_mib, needs_of
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.candidates import Candidates, candidates_key, decode_candidates
@@ -75,10 +76,14 @@ def run_masks(
     with stage_log("masks", scene.name) as counts:
         if settings.segmenter == "sam":
             model = SamModel.load(Path(settings.model), settings.variant)
+            every = train_views(scene)  # the same ones whichever views are segmented
+            checked = [scene.image(view) for view in every[:: max(1, len(every) // CHECKED_VIEWS)]]
+            model.choose_precision(settings.precision, checked[:CHECKED_VIEWS], Path(cache) / "int8", threads)
             identity: dict[str, str | None] = {
                 "segmenter": "sam",
                 "model": settings.model,
                 "model_sha256": model.digest,
+                "precision": model.precision,
             }
 
             batch = model.prompts_per_call(

@@ -70,7 +70,7 @@ def run_guided_masks(
 def guided_points(
     labels: dict[Level, Int32[np.ndarray, "H W"]], grid: Float[np.ndarray, "G 2"], min_area_px: int
 ) -> Float[np.ndarray, "P 2"]:
-    """Return a prompt in the middle of each node, and the grid points that no part or subpart explains.
+    """Return a prompt in the middle of each node, and the grid points that no subpart explains.
 
     Args:
         labels: node that each pixel shows at each level, -1 for none.
@@ -94,6 +94,6 @@ def guided_points(
     height, width = labels[Level.WHOLE].shape
     on_grid = grid * (width, height)
     x, y = on_grid.astype(np.int64).T
-    unexplained = (labels[Level.PART][y, x] == NONE) & (labels[Level.SUBPART][y, x] == NONE)
+    unexplained = labels[Level.SUBPART][y, x] == NONE
     points = np.concatenate([np.array(found, np.float64).reshape(-1, 2), on_grid[unexplained]])
     return points if len(points) else on_grid

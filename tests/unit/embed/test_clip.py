@@ -263,7 +263,8 @@ def test_only_the_best_crops_of_each_node_are_embedded_and_never_twice(red_scene
     # Two views of two masks: the first masks show node 0, better in the second view; no node has the others.
     write_npz(tree / "tree.npz", crop_rank=np.array([1, -1, 0, -1], np.int32))
     write_index(tree, {view: {**entry, "masks": 2} for view, entry in read_index(masks)["views"].items()})
-    settings, cache = ClipSettings(model=str(colour_clip), crops_per_node=1), tmp_path / "cache"
+    cache = tmp_path / "cache"
+    settings = ClipSettings(model=str(colour_clip), crops_per_node=1, precision="fp32")
     run_clip(scene, masks, tree, tmp_path / "best", cache, settings, threads=1)
     found = [read_npy(tmp_path / "best" / f"{view}.png.npy").tolist() for view in (0, 1)]
     assert found == [[[0, 0, 0], [0, 0, 0]], [[1, 0, 0], [0, 0, 0]]]
@@ -289,6 +290,39 @@ def test_a_tree_without_nodes_chooses_every_mask(red_scene, tmp_path):
     write_npz(tree / "tree.npz", crop_rank=np.full(4, -1, np.int32))
     write_index(tree, {view: {"masks": 2} for view in read_index(masks)["views"]})
     assert [rows.tolist() for rows in chosen_masks(tree, 5).values()] == [[0, 1], [0, 1]]
+
+
+@pytest.mark.parametrize(("largest", "precision"), [(1.0, "int8"), (1e4, "fp32")])
+def test_int8_is_used_only_if_it_agrees_on_crops_of_the_scene(
+    red_scene, colour_clip, tmp_path, largest, precision, caplog
+):
+    scene, masks = red_scene
+    # int8 has 127 steps up to the largest weight of an output, here of a pixel that is black in every crop:
+    # all others vanish if it is ten thousand times as large.
+    weights = np.random.default_rng(0).uniform(0.1, 1, (48, 3)).astype(np.float32)
+    weights[16:] *= -1
+    weights[47] = largest
+    value = helper.make_tensor_value_info
+    save(
+        colour_clip / "vision_model.onnx",
+        [
+            helper.make_node("Flatten", ["pixel_values"], ["flat"], name="flatten"),
+            helper.make_node("MatMul", ["flat", "weights"], ["image_embeds"], name="product"),
+        ],
+        [value("pixel_values", TensorProto.FLOAT, ["batch", 3, 4, 4])],
+        [value("image_embeds", TensorProto.FLOAT, ["batch", 3])],
+        {"weights": weights},
+    )
+    settings = ClipSettings(model=str(colour_clip))
+    with caplog.at_level("INFO"):
+        run_clip(scene, masks, None, tmp_path / "auto", tmp_path / "cache", settings, threads=1)
+    assert read_index(tmp_path / "auto")["precision"] == precision
+    assert f"CLIP runs in {'int8' if precision == 'int8' else 'float32'}" in caplog.text
+    always = settings.model_copy(update={"precision": "fp32"})
+    run_clip(scene, masks, None, tmp_path / "full", tmp_path / "cache", always, threads=1)
+    assert read_index(tmp_path / "full")["precision"] == "fp32"
+    same = sha256_of_path(tmp_path / "auto") == sha256_of_path(tmp_path / "full")
+    assert same == (precision == "fp32")
 
 
 def test_masks_of_other_views_are_refused(red_scene, colour_clip, tmp_path):

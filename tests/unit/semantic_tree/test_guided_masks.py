@@ -12,15 +12,13 @@ from hilsplat.semantic_tree.view_nodes import ViewNodes
 def test_each_node_is_prompted_in_its_middle_and_the_grid_only_where_nothing_is_explained():
     whole, part, subpart = (np.full((8, 12), -1, np.int32) for _ in range(3))
     whole[:, :] = 0
-    part[1:6, 1:6] = 1  # its middle is pixel (3, 3)
-    subpart[6:8, 10:12] = 4  # 4 px: too small for a prompt, and still explains
+    part[6:8, 10:12] = 1  # 4 px: too small for a prompt
+    subpart[1:6, 1:6] = 4  # its middle is pixel (3, 3)
     labels = {Level.WHOLE: whole, Level.PART: part, Level.SUBPART: subpart}
     points = guided_points(labels, point_grid(4), 5)
     assert (3.5, 3.5) in map(tuple, points)
-    assert (
-        len(points) == 2 + 16 - 6 - 1
-    )  # nodes 0 and 1; x 1.5, 4.5 at y 1, 3, 5, and (10.5, 7) are explained
-    assert not any(x == 10.5 and y == 7 for x, y in points)
+    assert len(points) == 2 + 16 - 6  # nodes 0 and 4; grid points at x 1.5, 4.5 and y 1, 3, 5 are explained
+    assert (4.5, 3.0) not in map(tuple, points)
 
 
 def test_without_any_node_the_grid_is_prompted():

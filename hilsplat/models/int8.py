@@ -1,0 +1,154 @@
+"""Networks in int8, dynamically quantised. Stages check them on the scene's own photographs."""
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hilsplat.base.artifacts import ViewCache, atomic_path, sha256_of_bytes, sha256_of_file, sha256_of_json
+from hilsplat.models.folder import ModelFolder
+from hilsplat.models.network import Network, execution_providers
+
+logger = logging.getLogger(__name__)
+
+RECIPE = "dynamic, per channel, 1"
+"""Changes whenever the same network would become other bytes."""
+
+WORDS = (
+    *("object", "things", "stuff", "texture", "person", "face", "hand", "animal", "head", "toy", "cup"),
+    *("bottle", "plate", "food", "fruit", "table", "chair", "sofa", "bed", "cushion", "blanket", "lamp"),
+    *("book", "screen", "door", "window", "wall", "floor", "plant", "tree", "car", "wheel", "button"),
+)
+"""The canonical phrases of LERF, and everyday words, that crops are ranked for."""
+
+LEAST_COSINE, LEAST_RANK_CORRELATION = 0.99, 0.95
+"""Mean agreement of the vectors of both precisions, and of the order of `WORDS` by their cosines with a crop.
+Two crops of one thing from neighbouring views differ by more."""
+
+LEAST_IOU = 0.98
+"""Mean IoU of masks of one prompt by both precisions."""
+
+CHECKED_CROPS, CHECKED_VIEWS, CHECKED_GRID = 16, 2, 8
+"""Crops that a CLIP is checked on; views, and prompts per side, that a SAM is checked on."""
+
+
+def may_be_int8(model: ModelFolder) -> bool:
+    """Whether int8 can pay: on a CPU, for a model whose weights take most of its time."""
+    return execution_providers()[0] == "CPUExecutionProvider" and not model.config.get("world_only")
+
+
+def int8_network(
+    model: ModelFolder, name: str, cache: Path, graph: bytes | None = None, exact: Sequence[str] = ()
+) -> Network:
+    """Open the int8 version of a model's network, computing it at the first use.
+
+    Args:
+        model: the folder.
+        name: network in it.
+        cache: folder of int8 networks; a file is named after the digest of what it was made from.
+        graph: a changed graph that takes the file's place.
+        exact: outputs that stay in float32, such as sines of large arguments.
+
+    Raises:
+        ModelError: the network cannot be opened.
+    """
+    source = sha256_of_file(model.networks[name]) if graph is None else sha256_of_bytes(graph)
+    path = Path(cache) / f"{sha256_of_json([source, RECIPE, list(exact)])}.onnx"
+    if not path.is_file():
+        logger.info("quantising %s of %s, once: seconds; later runs read it", name, model.folder)
+        _quantise(model.networks[name] if graph is None else graph, path, exact)
+    return model.network(name, graph=path.read_bytes())
+
+
+def _quantise(network: Path | bytes, out: Path, exact: Sequence[str]) -> None:
+    """Write the int8 version of a network."""
+    import onnx
+    from onnxruntime.quantization import QuantType, quantize_dynamic
+
+    graph = onnx.load_from_string(network) if isinstance(network, bytes) else onnx.load(str(network))
+    with atomic_path(out) as temporary:
+        quantize_dynamic(
+            graph,
+            str(temporary),
+            per_channel=True,
+            weight_type=QuantType.QInt8,
+            op_types_to_quantize=["MatMul", "Gemm"],
+            nodes_to_exclude=_leading_only_to(graph.graph, exact),
+        )
+
+
+def _leading_only_to(graph: object, outputs: Sequence[str]) -> list[str]:
+    """Return the names of nodes that no other output of a graph needs."""
+    makers = {name: node for node in graph.node for name in node.output}  # type: ignore[attr-defined]
+
+    def needed(names: Sequence[str]) -> set[str]:
+        found, waiting = set[str](), list(names)
+        while waiting:
+            node = makers.get(waiting.pop())
+            if node is not None and node.name not in found:
+                found.add(node.name)
+                waiting += node.input
+        return found
+
+    others = [each.name for each in graph.output if each.name not in outputs]  # type: ignore[attr-defined]
+    return sorted(needed(list(outputs)) - needed(others))
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How far a network in int8 agrees with the one in float32.
+
+    Attributes:
+        values: measured values by name.
+        least: what each must be at least.
+    """
+
+    values: dict[str, float]
+    least: dict[str, float]
+
+    def decide(self, precision: str, what: str) -> bool:
+        """Whether to use int8 (`precision` "auto" or "int8"), with a line about it in the log."""
+        agrees = all(self.values[name] >= least for name, least in self.least.items())
+        use = agrees or precision == "int8"
+        said = ", ".join(
+            f"{name} {self.values[name]:.4f} (least: {least})" for name, least in self.least.items()
+        )
+        logger.info("%s runs in %s. int8 and float32: %s", what, "int8" if use else "float32", said)
+        return use
+
+    @staticmethod
+    def remembered(cache: Path, inputs: object, measure: Callable[[], "Agreement"]) -> "Agreement":
+        """Return what was measured before on the same inputs, or measure it.
+
+        Args:
+            cache: folder of int8 networks.
+            inputs: digests of the model and of what it is checked on.
+        """
+
+        def arrays() -> dict[str, np.ndarray]:
+            found = measure()
+            return {name: np.array([value, found.least[name]]) for name, value in found.values.items()}
+
+        kept = ViewCache(cache).get(sha256_of_json([RECIPE, inputs]), arrays)
+        return Agreement(*({name: float(pair[k]) for name, pair in kept.items()} for k in (0, 1)))
+
+
+def agreement_of_vectors(
+    full: Float[np.ndarray, "B C"], quantised: Float[np.ndarray, "B C"], texts: Float[np.ndarray, "T C"]
+) -> Agreement:
+    """Compare unit vectors of crops by both precisions, also by how they rank texts."""
+    ranks = [np.argsort(np.argsort(vectors @ texts.T, axis=1), axis=1) for vectors in (full, quantised)]
+    centred = [rank - rank.mean(axis=1, keepdims=True) for rank in ranks]
+    order = (centred[0] * centred[1]).sum() / max(float(np.square(centred[0]).sum()), 1e-12)
+    values = {"cosine": float((full * quantised).sum(axis=1).mean()), "rank correlation": float(order)}
+    return Agreement(values, {"cosine": LEAST_COSINE, "rank correlation": LEAST_RANK_CORRELATION})
+
+
+def agreement_of_masks(full: Bool[np.ndarray, "K h w"], quantised: Bool[np.ndarray, "K h w"]) -> Agreement:
+    """Compare masks of the same prompts by both precisions; pairs of empty masks don't count."""
+    union, shared = (full | quantised).sum(axis=(1, 2)), (full & quantised).sum(axis=(1, 2))
+    iou = float((shared[union > 0] / union[union > 0]).mean()) if union.any() else 0.0
+    return Agreement({"mask IoU": iou}, {"mask IoU": LEAST_IOU})
