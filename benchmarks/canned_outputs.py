@@ -62,8 +62,8 @@ def replace_outputs(model: type[SamModel]) -> None:
     """Let a `SamModel` run its networks and return canned masks."""
     encode, decode, preview, finish = model.encode, model.decode, model.preview, model.finish
 
-    def canned_encode(self: Any, image: np.ndarray) -> Encoded:
-        encoded = encode(self, image)
+    def canned_encode(self: Any, image: np.ndarray, *encoder: Any) -> Encoded:
+        encoded = encode(self, image, *encoder)
         encoded.features["canned"] = Regions(image, encoded)  # type: ignore[index]
         return encoded
 

@@ -82,7 +82,7 @@ def run_clip(
         require_same_masks(semantic_tree_folder, masks_folder)
         chosen = chosen_masks(semantic_tree_folder, settings.crops_per_node)
     model = ClipModel.load(Path(settings.model), variant=settings.variant)
-    _choose_precision(model, scene, masks_folder, chosen, Path(cache) / "int8", settings, threads)
+    _choose_precision(model, scene, masks_folder, chosen, cache, settings, threads)
     needs = needs_of(model.model, settings.batch)
     threads = needs.views_at_once(threads, min(memory_mib or math.inf, available_mib()))
     view_cache = ViewCache(Path(cache) / "clip")

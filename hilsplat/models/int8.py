@@ -1,6 +1,7 @@
 """Networks in int8, dynamically quantised. Stages check them on the scene's own photographs."""
 
 import logging
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,12 +44,14 @@ def may_be_int8(model: ModelFolder) -> bool:
 def int8_network(
     model: ModelFolder, name: str, cache: Path, graph: bytes | None = None, exact: Sequence[str] = ()
 ) -> Network:
-    """Open the int8 version of a model's network, computing it at the first use.
+    """Open the int8 version of a model's network, which `hilsplat models get` or the first use computes.
+
+    It is stored in the folder `int8` of the model, under the digest of what it was made from.
 
     Args:
         model: the folder.
         name: network in it.
-        cache: folder of int8 networks; a file is named after the digest of what it was made from.
+        cache: stores the network instead if the model's folder is read-only.
         graph: a changed graph that takes the file's place.
         exact: outputs that stay in float32, such as sines of large arguments.
 
@@ -56,7 +59,8 @@ def int8_network(
         ModelError: the network cannot be opened.
     """
     source = sha256_of_file(model.networks[name]) if graph is None else sha256_of_bytes(graph)
-    path = Path(cache) / f"{sha256_of_json([source, RECIPE, list(exact)])}.onnx"
+    folder = model.folder if os.access(model.folder, os.W_OK) else Path(cache)
+    path = folder / "int8" / f"{sha256_of_json([source, RECIPE, list(exact)])}.onnx"
     if not path.is_file():
         logger.info("quantising %s of %s, once: seconds; later runs read it", name, model.folder)
         _quantise(model.networks[name] if graph is None else graph, path, exact)
@@ -69,15 +73,19 @@ def _quantise(network: Path | bytes, out: Path, exact: Sequence[str]) -> None:
     from onnxruntime.quantization import QuantType, quantize_dynamic
 
     graph = onnx.load_from_string(network) if isinstance(network, bytes) else onnx.load(str(network))
-    with atomic_path(out) as temporary:
-        quantize_dynamic(
-            graph,
-            str(temporary),
-            per_channel=True,
-            weight_type=QuantType.QInt8,
-            op_types_to_quantize=["MatMul", "Gemm"],
-            nodes_to_exclude=_leading_only_to(graph.graph, exact),
-        )
+    logging.disable(logging.WARNING)  # it logs a line per layer, about what it leaves in float32
+    try:
+        with atomic_path(out) as temporary:
+            quantize_dynamic(
+                graph,
+                str(temporary),
+                per_channel=True,
+                weight_type=QuantType.QInt8,
+                op_types_to_quantize=["MatMul", "Gemm"],
+                nodes_to_exclude=_leading_only_to(graph.graph, exact),
+            )
+    finally:
+        logging.disable(logging.NOTSET)
 
 
 def _leading_only_to(graph: object, outputs: Sequence[str]) -> list[str]:
@@ -124,7 +132,7 @@ class Agreement:
         """Return what was measured before on the same inputs, or measure it.
 
         Args:
-            cache: folder of int8 networks.
+            cache: folder of the caches.
             inputs: digests of the model and of what it is checked on.
         """
 
@@ -132,7 +140,7 @@ class Agreement:
             found = measure()
             return {name: np.array([value, found.least[name]]) for name, value in found.values.items()}
 
-        kept = ViewCache(cache).get(sha256_of_json([RECIPE, inputs]), arrays)
+        kept = ViewCache(Path(cache) / "int8").get(sha256_of_json([RECIPE, inputs]), arrays)
         return Agreement(*({name: float(pair[k]) for name, pair in kept.items()} for k in (0, 1)))
 
 

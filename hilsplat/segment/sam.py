@@ -6,6 +6,7 @@ exports are read here. The rounding of logits (`read_logits`) is ours.
 
 import logging
 import math
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -170,13 +171,12 @@ class SamModel:
         Args:
             precision: `masks.precision`.
             images: photographs of the scene.
-            cache: folder of int8 networks.
+            cache: folder of the caches.
             threads: images at once.
         """
         if precision == "fp32" or not may_be_int8(self.model):
             return
-        exact = [name for name in self.encoder.outputs if name == "image_positional_embeddings"]
-        quantised = int8_network(self.model, "vision_encoder", cache, self._graph, exact)
+        quantised = self.int8_encoder(cache)
         grid = point_grid(CHECKED_GRID)
         batch = self.prompts_per_call(self.own.points_per_batch, len(grid))
 
@@ -196,6 +196,26 @@ class SamModel:
         inputs = {"model": self.digest, "images": [sha256_of_bytes(image.tobytes()) for image in images]}
         if Agreement.remembered(cache, inputs, measure).decide(precision, "SAM's encoder"):
             self.encoder, self.precision = quantised, "int8"
+
+    def int8_encoder(self, cache: Path) -> Network:
+        """Open the int8 version of the encoder (`models.int8.int8_network`)."""
+        exact = [name for name in self.encoder.outputs if name == "image_positional_embeddings"]
+        return int8_network(self.model, "vision_encoder", cache, self._graph, exact)
+
+    def seconds(self, image: UInt8[np.ndarray, "H W 3"], encoder: Network) -> dict[str, float]:
+        """Measure an encoder and a call of the decoder: seconds per image, preview and prompt's masks."""
+        start = time.perf_counter()
+        encoded = self.encode(image, encoder)
+        found = {"image": time.perf_counter() - start}
+        prompts = self.prompts_per_call(1, 1)
+        points = np.tile(np.array(image.shape[1::-1]) / 2, (prompts, 1))
+        for name, decode in (("masks", self.decode), ("preview", self.preview)):
+            if name == "masks" or self.previews:
+                decode(encoded, points)  # compiled, and weights in the caches
+                start = time.perf_counter()
+                decode(encoded, points)
+                found[name] = (time.perf_counter() - start) / prompts
+        return found
 
     def _rowwise_encoder(self) -> bytes | None:
         """Change a ViT's global attentions for the CPU; None if the encoder is another, or a GPU runs it."""

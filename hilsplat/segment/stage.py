@@ -78,7 +78,7 @@ def run_masks(
             model = SamModel.load(Path(settings.model), settings.variant)
             every = train_views(scene)  # the same ones whichever views are segmented
             checked = [scene.image(view) for view in every[:: max(1, len(every) // CHECKED_VIEWS)]]
-            model.choose_precision(settings.precision, checked[:CHECKED_VIEWS], Path(cache) / "int8", threads)
+            model.choose_precision(settings.precision, checked[:CHECKED_VIEWS], cache, threads)
             identity: dict[str, str | None] = {
                 "segmenter": "sam",
                 "model": settings.model,

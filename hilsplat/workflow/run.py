@@ -26,6 +26,7 @@ from hilsplat.base.errors import HilsplatError
 from hilsplat.base.files import INSTALLED
 from hilsplat.base.processes import jobs_end_with_this_process, remove_leftovers
 from hilsplat.configuration import CONFIG, merged_config
+from hilsplat.workflow.forecast import forecasts
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.records import outdated
 
@@ -140,6 +141,9 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
         ) from error
     with lock:
         _recover(command, plan.results)
+        if not _has(others, *ELSEWHERE):
+            for line in forecasts(plan, _cores_of(command)):
+                logger.info("%s", line)
         mark_run()
         status = _start(command, plan, targets, scenes)
         if status != 0:
@@ -204,10 +208,22 @@ def _has(words: Sequence[str], *options: str) -> bool:
     )
 
 
+def _cores_of(command: Sequence[str]) -> int:
+    """Return the number after `--cores`, or all cores of this process."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--cores", "-c", default="all")
+    asked = parser.parse_known_args(list(command))[0].cores
+    return int(asked) if asked.isdigit() and int(asked) else _all_cores()
+
+
+def _all_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def _local_options(plan: Plan, others: Sequence[str]) -> list[str]:
     """Return cores and threads for this machine: one thread per job where there are jobs for all cores."""
     words = []
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = _all_cores()
     if not _has(others, "--cores", "-c", "--jobs", "-j"):
         words += ["--cores", str(cores)]
     if not _has(others, "--max-threads"):

@@ -1,0 +1,120 @@
+"""How long photographs take until they answer, from one measurement of their SAM and CLIP on this machine."""
+
+import functools
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from hilsplat.base.artifacts import read_json, sha256_of_json, write_json
+from hilsplat.base.errors import HilsplatError
+from hilsplat.base.images import read_image, resize_to_fit
+from hilsplat.configuration import StageSettings
+from hilsplat.models.store import read_model
+from hilsplat.scene.finished import KEY_VIEWS
+from hilsplat.scene.sheet import PHOTOS, SceneRow
+from hilsplat.workflow.plan import Plan
+from hilsplat.workflow.progress import duration
+from hilsplat.workflow.resources import JobResources
+
+NODES = 400
+"""Nodes of a room; those of `plush_bedroom` (docs/benchmarks.md)."""
+
+KEPT_PROMPTS, GUIDED_PROMPTS = 0.3, 0.25
+"""Share of the previewed prompts whose masks are decoded, and of the grid's prompts with guided ones."""
+
+VIEW_S = 1.0
+"""Core seconds of a view outside the networks: from logits to masks."""
+
+
+def forecasts(plan: Plan, cores: int) -> list[str]:
+    """Predict the times of scenes of photographs that a real SAM and CLIP still have to work on.
+
+    Returns:
+        a line per scene.
+    """
+    resources = JobResources(plan)
+    lines = []
+    for row in plan.scenes:
+        job = SimpleNamespace(dataset=row.dataset, scene=row.scene, variant="default")
+        stages = plan.stages(job)
+        if row.group == PHOTOS and _is_real(stages) and not Path(plan.path(job, "default", "clip")).exists():
+            lines.append(_forecast(plan, resources, row, job, stages, cores))
+    return lines
+
+
+def _is_real(stages: StageSettings) -> bool:
+    models = [read_model(Path(section.model)) for section in (stages.masks, stages.clip)]
+    return stages.masks.segmenter == "sam" and all(model and not model.embedded for model in models)
+
+
+def _forecast(
+    plan: Plan, resources: JobResources, row: SceneRow, job: Any, stages: StageSettings, cores: int
+) -> str:
+    """Return the line of one scene."""
+    files = plan.data.image_files(job)
+    view_s, crop_s = _measured(plan.results / ".cache", Path(files[0]), stages)
+    every = stages.poses.test_every
+    views = len(files) - (len(files) // every if every else 0)
+    prompts = stages.masks.points_per_side**2
+    full_s = view_s["image"] + VIEW_S + prompts * view_s["prompt"]
+    guided_s = view_s["image"] + VIEW_S + GUIDED_PROMPTS * prompts * view_s["prompt"]
+    before_s = sum(resources.core_seconds(rule, job) for rule in ("poses", "gaussians"))
+    after_s = sum(resources.core_seconds(rule, job) for rule in ("contributions", "semantic_tree"))
+    key = SimpleNamespace(dataset=row.dataset, scene=row.scene, variant=KEY_VIEWS)
+    said, rest_s = "", views * full_s
+    if plan.first_answer(job):
+        settings = plan.stages(key)
+        first = views * settings.masks.key_views
+        before_s += first * full_s + after_s / 2 + NODES * settings.clip.crops_per_node * crop_s
+        rest_s = (views - first) * (guided_s if stages.masks.prompts == "guided" else full_s)
+        said = f"first answer in {duration(before_s / cores)}, "
+    total_s = before_s + rest_s + after_s + NODES * stages.clip.crops_per_node * crop_s
+    return (
+        f"{row.name}: {said}all photographs in {duration(total_s / cores)}. "
+        f"A photograph takes {full_s:.0f} s of SAM on one of {cores} cores, a crop {crop_s:.2f} s of CLIP."
+    )
+
+
+def _measured(cache: Path, photograph: Path, stages: StageSettings) -> tuple[dict[str, float], float]:
+    """Seconds of SAM per image and per prompt, and of CLIP per crop; measured once per model."""
+    from hilsplat.embed.clip import ClipModel
+    from hilsplat.models.int8 import int8_network, may_be_int8
+    from hilsplat.segment.sam import SamModel
+
+    path = cache / "model_seconds.json"
+    try:
+        known = read_json(path)
+    except HilsplatError:
+        known = {}
+
+    def remembered(key: object, measure: Any) -> Any:
+        digest = sha256_of_json(key)
+        if digest not in known:
+            known[digest] = measure()
+            write_json(path, known)
+        return known[digest]
+
+    @functools.cache
+    def sam() -> SamModel:
+        return SamModel.load(Path(stages.masks.model), stages.masks.variant)
+
+    def sam_seconds() -> dict[str, float]:
+        model, precision = sam(), stages.masks.precision
+        image = resize_to_fit(read_image(photograph), stages.poses.max_side_px)
+        is_int8 = precision != "fp32" and may_be_int8(model.model)
+        found = model.seconds(image, model.int8_encoder(cache) if is_int8 else model.encoder)
+        prompt = found["masks"]
+        if "preview" in found:
+            prompt = found["preview"] + KEPT_PROMPTS * found["masks"]
+        return {"image": found["image"], "prompt": prompt}
+
+    def clip_seconds() -> float:
+        model = ClipModel.load(Path(stages.clip.model), variant=stages.clip.variant)
+        is_int8 = stages.clip.precision != "fp32" and may_be_int8(model.model)
+        return model.seconds(int8_network(model.model, "vision_model", cache) if is_int8 else model.vision)
+
+    masks, clip = stages.masks, stages.clip
+    return (
+        remembered(["sam", masks.model, masks.variant, masks.precision], sam_seconds),
+        remembered(["clip", clip.model, clip.variant, clip.precision], clip_seconds),
+    )
