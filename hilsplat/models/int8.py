@@ -46,12 +46,12 @@ def int8_network(
 ) -> Network:
     """Open the int8 version of a model's network, which `hilsplat models get` or the first use computes.
 
-    It is stored in the folder `int8` of the model, under the digest of what it was made from.
+    It is stored beside the model's folder, in `.int8`, under the digest of what it was made from.
 
     Args:
         model: the folder.
         name: network in it.
-        cache: stores the network instead if the model's folder is read-only.
+        cache: stores the network instead if that place is read-only.
         graph: a changed graph that takes the file's place.
         exact: outputs that stay in float32, such as sines of large arguments.
 
@@ -59,8 +59,9 @@ def int8_network(
         ModelError: the network cannot be opened.
     """
     source = sha256_of_file(model.networks[name]) if graph is None else sha256_of_bytes(graph)
-    folder = model.folder if os.access(model.folder, os.W_OK) else Path(cache)
-    path = folder / "int8" / f"{sha256_of_json([source, RECIPE, list(exact)])}.onnx"
+    beside = model.folder.parent  # a new file in the model's folder would be another model
+    folder = beside if os.access(beside, os.W_OK) else Path(cache)
+    path = folder / ".int8" / f"{sha256_of_json([source, RECIPE, list(exact)])}.onnx"
     if not path.is_file():
         logger.info("quantising %s of %s, once: seconds; later runs read it", name, model.folder)
         _quantise(model.networks[name] if graph is None else graph, path, exact)

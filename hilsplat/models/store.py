@@ -48,16 +48,14 @@ RELEASES = (
     Release(
         "sam-vit-large", "sam", "Xenova/sam-vit-large", 1250, "Apache-2.0", "between huge and base; a GPU"
     ),
-    Release(
-        "sam-vit-base", "sam", "Xenova/sam-vit-base", 376, "Apache-2.0", "masks of photographs, on a CPU"
-    ),
+    Release("sam-vit-base", "sam", "Xenova/sam-vit-base", 376, "Apache-2.0", "the smallest original SAM"),
     Release(
         "sam2.1-hiera-small",
         "sam",
         "onnx-community/sam2.1-hiera-small-ONNX",
         184,
         "Apache-2.0",
-        "a smaller, newer encoder",
+        "masks of photographs, on a CPU",
     ),
     Release(
         "sam2.1-hiera-base-plus",
@@ -82,7 +80,7 @@ RELEASES = (
 )
 """In the order in which `auto` prefers them, within a family."""
 
-RECOMMENDED = ("sam-vit-base", "clip-vit-base-patch16")
+RECOMMENDED = ("sam2.1-hiera-small", "clip-vit-base-patch16")
 """What `hilsplat models get` fetches without a name; docs/models.md says why."""
 
 

@@ -40,28 +40,37 @@ def files_of(folder: Path) -> list[str]:
 
 def test_without_a_name_the_recommended_pair_arrives_and_is_used(hub, repositories, caplog):
     caplog.set_level(logging.INFO)
-    assert "sam-vit-base" in models_table() and "in use" not in models_table()
+    hub.repositories["onnx-community/sam2.1-hiera-small-ONNX"] = repositories[SAM]
+    target = Path("models/sam2.1-hiera-small")
+    assert "sam2.1-hiera-small" in models_table() and "in use" not in models_table()
     text = get_models(())
-    assert "kind       sam" in text and "kind       clip" in text and "folder     models/sam-vit-base" in text
-    assert text.endswith("photographs use sam-vit-base and clip-vit-base-patch16")
-    assert "the recommended pair: sam-vit-base and clip-vit-base-patch16" in caplog.text
+    assert (
+        "kind       sam" in text
+        and "kind       clip" in text
+        and "folder     models/sam2.1-hiera-small" in text
+    )
+    assert text.endswith("photographs use sam2.1-hiera-small and clip-vit-base-patch16")
+    assert "the recommended pair: sam2.1-hiera-small and clip-vit-base-patch16" in caplog.text
     assert "0.6 MB in 4 files" in caplog.text and "GB free on the disk of models" in caplog.text
     assert "licence: Apache-2.0" in caplog.text
-    assert visible() == ["clip-vit-base-patch16", "sam-vit-base"]
+    assert visible() == ["clip-vit-base-patch16", "sam2.1-hiera-small"]
     # only what is needed: no card, no quantized copies, no whole CLIP
     networks = ["onnx/prompt_encoder_mask_decoder.onnx", "onnx/vision_encoder.onnx"]
-    assert files_of(TARGET) == ["config.json", *networks, "origin.json", "preprocessor_config.json"]
+    assert list(Path("models/.int8").glob("*.onnx"))
+    assert files_of(target) == ["config.json", *networks, "origin.json", "preprocessor_config.json"]
     assert "onnx/model.onnx" not in files_of(Path("models/clip-vit-base-patch16"))
     for path in networks:
-        assert (TARGET / path).read_bytes() == (repositories[SAM] / path).read_bytes()
-    assert (real_model("sam"), real_model("clip")) == (TARGET, Path("models/clip-vit-base-patch16"))
+        assert (target / path).read_bytes() == (repositories[SAM] / path).read_bytes()
+    assert (real_model("sam"), real_model("clip")) == (target, Path("models/clip-vit-base-patch16"))
     rows = [line.split() for line in models_table().splitlines()]
-    assert ["sam-vit-base", "SAM", "376", "Apache-2.0", "here,", "in", "use"] in [row[:7] for row in rows]
+    assert ["sam2.1-hiera-small", "SAM", "184", "Apache-2.0", "here,", "in", "use"] in [
+        row[:7] for row in rows
+    ]
     report, num_failed = check_models()
     assert num_failed == 0 and report.count("digest") == 2
-    (TARGET / "onnx" / ENCODER).write_bytes(b"damaged")
+    (target / "onnx" / ENCODER).write_bytes(b"damaged")
     report, num_failed = check_models()
-    assert num_failed == 1 and "models/sam-vit-base does not work" in report
+    assert num_failed == 1 and "models/sam2.1-hiera-small does not work" in report
 
 
 def test_the_origin_names_repository_commit_and_digests(hub, repositories):
