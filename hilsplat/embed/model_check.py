@@ -1,17 +1,22 @@
-"""Check that a model folder works, and describe it."""
+"""Check that a model folder works, describe it, and measure what it takes on this machine."""
 
 from pathlib import Path
 
 import numpy as np
 
+from hilsplat.base.artifacts import read_json, write_json
+from hilsplat.base.errors import ArtifactError
 from hilsplat.embed.clip import ClipModel
-from hilsplat.models.folder import input_side_px, open_model_folder
+from hilsplat.models.folder import ModelFolder, input_side_px, open_model_folder
 from hilsplat.models.int8 import int8_network, may_be_int8
 from hilsplat.models.network import require_one_space
 from hilsplat.segment.sam import SamModel
 
 CACHE = Path("results/.cache")
-"""Stores int8 networks of a model whose folder is read-only."""
+"""Stores measured seconds, and int8 networks if the models are read-only."""
+
+Seconds = dict[str, float]
+"""SAM: per "image", and per prompt for its "masks" and, if there is one, its "preview". CLIP: per "crop"."""
 
 
 def check_model(folder: Path, variant: str = "") -> str:
@@ -30,40 +35,81 @@ def check_model(folder: Path, variant: str = "") -> str:
     model = open_model_folder(folder, variant=variant)
     side = input_side_px(model)
     lines = [f"folder     {model.folder}", f"kind       {model.layout}", f"image      {side} x {side} px"]
-    if model.kind == "sam":
-        sam, blank = SamModel(model), np.zeros((side, side, 3), np.uint8)
-        seconds = sam.seconds(blank, sam.encoder)
-        times = (
-            f"{seconds['image']:.3f} s for one image, {seconds['masks']:.4f} s for the masks of one prompt"
-        )
-        if "preview" in seconds:
-            times += f", {seconds['preview']:.4f} s for its preview"
-        if may_be_int8(model):
-            times += f"; int8: {sam.seconds(blank, sam.int8_encoder(CACHE))['image']:.3f} s for one image"
-        encoded = sam.encode(blank)
-        _, masks = sam.decode(encoded, np.full((sam.prompts_per_call(1, 1), 2), side / 2))
+    opened = SamModel(model) if model.kind == "sam" else ClipModel(model)
+    seconds = {precision: _measure(opened, precision) for precision in _precisions(model)}
+    times = "; ".join(
+        f"{precision}: " + ", ".join(f"{value:.4f} s per {what}" for what, value in each.items())
+        for precision, each in seconds.items()
+    )
+    if isinstance(opened, SamModel):
+        encoded = opened.encode(np.zeros((side, side, 3), np.uint8))
+        _, masks = opened.decode(encoded, np.full((opened.prompts_per_call(1, 1), 2), side / 2))
         sizes = (" x ".join(map(str, value.shape[1:])) for value in encoded.features.values())
         lines += [
             f"embedding  {', '.join(sizes)}",
-            f"thresholds predicted IoU {sam.own.predicted_iou_min}, stability {sam.own.stability_min}, "
-            f"score {sam.own.nms_score}",
+            f"thresholds predicted IoU {opened.own.predicted_iou_min}, stability {opened.own.stability_min}, "
+            f"score {opened.own.nms_score}",
             f"masks      3 heads (subpart, part, whole) of {masks.shape[-2]} x {masks.shape[-1]} px",
-            f"decoder    {'factored' if sam.factored else 'onnxruntime'}",
-            f"time       {times}",
+            f"decoder    {'factored' if opened.factored else 'onnxruntime'}",
         ]
-        providers = sam.encoder.providers
+        providers = opened.encoder.providers
     else:
-        clip = ClipModel(model)
-        vision, blank = clip.vision, np.zeros((1, side, side, 3), np.uint8)
-        image_embeds, encode_s = clip.embed_crops(blank), clip.seconds(clip.vision)
-        times = f"{encode_s:.3f} s for one image"
-        if may_be_int8(model):
-            times += f"; int8: {clip.seconds(int8_network(model, 'vision_model', CACHE)):.3f} s"
-        require_one_space(model.folder, image_embeds.shape[1], clip.embed_texts(["object"]).shape[1])
-        lines += [
-            f"vectors    {image_embeds.shape[1]} numbers",
-            f"time       {times}",
-        ]
-        providers = vision.providers
-    lines += [f"runs on    {', '.join(providers)}", f"digest     {model.digest}"]
+        vectors = opened.embed_crops(np.zeros((1, side, side, 3), np.uint8))
+        require_one_space(model.folder, vectors.shape[1], opened.embed_texts(["object"]).shape[1])
+        lines += [f"vectors    {vectors.shape[1]} numbers"]
+        providers = opened.vision.providers
+    for precision, each in seconds.items():
+        _remember(folder, variant, precision, each)
+    lines += [f"time       {times}", f"runs on    {', '.join(providers)}", f"digest     {model.digest}"]
     return "\n".join(lines)
+
+
+def seconds_of(folder: Path, variant: str, precision: str, cache: Path) -> Seconds:
+    """Return the measured seconds of a model, from an earlier measurement if there is one.
+
+    Args:
+        folder: the model folder.
+        variant: as in `check_model`.
+        precision: "fp32", or "auto" or "int8" for int8 where it is possible.
+        cache: stores measurements.
+
+    Raises:
+        ModelError: the model cannot be opened.
+    """
+    model = open_model_folder(folder, variant=variant)
+    wanted = "fp32" if precision == "fp32" else _precisions(model)[-1]
+    found = _known(cache).get(_key(folder, variant, wanted))
+    if found is None:
+        found = _measure(SamModel(model) if model.kind == "sam" else ClipModel(model), wanted)
+        _remember(folder, variant, wanted, found, cache)
+    return found
+
+
+def _precisions(model: ModelFolder) -> list[str]:
+    return ["fp32", "int8"] if may_be_int8(model) else ["fp32"]
+
+
+def _measure(model: SamModel | ClipModel, precision: str) -> Seconds:
+    """Measure a model on an empty input."""
+    if isinstance(model, SamModel):
+        encoder = model.int8_encoder(CACHE) if precision == "int8" else model.encoder
+        side = input_side_px(model.model)
+        return model.seconds(np.zeros((side, side, 3), np.uint8), encoder)
+    is_int8 = precision == "int8"
+    network = int8_network(model.model, "vision_model", CACHE) if is_int8 else model.vision
+    return {"crop": model.seconds(network)}
+
+
+def _key(folder: Path, variant: str, precision: str) -> str:
+    return f"{Path(folder).name} {variant} {precision}"
+
+
+def _known(cache: Path) -> dict[str, Seconds]:
+    try:
+        return read_json(cache / "model_seconds.json")
+    except ArtifactError:
+        return {}
+
+
+def _remember(folder: Path, variant: str, precision: str, found: Seconds, cache: Path = CACHE) -> None:
+    write_json(cache / "model_seconds.json", {**_known(cache), _key(folder, variant, precision): found})

@@ -1,13 +1,9 @@
 """How long photographs take until they answer, from one measurement of their SAM and CLIP on this machine."""
 
-import functools
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from hilsplat.base.artifacts import read_json, sha256_of_json, write_json
-from hilsplat.base.errors import HilsplatError
-from hilsplat.base.images import read_image, resize_to_fit
 from hilsplat.configuration import StageSettings
 from hilsplat.models.store import read_model
 from hilsplat.scene.finished import KEY_VIEWS
@@ -51,13 +47,20 @@ def _forecast(
     plan: Plan, resources: JobResources, row: SceneRow, job: Any, stages: StageSettings, cores: int
 ) -> str:
     """Return the line of one scene."""
+    from hilsplat.embed.model_check import seconds_of  # onnxruntime takes a while to import
+
     files = plan.data.image_files(job)
-    view_s, crop_s = _measured(plan.results / ".cache", Path(files[0]), stages)
+    sam, clip, cache = stages.masks, stages.clip, plan.results / ".cache"
+    view_s = seconds_of(Path(sam.model), sam.variant, sam.precision, cache)
+    crop_s = seconds_of(Path(clip.model), clip.variant, clip.precision, cache)["crop"]
+    prompt_s = view_s["masks"]
+    if "preview" in view_s:
+        prompt_s = view_s["preview"] + KEPT_PROMPTS * view_s["masks"]
     every = stages.poses.test_every
     views = len(files) - (len(files) // every if every else 0)
     prompts = stages.masks.points_per_side**2
-    full_s = view_s["image"] + VIEW_S + prompts * view_s["prompt"]
-    guided_s = view_s["image"] + VIEW_S + GUIDED_PROMPTS * prompts * view_s["prompt"]
+    full_s = view_s["image"] + VIEW_S + prompts * prompt_s
+    guided_s = view_s["image"] + VIEW_S + GUIDED_PROMPTS * prompts * prompt_s
     before_s = sum(resources.core_seconds(rule, job) for rule in ("poses", "gaussians"))
     after_s = sum(resources.core_seconds(rule, job) for rule in ("contributions", "semantic_tree"))
     key = SimpleNamespace(dataset=row.dataset, scene=row.scene, variant=KEY_VIEWS)
@@ -72,49 +75,4 @@ def _forecast(
     return (
         f"{row.name}: {said}all photographs in {duration(total_s / cores)}. "
         f"A photograph takes {full_s:.0f} s of SAM on one of {cores} cores, a crop {crop_s:.2f} s of CLIP."
-    )
-
-
-def _measured(cache: Path, photograph: Path, stages: StageSettings) -> tuple[dict[str, float], float]:
-    """Seconds of SAM per image and per prompt, and of CLIP per crop; measured once per model."""
-    from hilsplat.embed.clip import ClipModel
-    from hilsplat.models.int8 import int8_network, may_be_int8
-    from hilsplat.segment.sam import SamModel
-
-    path = cache / "model_seconds.json"
-    try:
-        known = read_json(path)
-    except HilsplatError:
-        known = {}
-
-    def remembered(key: object, measure: Any) -> Any:
-        digest = sha256_of_json(key)
-        if digest not in known:
-            known[digest] = measure()
-            write_json(path, known)
-        return known[digest]
-
-    @functools.cache
-    def sam() -> SamModel:
-        return SamModel.load(Path(stages.masks.model), stages.masks.variant)
-
-    def sam_seconds() -> dict[str, float]:
-        model, precision = sam(), stages.masks.precision
-        image = resize_to_fit(read_image(photograph), stages.poses.max_side_px)
-        is_int8 = precision != "fp32" and may_be_int8(model.model)
-        found = model.seconds(image, model.int8_encoder(cache) if is_int8 else model.encoder)
-        prompt = found["masks"]
-        if "preview" in found:
-            prompt = found["preview"] + KEPT_PROMPTS * found["masks"]
-        return {"image": found["image"], "prompt": prompt}
-
-    def clip_seconds() -> float:
-        model = ClipModel.load(Path(stages.clip.model), variant=stages.clip.variant)
-        is_int8 = stages.clip.precision != "fp32" and may_be_int8(model.model)
-        return model.seconds(int8_network(model.model, "vision_model", cache) if is_int8 else model.vision)
-
-    masks, clip = stages.masks, stages.clip
-    return (
-        remembered(["sam", masks.model, masks.variant, masks.precision], sam_seconds),
-        remembered(["clip", clip.model, clip.variant, clip.precision], clip_seconds),
     )

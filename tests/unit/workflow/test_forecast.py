@@ -20,9 +20,8 @@ def photographs(tmp_path, monkeypatch):
         monkeypatch.setattr(
             f"hilsplat.workflow.{module}.read_model", lambda folder: SimpleNamespace(embedded=False)
         )
-    monkeypatch.setattr(
-        forecast, "_measured", lambda *inputs: ({"image": 19 - 1024 * 0.01, "prompt": 0.01}, 0.1)
-    )
+    seconds = {"image": 19 - 10.24, "preview": 0.007, "masks": 0.01, "crop": 0.1}
+    monkeypatch.setattr("hilsplat.embed.model_check.seconds_of", lambda *inputs: seconds)
     monkeypatch.setattr(forecast.JobResources, "core_seconds", lambda self, rule, job: 75.0)
     return tmp_path
 
