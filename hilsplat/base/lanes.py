@@ -1,22 +1,26 @@
-"""Sixteen float32 lanes as one numba value, so that a 4x4-pixel block is a single vector.
+"""Sixteen lanes as one numba value, so that a 4x4-pixel block is a single vector.
 
 numba turns a loop over 16 pixels into vector code only if it can prove that arrays do not
-overlap, and it spills every temporary to memory. A value of type `Lanes` is an LLVM `<16 x float>`:
-arithmetic on it is vector arithmetic and accumulators stay in registers. LLVM splits it into what
-the machine has (one register with AVX-512, two with AVX2, four with NEON).
+overlap, and it spills every temporary to memory. A value of type `LANES` is an LLVM `<16 x float>`, one
+of type `WIDE` a `<16 x double>`: arithmetic on them is vector arithmetic and accumulators stay in
+registers. LLVM splits them into what the machine has (16 floats are one register with AVX-512, two with
+AVX2, four with NEON).
 
-Operations, for use inside `numba.njit` functions: `+ - * /` between lanes, `lanes(x)` (all lanes equal
-x), and the functions below. Sums run in a fixed order.
+Operations, for use inside `numba.njit` functions: `+ - * /` between lanes or with a float, `lanes(x)`
+(all lanes equal x), and the functions below. Sums run in a fixed order.
 """
 
 import operator
-from typing import Any
+from typing import Any, no_type_check
 
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import intrinsic, lower_builtin, models, register_model
+from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model
+
+from hilsplat.base.compiled import compiled
 
 WIDTH = 16
 _FLOAT = ir.FloatType()
@@ -27,35 +31,48 @@ _INTS = ir.VectorType(_INT, WIDTH)
 _FLAGS = ("contract",)
 _RECIPROCAL_BITS = 0x7EF311C7
 """Twice the exponent bits of 1, less what makes the first guess equally wrong on both sides."""
-_ROOT = f"llvm.sqrt.v{WIDTH}f32"
 _MASKED_STORE = f"llvm.masked.store.v{WIDTH}f32.p0"
 
 
 class LanesType(types.Type):
-    """numba type of 16 float32 values."""
+    """numba type of 16 numbers of one element type."""
 
-    def __init__(self) -> None:
-        super().__init__(name="Lanes16")
+    def __init__(self, dtype: types.Float) -> None:
+        self.dtype = dtype
+        self.vector = ir.VectorType(_FLOAT if dtype == types.float32 else ir.DoubleType(), WIDTH)
+        super().__init__(name=f"Lanes16({dtype})")
 
 
-LANES = LanesType()
+LANES = LanesType(types.float32)
+WIDE = LanesType(types.float64)
+_OF = {types.float32: LANES, types.float64: WIDE}
 
 
 @register_model(LanesType)
 class _LanesModel(models.PrimitiveModel):
     def __init__(self, dmm: Any, fe_type: Any) -> None:
-        super().__init__(dmm, fe_type, _VECTOR)
+        super().__init__(dmm, fe_type, fe_type.vector)
+
+
+@lower_cast(types.Float, LanesType)
+def _all_equal(
+    context: Any, builder: ir.IRBuilder, scalar_type: Any, kind: Any, scalar: ir.Value
+) -> ir.Value:
+    return _splat(builder, context.cast(builder, scalar, scalar_type, kind.dtype))
 
 
 def _binary(python_operator: Any, emit: Any) -> None:
-    """Teach numba one operator between two lane values."""
+    """Teach numba one operator between two lane values, or one and a scalar."""
 
     class Template(AbstractTemplate):
         def generic(self, args: Any, kws: Any) -> Any:
-            return signature(LANES, LANES, LANES) if args == (LANES, LANES) else None
+            kinds = {arg for arg in args if isinstance(arg, LanesType)}
+            if len(kinds) != 1 or not all(isinstance(arg, (LanesType, types.Float)) for arg in args):
+                return None
+            return signature(*kinds, *kinds, *kinds)
 
     infer_global(python_operator)(Template)
-    lower_builtin(python_operator, LANES, LANES)(
+    lower_builtin(python_operator, LanesType, LanesType)(
         lambda context, builder, sig, args: emit(builder)(*args, flags=_FLAGS)
     )
 
@@ -71,22 +88,35 @@ def _constant(value: float) -> ir.Constant:
 
 
 def _splat(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
-    one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), scalar, ir.Constant(_INT, 0))
-    return builder.shuffle_vector(
-        one, ir.Constant(_VECTOR, ir.Undefined), ir.Constant(ir.VectorType(_INT, WIDTH), [0] * WIDTH)
-    )
+    undefined = ir.Constant(ir.VectorType(scalar.type, WIDTH), ir.Undefined)
+    one = builder.insert_element(undefined, scalar, ir.Constant(_INT, 0))
+    return builder.shuffle_vector(one, undefined, ir.Constant(_INTS, [0] * WIDTH))
 
 
 def _pointer(
     context: Any, builder: ir.IRBuilder, array_type: Any, array: ir.Value, index: ir.Value
 ) -> ir.Value:
     data = context.make_array(array_type)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), _VECTOR.as_pointer())
+    return builder.bitcast(builder.gep(data, [index]), _OF[array_type.dtype].vector.as_pointer())
+
+
+def _is_flat(array: Any) -> bool:
+    """Whether a numba type is that of a flat array of float32 or float64."""
+    return isinstance(array, types.Array) and array.dtype in _OF and array.ndim == 1
+
+
+@compiled
+@no_type_check
+def aligned(count):
+    """Room for float32 numbers that begins with a line of the cache, so that no vector spans two lines."""
+    room = np.empty(count + WIDTH, np.float32)
+    skip = (-(room.ctypes.data // 4)) % WIDTH
+    return room[skip : skip + count]
 
 
 @intrinsic
 def lanes(typingctx, scalar):
-    """All lanes equal one number."""
+    """All lanes equal one float32 number."""
 
     def codegen(context, builder, sig, args):
         return _splat(builder, args[0])
@@ -96,40 +126,54 @@ def lanes(typingctx, scalar):
 
 @intrinsic
 def load(typingctx, array, index):
-    """Sixteen consecutive numbers of a flat float32 array."""
-    if not (isinstance(array, types.Array) and array.dtype == types.float32 and array.ndim == 1):
+    """Sixteen consecutive numbers of a flat float32 or float64 array."""
+    if not _is_flat(array):
         return None
 
     def codegen(context, builder, sig, args):
-        return builder.load(_pointer(context, builder, sig.args[0], args[0], args[1]), align=4)
+        place = _pointer(context, builder, sig.args[0], args[0], args[1])
+        return builder.load(place, align=array.dtype.bitwidth // 8)
 
-    return LANES(array, types.intp), codegen
+    return _OF[array.dtype](array, types.intp), codegen
 
 
 @intrinsic
 def load_same(typingctx, array, index):
-    """All lanes equal one number of a flat float32 array; the index must not be negative."""
-    if not (isinstance(array, types.Array) and array.dtype == types.float32 and array.ndim == 1):
+    """All lanes equal one number of a flat array; the index must not be negative."""
+    if not _is_flat(array):
         return None
 
     def codegen(context, builder, sig, args):
         data = context.make_array(sig.args[0])(context, builder, args[0]).data
         return _splat(builder, builder.load(builder.gep(data, [args[1]])))
 
-    return LANES(array, types.intp), codegen
+    return _OF[array.dtype](array, types.intp), codegen
 
 
 @intrinsic
 def store(typingctx, array, index, value):
-    """Write sixteen consecutive numbers of a flat float32 array."""
-    if not (isinstance(array, types.Array) and array.dtype == types.float32 and array.ndim == 1):
+    """Write sixteen consecutive numbers of a flat array of the lanes' type."""
+    if not (_is_flat(array) and value == _OF[array.dtype]):
         return None
 
     def codegen(context, builder, sig, args):
-        builder.store(args[2], _pointer(context, builder, sig.args[0], args[0], args[1]), align=4)
+        place = _pointer(context, builder, sig.args[0], args[0], args[1])
+        builder.store(args[2], place, align=array.dtype.bitwidth // 8)
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, LANES), codegen
+    return types.void(array, types.intp, value), codegen
+
+
+@intrinsic
+def wide(typingctx, value):
+    """The same numbers as float64."""
+    return WIDE(LANES), lambda context, builder, sig, args: builder.fpext(args[0], WIDE.vector)
+
+
+@intrinsic
+def narrow(typingctx, value):
+    """The nearest float32 numbers."""
+    return LANES(WIDE), lambda context, builder, sig, args: builder.fptrunc(args[0], LANES.vector)
 
 
 @intrinsic
@@ -160,8 +204,6 @@ def exp2_negative(typingctx, value):
 
 def _fit_exp2() -> tuple[float, ...]:
     """Coefficients, constant first, of the polynomial for 2**f on [-1, 0]."""
-    import numpy as np
-
     fit = np.polynomial.chebyshev.Chebyshev.interpolate(np.exp2, 6, domain=[-1, 0])
     return tuple(float(np.float32(c)) for c in fit.convert(kind=np.polynomial.Polynomial).coef)
 
@@ -171,12 +213,14 @@ _EXP2 = _fit_exp2()
 
 def _select(condition: str, doc: str) -> Any:
     def keep(typingctx, left, right, value):
-        def codegen(context, builder, sig, args):
-            return builder.select(
-                builder.fcmp_ordered(condition, args[0], args[1]), args[2], ir.Constant(_VECTOR, None)
-            )
+        if not (isinstance(value, LanesType) and left == right == value):
+            return None
 
-        return LANES(LANES, LANES, LANES), codegen
+        def codegen(context, builder, sig, args):
+            mask = builder.fcmp_ordered(condition, args[0], args[1])
+            return builder.select(mask, args[2], ir.Constant(value.vector, None))
+
+        return value(left, right, value), codegen
 
     keep.__doc__ = doc
     return intrinsic(keep)
@@ -189,10 +233,13 @@ keep_lt = _select("<", "Lanes of `value` where left < right, 0 elsewhere.")
 
 def _pick(condition: str, doc: str) -> Any:
     def pick(typingctx, left, right):
+        if not (isinstance(left, LanesType) and left == right):
+            return None
+
         def codegen(context, builder, sig, args):
             return builder.select(builder.fcmp_ordered(condition, args[0], args[1]), args[0], args[1])
 
-        return LANES(LANES, LANES), codegen
+        return left(left, right), codegen
 
     pick.__doc__ = doc
     return intrinsic(pick)
@@ -222,6 +269,44 @@ def bits_ge(typingctx, left, right):
         return builder.zext(mask, ir.IntType(64))
 
     return types.int64(LANES, LANES), codegen
+
+
+@intrinsic
+def prefetch(typingctx, array, index):
+    """Begin to load a place of an array's memory into the cache; it may lie outside the array."""
+
+    def codegen(context, builder, sig, args):
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        byte = ir.IntType(8).as_pointer()
+        kind = ir.FunctionType(ir.VoidType(), [byte, _INT, _INT, _INT])
+        fetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        place = builder.bitcast(builder.gep(data, [args[1]]), byte)
+        builder.call(fetch, [place, *(ir.Constant(_INT, flag) for flag in (0, 3, 1))])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), codegen
+
+
+@intrinsic
+def column_bits(typingctx, words, index, bit):
+    """Bit k is set if bit `bit` of words[index + k] is, for 64 words of a flat uint16 array."""
+    count = 64
+
+    def codegen(context, builder, sig, args):
+        kind = ir.VectorType(ir.IntType(16), count)
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        held = builder.load(builder.bitcast(builder.gep(data, [args[1]]), kind.as_pointer()), align=2)
+        one = builder.shl(ir.Constant(ir.IntType(16), 1), builder.trunc(args[2], ir.IntType(16)))
+        undefined = ir.Constant(kind, ir.Undefined)
+        same = builder.shuffle_vector(
+            builder.insert_element(undefined, one, ir.Constant(_INT, 0)),
+            undefined,
+            ir.Constant(ir.VectorType(_INT, count), [0] * count),
+        )
+        mask = builder.icmp_unsigned("!=", builder.and_(held, same), ir.Constant(kind, None))
+        return builder.bitcast(mask, ir.IntType(count))
+
+    return types.int64(words, types.intp, types.intp), codegen
 
 
 @intrinsic
@@ -370,7 +455,8 @@ def root(typingctx, value):
     """Square root of every lane."""
 
     def codegen(context, builder, sig, args):
-        kind = ir.FunctionType(_VECTOR, [_VECTOR])
-        return builder.call(cgutils.get_or_insert_function(builder.module, kind, _ROOT), args)
+        kind = ir.FunctionType(value.vector, [value.vector])
+        name = f"llvm.sqrt.v{WIDTH}f{value.dtype.bitwidth}"
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), args)
 
-    return LANES(LANES), codegen
+    return value(value), codegen

@@ -7,11 +7,26 @@ import numpy as np
 from jaxtyping import Int32, Int64
 
 from hilsplat.base.compiled import compiled
+from hilsplat.base.lanes import bits_ge, lanes, larger, load, prefetch, smaller
+from hilsplat.splat.rasterise.project import MIN_ALPHA
 
 TILE = 16
 """Side of a tile, px."""
+BLOCK_X = np.tile(np.arange(4, dtype=np.float32) * 4, 4) + np.float32(0.5)
+BLOCK_Y = np.repeat(np.arange(4, dtype=np.float32) * 4, 4) + np.float32(0.5)
+"""Centre of the first pixel of each 4x4 block of a tile, from the tile's corner."""
+REACH_SLACK = (1e-2, 1e-6)
+"""A block is left out if the exponent misses the cut by more than this: absolute, and relative to the
+squares that the exponent is the difference of (float32 has 6e-8)."""
+AHEAD = 16
+"""Gaussians between one that is listed and one whose row is prefetched."""
 MAX_ENTRIES = 2**21
 """Entries of tile lists held at a time: 8 MiB, and 72 MiB of gradients for 3 channels."""
+
+_SPAN = np.float32(3.0)
+"""From a block's first pixel centre to its last."""
+_CUT = np.float32(np.log2(MIN_ALPHA))
+_SLACK, _RELATIVE = np.float32(REACH_SLACK[0]), np.float32(REACH_SLACK[1])
 
 
 @dataclass(frozen=True)
@@ -96,19 +111,59 @@ def _count(box, keys, tiles_x, tiles_y):
     return _depth_order(rows[:drawn], drawn_keys[:drawn]), tile_start
 
 
+@compiled(inline="always")
+@no_type_check
+def _least(a, b, c, u, v):
+    """Lower bound, for rounding, of a u^2 + b u v + c v^2."""
+    uu, vv = a * u * u, c * v * v
+    return uu + b * u * v + vv - lanes(_RELATIVE) * (uu + vv)
+
+
+@compiled(inline="always")
+@no_type_check
+def _reach(mean_x, mean_y, a, b, c, top, along_x, along_y):
+    """Bits of the blocks in which a Gaussian's alpha can reach MIN_ALPHA.
+
+    The least exponent over a block is that at the mean, if the block holds it, else on one of the edges
+    that face the mean: there it is least where its slope along the edge is zero (along_x v and along_y u
+    from the mean), or at the nearer corner.
+    """
+    left, upper = load(BLOCK_X, 0) - lanes(mean_x), load(BLOCK_Y, 0) - lanes(mean_y)
+    right, lower = left + lanes(_SPAN), upper + lanes(_SPAN)
+    zero = lanes(np.float32(0))
+    u, v = smaller(larger(zero, left), right), smaller(larger(zero, upper), lower)
+    along_v = smaller(larger(lanes(along_y) * u, upper), lower)
+    along_u = smaller(larger(lanes(along_x) * v, left), right)
+    a, b, c = lanes(a), lanes(b), lanes(c)
+    least = smaller(_least(a, b, c, u, along_v), _least(a, b, c, along_u, v))
+    return bits_ge(lanes(top + _SLACK) - least, lanes(_CUT))
+
+
 @compiled
 @no_type_check
-def fill_lists(begin, end, base, tiles_x, order, tile_start, box, gaussian):
-    """Write the lists of tiles begin..end; entry e goes to gaussian[e - base]."""
-    cursor = tile_start[begin:end] - base
+def fill_lists(begin, end, base, tiles_x, order, tile_start, box, geometry, gaussian, reach, tile_end):
+    """Write the lists of tiles begin..end, and where they end; entry e goes to gaussian[e - base].
+
+    reach[e - base] has a bit for each block that the Gaussian can reach; without any it is left out.
+    """
+    tile_end[begin:end] = tile_start[begin:end]
     for k in range(len(order)):
+        ahead = order[min(k + AHEAD, len(order) - 1)]
+        prefetch(geometry, ahead * geometry.shape[1])
+        prefetch(box, ahead * 4)
         i = order[k]
         x0, x1 = box[i, 0] // TILE, box[i, 1] // TILE + 1
         y0, y1 = max(box[i, 2] // TILE, begin // tiles_x), box[i, 3] // TILE + 1
+        a, b, c, top = geometry[i, 2], geometry[i, 3], geometry[i, 4], geometry[i, 5]
+        along_x, along_y = np.float32(-0.5) * b / a, np.float32(-0.5) * b / c
         for y in range(y0, min(y1, (end - 1) // tiles_x + 1)):
+            mean_y = np.float32(geometry[i, 1] - np.float32(y * TILE))
             for tile in range(max(y * tiles_x + x0, begin), min(y * tiles_x + x1, end)):
-                gaussian[cursor[tile - begin]] = i
-                cursor[tile - begin] += 1
+                mean_x = np.float32(geometry[i, 0] - np.float32((tile - y * tiles_x) * TILE))
+                bits = _reach(mean_x, mean_y, a, b, c, top, along_x, along_y)
+                entry = tile_end[tile] - base
+                gaussian[entry], reach[entry] = i, bits
+                tile_end[tile] += np.int64(bits != 0)
 
 
 def bin_gaussians(box: Int32[np.ndarray, "N 4"], depths: np.ndarray, size_hw: tuple[int, int]) -> Tiles:

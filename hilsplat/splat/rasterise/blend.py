@@ -24,8 +24,9 @@ import numpy as np
 
 from hilsplat.base.compiled import compiled
 from hilsplat.base.lanes import (
+    aligned,
     any_ge,
-    bits_ge,
+    column_bits,
     exp2_negative,
     first_bit,
     keep_ge,
@@ -33,33 +34,27 @@ from hilsplat.base.lanes import (
     keep_lt,
     lane_sum,
     lanes,
-    larger,
     load,
+    load_same,
+    prefetch,
     reciprocal,
     smaller,
     store,
     store_sums,
 )
-from hilsplat.splat.rasterise.binning import TILE
+from hilsplat.splat.rasterise.binning import AHEAD, BLOCK_X, BLOCK_Y, TILE
 from hilsplat.splat.rasterise.project import MIN_ALPHA, MOMENTS
 
 MAX_ALPHA = 0.999
 """Alpha of one Gaussian at a pixel is cut here, and passes no gradient beyond (gsplat: 0.999)."""
 MIN_TRANSMITTANCE = 1e-4
 """Blending stops at a pixel before the Gaussian that would leave less light than this (3DGS, gsplat)."""
-CHECK_EVERY = 8
-"""Gaussians between two checks for finished blocks."""
 CHUNK = 128
 """Entries of a list that are copied beside each other: with their lists, 40 kB for 3 channels."""
-REACH_SLACK = (1e-2, 1e-6)
-"""A block is left out if the exponent misses the cut by more than this: absolute, and relative to the
-squares that the exponent is the difference of (float32 has 6e-8)."""
-
 _CUT = np.float32(np.log2(MIN_ALPHA))
 _TOP = np.float32(MAX_ALPHA)
 _STOP = np.float32(MIN_TRANSMITTANCE)
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
-_SLACK, _RELATIVE = np.float32(REACH_SLACK[0]), np.float32(REACH_SLACK[1])
 BLOCKS = 16
 LANES = 16
 PIXELS = BLOCKS * LANES
@@ -68,15 +63,10 @@ RECORD = 8
 GROUP = 4
 """Channels that are summed in registers at a time."""
 
-_NUMBERS = np.arange(BLOCKS, dtype=np.float32)
-_LEFT = 4 * (_NUMBERS % 4) + np.float32(0.5)
-_UPPER = 4 * (_NUMBERS // 4) + np.float32(0.5)
-"""Centres of each block's first pixel, from the tile's corner."""
-_X = np.repeat(_LEFT, LANES) + np.tile(_NUMBERS % 4, BLOCKS)
-_Y = np.repeat(_UPPER, LANES) + np.tile(_NUMBERS // 4, BLOCKS)
+_NUMBERS = np.arange(LANES, dtype=np.float32)
+_X = np.repeat(BLOCK_X, LANES) + np.tile(_NUMBERS % 4, BLOCKS)
+_Y = np.repeat(BLOCK_Y, LANES) + np.tile(_NUMBERS // 4, BLOCKS)
 """Centres of all pixels of a tile, block by block."""
-_SPAN = np.float32(3.0)
-"""From a block's first pixel centre to its last."""
 
 
 @compiled(inline="always")
@@ -104,55 +94,26 @@ def unfinished(transmittance):
 
 @compiled(inline="always")
 @no_type_check
-def _least(a, b, c, u, v):
-    """Lower bound, for rounding, of a u^2 + b u v + c v^2."""
-    uu, vv = a * u * u, c * v * v
-    return uu + b * u * v + vv - lanes(_RELATIVE) * (uu + vv)
-
-
-@compiled(inline="always")
-@no_type_check
-def _reach(mean_x, mean_y, a, b, c, top):
-    """Bits of the blocks in which a Gaussian's alpha can reach MIN_ALPHA.
-
-    The least exponent over a block is that at the mean, if the block holds it, else on one of the edges
-    that face the mean: there it is least where its slope along the edge is zero, or at the nearer corner.
-    """
-    left, upper = load(_LEFT, 0) - lanes(mean_x), load(_UPPER, 0) - lanes(mean_y)
-    right, lower = left + lanes(_SPAN), upper + lanes(_SPAN)
-    zero = lanes(_ZERO)
-    u, v = smaller(larger(zero, left), right), smaller(larger(zero, upper), lower)
-    half_b = np.float32(0.5) * b
-    along_v = smaller(larger(lanes(-half_b / c) * u, upper), lower)
-    along_u = smaller(larger(lanes(-half_b / a) * v, left), right)
-    a, b, c = lanes(a), lanes(b), lanes(c)
-    least = smaller(_least(a, b, c, u, along_v), _least(a, b, c, along_u, v))
-    return bits_ge(lanes(top + _SLACK) - least, lanes(_CUT))
-
-
-@compiled(inline="always")
-@no_type_check
-def gather(first, count, x0, y0, gaussian, geometry, records, reach):
-    """Copy the Gaussians of entries first..first + count of the band, and the blocks that they reach."""
+def gather(first, count, x0, y0, gaussian, geometry, records):
+    """Copy the Gaussians of entries first..first + count of the band."""
     for k in range(count):
         i = gaussian[first + k]
-        mean_x = np.float32(geometry[i, 0] - np.float32(x0))
-        mean_y = np.float32(geometry[i, 1] - np.float32(y0))
-        a, b, c, top = geometry[i, 2], geometry[i, 3], geometry[i, 4], geometry[i, 5]
+        prefetch(geometry, gaussian[min(first + k + AHEAD, len(gaussian) - 1)] * geometry.shape[1])
         at = k * RECORD
-        records[at], records[at + 1] = mean_x, mean_y
-        records[at + 2], records[at + 3], records[at + 4], records[at + 5] = a, b, c, top
-        reach[k] = _reach(mean_x, mean_y, a, b, c, top)
+        records[at] = geometry[i, 0] - np.float32(x0)
+        records[at + 1] = geometry[i, 1] - np.float32(y0)
+        for column in range(2, 6):
+            records[at + column] = geometry[i, column]
 
 
 @compiled(inline="always")
 @no_type_check
 def _exponent(records, at, px, py):
     """Distances of a copied Gaussian to pixel centres, and log2 of its uncut alpha there."""
-    dx, dy = lanes(records[at]) - px, lanes(records[at + 1]) - py
-    slope = lanes(records[at + 3]) * dy
-    peak = lanes(records[at + 5]) - lanes(records[at + 4]) * dy * dy
-    return dx, dy, peak - dx * (lanes(records[at + 2]) * dx + slope)
+    dx, dy = load_same(records, at) - px, load_same(records, at + 1) - py
+    slope = load_same(records, at + 3) * dy
+    peak = load_same(records, at + 5) - load_same(records, at + 4) * dy * dy
+    return dx, dy, peak - dx * (load_same(records, at + 2) * dx + slope)
 
 
 @compiled(inline="always")
@@ -168,42 +129,40 @@ def _shine(exponent, light):
 
 @compiled(inline="always")
 @no_type_check
-def list_block(block, count, reach, entries):
-    """Which Gaussians of a chunk reach a block, front to back; returns how many."""
-    size = 0
-    for k in range(count):  # without a branch, which the processor could not foresee
-        entries[size] = k
-        size += (reach[k] >> block) & 1
-    return size
-
-
-@compiled(inline="always")
-@no_type_check
-def weigh(block, size, records, entries, shades, width, transmittance, weights):
-    """Weights of a block's Gaussians, front to back, and its transmittance behind them.
+def weigh(block, first, count, reach, records, shades, width, transmittance, entries, weights):
+    """Weights of the Gaussians of a chunk that reach a block, front to back.
 
     Args:
+        first, count: the chunk's entries of the band.
         shades: the channels of Gaussian k begin at k * width.
+        entries, weights: get the Gaussians' places in the chunk, and 16 weights of each.
 
     Returns:
         how many were weighed before all pixels were finished, and the sums of the first 4 channels.
     """
     light = load(transmittance, block * LANES)
     px, py = load(_X, block * LANES), load(_Y, block * LANES)
-    done = size
+    done = 0
     one, two, three, four = lanes(_ZERO), lanes(_ZERO), lanes(_ZERO), lanes(_ZERO)
-    for n in range(size):
-        k = entries[n]
-        _, _, exponent = _exponent(records, k * RECORD, px, py)
-        _, _, weight, light = _shine(exponent, light)
-        store(weights, n * LANES, weight)
-        one = one + weight * lanes(shades[k * width])
-        two = two + weight * lanes(shades[k * width + 1])
-        three = three + weight * lanes(shades[k * width + 2])
-        four = four + weight * lanes(shades[k * width + 3])
-        if n % CHECK_EVERY == CHECK_EVERY - 1 and not any_ge(light, lanes(_STOP)):
-            done = n + 1
-            break
+    for word in range(0, count, 64):
+        bits = column_bits(reach, first + word, block)
+        if count - word < 64:
+            bits &= (1 << (count - word)) - 1
+        while bits != 0:
+            k = word + first_bit(bits)
+            bits &= bits - 1
+            _, _, exponent = _exponent(records, k * RECORD, px, py)
+            _, _, weight, light = _shine(exponent, light)
+            entries[done] = k
+            store(weights, done * LANES, weight)
+            done += 1
+            shade = k * width
+            one = one + weight * load_same(shades, shade)
+            two = two + weight * load_same(shades, shade + 1)
+            three = three + weight * load_same(shades, shade + 2)
+            four = four + weight * load_same(shades, shade + 3)
+            if not any_ge(light, lanes(_STOP)):
+                break
     store(transmittance, block * LANES, light)
     return done, one, two, three, four
 
@@ -220,26 +179,27 @@ def _add_group(sums, at, one, two, three, four):
 
 @compiled
 @no_type_check
-def blend(begin, end, base, tiles_x, tile_start, gaussian, geometry, colours, image, alpha):
+def blend(begin, end, base, tiles_x, tile_start, tile_end, gaussian, reach, geometry, colours, image, alpha):
     """Blend tiles: image (H, W, C) gets the premultiplied channels, alpha (H, W) the coverage."""
     height, width, channels = image.shape
     per_gaussian = (channels + GROUP) // GROUP * GROUP
     stride = LANES * per_gaussian
-    transmittance = np.empty(PIXELS, np.float32)
-    sums = np.empty(BLOCKS * stride, np.float32)
-    records, reach = np.empty(CHUNK * RECORD, np.float32), np.empty(CHUNK, np.int64)
+    transmittance = aligned(PIXELS)
+    sums = aligned(BLOCKS * stride)
+    records = aligned(CHUNK * RECORD)
     shades = np.zeros(CHUNK * per_gaussian, np.float32)
     shades[::per_gaussian] = 1.0
-    entries, weights = np.empty(CHUNK, np.int64), np.empty(CHUNK * LANES, np.float32)
+    entries, weights = np.empty(CHUNK, np.int64), aligned(CHUNK * LANES)
+    flat_image, flat_alpha = image.reshape(-1), alpha.reshape(-1)
     for tile in range(begin, end):
         x0, y0 = start_tile(tile, tiles_x, height, width, transmittance)
         sums[:] = 0.0
-        for chunk in range(tile_start[tile], tile_start[tile + 1], CHUNK):
+        for chunk in range(tile_start[tile], tile_end[tile], CHUNK):
             alive = unfinished(transmittance)
             if alive == 0:
                 break
-            count = min(tile_start[tile + 1] - chunk, CHUNK)
-            gather(chunk - base, count, x0, y0, gaussian, geometry, records, reach)
+            count = min(tile_end[tile] - chunk, CHUNK)
+            gather(chunk - base, count, x0, y0, gaussian, geometry, records)
             for k in range(count):
                 i = gaussian[chunk - base + k]
                 for channel in range(channels):
@@ -247,9 +207,17 @@ def blend(begin, end, base, tiles_x, tile_start, gaussian, geometry, colours, im
             for block in range(BLOCKS):
                 if not (alive >> block) & 1:
                     continue
-                size = list_block(block, count, reach, entries)
                 done, one, two, three, four = weigh(
-                    block, size, records, entries, shades, per_gaussian, transmittance, weights
+                    block,
+                    chunk - base,
+                    count,
+                    reach,
+                    records,
+                    shades,
+                    per_gaussian,
+                    transmittance,
+                    entries,
+                    weights,
                 )
                 _add_group(sums, block * stride, one, two, three, four)
                 for group in range(GROUP, per_gaussian, GROUP):
@@ -257,43 +225,47 @@ def blend(begin, end, base, tiles_x, tile_start, gaussian, geometry, colours, im
                     for n in range(done):
                         weight = load(weights, n * LANES)
                         shade = entries[n] * per_gaussian + group
-                        one = one + weight * lanes(shades[shade])
-                        two = two + weight * lanes(shades[shade + 1])
-                        three = three + weight * lanes(shades[shade + 2])
-                        four = four + weight * lanes(shades[shade + 3])
+                        one = one + weight * load_same(shades, shade)
+                        two = two + weight * load_same(shades, shade + 1)
+                        three = three + weight * load_same(shades, shade + 2)
+                        four = four + weight * load_same(shades, shade + 3)
                     _add_group(sums, block * stride + group * LANES, one, two, three, four)
-        for y in range(y0, min(y0 + TILE, height)):
-            for x in range(x0, min(x0 + TILE, width)):
-                at = _spot(x - x0, y - y0, stride)
-                alpha[y, x] = sums[at]
+        for block in range(BLOCKS):
+            left, upper = x0 + 4 * (block & 3), y0 + 4 * (block >> 2)
+            columns = min(4, width - left)
+            for y in range(min(4, height - upper)):
+                pixel, at = (upper + y) * width + left, block * stride + 4 * y
+                for x in range(columns):
+                    flat_alpha[pixel + x] = sums[at + x]
                 for channel in range(channels):
-                    image[y, x, channel] = sums[at + LANES * (channel + 1)]
+                    at += LANES
+                    for x in range(columns):
+                        flat_image[(pixel + x) * channels + channel] = sums[at + x]
 
 
 @compiled(inline="always")
 @no_type_check
-def _spot(x, y, stride):
-    """Place of a tile's pixel among blocks of `stride` numbers."""
-    return ((y >> 2) * 4 + (x >> 2)) * stride + (y & 3) * 4 + (x & 3)
-
-
-@compiled(inline="always")
-@no_type_check
-def _load_gradients(x0, y0, stride, image, alpha, grad_image, grad_alpha, grads, to_come):
+def _load_gradients(x0, y0, stride, size, flats, grads, to_come):
     """Gradients of a tile's pixels by block and channel, and R before the first Gaussian."""
-    height, width, channels = image.shape
+    height, width, channels = size
+    image, alpha, grad_image, grad_alpha = flats
     if x0 + TILE > width or y0 + TILE > height:
         grads[:] = 0.0
         to_come[:] = 0.0
-    for y in range(y0, min(y0 + TILE, height)):
-        for x in range(x0, min(x0 + TILE, width)):
-            at = _spot(x - x0, y - y0, stride)
-            grads[at] = grad_alpha[y, x]
-            total = alpha[y, x] * grad_alpha[y, x]
+    for block in range(BLOCKS):
+        left, upper = x0 + 4 * (block & 3), y0 + 4 * (block >> 2)
+        columns = min(4, width - left)
+        for y in range(min(4, height - upper)):
+            pixel, at, spot = (upper + y) * width + left, block * stride + 4 * y, block * LANES + 4 * y
+            for x in range(columns):
+                grads[at + x] = grad_alpha[pixel + x]
+                to_come[spot + x] = alpha[pixel + x] * grad_alpha[pixel + x]
             for channel in range(channels):
-                grads[at + LANES * (channel + 1)] = grad_image[y, x, channel]
-                total += image[y, x, channel] * grad_image[y, x, channel]
-            to_come[_spot(x - x0, y - y0, LANES)] = total
+                at += LANES
+                for x in range(columns):
+                    there = (pixel + x) * channels + channel
+                    grads[at + x] = grad_image[there]
+                    to_come[spot + x] += image[there] * grad_image[there]
 
 
 @compiled
@@ -304,7 +276,9 @@ def blend_backward(
     base,
     tiles_x,
     tile_start,
+    tile_end,
     gaussian,
+    reach,
     geometry,
     colours,
     image,
@@ -312,39 +286,38 @@ def blend_backward(
     grad_image,
     grad_alpha,
     slots,
+    columns,
 ):
-    """Gradient of `blend`, into one slot per entry of the lists: slots[entry - base].
+    """Gradient of `blend`, into one slot of `columns` numbers per entry of the lists.
 
     A slot holds the moments of v = alpha dL/dalpha (see MOMENTS), then dL/dcolour per channel; those
     of entries behind finished pixels are zeros.
     """
     height, width, channels = image.shape
-    transmittance = np.empty(PIXELS, np.float32)
-    to_come = np.empty(PIXELS, np.float32)
+    transmittance = aligned(PIXELS)
+    to_come = aligned(PIXELS)
     stride = LANES * (channels + 1)
-    grads = np.empty(BLOCKS * stride, np.float32)
-    colour_sums = np.empty(LANES * channels, np.float32)
-    records, reach = np.empty(CHUNK * RECORD, np.float32), np.empty(CHUNK, np.int64)
-    flat_slots, columns = slots.reshape(-1), slots.shape[1]
+    grads = aligned(BLOCKS * stride)
+    colour_sums = aligned(LANES * channels)
+    records = aligned(CHUNK * RECORD)
+    flats = image.reshape(-1), alpha.reshape(-1), grad_image.reshape(-1), grad_alpha.reshape(-1)
     zero = lanes(_ZERO)
     for tile in range(begin, end):
         x0, y0 = start_tile(tile, tiles_x, height, width, transmittance)
-        _load_gradients(x0, y0, stride, image, alpha, grad_image, grad_alpha, grads, to_come)
+        _load_gradients(x0, y0, stride, image.shape, flats, grads, to_come)
         alive = unfinished(transmittance)
-        for chunk in range(tile_start[tile], tile_start[tile + 1], CHUNK):
-            count = min(tile_start[tile + 1] - chunk, CHUNK)
+        for chunk in range(tile_start[tile], tile_end[tile], CHUNK):
+            count = min(tile_end[tile] - chunk, CHUNK)
             if alive == 0:
-                slots[chunk - base : chunk - base + count, :] = 0.0
+                slots[(chunk - base) * columns : (chunk - base + count) * columns] = 0.0
                 continue
-            gather(chunk - base, count, x0, y0, gaussian, geometry, records, reach)
+            gather(chunk - base, count, x0, y0, gaussian, geometry, records)
             for k in range(count):
                 slot = chunk - base + k
-                if k % CHECK_EVERY == 0:
-                    alive = unfinished(transmittance)
-                bits = reach[k] & alive
+                bits = np.int64(reach[slot]) & alive
                 if bits == 0:
                     for column in range(columns):
-                        slots[slot, column] = 0.0
+                        slots[slot * columns + column] = 0.0
                     continue
                 i = gaussian[slot]
                 s, sx, sy, sxx, sxy, syy = zero, zero, zero, zero, zero, zero
@@ -358,6 +331,8 @@ def blend_backward(
                     dx, dy, exponent = _exponent(records, k * RECORD, load(_X, spot), load(_Y, spot))
                     uncut, here, weight, left = _shine(exponent, load(transmittance, spot))
                     store(transmittance, spot, left)
+                    if not any_ge(left, lanes(_STOP)):
+                        alive ^= 1 << block
                     at = block * stride
                     shade = load(grads, at)
                     if channels == 3:  # colour sums in registers: a fifth faster
@@ -389,19 +364,26 @@ def blend_backward(
                     syy = syy + vy * dy
                 at = slot * columns
                 if channels == 3:
-                    store_sums(flat_slots, at, (s, sx, sy, sxx, sxy, syy, red, green, blue))
+                    store_sums(slots, at, (s, sx, sy, sxx, sxy, syy, red, green, blue))
                 else:
-                    store_sums(flat_slots, at, (s, sx, sy, sxx, sxy, syy))
+                    store_sums(slots, at, (s, sx, sy, sxx, sxy, syy))
                     for channel in range(channels):
-                        slots[slot, MOMENTS + channel] = lane_sum(load(colour_sums, LANES * channel))
+                        slots[at + MOMENTS + channel] = lane_sum(load(colour_sums, LANES * channel))
 
 
 @compiled
 @no_type_check
-def add_slots(begin, end, gaussian, slots, sums):
-    """Add the slots of Gaussians begin..end to their sums, in the order of the entries."""
-    for entry in range(len(gaussian)):
-        i = gaussian[entry]
-        if begin <= i < end:
-            for k in range(slots.shape[1]):
-                sums[i, k] += slots[entry, k]
+def add_slots(begin, end, tiles, base, tile_start, tile_end, gaussian, slots, columns, sums):
+    """Add the slots of Gaussians begin..end to their sums, in the order of the entries.
+
+    Rows of sums are whole vectors: what they hold beyond `columns` numbers means nothing.
+    """
+    flat_sums, width = sums.reshape(-1), sums.shape[1]
+    for tile in range(tiles[0], tiles[1]):
+        for entry in range(tile_start[tile] - base, tile_end[tile] - base):
+            prefetch(flat_sums, gaussian[min(entry + AHEAD, len(gaussian) - 1)] * width)
+            i = gaussian[entry]
+            if begin <= i < end:
+                for k in range(0, width, LANES):
+                    added = load(flat_sums, i * width + k) + load(slots, entry * columns + k)
+                    store(flat_sums, i * width + k, added)

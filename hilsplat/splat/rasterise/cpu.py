@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 
 from hilsplat.base.errors import HilsplatError
+from hilsplat.base.lanes import WIDTH, aligned
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise.binning import Tiles, bin_gaussians, fill_lists
@@ -69,7 +70,7 @@ class Projected:
     camera: Float64[np.ndarray, " 25"]
     size_hw: tuple[int, int]
     degree: int
-    geometry: Float32[np.ndarray, "N 8"]
+    geometry: Float32[np.ndarray, "N_padded 16"]
     box: Int32[np.ndarray, "N 4"]
     colours: Float32[np.ndarray, "N 3"]
     tiles: Tiles
@@ -123,29 +124,34 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, degree: int, threads
         HilsplatError: parameters that are not finite, or quaternions of length zero.
     """
     n = len(gaussians)
-    geometry = np.zeros((n, GEOMETRY), np.float32)
+    groups = (n + WIDTH - 1) // WIDTH
+    geometry = aligned(groups * WIDTH * GEOMETRY).reshape(-1, GEOMETRY)
     box = np.empty((n, 4), np.int32)
     colours = np.zeros((n, 3), np.float32)
     row = pack_camera(camera)
     p = gaussians
     known = (p.means, p.log_scales, p.quats, p.opacity_logits, p.sh, degree, row)
-    refuse_broken(sum(over_ranges(project, n, threads, *known, geometry, box, colours)), n)
-    tiles = bin_gaussians(box, geometry[:, 6], camera.size_hw)
+    refuse_broken(sum(over_ranges(project, groups, threads, *known, geometry, box, colours)), n)
+    tiles = bin_gaussians(box, geometry[:n, 6], camera.size_hw)
     return Projected(row, camera.size_hw, degree, geometry, box, colours, tiles)
 
 
 @dataclass(frozen=True)
 class Band:
-    """The filled lists of tiles begin..end: entry e is gaussian[e - base]."""
+    """The filled lists of tiles begin..end, as the loops take them.
+
+    Attributes:
+        lists: base, tiles_x, tile_start, tile_end, gaussian, reach: the list of tile t is
+            gaussian[tile_start[t] - base : tile_end[t] - base]; reach has the bits of the tile's blocks.
+    """
 
     begin: int
     end: int
-    base: int
-    gaussian: Int32[np.ndarray, " E"]
+    lists: tuple[Any, ...]
 
     def over_tiles(self, work: Callable[..., Any], threads: int, *arguments: Any) -> None:
-        """Call `work(begin, end, *arguments)` over ranges that cover the band's tiles, on threads."""
-        over_ranges(work, self.end - self.begin, threads, *arguments, first=self.begin)
+        """Call `work(begin, end, *lists, *arguments)` over ranges that cover the band's tiles, on threads."""
+        over_ranges(work, self.end - self.begin, threads, *self.lists, *arguments, first=self.begin)
 
 
 def tile_lists(view: Projected, threads: int) -> Iterator[Band]:
@@ -157,16 +163,18 @@ def tile_lists(view: Projected, threads: int) -> Iterator[Band]:
         yield view.only_band[0]
         return
     t = view.tiles
-    bands = t.bands()
+    bands, tile_end = t.bands(), np.empty_like(t.tile_start)
     for begin, end in bands:
         base = int(t.tile_start[begin])
-        gaussian = np.empty(int(t.tile_start[end]) - base, np.int32)
+        entries = int(t.tile_start[end]) - base
+        # 64 words of reach are read at a time
+        gaussian, reach = np.empty(entries, np.int32), np.empty(entries + 64, np.uint16)
         # every range reads the whole depth order: one per thread, with as many entries each
-        shares = base + np.linspace(0, len(gaussian), max(threads, 1) + 1)
+        shares = base + np.linspace(0, entries, max(threads, 1) + 1)
         edges = np.searchsorted(t.tile_start, shares[1:-1]).clip(begin, end).tolist()
-        lists = (base, t.tiles_x, t.order, t.tile_start, view.box, gaussian)
-        over_edges(fill_lists, [begin, *edges, end], threads, *lists)
-        band = Band(begin, end, base, gaussian)
+        filled = (view.box, view.geometry, gaussian, reach, tile_end)
+        over_edges(fill_lists, [begin, *edges, end], threads, base, t.tiles_x, t.order, t.tile_start, *filled)
+        band = Band(begin, end, (base, t.tiles_x, t.tile_start, tile_end, gaussian, reach))
         if len(bands) == 1:
             view.only_band.append(band)
         yield band
@@ -178,10 +186,8 @@ def blend_forward(
     """Blend per-Gaussian channels: premultiplied image and alpha."""
     image = np.empty((*view.size_hw, channels.shape[1]), np.float32)
     alpha = np.empty(view.size_hw, np.float32)
-    t, blended = view.tiles, (view.geometry, channels, image, alpha)
     for band in tile_lists(view, threads):
-        lists = (band.base, t.tiles_x, t.tile_start, band.gaussian)
-        band.over_tiles(blend, threads, *lists, *blended)
+        band.over_tiles(blend, threads, view.geometry, channels, image, alpha)
     return image, alpha
 
 
@@ -201,25 +207,28 @@ def blend_gradients(
         channels: what was blended: the view's colours in the first 3 columns, then features.
         image, alpha: what `blend_forward` returned.
     """
-    t, p, n = view.tiles, gaussians, len(gaussians)
+    p, n = gaussians, len(gaussians)
     columns = MOMENTS + channels.shape[1]
-    sums = np.zeros((n, columns))
+    width = (columns + WIDTH - 1) // WIDTH * WIDTH
+    sums = aligned(len(view.geometry) * width).reshape(-1, width)
+    sums[:] = 0.0
     blended = (view.geometry, channels, image, alpha, grad_image, grad_alpha)
     for band in tile_lists(view, threads):
-        slots = np.empty((len(band.gaussian), columns), np.float32)
-        lists = (band.base, t.tiles_x, t.tile_start, band.gaussian)
-        band.over_tiles(blend_backward, threads, *lists, *blended, slots)
+        base, _, tile_start, tile_end, gaussian, _ = band.lists
+        slots = aligned(len(gaussian) * columns + WIDTH)
+        band.over_tiles(blend_backward, threads, *blended, slots, columns)
         # every range reads all entries, so there is one per thread
         edges = np.linspace(0, n, max(threads, 1) + 1).astype(int).tolist()
-        over_edges(add_slots, edges, threads, band.gaussian, slots, sums)
+        listed = ((band.begin, band.end), base, tile_start, tile_end, gaussian)
+        over_edges(add_slots, edges, threads, *listed, slots, columns, sums)
     out = Gradients(
         **{name: np.empty(getattr(p, name).shape, np.float32) for name in FIELDS},
-        features=sums[:, MOMENTS + 3 :].astype(np.float32),
+        features=sums[:n, MOMENTS + 3 : columns].copy(),
         means_px=np.empty((n, 2), np.float32),
     )
-    known = (p.means, p.log_scales, p.quats, p.sh, view.degree, view.camera, view.geometry, view.box)
+    known = (p.means, p.log_scales, p.quats, p.sh, view.degree, view.camera, view.geometry, sums)
     outputs = (out.means, out.log_scales, out.quats, out.opacity_logits, out.sh, out.means_px)
-    over_ranges(project_backward, n, threads, *known, view.colours, sums, *outputs)
+    over_ranges(project_backward, len(view.geometry) // WIDTH, threads, *known, *outputs)
     return out
 
 
@@ -254,13 +263,11 @@ def sparse_weights(
 
     Rows are row-major pixels; columns ascend within a row. Row starts are int64.
     """
-    t = view.tiles
     counts = np.zeros(view.size_hw[0] * view.size_hw[1], np.int64)
 
     def over_bands(work: Callable[..., Any], *arguments: Any) -> None:
         for band in tile_lists(view, threads):
-            lists = (band.base, t.tiles_x, view.size_hw, t.tile_start, band.gaussian, view.geometry)
-            band.over_tiles(work, threads, *lists, np.float32(min_weight), *arguments)
+            band.over_tiles(work, threads, view.size_hw, view.geometry, np.float32(min_weight), *arguments)
 
     over_bands(count_weights, counts)
     row_start = np.concatenate([[0], np.cumsum(counts)])

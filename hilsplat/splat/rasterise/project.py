@@ -16,6 +16,22 @@ import numpy as np
 from jaxtyping import Float
 
 from hilsplat.base.compiled import compiled
+from hilsplat.base.lanes import (
+    WIDTH,
+    aligned,
+    exp2_negative,
+    keep_ge,
+    keep_gt,
+    lanes,
+    larger,
+    load,
+    narrow,
+    root,
+    smaller,
+    store,
+    transpose,
+    wide,
+)
 from hilsplat.base.rotations import matrix_entries
 from hilsplat.scene.cameras import Camera
 
@@ -29,12 +45,27 @@ MAX_LOG_SCALE = np.float32(20.0)
 """Scales are cut at exp(20), 5e8 scene units, and get no gradient beyond. A Gaussian that wide covers any
 view evenly along that axis; at exp(40) the columns of its pixel box would overflow 64-bit integers. float32
 as the scales: with a float64 they would all be computed in float64, and change in their last bits."""
-LOG2_E = 1.4426950408889634
+_LEAST_LOG = np.float32(-60.0)
+LOG2_E, LN_2 = 1.4426950408889634, 0.6931471805599453
+LOG2_MIN_ALPHA = math.log2(MIN_ALPHA)
+_LOG2_1P = tuple(
+    np.polynomial.Chebyshev.interpolate(lambda e: np.log1p(e) / (e * LN_2), 9, domain=[0, 1])
+    .convert(kind=np.polynomial.Polynomial)
+    .coef.astype(np.float32)
+)
+"""Polynomial for log2(1 + e) / e on [0, 1], constant first."""
 
-GEOMETRY = 8
-"""Columns of a projected Gaussian: mean x, mean y, a, b, c, log2 of the peak alpha, depth, spare."""
+GEOMETRY = 16
+"""Columns of a projected Gaussian, one line of the cache: mean x, mean y, a, b, c, log2 of the peak alpha,
+depth, whether it is drawn, colour (3), spare (5)."""
 MOMENTS = 6
 """Leading columns of gradient slots and sums: v, v dx, v dy, v dx^2, v dx dy, v dy^2; v = alpha dL/dalpha."""
+
+LANES = WIDTH
+SH_COLUMN = 16
+ROW = 96
+"""Columns of 16 Gaussians that are projected together: mean, log scales, quaternion, logit; from 16
+harmonics; from 64 geometry; from 80 sums."""
 
 _C0 = 0.28209479177387814
 _C1 = 0.4886025119029199
@@ -72,80 +103,169 @@ def pack_camera(camera: Camera) -> Float[np.ndarray, " 25"]:
 @compiled(inline="always")
 @no_type_check
 def _sh_basis(x, y, z, degree, basis):
-    """Real spherical harmonics up to `degree` (at most 3) of a unit direction, 3DGS order and signs."""
-    basis[0] = _C0
+    """Real spherical harmonics up to `degree` (at most 3) of unit directions, 3DGS order and signs."""
+    one = lanes(np.float32(1))
+    store(basis, 0, _C0 * one)
     if degree >= 1:
-        basis[1] = -_C1 * y
-        basis[2] = _C1 * z
-        basis[3] = -_C1 * x
+        store(basis, 1 * LANES, -_C1 * y)
+        store(basis, 2 * LANES, _C1 * z)
+        store(basis, 3 * LANES, -_C1 * x)
     if degree >= 2:
         xx, yy, zz = x * x, y * y, z * z
-        basis[4] = _C20 * x * y
-        basis[5] = -_C20 * y * z
-        basis[6] = _C22 * (2.0 * zz - xx - yy)
-        basis[7] = -_C20 * x * z
-        basis[8] = _C24 * (xx - yy)
+        store(basis, 4 * LANES, _C20 * x * y)
+        store(basis, 5 * LANES, -_C20 * y * z)
+        store(basis, 6 * LANES, _C22 * (2.0 * zz - xx - yy))
+        store(basis, 7 * LANES, -_C20 * x * z)
+        store(basis, 8 * LANES, _C24 * (xx - yy))
         if degree >= 3:
-            basis[9] = -_C30 * y * (3.0 * xx - yy)
-            basis[10] = _C31 * x * y * z
-            basis[11] = -_C32 * y * (4.0 * zz - xx - yy)
-            basis[12] = _C33 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy)
-            basis[13] = -_C32 * x * (4.0 * zz - xx - yy)
-            basis[14] = _C35 * z * (xx - yy)
-            basis[15] = -_C30 * x * (xx - 3.0 * yy)
+            store(basis, 9 * LANES, -_C30 * y * (3.0 * xx - yy))
+            store(basis, 10 * LANES, _C31 * x * y * z)
+            store(basis, 11 * LANES, -_C32 * y * (4.0 * zz - xx - yy))
+            store(basis, 12 * LANES, _C33 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy))
+            store(basis, 13 * LANES, -_C32 * x * (4.0 * zz - xx - yy))
+            store(basis, 14 * LANES, _C35 * z * (xx - yy))
+            store(basis, 15 * LANES, -_C30 * x * (xx - 3.0 * yy))
 
 
 @compiled(inline="always")
 @no_type_check
-def _sh_slope(x, y, z, degree, slope):
-    """Derivatives of `_sh_basis` with respect to x, y, z as if independent: slope[k] = (d/dx, d/dy, d/dz)."""
-    slope[:, :] = 0.0
-    if degree >= 1:
-        slope[1, 1] = -_C1
-        slope[2, 2] = _C1
-        slope[3, 0] = -_C1
+def _sh_pull(x, y, z, degree, w):
+    """Gradient of the sum of w[k] times `_sh_basis` with respect to x, y, z as if independent."""
+    w1, w2, w3 = load(w, 1 * LANES), load(w, 2 * LANES), load(w, 3 * LANES)
+    gx, gy, gz = -_C1 * w3, -_C1 * w1, _C1 * w2
     if degree >= 2:
-        slope[4, 0], slope[4, 1] = _C20 * y, _C20 * x
-        slope[5, 1], slope[5, 2] = -_C20 * z, -_C20 * y
-        slope[6, 0], slope[6, 1], slope[6, 2] = -2.0 * _C22 * x, -2.0 * _C22 * y, 4.0 * _C22 * z
-        slope[7, 0], slope[7, 2] = -_C20 * z, -_C20 * x
-        slope[8, 0], slope[8, 1] = 2.0 * _C24 * x, -2.0 * _C24 * y
+        w4, w5, w6 = load(w, 4 * LANES), load(w, 5 * LANES), load(w, 6 * LANES)
+        w7, w8 = load(w, 7 * LANES), load(w, 8 * LANES)
+        gx = gx + _C20 * (y * w4 - z * w7) - 2.0 * _C22 * x * w6 + 2.0 * _C24 * x * w8
+        gy = gy + _C20 * (x * w4 - z * w5) - 2.0 * _C22 * y * w6 - 2.0 * _C24 * y * w8
+        gz = gz - _C20 * (y * w5 + x * w7) + 4.0 * _C22 * z * w6
     if degree >= 3:
         xx, yy, zz = x * x, y * y, z * z
-        slope[9, 0], slope[9, 1] = -6.0 * _C30 * x * y, -_C30 * (3.0 * xx - 3.0 * yy)
-        slope[10, 0], slope[10, 1], slope[10, 2] = _C31 * y * z, _C31 * x * z, _C31 * x * y
-        slope[11, 0], slope[11, 1] = 2.0 * _C32 * x * y, -_C32 * (4.0 * zz - xx - 3.0 * yy)
-        slope[11, 2] = -8.0 * _C32 * y * z
-        slope[12, 0], slope[12, 1] = -6.0 * _C33 * x * z, -6.0 * _C33 * y * z
-        slope[12, 2] = _C33 * (6.0 * zz - 3.0 * xx - 3.0 * yy)
-        slope[13, 0], slope[13, 1] = -_C32 * (4.0 * zz - 3.0 * xx - yy), 2.0 * _C32 * x * y
-        slope[13, 2] = -8.0 * _C32 * x * z
-        slope[14, 0], slope[14, 1], slope[14, 2] = 2.0 * _C35 * x * z, -2.0 * _C35 * y * z, _C35 * (xx - yy)
-        slope[15, 0], slope[15, 1] = -_C30 * (3.0 * xx - 3.0 * yy), 6.0 * _C30 * x * y
+        w9, w10, w11 = load(w, 9 * LANES), load(w, 10 * LANES), load(w, 11 * LANES)
+        w12, w13, w14 = load(w, 12 * LANES), load(w, 13 * LANES), load(w, 14 * LANES)
+        w15 = load(w, 15 * LANES)
+        across, along = 3.0 * _C30 * (xx - yy), 6.0 * _C30 * x * y
+        gx = gx - along * w9 - across * w15 + _C31 * y * z * w10 + 2.0 * _C35 * x * z * w14
+        gx = gx + _C32 * (2.0 * x * y * w11 - (4.0 * zz - 3.0 * xx - yy) * w13) - 6.0 * _C33 * x * z * w12
+        gy = gy - across * w9 + along * w15 + _C31 * x * z * w10 - 2.0 * _C35 * y * z * w14
+        gy = gy + _C32 * (2.0 * x * y * w13 - (4.0 * zz - xx - 3.0 * yy) * w11) - 6.0 * _C33 * y * z * w12
+        gz = gz + _C31 * x * y * w10 + _C35 * (xx - yy) * w14 - 8.0 * _C32 * z * (y * w11 + x * w13)
+        gz = gz + _C33 * (6.0 * zz - 3.0 * xx - 3.0 * yy) * w12
+    return gx, gy, gz
 
 
 @compiled(inline="always")
 @no_type_check
-def _cam_from_gaussian(camera, quats, scales, i, axes, factor):
-    """Rotation of Gaussian i into the camera (axes) and the same with columns scaled (factor)."""
-    w, x, y, z = float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3])
-    norm = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
-    w, x, y, z = w * norm, x * norm, y * norm, z * norm
-    r00, r01, r02, r10, r11, r12, r20, r21, r22 = matrix_entries(w, x, y, z)
-    for row in range(3):
-        a, b, c = camera[3 * row], camera[3 * row + 1], camera[3 * row + 2]
-        axes[row, 0] = a * r00 + b * r10 + c * r20
-        axes[row, 1] = a * r01 + b * r11 + c * r21
-        axes[row, 2] = a * r02 + b * r12 + c * r22
-        for k in range(3):
-            factor[row, k] = axes[row, k] * scales[k]
-    return w, x, y, z, norm
+def _read(table, width, first, count, rows, columns, column):
+    """Transpose rows first..first + count of a flat table to columns of 16 lanes, and numbers behind them.
+
+    Lanes beyond `count` and columns beyond `width` get some numbers.
+    """
+    blocks = (width + LANES - 1) // LANES
+    if (first + LANES - 1) * width + blocks * LANES <= len(table):
+        for block in range(blocks):
+            at = first * width + block * LANES
+            transpose(table, at, width, columns, (column + block * LANES) * LANES, LANES)
+    else:  # a vector would pass the end of the table
+        for k in range(count * width):
+            rows[k] = table[first * width + k]
+        for block in range(blocks):
+            transpose(rows, block * LANES, width, columns, (column + block * LANES) * LANES, LANES)
+
+
+@compiled(inline="always")
+@no_type_check
+def _write(columns, column, width, rows, table, first, count, last):
+    """The reverse of `_read`, to rows below `last`.
+
+    The last block of a row runs into the next row, whose first block is written after it.
+    """
+    blocks = (width + LANES - 1) // LANES
+    if (first + LANES - 1) * width + blocks * LANES <= last * width:
+        for block in range(blocks - 1, -1, -1):
+            at = first * width + block * LANES
+            transpose(columns, (column + block * LANES) * LANES, LANES, table, at, width)
+    else:
+        for block in range(blocks - 1, -1, -1):
+            transpose(columns, (column + block * LANES) * LANES, LANES, rows, block * LANES, width)
+        for k in range(count * width):
+            table[first * width + k] = rows[k]
+
+
+@compiled(inline="always")
+@no_type_check
+def _exp(value):
+    """exp of float32 lanes, cut to [-60, MAX_LOG_SCALE]: exp(-60) is nothing beside the low-pass."""
+    exponent = wide(smaller(larger(value, lanes(_LEAST_LOG)), lanes(MAX_LOG_SCALE))) * LOG2_E - 32.0
+    near = narrow(exponent)
+    return wide(exp2_negative(near)) * (1.0 + (exponent - wide(near)) * LN_2) * 2.0**32
+
+
+@compiled(inline="always")
+@no_type_check
+def _log2_sigmoid(logit):
+    """log2 of 1 / (1 + exp(-logit)), float32 lanes, absolute error below 1e-6."""
+    zero = lanes(np.float32(0))
+    e = narrow(_exp(smaller(logit, zero - logit)))
+    series = lanes(_LOG2_1P[-1])
+    for k in range(len(_LOG2_1P) - 2, -1, -1):
+        series = series * e + lanes(_LOG2_1P[k])
+    return smaller(logit, zero) * LOG2_E - series * e
+
+
+@compiled(inline="always")
+@no_type_check
+def _wide_column(columns, k):
+    return wide(load(columns, k * LANES))
+
+
+@compiled(inline="always")
+@no_type_check
+def _place(columns, camera):
+    """Means of 16 Gaussians in the camera, unit quaternions and the inverse of their lengths."""
+    mx, my, mz = _wide_column(columns, 0), _wide_column(columns, 1), _wide_column(columns, 2)
+    x = camera[0] * mx + camera[1] * my + camera[2] * mz + camera[9]
+    y = camera[3] * mx + camera[4] * my + camera[5] * mz + camera[10]
+    z = camera[6] * mx + camera[7] * my + camera[8] * mz + camera[11]
+    w, i, j, k = (
+        _wide_column(columns, 6),
+        _wide_column(columns, 7),
+        _wide_column(columns, 8),
+        _wide_column(columns, 9),
+    )
+    norm = 1.0 / root(w * w + i * i + j * j + k * k)
+    dx, dy, dz = mx - camera[16], my - camera[17], mz - camera[18]
+    distance = 1.0 / root(dx * dx + dy * dy + dz * dz)
+    return (
+        (x, y, z),
+        (w * norm, i * norm, j * norm, k * norm),
+        norm,
+        (dx * distance, dy * distance, dz * distance),
+        distance,
+    )
+
+
+@compiled(inline="always")
+@no_type_check
+def _axis(camera, scale, i, j, k):
+    """An axis (i, j, k) of Gaussians in the camera, times their scale along it."""
+    return (
+        (camera[0] * i + camera[1] * j + camera[2] * k) * scale,
+        (camera[3] * i + camera[4] * j + camera[5] * k) * scale,
+        (camera[6] * i + camera[7] * j + camera[8] * k) * scale,
+    )
+
+
+@compiled(inline="always")
+@no_type_check
+def _clamped(value, low, high):
+    return smaller(larger(value, value * 0.0 + low), value * 0.0 + high)
 
 
 @compiled
 @no_type_check
 def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, camera, geometry, box, colours):
-    """Project Gaussians begin..end into a view.
+    """Project Gaussians into a view: groups begin..end of 16.
 
     Fills, per Gaussian: geometry (see GEOMETRY), box = first and last pixel column, first and last
     pixel row where alpha can reach MIN_ALPHA (last < first: not drawn), colours.
@@ -155,77 +275,130 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
     """
     height, width = int(camera[23]), int(camera[24])
     fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
-    axes, factor = np.empty((3, 3)), np.empty((3, 3))
-    scales, basis = np.empty(3), np.empty(16)
-    bases = (degree + 1) * (degree + 1)
-    broken = 0
-    for i in range(begin, end):
-        box[i, 0], box[i, 1], box[i, 2], box[i, 3] = 0, -1, 0, -1
-        total = float(opacity_logits[i])
-        for k in range(3):
-            total += float(means[i, k]) + float(log_scales[i, k])
-        length = 0.0
-        for k in range(4):
-            length += float(quats[i, k]) * float(quats[i, k])
-        for k in range(sh.shape[1]):
-            total += float(sh[i, k, 0]) + float(sh[i, k, 1]) + float(sh[i, k, 2])
-        if not (abs(total) < np.inf and 0.0 < length < np.inf):
-            broken += 1
-            continue
-        mx, my, mz = float(means[i, 0]), float(means[i, 1]), float(means[i, 2])
-        x = camera[0] * mx + camera[1] * my + camera[2] * mz + camera[9]
-        y = camera[3] * mx + camera[4] * my + camera[5] * mz + camera[10]
-        z = camera[6] * mx + camera[7] * my + camera[8] * mz + camera[11]
-        if z <= NEAR:
-            continue
-        opacity = 1.0 / (1.0 + math.exp(-float(opacity_logits[i])))
-        if opacity < MIN_ALPHA:
-            continue
-        for k in range(3):
-            scales[k] = math.exp(min(float(log_scales[i, k]), MAX_LOG_SCALE))
-        _cam_from_gaussian(camera, quats, scales, i, axes, factor)
+    rows, columns, basis = aligned(LANES * ROW), aligned(LANES * ROW), aligned(16 * LANES)
+    rows[:] = 0.0
+    found, zero = np.empty(7 * LANES), lanes(np.float32(0))
+    tables = means.reshape(-1), log_scales.reshape(-1), quats.reshape(-1), sh.reshape(-1)
+    flat_geometry = geometry.reshape(-1)
+    numbers, broken = 3 * sh.shape[1], 0
+    for group in range(begin, end):
+        first = group * LANES
+        count = min(LANES, len(means) - first)
+        _read(tables[0], 3, first, count, rows, columns, 0)
+        _read(tables[1], 3, first, count, rows, columns, 3)
+        _read(tables[2], 4, first, count, rows, columns, 6)
+        _read(opacity_logits, 1, first, count, rows, columns, 10)
+        _read(tables[3], numbers, first, count, rows, columns, SH_COLUMN)
+        finite = zero  # and not a number if a parameter is not finite
+        for k in range(SH_COLUMN + numbers):
+            if k < 11 or k >= SH_COLUMN:
+                finite = finite + load(columns, k * LANES) * zero
+        (x, y, z), (qw, qx, qy, qz), norm, towards, _ = _place(columns, camera)
+        store(found, 0, z)
+        # a quaternion of length zero has no norm
+        store(found, LANES, norm * 0.0 + wide(finite))
+        r00, r01, r02, r10, r11, r12, r20, r21, r22 = matrix_entries(qw, qx, qy, qz)
         inverse_z = 1.0 / z
-        ray_x = min(max(x * inverse_z, camera[19]), camera[20])
-        ray_y = min(max(y * inverse_z, camera[21]), camera[22])
+        ray_x = _clamped(x * inverse_z, camera[19], camera[20])
+        ray_y = _clamped(y * inverse_z, camera[21], camera[22])
         jx, jy = fx * inverse_z, fy * inverse_z
-        xx, xy, yy = LOW_PASS_PX2, 0.0, LOW_PASS_PX2
-        for k in range(3):
-            u = jx * (factor[0, k] - ray_x * factor[2, k])
-            v = jy * (factor[1, k] - ray_y * factor[2, k])
-            xx += u * u
-            xy += u * v
-            yy += v * v
+        one = _axis(camera, _exp(load(columns, 3 * LANES)), r00, r10, r20)
+        two = _axis(camera, _exp(load(columns, 4 * LANES)), r01, r11, r21)
+        three = _axis(camera, _exp(load(columns, 5 * LANES)), r02, r12, r22)
+        u1, u2, u3 = one[0] - ray_x * one[2], two[0] - ray_x * two[2], three[0] - ray_x * three[2]
+        v1, v2, v3 = one[1] - ray_y * one[2], two[1] - ray_y * two[2], three[1] - ray_y * three[2]
+        xx = jx * jx * (u1 * u1 + u2 * u2 + u3 * u3) + LOW_PASS_PX2
+        xy = jx * jy * (u1 * v1 + u2 * v2 + u3 * v3)
+        yy = jy * jy * (v1 * v1 + v2 * v2 + v3 * v3) + LOW_PASS_PX2
         determinant = xx * yy - xy * xy
-        if not 0.0 < determinant < np.inf:
-            continue
         inverse = 1.0 / determinant
-        px, py = fx * x * inverse_z + cx, fy * y * inverse_z + cy
+        px, py = jx * x + cx, jy * y + cy
+        top = _log2_sigmoid(load(columns, 10 * LANES))
         # The level set alpha = MIN_ALPHA has half-widths sqrt(q cov); slightly more for rounding.
-        q = 2.0 * math.log(opacity / MIN_ALPHA)
-        half_x, half_y = math.sqrt(q * xx) + 1e-2, math.sqrt(q * yy) + 1e-2
-        if not (px + half_x > 0.0 and px - half_x < width and py + half_y > 0.0 and py - half_y < height):
-            continue
-        first_x, last_x = max(math.ceil(px - half_x - 0.5), 0), min(math.floor(px + half_x - 0.5), width - 1)
-        first_y, last_y = max(math.ceil(py - half_y - 0.5), 0), min(math.floor(py + half_y - 0.5), height - 1)
-        if last_x < first_x or last_y < first_y:
-            continue
-        box[i, 0], box[i, 1], box[i, 2], box[i, 3] = first_x, last_x, first_y, last_y
-        geometry[i, 0], geometry[i, 1] = px, py
-        geometry[i, 2] = 0.5 * LOG2_E * yy * inverse
-        geometry[i, 3] = -LOG2_E * xy * inverse
-        geometry[i, 4] = 0.5 * LOG2_E * xx * inverse
-        geometry[i, 5] = math.log2(opacity)
-        geometry[i, 6] = z
-        dx, dy, dz = mx - camera[16], my - camera[17], mz - camera[18]
-        distance = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
-        _sh_basis(dx * distance, dy * distance, dz * distance, degree, basis)
-        red, green, blue = 0.5, 0.5, 0.5
-        for k in range(bases):
-            red += basis[k] * sh[i, k, 0]
-            green += basis[k] * sh[i, k, 1]
-            blue += basis[k] * sh[i, k, 2]
-        colours[i, 0], colours[i, 1], colours[i, 2] = max(red, 0.0), max(green, 0.0), max(blue, 0.0)
+        q = 2.0 * LN_2 * (wide(top) - LOG2_MIN_ALPHA)
+        store(found, 2 * LANES, determinant)
+        store(found, 3 * LANES, px)
+        store(found, 4 * LANES, py)
+        store(found, 5 * LANES, root(q * xx) + 1e-2)
+        store(found, 6 * LANES, root(q * yy) + 1e-2)
+        store(columns, 0, narrow(px))
+        store(columns, 1 * LANES, narrow(py))
+        store(columns, 2 * LANES, narrow(0.5 * LOG2_E * yy * inverse))
+        store(columns, 3 * LANES, narrow(-LOG2_E * xy * inverse))
+        store(columns, 4 * LANES, narrow(0.5 * LOG2_E * xx * inverse))
+        store(columns, 5 * LANES, top)
+        store(columns, 6 * LANES, narrow(z))
+        store(columns, 7 * LANES, zero)
+        _sh_basis(narrow(towards[0]), narrow(towards[1]), narrow(towards[2]), degree, basis)
+        red, green, blue = zero + 0.5, zero + 0.5, zero + 0.5
+        for k in range((degree + 1) * (degree + 1)):
+            each, at = load(basis, k * LANES), (SH_COLUMN + 3 * k) * LANES
+            red = red + each * load(columns, at)
+            green = green + each * load(columns, at + LANES)
+            blue = blue + each * load(columns, at + 2 * LANES)
+        store(columns, 8 * LANES, larger(red, zero))
+        store(columns, 9 * LANES, larger(green, zero))
+        store(columns, 10 * LANES, larger(blue, zero))
+        store(columns, 7 * LANES, zero)
+        transpose(columns, 0, LANES, flat_geometry, first * GEOMETRY, GEOMETRY)
+        for lane in range(count):
+            i = first + lane
+            box[i, 0], box[i, 1], box[i, 2], box[i, 3] = 0, -1, 0, -1
+            if found[LANES + lane] != 0.0:  # so is what is not a number
+                broken += 1
+                continue
+            if not (found[lane] > NEAR and 0.0 < found[2 * LANES + lane] < np.inf):
+                continue
+            x, y = found[3 * LANES + lane], found[4 * LANES + lane]
+            half_x, half_y = found[5 * LANES + lane], found[6 * LANES + lane]
+            # also false if the peak is below MIN_ALPHA and the widths are roots of negative numbers
+            if not (x + half_x > 0.0 and x - half_x < width and y + half_y > 0.0 and y - half_y < height):
+                continue
+            first_x, last_x = (
+                max(math.ceil(x - half_x - 0.5), 0),
+                min(math.floor(x + half_x - 0.5), width - 1),
+            )
+            first_y, last_y = (
+                max(math.ceil(y - half_y - 0.5), 0),
+                min(math.floor(y + half_y - 0.5), height - 1),
+            )
+            if last_x < first_x or last_y < first_y:
+                continue
+            box[i, 0], box[i, 1], box[i, 2], box[i, 3] = first_x, last_x, first_y, last_y
+            geometry[i, 7] = 1.0
+            for k in range(3):
+                colours[i, k] = geometry[i, 8 + k]
     return broken
+
+
+@compiled(inline="always")
+@no_type_check
+def _where_equal(left, right, value):
+    return keep_ge(left, right, keep_ge(right, left, value))
+
+
+@compiled(inline="always")
+@no_type_check
+def _axis_backward(camera, scale, i, j, k, shared):
+    """Gradients through one column of cov = U U' + low pass, U = J factor (2 x 3), factor = cam_R rot scales.
+
+    dU = 2 dcov U, dJ = dU factor', dfactor = J' dU.
+
+    Returns:
+        dL/d of the log scale, of the three entries of rot, and of J (its entries 00, 02, 11, 12).
+    """
+    jx, jy, ray_x, ray_y, cov_xx, cov_xy, cov_yy = shared
+    f0, f1, f2 = _axis(camera, scale, i, j, k)
+    u, v = jx * (f0 - ray_x * f2), jy * (f1 - ray_y * f2)
+    du, dv = 2.0 * (cov_xx * u + cov_xy * v), 2.0 * (cov_xy * u + cov_yy * v)
+    g0, g1 = jx * du, jy * dv
+    g2 = 0.0 - (ray_x * g0 + ray_y * g1)
+    rotation = (
+        (camera[0] * g0 + camera[3] * g1 + camera[6] * g2) * scale,
+        (camera[1] * g0 + camera[4] * g1 + camera[7] * g2) * scale,
+        (camera[2] * g0 + camera[5] * g1 + camera[8] * g2) * scale,
+    )
+    return g0 * f0 + g1 * f1 + g2 * f2, rotation, (du * f0, du * f2, dv * f1, dv * f2)
 
 
 @compiled
@@ -240,8 +413,6 @@ def project_backward(
     degree,
     camera,
     geometry,
-    box,
-    colours,
     sums,
     grad_means,
     grad_log_scales,
@@ -250,148 +421,125 @@ def project_backward(
     grad_sh,
     grad_means_px,
 ):
-    """Gradients of Gaussians begin..end from their moments and dL/dcolours (rows of `sums`).
+    """Gradients of groups begin..end of 16 Gaussians from their moments and dL/dcolours (rows of `sums`).
 
     The outputs are overwritten; Gaussians that are not drawn get zeros. `grad_means_px` is dL/d(projected
     mean), per pixel.
     """
     fx, fy = camera[12], camera[13]
-    axes, factor, grad_factor = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    scales, basis, slope = np.empty(3), np.empty(16), np.empty((16, 3))
-    rotation_grad, jacobian = np.empty((3, 3)), np.empty((2, 3))
-    bases = (degree + 1) * (degree + 1)
-    for i in range(begin, end):
-        if box[i, 1] < box[i, 0]:
-            for k in range(3):
-                grad_means[i, k] = grad_log_scales[i, k] = 0.0
-            for k in range(4):
-                grad_quats[i, k] = 0.0
-            grad_opacity_logits[i] = grad_means_px[i, 0] = grad_means_px[i, 1] = 0.0
-            for k in range(grad_sh.shape[1]):
-                grad_sh[i, k, 0] = grad_sh[i, k, 1] = grad_sh[i, k, 2] = 0.0
-            continue
+    rows, columns = aligned(LANES * ROW), aligned(LANES * ROW)
+    basis, pulls = aligned(16 * LANES), aligned(16 * LANES)
+    rows[:] = 0.0
+    zero, numbers, bases = lanes(np.float32(0)), 3 * sh.shape[1], (degree + 1) * (degree + 1)
+    tables = means.reshape(-1), log_scales.reshape(-1), quats.reshape(-1), sh.reshape(-1)
+    grads = grad_means.reshape(-1), grad_log_scales.reshape(-1), grad_quats.reshape(-1), grad_sh.reshape(-1)
+    flat_geometry, flat_sums, flat_px = geometry.reshape(-1), sums.reshape(-1), grad_means_px.reshape(-1)
+    last = min(end * LANES, len(means))
+    for group in range(begin, end):
+        first = group * LANES
+        count = min(LANES, len(means) - first)
+        _read(tables[0], 3, first, count, rows, columns, 0)
+        _read(tables[1], 3, first, count, rows, columns, 3)
+        _read(tables[2], 4, first, count, rows, columns, 6)
+        _read(tables[3], numbers, first, count, rows, columns, SH_COLUMN)
+        transpose(flat_geometry, first * GEOMETRY, GEOMETRY, columns, 64 * LANES, LANES)
+        transpose(flat_sums, first * sums.shape[1], sums.shape[1], columns, 80 * LANES, LANES)
+        drawn = load(columns, 71 * LANES)
+        (x, y, z), (qw, qx, qy, qz), norm, (vx, vy, vz), inverse = _place(columns, camera)
 
         # log alpha = ln opacity - (A dx^2 + 2 B dx dy + C dy^2) / 2, conic (A, B, C) = inverse covariance
-        conic_a = 2.0 / LOG2_E * geometry[i, 2]
-        conic_b = geometry[i, 3] / LOG2_E
-        conic_c = 2.0 / LOG2_E * geometry[i, 4]
-        opacity = 2.0 ** float(geometry[i, 5])
-        grad_opacity_logits[i] = sums[i, 0] * (1.0 - opacity)
-        gpx = -(conic_a * sums[i, 1] + conic_b * sums[i, 2])
-        gpy = -(conic_b * sums[i, 1] + conic_c * sums[i, 2])
-        grad_means_px[i, 0], grad_means_px[i, 1] = gpx, gpy
+        conic_a = 2.0 / LOG2_E * _wide_column(columns, 66)
+        conic_b = 1.0 / LOG2_E * _wide_column(columns, 67)
+        conic_c = 2.0 / LOG2_E * _wide_column(columns, 68)
+        s, sx, sy = load(columns, 80 * LANES), _wide_column(columns, 81), _wide_column(columns, 82)
+        opacity = exp2_negative(load(columns, 69 * LANES))
+        gpx, gpy = 0.0 - (conic_a * sx + conic_b * sy), 0.0 - (conic_b * sx + conic_c * sy)
         # dL/d conic as a symmetric matrix (p, q; q, r); dL/d cov = -conic (p, q; q, r) conic
-        p, q, r = -0.5 * sums[i, 3], -0.5 * sums[i, 4], -0.5 * sums[i, 5]
+        p, q, r = (
+            -0.5 * _wide_column(columns, 83),
+            -0.5 * _wide_column(columns, 84),
+            -0.5 * _wide_column(columns, 85),
+        )
         m00, m01 = conic_a * p + conic_b * q, conic_a * q + conic_b * r
         m10, m11 = conic_b * p + conic_c * q, conic_b * q + conic_c * r
-        cov_xx = -(m00 * conic_a + m01 * conic_b)
-        cov_xy = -(m00 * conic_b + m01 * conic_c)
-        cov_yy = -(m10 * conic_b + m11 * conic_c)
+        cov_xx = 0.0 - (m00 * conic_a + m01 * conic_b)
+        cov_xy = 0.0 - (m00 * conic_b + m01 * conic_c)
+        cov_yy = 0.0 - (m10 * conic_b + m11 * conic_c)
 
-        mx, my, mz = float(means[i, 0]), float(means[i, 1]), float(means[i, 2])
-        x = camera[0] * mx + camera[1] * my + camera[2] * mz + camera[9]
-        y = camera[3] * mx + camera[4] * my + camera[5] * mz + camera[10]
-        z = camera[6] * mx + camera[7] * my + camera[8] * mz + camera[11]
-        for k in range(3):
-            scales[k] = math.exp(min(float(log_scales[i, k]), MAX_LOG_SCALE))
-        qw, qx, qy, qz, norm = _cam_from_gaussian(camera, quats, scales, i, axes, factor)
+        r00, r01, r02, r10, r11, r12, r20, r21, r22 = matrix_entries(qw, qx, qy, qz)
         inverse_z = 1.0 / z
-        ray_x, ray_y = x * inverse_z, y * inverse_z
-        inside_x = camera[19] <= ray_x <= camera[20]
-        inside_y = camera[21] <= ray_y <= camera[22]
-        ray_x = min(max(ray_x, camera[19]), camera[20])
-        ray_y = min(max(ray_y, camera[21]), camera[22])
+        free_x, free_y = x * inverse_z, y * inverse_z
+        ray_x = _clamped(free_x, camera[19], camera[20])
+        ray_y = _clamped(free_y, camera[21], camera[22])
         jx, jy = fx * inverse_z, fy * inverse_z
-        jacobian[0, 0], jacobian[0, 1], jacobian[0, 2] = jx, 0.0, -jx * ray_x
-        jacobian[1, 0], jacobian[1, 1], jacobian[1, 2] = 0.0, jy, -jy * ray_y
-        # cov = U U' + low pass, U = J factor (2 x 3): dU = 2 dcov U, dJ = dU factor', dfactor = J' dU
-        j00, j02, j11, j12 = 0.0, 0.0, 0.0, 0.0
-        for k in range(3):
-            u = jx * (factor[0, k] - ray_x * factor[2, k])
-            v = jy * (factor[1, k] - ray_y * factor[2, k])
-            du = 2.0 * (cov_xx * u + cov_xy * v)
-            dv = 2.0 * (cov_xy * u + cov_yy * v)
-            j00 += du * factor[0, k]
-            j02 += du * factor[2, k]
-            j11 += dv * factor[1, k]
-            j12 += dv * factor[2, k]
-            along = 0.0
-            for row in range(3):
-                grad_factor[row, k] = jacobian[0, row] * du + jacobian[1, row] * dv
-                along += grad_factor[row, k] * factor[row, k]
-            grad_log_scales[i, k] = along if log_scales[i, k] <= MAX_LOG_SCALE else 0.0
+        shared = (jx, jy, ray_x, ray_y, cov_xx, cov_xy, cov_yy)
+        size_1, size_2, size_3 = (
+            load(columns, 3 * LANES),
+            load(columns, 4 * LANES),
+            load(columns, 5 * LANES),
+        )
+        along_1, (d00, d10, d20), to_j1 = _axis_backward(camera, _exp(size_1), r00, r10, r20, shared)
+        along_2, (d01, d11, d21), to_j2 = _axis_backward(camera, _exp(size_2), r01, r11, r21, shared)
+        along_3, (d02, d12, d22), to_j3 = _axis_backward(camera, _exp(size_3), r02, r12, r22, shared)
+        most = lanes(MAX_LOG_SCALE)
+        store(columns, 3 * LANES, keep_ge(most, size_1, narrow(along_1)))
+        store(columns, 4 * LANES, keep_ge(most, size_2, narrow(along_2)))
+        store(columns, 5 * LANES, keep_ge(most, size_3, narrow(along_3)))
+        j00, j02 = to_j1[0] + to_j2[0] + to_j3[0], to_j1[1] + to_j2[1] + to_j3[1]
+        j11, j12 = to_j1[2] + to_j2[2] + to_j3[2], to_j1[3] + to_j2[3] + to_j3[3]
         gx, gy = gpx * jx, gpy * jy
-        gz = -(gpx * jx * x + gpy * jy * y) * inverse_z
         # J = (fx/z, 0, -fx/z ray_x; 0, fy/z, -fy/z ray_y); the ray is constant where it is clamped
-        gz += -(j00 - j02 * ray_x) * jx * inverse_z - (j11 - j12 * ray_y) * jy * inverse_z
-        if inside_x:
-            gx += -j02 * jx * inverse_z
-            gz += j02 * jx * ray_x * inverse_z
-        if inside_y:
-            gy += -j12 * jy * inverse_z
-            gz += j12 * jy * ray_y * inverse_z
+        gz = (gx * x + gy * y + (j00 - j02 * ray_x) * jx + (j11 - j12 * ray_y) * jy) * inverse_z
+        by_ray_x = _where_equal(free_x, ray_x, j02 * jx * inverse_z)
+        by_ray_y = _where_equal(free_y, ray_y, j12 * jy * inverse_z)
+        gx, gy = gx - by_ray_x, gy - by_ray_y
+        gz = ray_x * by_ray_x + ray_y * by_ray_y - gz
         wx = camera[0] * gx + camera[3] * gy + camera[6] * gz
         wy = camera[1] * gx + camera[4] * gy + camera[7] * gz
         wz = camera[2] * gx + camera[5] * gy + camera[8] * gz
 
-        # rotation: factor = cam_R rot diag(scales)
-        for row in range(3):
-            for k in range(3):
-                rotation_grad[row, k] = scales[k] * (
-                    camera[row] * grad_factor[0, k]
-                    + camera[3 + row] * grad_factor[1, k]
-                    + camera[6 + row] * grad_factor[2, k]
-                )
-        d = rotation_grad
-        dw = 2.0 * (qx * (d[2, 1] - d[1, 2]) + qy * (d[0, 2] - d[2, 0]) + qz * (d[1, 0] - d[0, 1]))
-        dx = 2.0 * (
-            -2.0 * qx * (d[1, 1] + d[2, 2])
-            + qy * (d[0, 1] + d[1, 0])
-            + qz * (d[0, 2] + d[2, 0])
-            + qw * (d[2, 1] - d[1, 2])
-        )
-        dy = 2.0 * (
-            qx * (d[0, 1] + d[1, 0])
-            - 2.0 * qy * (d[0, 0] + d[2, 2])
-            + qz * (d[1, 2] + d[2, 1])
-            + qw * (d[0, 2] - d[2, 0])
-        )
-        dz = 2.0 * (
-            qx * (d[0, 2] + d[2, 0])
-            + qy * (d[1, 2] + d[2, 1])
-            - 2.0 * qz * (d[0, 0] + d[1, 1])
-            + qw * (d[1, 0] - d[0, 1])
-        )
+        dw = 2.0 * (qx * (d21 - d12) + qy * (d02 - d20) + qz * (d10 - d01))
+        dx = 2.0 * (qy * (d01 + d10) + qz * (d02 + d20) + qw * (d21 - d12) - 2.0 * qx * (d11 + d22))
+        dy = 2.0 * (qx * (d01 + d10) + qz * (d12 + d21) + qw * (d02 - d20) - 2.0 * qy * (d00 + d22))
+        dz = 2.0 * (qx * (d02 + d20) + qy * (d12 + d21) + qw * (d10 - d01) - 2.0 * qz * (d00 + d11))
         along = qw * dw + qx * dx + qy * dy + qz * dz
-        grad_quats[i, 0] = (dw - along * qw) * norm
-        grad_quats[i, 1] = (dx - along * qx) * norm
-        grad_quats[i, 2] = (dy - along * qy) * norm
-        grad_quats[i, 3] = (dz - along * qz) * norm
+        store(columns, 6 * LANES, narrow((dw - along * qw) * norm))
+        store(columns, 7 * LANES, narrow((dx - along * qx) * norm))
+        store(columns, 8 * LANES, narrow((dy - along * qy) * norm))
+        store(columns, 9 * LANES, narrow((dz - along * qz) * norm))
+        store(columns, 10 * LANES, s * (1.0 - opacity))
+        store(columns, 11 * LANES, narrow(gpx))
+        store(columns, 12 * LANES, narrow(gpy))
 
         # colour; a channel that is clamped at 0 passes no gradient
-        vx, vy, vz = mx - camera[16], my - camera[17], mz - camera[18]
-        inverse = 1.0 / math.sqrt(vx * vx + vy * vy + vz * vz)
-        vx, vy, vz = vx * inverse, vy * inverse, vz * inverse
-        _sh_basis(vx, vy, vz, degree, basis)
-        red = sums[i, MOMENTS] if colours[i, 0] > 0.0 else 0.0
-        green = sums[i, MOMENTS + 1] if colours[i, 1] > 0.0 else 0.0
-        blue = sums[i, MOMENTS + 2] if colours[i, 2] > 0.0 else 0.0
+        red = keep_gt(load(columns, 72 * LANES), zero, load(columns, 86 * LANES))
+        green = keep_gt(load(columns, 73 * LANES), zero, load(columns, 87 * LANES))
+        blue = keep_gt(load(columns, 74 * LANES), zero, load(columns, 88 * LANES))
+        ux, uy, uz = narrow(vx), narrow(vy), narrow(vz)
+        _sh_basis(ux, uy, uz, degree, basis)
         for k in range(bases):
-            grad_sh[i, k, 0] = basis[k] * red
-            grad_sh[i, k, 1] = basis[k] * green
-            grad_sh[i, k, 2] = basis[k] * blue
-        for k in range(bases, grad_sh.shape[1]):
-            grad_sh[i, k, 0] = grad_sh[i, k, 1] = grad_sh[i, k, 2] = 0.0
+            each, at = load(basis, k * LANES), (SH_COLUMN + 3 * k) * LANES
+            pull = red * load(columns, at) + green * load(columns, at + LANES)
+            store(pulls, k * LANES, pull + blue * load(columns, at + 2 * LANES))
+            store(columns, at, each * red)
+            store(columns, at + LANES, each * green)
+            store(columns, at + 2 * LANES, each * blue)
+        for k in range(SH_COLUMN + 3 * bases, SH_COLUMN + numbers):
+            store(columns, k * LANES, zero)
         if degree > 0:
-            _sh_slope(vx, vy, vz, degree, slope)
-            hx, hy, hz = 0.0, 0.0, 0.0
-            for k in range(1, bases):
-                weight = red * sh[i, k, 0] + green * sh[i, k, 1] + blue * sh[i, k, 2]
-                hx += weight * slope[k, 0]
-                hy += weight * slope[k, 1]
-                hz += weight * slope[k, 2]
-            along = hx * vx + hy * vy + hz * vz
-            wx += (hx - along * vx) * inverse
-            wy += (hy - along * vy) * inverse
-            wz += (hz - along * vz) * inverse
-        grad_means[i, 0], grad_means[i, 1], grad_means[i, 2] = wx, wy, wz
+            hx, hy, hz = _sh_pull(ux, uy, uz, degree, pulls)
+            along = hx * ux + hy * uy + hz * uz
+            wx = wx + wide(hx - along * ux) * inverse
+            wy = wy + wide(hy - along * uy) * inverse
+            wz = wz + wide(hz - along * uz) * inverse
+        store(columns, 0, narrow(wx))
+        store(columns, 1 * LANES, narrow(wy))
+        store(columns, 2 * LANES, narrow(wz))
+        for k in range(SH_COLUMN + numbers):
+            store(columns, k * LANES, keep_gt(drawn, zero, load(columns, k * LANES)))
+        _write(columns, 0, 3, rows, grads[0], first, count, last)
+        _write(columns, 3, 3, rows, grads[1], first, count, last)
+        _write(columns, 6, 4, rows, grads[2], first, count, last)
+        _write(columns, 10, 1, rows, grad_opacity_logits, first, count, last)
+        _write(columns, 11, 2, rows, flat_px, first, count, last)
+        _write(columns, SH_COLUMN, numbers, rows, grads[3], first, count, last)

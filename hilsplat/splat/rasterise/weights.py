@@ -9,7 +9,7 @@ from typing import no_type_check
 import numpy as np
 
 from hilsplat.base.compiled import compiled
-from hilsplat.base.lanes import keep_gt, lanes, load, store
+from hilsplat.base.lanes import aligned, keep_gt, lanes, load, store
 from hilsplat.splat.rasterise.blend import (
     BLOCKS,
     CHUNK,
@@ -17,7 +17,6 @@ from hilsplat.splat.rasterise.blend import (
     PIXELS,
     RECORD,
     gather,
-    list_block,
     start_tile,
     unfinished,
     weigh,
@@ -36,23 +35,26 @@ def _place(pixel):
 
 @compiled
 @no_type_check
-def count_weights(begin, end, base, tiles_x, size_hw, tile_start, gaussian, geometry, least, counts):
+def count_weights(
+    begin, end, base, tiles_x, tile_start, tile_end, gaussian, reach, size_hw, geometry, least, counts
+):
     """Number of weights >= `least` of each pixel (row-major) of tiles begin..end."""
     height, width = size_hw
-    transmittance, found = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.int64)
-    records, reach = np.empty(CHUNK * RECORD, np.float32), np.empty(CHUNK, np.int64)
-    entries, by_lane = np.empty(CHUNK, np.int64), np.empty(CHUNK * LANES, np.float32)
+    transmittance, found = aligned(PIXELS), np.empty(PIXELS, np.int64)
+    records = aligned(CHUNK * RECORD)
+    entries, by_lane = np.empty(CHUNK, np.int64), aligned(CHUNK * LANES)
     for tile in range(begin, end):
         x0, y0 = start_tile(tile, tiles_x, height, width, transmittance)
         found[:] = 0
-        for chunk in range(tile_start[tile], tile_start[tile + 1], CHUNK):
+        for chunk in range(tile_start[tile], tile_end[tile], CHUNK):
             if unfinished(transmittance) == 0:
                 break
-            count = min(tile_start[tile + 1] - chunk, CHUNK)
-            gather(chunk - base, count, x0, y0, gaussian, geometry, records, reach)
+            count = min(tile_end[tile] - chunk, CHUNK)
+            gather(chunk - base, count, x0, y0, gaussian, geometry, records)
             for block in range(BLOCKS):
-                size = list_block(block, count, reach, entries)
-                done = weigh(block, size, records, entries, records, 0, transmittance, by_lane)[0]
+                done = weigh(
+                    block, chunk - base, count, reach, records, records, 0, transmittance, entries, by_lane
+                )[0]
                 for n in range(done):
                     for lane in range(LANES):
                         weight = by_lane[n * LANES + lane]
@@ -70,9 +72,11 @@ def write_weights(
     end,
     base,
     tiles_x,
-    size_hw,
     tile_start,
+    tile_end,
     gaussian,
+    reach,
+    size_hw,
     geometry,
     least,
     longest,
@@ -82,24 +86,25 @@ def write_weights(
 ):
     """Columns and weights of the rows that `count_weights` counted; none is longer than `longest`."""
     height, width = size_hw
-    transmittance, size_of = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.int64)
-    records, reach = np.empty(CHUNK * RECORD, np.float32), np.empty(CHUNK, np.int64)
+    transmittance, size_of = aligned(PIXELS), np.empty(PIXELS, np.int64)
+    records = aligned(CHUNK * RECORD)
     entries, rows = np.empty(CHUNK, np.int64), np.empty(CHUNK, np.int32)
-    by_lane = np.empty(CHUNK * LANES, np.float32)
+    by_lane = aligned(CHUNK * LANES)
     room = (longest // LANES + 1) * LANES  # of a pixel's row, and at least one entry more
     held, held_weights = np.empty(PIXELS * room, np.float32), np.empty(PIXELS * room, np.float32)
     held_columns, rank = held.view(np.int32), np.empty(room, np.float32)
     for tile in range(begin, end):
         x0, y0 = start_tile(tile, tiles_x, height, width, transmittance)
         size_of[:] = 0
-        for chunk in range(tile_start[tile], tile_start[tile + 1], CHUNK):
+        for chunk in range(tile_start[tile], tile_end[tile], CHUNK):
             if unfinished(transmittance) == 0:
                 break
-            count = min(tile_start[tile + 1] - chunk, CHUNK)
-            gather(chunk - base, count, x0, y0, gaussian, geometry, records, reach)
+            count = min(tile_end[tile] - chunk, CHUNK)
+            gather(chunk - base, count, x0, y0, gaussian, geometry, records)
             for block in range(BLOCKS):
-                size = list_block(block, count, reach, entries)
-                done = weigh(block, size, records, entries, records, 0, transmittance, by_lane)[0]
+                done = weigh(
+                    block, chunk - base, count, reach, records, records, 0, transmittance, entries, by_lane
+                )[0]
                 for n in range(done):
                     rows[n] = gaussian[chunk - base + entries[n]]
                 for lane in range(LANES if done else 0):

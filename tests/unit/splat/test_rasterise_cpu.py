@@ -12,6 +12,7 @@ from hilsplat.splat.rasterise import binning
 from hilsplat.splat.rasterise.api import draw, pixel_weights
 from hilsplat.splat.rasterise.binning import bin_gaussians, fill_lists
 from hilsplat.splat.rasterise.device import choose_device, cuda_problem
+from hilsplat.splat.rasterise.project import GEOMETRY
 from tests.unit.splat.rasterise_scenes import camera, random_gaussians
 
 
@@ -57,14 +58,29 @@ def test_tiles_list_the_boxes_that_touch_them_front_to_back():
     depths[10:20] = depths[10]  # equal depths stay in the order of the rows
     tiles = bin_gaussians(box, depths, (35, 50))
     order = np.argsort(depths, kind="stable")
-    gaussian = np.empty(tiles.tile_start[-1], np.int32)
+    gaussian, reach = np.empty(tiles.tile_start[-1], np.int32), np.empty(tiles.tile_start[-1], np.uint16)
+    flat, tile_end = np.ones((50, GEOMETRY), np.float32) * 1e-9, np.empty_like(tiles.tile_start)
+    out = gaussian, reach, tile_end
     for begin, end in ((0, 5), (5, 6), (6, 12)):  # in pieces: as threads and bands fill them
-        fill_lists(begin, end, 0, tiles.tiles_x, tiles.order, tiles.tile_start, box, gaussian)
+        fill_lists(begin, end, 0, tiles.tiles_x, tiles.order, tiles.tile_start, box, flat, *out)
+    assert (reach == 2**16 - 1).all()  # as wide as they are
     for tile in range(4 * 3):
         x, y = tile % 4 * 16, tile // 4 * 16
         touches = (box[:, 0] < x + 16) & (box[:, 1] >= x) & (box[:, 2] < y + 16) & (box[:, 3] >= y)
         expected = [i for i in order if touches[i] and box[i, 1] >= box[i, 0]]
-        assert gaussian[tiles.tile_start[tile] : tiles.tile_start[tile + 1]].tolist() == expected
+        assert gaussian[tiles.tile_start[tile] : tile_end[tile]].tolist() == expected
+
+
+def test_a_tile_that_only_the_box_of_a_needle_touches_does_not_list_it():
+    # along the diagonal of 2 x 2 tiles, (x - y)^2 / 2 px^2: the other two tiles are 1.5 px away at least
+    box, order = np.array([[0, 31, 0, 31]], np.int32), np.zeros(1, np.int32)
+    geometry = np.zeros((1, GEOMETRY), np.float32)
+    geometry[0, :6] = 16, 16, 40, -80 + 1e-3, 40, -0.1
+    gaussian, reach = np.empty(4, np.int32), np.empty(4, np.uint16)
+    tile_start, tile_end = np.arange(5), np.empty(5, int)
+    fill_lists(0, 4, 0, 2, order, tile_start, box, geometry, gaussian, reach, tile_end)
+    assert (tile_end[:4] - tile_start[:4]).tolist() == [1, 0, 0, 1]
+    assert reach[0] & 0b1000_0100_0010_0001 == 0b1000_0100_0010_0001  # its blocks on the diagonal
 
 
 # ---- compiling ------------------------------------------------------------------------------------
@@ -75,7 +91,8 @@ logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(message)s")
 import numpy as np
 from hilsplat.splat.rasterise.binning import fill_lists
 one = np.zeros(1, np.int32)
-fill_lists(0, 1, 0, 1, one, np.array([0, 1]), np.zeros((1, 4), np.int32), one.copy())
+geometry, out = np.zeros((1, 16), np.float32), (one.copy(), np.zeros(1, np.uint16), np.zeros(2, int))
+fill_lists(0, 1, 0, 1, one, np.array([0, 1]), np.zeros((1, 4), np.int32), geometry, *out)
 """
 
 
