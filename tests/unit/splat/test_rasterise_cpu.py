@@ -91,7 +91,7 @@ logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(message)s")
 import numpy as np
 from hilsplat.splat.rasterise.binning import fill_lists
 one = np.zeros(1, np.int32)
-geometry, out = np.zeros((1, 16), np.float32), (one.copy(), np.zeros(1, np.uint16), np.zeros(2, int))
+geometry, out = np.ones((1, 16), np.float32), (one.copy(), np.zeros(1, np.uint16), np.zeros(2, int))
 fill_lists(0, 1, 0, 1, one, np.array([0, 1]), np.zeros((1, 4), np.int32), geometry, *out)
 """
 
