@@ -11,7 +11,6 @@ from hilsplat.base.artifacts import read_full_index, read_into, read_npy
 from hilsplat.base.levels import Level
 from hilsplat.contributions.quadratic import Quadratic, load_quadratic
 from hilsplat.contributions.streams import mapped
-from hilsplat.segment.digests import require_same_masks
 
 
 @dataclass(frozen=True)
@@ -96,14 +95,3 @@ class Contributions:
             gaussians_sha256=index["gaussians_sha256"],
             min_weight=index["min_weight"],
         )
-
-
-def mask_embeddings(clip_folder: Path, folder: Path) -> Float32[np.ndarray, "M C"]:
-    """CLIP vectors of all masks in the row order of an artifact of theirs; zero where none was computed.
-
-    Raises:
-        MisalignedArtifactError: the vectors were computed from other masks.
-    """
-    views = require_same_masks(clip_folder, folder)
-    parts = [read_npy(Path(clip_folder) / f"{view}.npy") for view in views]
-    return np.concatenate(parts, dtype=np.float32)

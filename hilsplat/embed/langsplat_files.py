@@ -17,6 +17,7 @@ from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, unit
+from hilsplat.embed.vectors import require_every_vector
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import (
     MASKS_SHA256,
@@ -212,6 +213,7 @@ def write_langsplat(masks_folder: Path, clip_folder: Path, out: Path) -> None:
 
     Raises:
         MisalignedArtifactError: the vectors were computed from other masks.
+        ArtifactError: a mask has no vector.
     """
     scene, digests = read_index(masks_folder)["scene"], digests_in(masks_folder)
     require_same_masks(clip_folder, masks_folder)
@@ -220,6 +222,7 @@ def write_langsplat(masks_folder: Path, clip_folder: Path, out: Path) -> None:
         for view, stem in stems.items():
             masks = load_masks(masks_folder, view, digests)
             vectors = read_npy(Path(clip_folder) / f"{view}.npy")
+            require_every_vector(vectors, clip_folder, "LangSplat's format")
             maps, rows = maps_of(masks)
             write_npy(folder / f"{stem}_s.npy", maps)
             write_npy(folder / f"{stem}_f.npy", vectors[rows].astype(np.float32))

@@ -6,9 +6,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from hilsplat.base.artifacts import atomic_folder, read_index, sha256_of_file, write_index, write_npz
-from hilsplat.base.errors import ArtifactError
 from hilsplat.base.progress import stage_log
-from hilsplat.contributions.rows import mask_embeddings
+from hilsplat.embed.vectors import mask_embeddings, require_every_vector
 from hilsplat.field.code import Code, autoencoder_file
 from hilsplat.field.linear_code import LinearCode
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, require_same_masks
@@ -26,18 +25,10 @@ def mask_targets(
         tree: nodes with their vectors, and the node that each mask fits best.
         targets: "node": the vector of that node, or the mean of all nodes for a mask that shares no Gaussian
             with any; "mask": always its own, as in the paper. A tree without nodes gives masks their own.
-
-    Raises:
-        ArtifactError: a mask needs its own vector and has none.
     """
     if targets == "node" and len(tree):
         or_mean = np.append(tree.clip, tree.clip.mean(axis=0, keepdims=True), axis=0)
         return or_mean[tree.node_of_mask], tree.clip
-    if without := int((~clip.any(axis=1)).sum()):
-        raise ArtifactError(
-            f"{without} of {len(clip)} masks have no CLIP vector, and targets: {targets} needs all",
-            fix="set clip.crops to auto or masks, and rerun the clip stage",
-        )
     return clip, clip
 
 
@@ -60,6 +51,8 @@ def run_autoencoder(
     require_same_masks(semantic_tree_folder, contributions_folder)
     tree = SemanticTree.load(semantic_tree_folder, clip_folder)
     clip = mask_embeddings(clip_folder, contributions_folder)
+    if settings.targets == "mask" or not len(tree):
+        require_every_vector(clip, clip_folder, "autoencoder.targets: mask")
     target, train = mask_targets(clip, tree, settings.targets)
     with stage_log("autoencoder", read_index(contributions_folder)["scene"]) as counts:
         model: Code

@@ -28,7 +28,8 @@ from hilsplat.base.artifacts import (
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log
-from hilsplat.contributions.rows import Contributions, mask_embeddings
+from hilsplat.contributions.rows import Contributions
+from hilsplat.embed.vectors import mask_embeddings
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, require_same_masks
 from hilsplat.semantic_tree.boxes import node_boxes
 from hilsplat.semantic_tree.crops import crop_ranks

@@ -31,11 +31,14 @@ def test_prose_and_what_no_stage_reaches_rerun_nothing(copy_of_finished: Project
     assert copy_of_finished.planned() == set()
 
 
+BEFORE_CLIP = {"masks", "coverage_tree", "contributions", "semantic_tree"}
+
+
 @pytest.mark.parametrize(
     ("module", "function", "expected"),
     [
         ("hilsplat/field/field.py", "run_field", AFTER_FIELD),
-        ("hilsplat/embed/stage.py", "run_clip", VARIANT_STAGES - {"masks", "coverage_tree", "contributions"}),
+        ("hilsplat/embed/stage.py", "run_clip", VARIANT_STAGES - BEFORE_CLIP),
         ("hilsplat/evaluate/tables/hierarchy.py", "hierarchy_table", {"table", "sweep_plot"}),
         ("hilsplat/methods/lifted.py", "fit", {"method", "evaluate", "table", "comparison"}),
         ("hilsplat/datasets/images/lerf_ovs.py", "open_scene", set()),

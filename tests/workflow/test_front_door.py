@@ -49,8 +49,8 @@ def test_another_clip_is_refused(finished: Project, tmp_path: Path) -> None:
 
 
 def test_langsplat_files_go_out_and_come_back(finished: Project, tmp_path: Path) -> None:
-    default = finished.root / SCENE / "default"
-    places = ("--masks", str(default / "masks"), "--clip", str(default / "clip"))
+    default = finished.root / SCENE / "paper"  # its vectors are of every mask
+    places = ("--masks", str(default.with_name("default") / "masks"), "--clip", str(default / "clip"))
     hilsplat(finished, tmp_path, "langsplat", "write", *places, "--out", "language_features")
     model = json.dumps({"model": str(finished.root / "models/clip-tiny")})
     scene = ("--scene", str(finished.root / SCENE / "scene"), "--files", "language_features")

@@ -15,7 +15,7 @@ from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.contributions.gram_builder import GramBuilder
 from hilsplat.contributions.quadratic import _gram_product, level_mass, load_quadratic
 from hilsplat.contributions.quadratic_builder import QuadraticBuilder, stack_weights
-from hilsplat.contributions.rows import Contributions, mask_embeddings
+from hilsplat.contributions.rows import Contributions
 from hilsplat.contributions.stage import run_contributions
 from hilsplat.contributions.streams import ArrayStream
 from hilsplat.contributions.view_matrices import (
@@ -24,6 +24,7 @@ from hilsplat.contributions.view_matrices import (
     random_half,
     view_contributions,
 )
+from hilsplat.embed.vectors import mask_embeddings
 from hilsplat.segment.digests import index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ContributionsSettings

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from hilsplat.base.artifacts import read_index
+from hilsplat.base.artifacts import read_index, read_npy, write_npy
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.autoencoder import mask_targets, run_autoencoder
@@ -213,11 +213,15 @@ def test_targets_are_the_vectors_of_the_nodes_that_masks_fit_best(boxes_with_tre
 
 
 def test_targets_of_masks_without_vectors_are_refused(boxes_with_tree):
-    world, _, folder = boxes_with_tree
-    own = unit_vectors(24, 16)
-    own[5] = 0
-    with pytest.raises(ArtifactError, match=r"1 of 24 masks have no CLIP vector(.|\n)*clip\.crops"):
-        mask_targets(own, SemanticTree.load(folder, world.clip), "mask")
+    world, contributions, tree = boxes_with_tree
+    own = read_npy(world.clip / "001.png.npy")
+    own[2] = 0
+    write_npy(world.clip / "001.png.npy", own)
+    inputs = world.clip, tree, contributions, world.folder / "autoencoder"
+    own_vectors = AutoencoderSettings(latent=2, targets="mask")
+    with pytest.raises(ArtifactError, match=r"1 of 24 masks have no CLIP vector(.|\n)*clip\.crops: masks"):
+        run_autoencoder(*inputs, own_vectors, 0)
+    run_autoencoder(*inputs, AutoencoderSettings(latent=2), 0)
 
 
 def test_a_tree_of_masks_in_another_order_is_refused(boxes_with_tree):
