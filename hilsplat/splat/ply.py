@@ -106,7 +106,7 @@ def load_ply(path: Path, fix: str = "") -> Gaussians:
         log_scales=columns(*(f"scale_{k}" for k in range(3))),
         quats=columns(*(f"rot_{k}" for k in range(4))),
         opacity_logits=columns("opacity")[:, 0],
-        sh=np.concatenate([dc, rest], axis=1),
+        sh=np.ascontiguousarray(np.concatenate([dc, rest], axis=1)),
     )
     finite = np.ones(len(gaussians), np.bool_)
     for name in FIELDS:

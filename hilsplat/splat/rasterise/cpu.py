@@ -130,7 +130,8 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, degree: int, threads
     colours = np.zeros((n, 3), np.float32)
     row = pack_camera(camera)
     p = gaussians
-    known = (p.means, p.log_scales, p.quats, p.opacity_logits, p.sh, degree, row)
+    tables = map(np.ascontiguousarray, (p.means, p.log_scales, p.quats, p.opacity_logits, p.sh))
+    known = (*tables, degree, row)
     refuse_broken(sum(over_ranges(project, groups, threads, *known, geometry, box, colours)), n)
     tiles = bin_gaussians(box, geometry[:n, 6], camera.size_hw)
     return Projected(row, camera.size_hw, degree, geometry, box, colours, tiles)
@@ -226,7 +227,8 @@ def blend_gradients(
         features=sums[:n, MOMENTS + 3 : columns].copy(),
         means_px=np.empty((n, 2), np.float32),
     )
-    known = (p.means, p.log_scales, p.quats, p.sh, view.degree, view.camera, view.geometry, sums)
+    tables = map(np.ascontiguousarray, (p.means, p.log_scales, p.quats, p.sh))
+    known = (*tables, view.degree, view.camera, view.geometry, sums)
     outputs = (out.means, out.log_scales, out.quats, out.opacity_logits, out.sh, out.means_px)
     over_ranges(project_backward, len(view.geometry) // WIDTH, threads, *known, *outputs)
     return out

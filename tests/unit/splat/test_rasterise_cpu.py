@@ -3,6 +3,7 @@
 import logging
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -81,6 +82,13 @@ def test_a_tile_that_only_the_box_of_a_needle_touches_does_not_list_it():
     fill_lists(0, 4, 0, 2, order, tile_start, box, geometry, gaussian, reach, tile_end)
     assert (tile_end[:4] - tile_start[:4]).tolist() == [1, 0, 0, 1]
     assert reach[0] & 0b1000_0100_0010_0001 == 0b1000_0100_0010_0001  # its blocks on the diagonal
+
+
+def test_gaussians_in_any_memory_order_give_the_same_picture():
+    gaussians, view = random_gaussians(40, 2), camera(30, 20)
+    turned = replace(gaussians, sh=np.asfortranarray(gaussians.sh), means=np.asfortranarray(gaussians.means))
+    same, other = (pixel_weights(each, view, min_weight=0.0) for each in (gaussians, turned))
+    assert (same != other).nnz == 0
 
 
 # ---- compiling ------------------------------------------------------------------------------------
