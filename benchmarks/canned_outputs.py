@@ -9,7 +9,7 @@ from hilsplat.base.levels import Level
 from hilsplat.segment.graph import segment_graph
 from hilsplat.segment.sam import HEADS, Encoded, SamModel, in_input
 
-SCALES = (0.1, 0.03, 0.006)
+SCALES = (0.07, 0.02, 0.004)
 """Segments of about 300 masks per photograph."""
 
 LOW_PX, SLOPE, REACH_PX = 256, 5.0, 8.0

@@ -1,4 +1,4 @@
-"""Key views: training views that together see most of the scene. Their masks come first, and answer first."""
+"""Key views: training views that together show most of the scene, and are segmented first."""
 
 import math
 from pathlib import Path
@@ -21,7 +21,7 @@ MIN_WEIGHT = 1 / 255
 """Smaller weights of a Gaussian at a pixel don't count."""
 
 MIN_VISIBLE_PX = 0.02
-"""A view sees a Gaussian whose visible mass there exceeds this: 0.3 px in a view of 800 px."""
+"""A Gaussian is visible in a view if its mass there exceeds this: 0.3 px in a view of 800 px."""
 
 
 def run_key_masks(
@@ -45,8 +45,8 @@ def run_key_masks(
 def key_views(scene: Scene, gaussians_ply: Path, share: float, threads: int = 1) -> list[str]:
     """Choose training views one by one, each for the Gaussians that it adds.
 
-    A Gaussian counts by its mean visible mass, and half as much with each chosen view that sees it, so views
-    cover the scene before they repeat.
+    A Gaussian counts by its mean visible mass, and each chosen view that shows it halves its weight, so that
+    the views cover the scene before they repeat.
 
     Args:
         scene: its cameras; images are not read.

@@ -89,7 +89,7 @@ class ClipModel:
         return opened
 
     def use_int8(self, network: Network) -> None:
-        """Embed pictures by the int8 version of their network from now on."""
+        """Embed pictures with the int8 version of their network."""
         self.__dict__["vision"], self.precision = network, "int8"
 
     def _pad_id(self, text_config: dict[str, Any]) -> int:
@@ -153,7 +153,7 @@ class ClipModel:
         return unit(np.concatenate([self.vision(**{pixels: piece})[0] for piece in pieces]))
 
     def seconds(self, network: Network) -> float:
-        """Measure the seconds of a crop by the network of pictures, or by a version of it."""
+        """Measure the seconds per crop of the picture network, or of a version of it."""
         pixels = next(iter(self.vision.spec.inputs))
         crops = np.zeros((self.vision.fixed_axis(pixels, 0) or 1, self.side_px, self.side_px, 3), np.uint8)
         network(**{pixels: self.prepare(crops)})

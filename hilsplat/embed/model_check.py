@@ -65,7 +65,7 @@ def check_model(folder: Path, variant: str = "") -> str:
 
 
 def seconds_of(folder: Path, variant: str, precision: str, cache: Path) -> Seconds:
-    """Return the measured seconds of a model, from an earlier measurement if there is one.
+    """Return how long a model takes, from an earlier measurement if there is one.
 
     Args:
         folder: the model folder.

@@ -63,7 +63,7 @@ class FinishedScene:
 
         Provenance names what a stage read; without it, a part is expected beside the artifact made from it.
         A variant that has no field was scored with another variant's, named in the provenance of its scores.
-        While the run goes on, CLIP vectors of the variant's own are enough, and `default` falls back to those
+        During a run, CLIP vectors of the variant's own are enough, and `default` falls back to those
         of the key views, with a warning.
 
         Raises:
@@ -134,7 +134,7 @@ class FinishedScene:
 
 
 def refining(folder: Path) -> str:
-    """Say how many photographs the answers of the key views come from."""
+    """Return a sentence with the number of photographs that the key views are."""
     used = len(read_index(folder / KEY_VIEWS / "masks")["views"])
     train = sum(entry["split"] == "train" for entry in read_index(folder / "scene")["views"].values())
     return f"{folder.parent.name}/{folder.name} answers from {used} of {train} photographs until the run ends"

@@ -43,7 +43,7 @@ def weights_at(
     view = project_gaussians(gaussians, camera, 0, threads)
     first_x, last_x, first_y, last_y = view.box.T
     rows = np.flatnonzero((first_x <= x) & (x <= last_x) & (first_y <= y) & (y <= last_y))
-    mean_x, mean_y, a, b, c, peak, depth, _ = view.geometry[rows].astype(np.float64).T
+    mean_x, mean_y, a, b, c, peak, depth, _ = view.geometry[rows, :8].astype(np.float64).T
     dx, dy = mean_x - (x + 0.5), mean_y - (y + 0.5)
     alpha = np.exp2(peak - (a * dx * dx + b * dx * dy + c * dy * dy))
     kept = np.flatnonzero(alpha >= MIN_ALPHA)

@@ -19,7 +19,7 @@ KEPT_PROMPTS, GUIDED_PROMPTS = 0.3, 0.25
 """Share of the previewed prompts whose masks are decoded, and of the grid's prompts with guided ones."""
 
 VIEW_S = 1.0
-"""Core seconds of a view outside the networks: from logits to masks."""
+"""Core seconds per view outside the networks: from logits to masks."""
 
 
 def forecasts(plan: Plan, cores: int) -> list[str]:

@@ -5,14 +5,14 @@ import shutil
 
 from tests.workflow.conftest import SCENE, Project
 
-TREE = f"{SCENE}/default/semantic_tree"
+VECTORS = f"{SCENE}/default/clip"
 
 
 def test_a_finished_stage_is_one_line_and_query_commands_follow(copy_of_finished: Project) -> None:
     project = copy_of_finished
-    shutil.rmtree(project.root / TREE)
-    printed = project.snakemake(TREE).stderr
-    assert re.search(r"^synthetic/tiny semantic tree: \d+ s \(1 of 1 done\)$", printed, re.MULTILINE), printed
+    shutil.rmtree(project.root / VECTORS)
+    printed = project.snakemake(VECTORS).stderr
+    assert re.search(r"^synthetic/tiny clip: \d+ s \(1 of 1 done\)$", printed, re.MULTILINE), printed
     assert printed.count("hilsplat view synthetic/tiny") == 1
     assert "rule semantic_tree:" not in printed and "Select jobs" not in printed
     record = max((project.root / ".snakemake/log").iterdir(), key=lambda file: file.stat().st_mtime)

@@ -46,13 +46,15 @@ def test_get_new_run_and_query(project: Path, tmp_path: Path) -> None:
         hub.cuts["vision_encoder.onnx"] = [2_000_000]
         printed = hilsplat(copy, "models", "get", HF_ENDPOINT=hub.endpoint, HF_HOME=str(tmp_path / "home"))
         assert len(hub.ranges("vision_encoder.onnx")) == 2
-    assert "photographs use sam-vit-base and clip-vit-base-patch16" in printed
+    assert "photographs use sam2.1-hiera-small and clip-vit-base-patch16" in printed
     told = hilsplat(copy, "new", "desk", "photographs")
-    assert "masks by sam-vit-base; text queries by clip-vit-base-patch16" in told and "nothing" not in told
+    assert (
+        "masks by sam2.1-hiera-small; text queries by clip-vit-base-patch16" in told and "nothing" not in told
+    )
 
     run = snakemake(copy)
-    assert "photos/desk: masks by sam-vit-base; text queries by clip-vit-base-patch16" in run
-    for stage, name in (("masks", "sam-vit-base"), ("clip", "clip-vit-base-patch16")):
+    assert "photos/desk: masks by sam2.1-hiera-small; text queries by clip-vit-base-patch16" in run
+    for stage, name in (("masks", "sam2.1-hiera-small"), ("clip", "clip-vit-base-patch16")):
         index = json.loads((copy.root / DESK / "default" / stage / "index.json").read_text())
         assert index["model"] == f"models/{name}"
         record = json.loads((copy.root / DESK / f"default/{stage}.provenance.json").read_text())
@@ -61,7 +63,7 @@ def test_get_new_run_and_query(project: Path, tmp_path: Path) -> None:
     assert "to 'mug' in photos/desk" in answer and "mean nothing" not in answer
 
     # without them, masks and words would be made anew by what is left; poses and Gaussians stay
-    shutil.rmtree(copy.root / "models/sam-vit-base")
+    shutil.rmtree(copy.root / "models/sam2.1-hiera-small")
     shutil.rmtree(copy.root / "models/clip-vit-base-patch16")
     planned = snakemake(copy, "-n")
     assert "rule masks:" in planned and "rule clip:" in planned

@@ -278,7 +278,7 @@ def edit_function(root: Path, place: str) -> None:
         ("embed/langsplat_files.py:write_langsplat", {"langsplat"}),
         ("evaluate/tables/html_page.py:as_html", {"table"}),
         ("query/field_answers.py:field_colours", {"evaluate", "figures", "comparison"}),
-        ("segment/graph.py:segment_graph", {"masks"}),
+        ("segment/graph.py:segment_graph", {"masks", "key_masks", "guided_masks"}),
         ("cli/stage.py:stage", set()),
     ],
 )

@@ -22,7 +22,12 @@ from hilsplat.settings import CoverageTreeSettings, MasksSettings
 @pytest.fixture
 def settings(disc_sam) -> MasksSettings:
     return MasksSettings(
-        model=str(disc_sam), points_per_side=2, points_per_batch=2, stability_min=0.0, min_area_px=1
+        precision="fp32",
+        model=str(disc_sam),
+        points_per_side=2,
+        points_per_batch=2,
+        stability_min=0.0,
+        min_area_px=1,
     )
 
 
@@ -61,7 +66,9 @@ def test_prompts_that_repeat_others_in_the_preview_are_not_decoded(
 ):
     # 64 prompts, 16 to each quarter of the picture, all with the same three discs; calls of 4 prompts
     folder = make_disc_sam(tmp_path / "sam", cell_px=16)
-    settings = MasksSettings(model=str(folder), points_per_side=8, points_per_batch=4, stability_min=0.0)
+    settings = MasksSettings(
+        model=str(folder), precision="fp32", points_per_side=8, points_per_batch=4, stability_min=0.0
+    )
     scene = make_scene(views=2)
     run_masks(scene, tmp_path / "some", tmp_path / "cache", settings, threads=1)
     assert (calls.count(PREVIEW), calls.count(DECODER)) == (16, 1)
@@ -80,7 +87,9 @@ def test_all_prompts_are_decoded_where_repeated_masks_could_stay(
     make_disc_sam, make_scene, tmp_path, calls, change
 ):
     folder = make_disc_sam(tmp_path / "sam", cell_px=16)
-    settings = MasksSettings(model=str(folder), points_per_side=8, points_per_batch=4, **change)
+    settings = MasksSettings(
+        model=str(folder), precision="fp32", points_per_side=8, points_per_batch=4, **change
+    )
     run_masks(make_scene(views=2), tmp_path / "masks", tmp_path / "cache", settings, threads=1)
     assert (calls.count(PREVIEW), calls.count(DECODER)) == (0, 16)
 

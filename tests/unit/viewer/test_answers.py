@@ -312,7 +312,7 @@ def test_an_exported_page_holds_all_that_it_needs(client, shown):
 
 def test_gaussians_are_shown_while_the_run_goes_and_answers_come_later(built_desk, tmp_path):
     whole, growing = built_desk / SCENE, tmp_path / "photos/desk"
-    later = ("semantic_tree", "autoencoder", "field.safetensors*", "models")
+    later = ("clip", "autoencoder", "field.safetensors*", "models")
     shutil.copytree(whole, growing, ignore=shutil.ignore_patterns(*later))
     shutil.copytree(built_desk / "models", tmp_path / "models")
     shown = ShownScene(growing)
@@ -325,7 +325,7 @@ def test_gaussians_are_shown_while_the_run_goes_and_answers_come_later(built_des
         assert client.post("/api/pick", json={"camera": view, "x": 3, "y": 3}).status_code == 200
         early = client.post("/api/query", json={"text": "mug"})
         assert early.status_code == 422 and "the run goes on" in early.json()["error"]
-        shutil.copytree(whole / "default/semantic_tree", growing / "default/semantic_tree")
+        shutil.copytree(whole / "default/clip", growing / "default/clip")
         assert client.get("/api/scene").json()["variants"] == ["default"]
         assert ask(client, "mug")["hits"]  # before there is a field
         decoded = client.post("/api/query", json={"text": "mug", "answerer": "field"})
