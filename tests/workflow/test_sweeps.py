@@ -67,7 +67,7 @@ def test_without_sweeps_every_stage_runs_once(base):
         # write the field by another rule
         (
             "ablation_variants=[regression,paper]",
-            {"clip": 1, "autoencoder": 2, "field": 2, "evaluate": 2, "table": 1},
+            {"clip": 1, "autoencoder": 1, "field": 2, "evaluate": 2, "table": 1},
         ),
         (
             "main_variants=[default,langsplat,lifted]",
