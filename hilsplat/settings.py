@@ -342,7 +342,7 @@ class ClipSettings(Section):
         "autoencoder.targets is mask, else nodes",
         origin="paper, LangSplat: masks",
     )
-    crops_per_node: int = knob(6, "nodes: the most crops that a node's vector is averaged from", ge=1, le=32)
+    crops_per_node: int = knob(5, "nodes: the most crops that a node's vector is averaged from", ge=1, le=32)
 
     model: str = knob(
         "models/clip-tiny",

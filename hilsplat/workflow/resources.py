@@ -46,11 +46,11 @@ TIME_FACTOR, LEAST_MINUTES = 6, 10
 START_S = 2.0
 """Seconds that every job takes to start Python, load libraries and read."""
 
-FIT_S_PER_MP, GRAPH_S_PER_MP = 0.18, 4.0
+FIT_S_PER_MP, GRAPH_S_PER_MP = 0.14, 4.0
 """Core seconds per megapixel of a view and step of the fit, and of the graph segmenter per megapixel."""
 
-EMBEDDED_S, FULL_S = {"masks": 2.5, "clip": 0.2}, {"masks": 27.0, "clip": 87.0}
-"""Core seconds per view of the embedded models, and of SAM ViT-B and CLIP B/16 (docs/benchmarks.md)."""
+EMBEDDED_S, FULL_S = {"masks": 2.5, "clip": 0.2}, {"masks": 13.0, "clip": 5.0}
+"""Core seconds per view of the embedded models, and of SAM 2.1 small and CLIP B/16 (docs/benchmarks.md)."""
 
 UNKNOWN_MP = 0.5
 """Megapixels of a view if no image header can be read before the run, such as in an archive."""
