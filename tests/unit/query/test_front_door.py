@@ -309,3 +309,20 @@ def test_variants_share_what_they_share(desk, tmp_path):
     assert first.tree is second.tree
     assert first.scene is second.scene
     assert first.language is not second.language
+
+
+def test_key_views_answer_until_the_vectors_of_all_views_exist(desk, tmp_path, caplog):
+    growing = tmp_path / "photos/desk"
+    shutil.copytree(desk / SCENE, growing, ignore=shutil.ignore_patterns("field.safetensors*", "scores.csv*"))
+    key = growing / "key-views"
+    key.mkdir()
+    for part in ("clip", "semantic_tree", "masks"):
+        (growing / "default" / part).rename(key / part)
+    parts = FinishedScene.locate(growing).parts
+    assert (parts.clip, parts.semantic_tree, parts.masks) == (
+        key / "clip",
+        key / "semantic_tree",
+        key / "masks",
+    )
+    assert parts.field is None
+    assert re.search(r"photos/desk answers from \d+ of \d+ photographs until the run ends", caplog.text)
