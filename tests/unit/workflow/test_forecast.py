@@ -30,7 +30,7 @@ def test_first_answer_and_all_photographs_are_predicted(photographs):
     masks, variants = {"prompts": "guided"}, {"key-views": KEY_VIEWS}
     found = plan(photographs, groups=["photos"], variants=variants, main_variants=["default"], masks=masks)
     (line,) = forecast.forecasts(found, 2)
-    # 15 training views: 150 + 7.5 x 20 + 75 + 400 x 3 x 0.1 = 495 core seconds, then 7.5 x 12.3 + 150 + 240
+    # 15 training views: 150 + 7.5 x 20 + 75 + 400 x 3 x 0.1 = 495 core seconds, then 7.5 x 12.3 + 150 + 200
     assert line.startswith("photos/desk: first answer in about 4 min, all photographs in about 8 min.")
     assert "20 s of SAM on one of 2 cores, a crop 0.10 s of CLIP" in line
 
@@ -38,7 +38,7 @@ def test_first_answer_and_all_photographs_are_predicted(photographs):
 def test_without_key_views_there_is_one_time(photographs):
     found = plan(photographs, groups=["photos"], variants={}, main_variants=["default"])
     (line,) = forecast.forecasts(found, 1)
-    assert line.startswith("photos/desk: all photographs in about 14 min.")
+    assert line.startswith("photos/desk: all photographs in about 13 min.")
 
 
 def test_scenes_that_answer_and_synthetic_scenes_have_no_forecast(photographs, monkeypatch):
