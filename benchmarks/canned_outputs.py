@@ -7,7 +7,7 @@ import numpy as np
 
 from hilsplat.base.levels import Level
 from hilsplat.segment.graph import segment_graph
-from hilsplat.segment.sam import HEADS, Encoded, SamModel, in_input
+from hilsplat.segment.sam import HEADS, Encoded, Frame, SamModel, in_input
 
 SCALES = (0.07, 0.02, 0.004)
 """Segments of about 300 masks per photograph."""
@@ -16,19 +16,23 @@ LOW_PX, SLOPE, REACH_PX = 256, 5.0, 8.0
 """Side of SAM's masks, slope of the logits at a border per pixel, and where they level off."""
 
 
+def labels_of(image: np.ndarray, frame: Frame) -> list[np.ndarray]:
+    """Region of each pixel of the network's masks, for each head; -1 for none."""
+    masks, labels = segment_graph(image, SCALES, 16), []
+    height, width = (side * LOW_PX // frame.padded_hw[0] for side in frame.resized_hw)
+    for level in HEADS:
+        low = np.full((LOW_PX, LOW_PX), -1, np.int32)
+        whole = masks.label_map(Level(level)).astype(np.float32)
+        low[:height, :width] = cv2.resize(whole, (width, height), interpolation=cv2.INTER_NEAREST)
+        labels.append(low)
+    return labels
+
+
 class Regions:
     """Logits of the regions of one image, in the frame of the network's masks."""
 
-    def __init__(self, image: np.ndarray, encoded: Encoded) -> None:
-        masks, frame = segment_graph(image, SCALES, 16), encoded.frame
-        height, width = (side * LOW_PX // frame.padded_hw[0] for side in frame.resized_hw)
-        self.scale = LOW_PX / frame.padded_hw[0]
-        self.labels = []
-        for level in HEADS:
-            low = np.full((LOW_PX, LOW_PX), -1, np.int32)
-            whole = masks.label_map(Level(level)).astype(np.float32)
-            low[:height, :width] = cv2.resize(whole, (width, height), interpolation=cv2.INTER_NEAREST)
-            self.labels.append(low)
+    def __init__(self, labels: list[np.ndarray], frame: Frame) -> None:
+        self.scale, self.labels = LOW_PX / frame.padded_hw[0], labels
         self._known: dict[tuple[int, int], np.ndarray] = {}
 
     def logits(self, points: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
@@ -61,10 +65,13 @@ class Regions:
 def replace_outputs(model: type[SamModel]) -> None:
     """Let a `SamModel` run its networks and return canned masks."""
     encode, decode, preview, finish = model.encode, model.decode, model.preview, model.finish
+    known: dict[int, list[np.ndarray]] = {}  # the check of int8 encodes an image twice
 
     def canned_encode(self: Any, image: np.ndarray, *encoder: Any) -> Encoded:
-        encoded = encode(self, image, *encoder)
-        encoded.features["canned"] = Regions(image, encoded)  # type: ignore[index]
+        encoded, digest = encode(self, image, *encoder), hash(image.tobytes())
+        if digest not in known:
+            known[digest] = labels_of(image, encoded.frame)
+        encoded.features["canned"] = Regions(known[digest], encoded.frame)  # type: ignore[index]
         return encoded
 
     def canned_decode(self: Any, encoded: Encoded, points_xy: np.ndarray) -> Any:

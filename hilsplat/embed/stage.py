@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from functools import cache as cache_calls
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from hilsplat.base.identity import code_digest
 from hilsplat.base.parallel import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, unit
+from hilsplat.models.folder import open_model_folder
 from hilsplat.models.int8 import (
     CHECKED_CROPS,
     WORDS,
@@ -33,6 +35,7 @@ from hilsplat.models.int8 import (
     may_be_int8,
 )
 from hilsplat.models.memory import available_mib, needs_of
+from hilsplat.models.network import Network
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks, require_same_masks
 from hilsplat.settings import ClipSettings
@@ -81,7 +84,7 @@ def run_clip(
     if semantic_tree_folder is not None:
         require_same_masks(semantic_tree_folder, masks_folder)
         chosen = chosen_masks(semantic_tree_folder, settings.crops_per_node)
-    model = ClipModel.load(Path(settings.model), variant=settings.variant)
+    model = ClipModel(open_model_folder(Path(settings.model), "clip", variant=settings.variant))
     _choose_precision(model, scene, masks_folder, chosen, cache, settings, threads)
     needs = needs_of(model.model, settings.batch)
     threads = needs.views_at_once(threads, min(memory_mib or math.inf, available_mib()))
@@ -172,13 +175,17 @@ def _choose_precision(
         return model.crop(scene.image(view), load_masks(masks_folder, view, digests), row, settings)
 
     crops = np.stack([crop(place) for place in places])
-    quantised = int8_network(model.model, "vision_model", cache)
+
+    @cache_calls
+    def quantised() -> Network:
+        return int8_network(model.model, "vision_model", cache)
 
     def measure() -> Agreement:
         pixels = next(iter(model.vision.spec.inputs))
+        quantised()  # before threads ask for it
 
         def both(one: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            return model.embed_crops(one[None]), unit(quantised(**{pixels: model.prepare(one[None])})[0])
+            return model.embed_crops(one[None]), unit(quantised()(**{pixels: model.prepare(one[None])})[0])
 
         full, found = (
             np.concatenate(each) for each in zip(*in_order(both, list(crops), threads), strict=True)
@@ -187,7 +194,7 @@ def _choose_precision(
 
     inputs = {"model": model.digest, "crops": sha256_of_bytes(crops.tobytes()), "words": WORDS}
     if Agreement.remembered(cache, inputs, measure).decide(settings.precision, "CLIP"):
-        model.use_int8(quantised)
+        model.use_int8(quantised())
 
 
 def chosen_masks(semantic_tree_folder: Path, per_node: int) -> dict[str, Int64[np.ndarray, " m"]]:

@@ -18,7 +18,7 @@ def lbfgs(objective: Objective, point: np.ndarray, steps: int, first_step: float
 
     Args:
         objective: value and gradient at a point.
-        point: where to start; it is freed once it is left.
+        point: where to start; it is overwritten.
         steps: iterations; each costs one evaluation unless its step must be halved.
         first_step: inverse curvature assumed before the first step.
     """
@@ -40,7 +40,12 @@ def lbfgs(objective: Objective, point: np.ndarray, steps: int, first_step: float
             length /= 2
         else:
             break
-        moved, turned = candidate - point, new_gradient - gradient
+        del direction
+        # In the memory of what is no longer needed: a vector of a large scene takes over 100 MiB.
+        moved, turned = (
+            np.subtract(candidate, point, out=point),
+            np.subtract(new_gradient, gradient, out=gradient),
+        )
         curvature = dot(moved, turned)
         if curvature > 0:
             memory = [*memory, (moved, turned, curvature)][-LBFGS_MEMORY:]

@@ -40,6 +40,7 @@ def solve_field(
         value = (dot(features, curved) - 2 * dot(features, right)) / total
         contrastive, gradient = contrast.weighted(features, weights)
         add_slope(np.float32(2 / total), curved, right, inverse_root, gradient)
+        del curved
         return value + contrastive, _rows(gradient)[shown]
 
     lifted = problem.lifted

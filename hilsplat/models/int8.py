@@ -32,7 +32,7 @@ Two crops of one thing from neighbouring views differ by more."""
 LEAST_IOU = 0.98
 """Mean IoU of masks of one prompt by both precisions."""
 
-CHECKED_CROPS, CHECKED_VIEWS, CHECKED_GRID = 16, 2, 8
+CHECKED_CROPS, CHECKED_VIEWS, CHECKED_GRID = 16, 2, 5
 """Crops that a CLIP is checked on; views, and prompts per side, that a SAM is checked on."""
 
 

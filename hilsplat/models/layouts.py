@@ -125,7 +125,12 @@ LAYOUTS: dict[str, Layout] = {
 """Layouts that are read: SAM, SAM 2 and 2.1, CLIP and SigLIP as transformers.js and optimum name their parts,
 and open_clip's two folders, as Immich publishes them."""
 
-MODEL_TYPES = {"sam": "sam", "sam2": "sam2", "sam2_video": "sam2", "clip": "clip", "siglip": "siglip"}
+MODEL_TYPES = {
+    "sam": "sam",
+    **dict.fromkeys(("sam2", "sam2_video", "edgetam", "edgetam_video"), "sam2"),
+    "clip": "clip",
+    "siglip": "siglip",
+}
 """`model_type` of a config.json -> layout. open_clip's has `vision_cfg` and `text_cfg` instead."""
 
 
@@ -140,7 +145,7 @@ def layout_of(config: object) -> str | None:
 
 
 SUPPORTED = {
-    "sam": "SAM (model_type sam), SAM 2 or 2.1 (sam2)",
+    "sam": "SAM (model_type sam), SAM 2 or 2.1 (sam2), EdgeTAM (edgetam)",
     "clip": "CLIP (model_type clip), SigLIP or SigLIP 2 of fixed resolution (siglip), open_clip (folders "
     "visual/ and textual/)",
 }
@@ -152,7 +157,6 @@ OTHER_TYPES = {
     "sam_hq": "take SAM, or SAM 2.1",
     "sam3": "take SAM 2.1",
     "sam3_tracker": "take SAM 2.1",
-    "edgetam": "take SAM 2.1",
     "chinese_clip": "take CLIP, SigLIP 2 (many languages) or an open_clip in two folders",
 }
 """What to take instead of models that look alike."""

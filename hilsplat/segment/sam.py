@@ -193,7 +193,8 @@ class SamModel:
             halves = found[: len(images)], found[len(images) :]
             return agreement_of_masks(*(np.concatenate(half) for half in halves))
 
-        inputs = {"model": self.digest, "images": [sha256_of_bytes(image.tobytes()) for image in images]}
+        digests = [sha256_of_bytes(image.tobytes()) for image in images]
+        inputs = {"model": self.digest, "images": digests, "grid": CHECKED_GRID}
         if Agreement.remembered(cache, inputs, measure).decide(precision, "SAM's encoder"):
             self.encoder, self.precision = quantised, "int8"
 

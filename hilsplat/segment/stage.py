@@ -25,7 +25,7 @@ from hilsplat.models.int8 import CHECKED_VIEWS
 from hilsplat.models.memory import available_mib, needs_of
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.candidates import Candidates, candidates_key, decode_candidates
-from hilsplat.segment.digests import index_entry
+from hilsplat.segment.digests import digests_in, index_entry, load_masks
 from hilsplat.segment.generate import masks_from_candidates
 from hilsplat.segment.graph import segment_graph
 from hilsplat.segment.masks import HierarchicalMasks
@@ -56,6 +56,7 @@ def run_masks(
     memory_mib: float | None = None,
     key_views: Sequence[str] | None = None,
     prompts: Callable[[str], np.ndarray | None] = lambda view: None,
+    finished: Path | None = None,
 ) -> None:
     """Segment training views at three levels.
 
@@ -69,10 +70,12 @@ def run_masks(
         memory_mib: memory that the stage may use; None: what is free.
         key_views: the views to segment; None: every training view.
         prompts: points (x, y, px) that SAM is prompted at in a view; None: the grid of the settings.
+        finished: output of this stage whose views are taken as they are.
     """
     scene = Scene.load(scene_folder)
     views = train_views(scene) if key_views is None else list(key_views)
     view_cache = ViewCache(Path(cache) / "masks")
+    taken = digests_in(finished) if finished else {}
     with stage_log("masks", scene.name) as counts:
         if settings.segmenter == "sam":
             model = SamModel.load(Path(settings.model), settings.variant)
@@ -94,6 +97,8 @@ def run_masks(
             logger.info("masks %s: %d views at once, %.0f MiB each", scene.name, threads, needs.view_mib)
 
             def segment(view: str) -> HierarchicalMasks:
+                if finished and view in taken:
+                    return load_masks(finished, view, taken)
                 return sam_masks(scene, view, model, view_cache, settings, prompts(view))
 
         else:

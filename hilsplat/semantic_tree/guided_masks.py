@@ -11,7 +11,6 @@ from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.scene.finished import require_same
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.digests import digests_in
 from hilsplat.segment.sam import point_grid
 from hilsplat.segment.stage import run_masks
 from hilsplat.semantic_tree.tree import SemanticTree
@@ -32,13 +31,13 @@ def run_guided_masks(
     threads: int,
     memory_mib: float | None = None,
 ) -> None:
-    """Segment every training view (`segment.stage.run_masks`), all but the key views with guided prompts.
+    """Segment the training views after the key views, with guided prompts (`segment.stage.run_masks`).
 
     Departs: SAM and LangSplat prompt a grid in every view (docs/experiments.md has what that gains).
 
     Args:
         gaussians_ply: the scene's Gaussians.
-        key_masks_folder: masks of the key views, which were prompted on the grid.
+        key_masks_folder: masks of the key views, which are taken as they are.
         semantic_tree_folder: the tree of those masks.
 
     Raises:
@@ -50,12 +49,9 @@ def run_guided_masks(
         load_ply(gaussians_ply),
     )
     require_same("semantic tree", scene.name, gaussians_ply, tree.gaussians_sha256)
-    key_views = digests_in(key_masks_folder)
     grid = point_grid(settings.points_per_side)
 
-    def points(view: str) -> np.ndarray | None:
-        if view in key_views:
-            return None
+    def points(view: str) -> np.ndarray:
         camera = scene.cameras[view]
         weights = normalised_weights(pixel_weights(gaussians, camera, min_weight=tree.min_weight))
         labels = {
@@ -64,7 +60,9 @@ def run_guided_masks(
         }
         return guided_points(labels, grid, settings.min_area_px)
 
-    run_masks(scene_folder, out, cache, settings, threads, memory_mib, prompts=points)
+    run_masks(
+        scene_folder, out, cache, settings, threads, memory_mib, prompts=points, finished=key_masks_folder
+    )
 
 
 def guided_points(

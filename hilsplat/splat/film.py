@@ -8,7 +8,7 @@ import av
 import numpy as np
 from jaxtyping import UInt8
 
-OPTIONS = {"crf": "20", "preset": "fast", "x264-params": "threads=1:mbtree=0"}
+OPTIONS = {"crf": "20", "preset": "veryfast", "x264-params": "threads=1:mbtree=0"}
 """Macroblock-tree rate control gave other bytes each time, also on one thread (x264 in PyAV 18.1)."""
 
 

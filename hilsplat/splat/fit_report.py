@@ -1,6 +1,7 @@
 """Report of a fit: scores on held-out views, curves, pictures, fly-around."""
 
 import logging
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,7 @@ def write_report(
     """
     background = {"white": (1.0, 1.0, 1.0)}.get(settings.background, (0.0, 0.0, 0.0))
 
-    def picture(camera: Camera) -> UInt8[np.ndarray, "H W 3"]:
+    def picture(camera: Camera, threads: int = threads) -> UInt8[np.ndarray, "H W 3"]:
         color = render(gaussians, camera, background=background, threads=threads).color
         return np.round(color.clip(0, 1) * 255).astype(np.uint8)
 
@@ -86,7 +87,7 @@ def write_report(
         write_png(temporary / "test_views.png", contact_sheet(cells, columns=6))
         path = [view.camera for view in load_views(scene, "train", settings.image_scale)]
         path = path or [view.camera for view in views]
-        write_flyaround(temporary, path, picture)
+        write_flyaround(temporary, path, partial(picture, threads=1), threads)
         if curve is not None:
             _draw_curves(temporary / "curves.png", curve)
         write_json(temporary / "report.json", report)

@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.distance import cdist
 
 from hilsplat.base.images import write_png
+from hilsplat.base.parallel import in_order
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.film import write_film
 from hilsplat.splat.sheets import contact_sheet
@@ -86,19 +87,25 @@ def short_round(distances: Float64[np.ndarray, "S S"]) -> list[int]:
 
 
 def write_flyaround(
-    folder: Path, cameras: list[Camera], picture: Callable[[Camera], UInt8[np.ndarray, "H W 3"]]
+    folder: Path,
+    cameras: list[Camera],
+    picture: Callable[[Camera], UInt8[np.ndarray, "H W 3"]],
+    threads: int = 1,
 ) -> None:
     """Write `flyaround.mp4`, and every tenth of its frames as `flyaround.png`.
 
     Args:
         cameras: training cameras, which the path visits.
         picture: renders a camera.
+        threads: frames rendered at once while others are encoded; the bytes do not depend on it.
     """
     shown: list[UInt8[np.ndarray, "H W 3"]] = []
+    path = closed_path(cameras, FRAMES)
 
     def frames() -> Iterator[UInt8[np.ndarray, "H W 3"]]:
-        for number, camera in enumerate(closed_path(cameras, FRAMES)):
-            frame = picture(camera)
+        for number, frame in enumerate(
+            in_order(picture, path, threads) if threads > 1 else map(picture, path)
+        ):
             if number % (FRAMES // SHEET_FRAMES) == 0:
                 shown.append(frame)
             yield frame

@@ -59,8 +59,8 @@ def _forecast(
     every = stages.poses.test_every
     views = len(files) - (len(files) // every if every else 0)
     prompts = stages.masks.points_per_side**2
-    full_s = view_s["image"] + VIEW_S + prompts * prompt_s
-    guided_s = view_s["image"] + VIEW_S + GUIDED_PROMPTS * prompts * prompt_s
+    base_s = view_s["image"] + VIEW_S
+    full_s, guided_s = base_s + prompts * prompt_s, base_s + GUIDED_PROMPTS * prompts * prompt_s
     before_s = sum(resources.core_seconds(rule, job) for rule in ("poses", "gaussians"))
     after_s = sum(resources.core_seconds(rule, job) for rule in ("contributions", "semantic_tree"))
     key = SimpleNamespace(dataset=row.dataset, scene=row.scene, variant=KEY_VIEWS)
@@ -68,7 +68,8 @@ def _forecast(
     if plan.first_answer(job):
         settings = plan.stages(key)
         first = views * settings.masks.key_views
-        before_s += first * full_s + after_s / 2 + NODES * settings.clip.crops_per_node * crop_s
+        key_s = base_s + settings.masks.points_per_side**2 * prompt_s
+        before_s += first * key_s + after_s / 2 + NODES * settings.clip.crops_per_node * crop_s
         rest_s = (views - first) * (guided_s if stages.masks.prompts == "guided" else full_s)
         said = f"first answer in {duration(before_s / cores)}, "
     total_s = before_s + rest_s + after_s + NODES * stages.clip.crops_per_node * crop_s
