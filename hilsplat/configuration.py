@@ -94,8 +94,8 @@ Settings = TypeVar("Settings", bound=Section)
 def with_models(section: Settings) -> Settings:
     """The section with `auto` replaced by the models that are there, so that records name what was used.
 
-    `masks.segmenter: auto` is the SAM that `masks.model` names or, if that is auto too, the best real one in
-    `models/`; without a real one it is the graph segmenter. `masks.model: auto` and `clip.model: auto` are
+    `masks.segmenter: auto` is the SAM that `masks.model` names or, if that is auto too, the best real one
+    that is here; without a real one it is the graph segmenter. `masks.model: auto` and `clip.model: auto` are
     the best real model, else the embedded one. Other sections come back as they are.
     """
     if isinstance(section, ClipSettings) and section.model == AUTO:

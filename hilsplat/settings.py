@@ -179,7 +179,7 @@ class MasksSettings(Section):
     )
     model: str = knob(
         "models/sam-tiny",
-        "folder of a SAM in the Hugging Face ONNX export layout; auto: the best real one in models/, else "
+        "folder of a SAM in the Hugging Face ONNX export layout; auto: the best real one that is here, else "
         "models/sam-tiny",
     )
     variant: str = knob(
@@ -346,7 +346,7 @@ class ClipSettings(Section):
 
     model: str = knob(
         "models/clip-tiny",
-        "folder of a CLIP in the Hugging Face ONNX export layout; auto: the best real one in models/, else "
+        "folder of a CLIP in the Hugging Face ONNX export layout; auto: the best real one that is here, else "
         "models/clip-tiny",
     )
     variant: str = knob(

@@ -26,6 +26,7 @@ checked = [name for name in map(".".join, (file.parts for file in files)) if not
 install_import_hook(checked, "beartype.beartype")
 
 os.environ.setdefault("MPLBACKEND", "Agg")
+os.environ["HILSPLAT_MODELS"] = "models"  # whatever the user of this machine has fetched
 
 # No test fails for being slow on a busy machine, and every run tries the same examples.
 settings.register_profile("hilsplat", deadline=None, derandomize=True)

@@ -9,8 +9,9 @@ IMAGE_SUFFIXES = frozenset(
 )
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi"})
 
-INSTALLED = Path(__file__).resolve().parents[2]
-"""Folder of the installed project: Snakefile, rules, config, models."""
+_PACKAGE = Path(__file__).resolve().parents[1]
+INSTALLED = _PACKAGE / "_project" if (_PACKAGE / "_project").is_dir() else _PACKAGE.parent
+"""Folder of the installed project: Snakefile, rules, config, models. A wheel holds it in the package."""
 
 MAX_NAME = 100
 """Length of a name of a data set, scene, group or variant: folders, files and commands are made from them."""

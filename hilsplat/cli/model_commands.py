@@ -14,7 +14,6 @@ from hilsplat.cli.stage import (
     section_of,
     start_logging,
 )
-from hilsplat.models.store import MODELS
 
 
 @models_app.command("get")
@@ -30,9 +29,16 @@ def models_get(
     variant: Annotated[
         str, typer.Option(help="networks of another precision: quantized, fp16, int8, ...; default: full")
     ] = "",
-    out: Annotated[Path, typer.Option(help="folder of the models")] = MODELS,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="folder of the models; default: HILSPLAT_MODELS, or the data folder of the user, which all "
+            "projects share",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
-    """Fetch released models from the model hub, check them, and put them into models/.
+    """Fetch released models from the model hub and check them.
 
     A transfer that was cut goes on where it stopped. HF_ENDPOINT, HF_HOME, HF_TOKEN, HF_HUB_OFFLINE and the
     usual proxy variables are respected.
@@ -44,17 +50,17 @@ def models_get(
 
 
 @models_app.command("list")
-def models_list(folder: Annotated[Path, typer.Option(help="folder of the models")] = MODELS) -> None:
+def models_list() -> None:
     """List released models and those that are here, with size, licence and use."""
     start_logging()
     from hilsplat.hub.overview import models_table
 
-    typer.echo(models_table(folder))
+    typer.echo(models_table())
 
 
 @models_app.command("check")
 def models_check(
-    folder: Annotated[Path | None, typer.Argument(help="model folder; default: all in models/")] = None,
+    folder: Annotated[Path | None, typer.Argument(help="model folder; default: all that are here")] = None,
     variant: Annotated[str, typer.Option(help="ending of the networks' names, such as fp16")] = "",
 ) -> None:
     """Describe a model folder, or all that are here, and time one image."""

@@ -10,6 +10,18 @@ from hilsplat.cli.apps import app
 from hilsplat.cli.stage import start_logging
 
 
+@app.command()
+def init(
+    folder: Annotated[Path, typer.Argument(help="folder of the project")] = Path(),
+) -> None:
+    """Write config/config.yaml and config/scenes.tsv, commented, to edit: they replace the installed ones."""
+    start_logging()
+    from hilsplat.workflow.run import start_project
+
+    for path in start_project(folder):
+        typer.echo(f"wrote {path}")
+
+
 @app.command("run")
 def run_command(
     targets: Annotated[

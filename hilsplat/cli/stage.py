@@ -12,8 +12,8 @@ import typer
 
 from hilsplat.base.artifacts import output_lock, parse_json, provenance_path, require_free_space
 from hilsplat.base.errors import HilsplatError, SettingsError, place_error
-from hilsplat.base.files import project_path
 from hilsplat.base.progress import LOG_FORMAT
+from hilsplat.models.store import model_path
 from hilsplat.workflow.stages import stage_code
 
 PathIn = Annotated[Path, typer.Option(help="input artifact", show_default=False)]
@@ -142,7 +142,7 @@ def section_of(name: str, text: str) -> Any:
 
 def model_input(section: Any) -> dict[str, Path]:
     """The model folder of a section as an input; a missing one is for the stage to report."""
-    folder = project_path(section.model)
+    folder = model_path(section.model)
     return {"model": folder} if folder.is_dir() else {}
 
 

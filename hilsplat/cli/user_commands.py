@@ -114,6 +114,29 @@ def verify(
 
 
 @app.command()
+def doctor(
+    as_json: Annotated[bool, typer.Option("--json", help="print a list of findings as JSON")] = False,
+) -> None:
+    """Check this machine: libraries, GPU, models, disk, memory. Exit status 1 if something is at fault."""
+    import json
+    from dataclasses import asdict
+
+    from hilsplat.workflow.doctor import examine
+
+    findings = []
+    for finding in examine():
+        findings.append(asdict(finding))
+        if not as_json:
+            typer.echo(f"{finding.state:<5}  {finding.check:<14} {finding.found}")
+            if finding.fix:
+                typer.echo(f"       {'':<14} -> {finding.fix}")
+    if as_json:
+        typer.echo(json.dumps(findings, indent=1))
+    if any(finding["state"] == "fault" for finding in findings):
+        raise typer.Exit(1)
+
+
+@app.command()
 def settings(
     schema: Annotated[
         bool, typer.Option(help="print the JSON schema of the configuration, for editors")

@@ -17,6 +17,7 @@ from hilsplat.base.files import INSTALLED
 from hilsplat.base.parallel import in_order
 from hilsplat.models.folder import ModelFolder, input_side_px, open_model_folder
 from hilsplat.models.network import Network, require_one_space
+from hilsplat.models.store import MODELS, user_models
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ClipSettings
 
@@ -243,7 +244,7 @@ def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> C
 
     Its digest identifies it. The search covers the recorded path and every folder in `models/`, each relative
     to the working directory, to the folders above the artifact (such as the project that holds the results)
-    and to the project that this package runs from. The network of pictures is opened at its first use.
+    and to the installation, and the user's models. The network of pictures is opened at its first use.
 
     Args:
         clip_folder: what the clip stage wrote.
@@ -257,7 +258,7 @@ def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> C
     recorded, wanted = Path(index["model"]), index["model_sha256"]
     variant = index.get("model_variant", "")
     roots = list(dict.fromkeys([Path.cwd(), *Path(clip_folder).resolve().parents, INSTALLED]))
-    stores = [root / "models" for root in roots if (root / "models").is_dir()]
+    stores = [place for place in (*(root / MODELS for root in roots), user_models()) if place.is_dir()]
     configs = [config for store in stores for pattern in MODEL_PATTERNS for config in store.glob(pattern)]
     seen: dict[Path, str] = {}
     for folder in [*(root / recorded for root in roots), *sorted(config.parent for config in configs)]:
@@ -276,6 +277,6 @@ def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> C
         expected=f"a model folder with digest {wanted[:12]}; it was {recorded}",
         found=", ".join(f"{folder} with digest {digest[:12]}" for folder, digest in seen.items())
         or f"no CLIP at {recorded} or in {', '.join(map(str, stores)) or 'any folder models/'}",
-        fix="copy that model folder into models/ beside the results folder, or rerun the clip stage with the "
-        "CLIP you have",
+        fix=f"fetch it (hilsplat models get), copy its folder into {user_models()}, or rerun the clip stage "
+        "with the CLIP you have",
     )

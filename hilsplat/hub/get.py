@@ -1,4 +1,4 @@
-"""`hilsplat models get`: a model from the hub into `models/`, whole and checked, or not at all."""
+"""`hilsplat models get`: a model from the hub, whole and checked, or not at all."""
 
 import logging
 import shutil
@@ -24,7 +24,7 @@ from hilsplat.hub.refusals import told_plainly
 from hilsplat.hub.transfer import fetch, partial, patiently
 from hilsplat.hub.wanted import Wanted
 from hilsplat.models.clip_split import split_whole
-from hilsplat.models.store import MODELS, RECOMMENDED, real_model
+from hilsplat.models.store import RECOMMENDED, real_model, user_models
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ class Prepared:
         listing: the repository at a commit.
         choice: its files that are needed.
         staging: folder in which they grow; kept after a failure, and continued.
-        target: folder in `models/`.
+        target: the model's folder.
     """
 
     wanted: Wanted
@@ -72,13 +72,13 @@ class Prepared:
 
 
 def get_models(
-    names: Sequence[str], models: Path = MODELS, revision: str | None = None, variant: str = ""
+    names: Sequence[str], models: Path | None = None, revision: str | None = None, variant: str = ""
 ) -> str:
-    """Fetch models into `models/<name>`, each whole and checked; say what they are.
+    """Fetch models into a folder of models, each whole and checked; say what they are.
 
     Args:
         names: names of the table, or owner/name; empty: the recommended pair.
-        models: folder of the models.
+        models: folder of the models; None: the user's.
         revision: branch, tag or commit of a single model; None: the hub's default.
         variant: networks of another precision, such as "quantized" or "fp16"; empty: full precision.
 
@@ -90,6 +90,7 @@ def get_models(
         DiskSpaceError: the disk is or becomes full; what was transferred is kept.
         ModelError: what was fetched does not work, or cannot be exported.
     """
+    models = models or user_models()
     if not names:
         logger.info("the recommended pair: %s", " and ".join(RECOMMENDED))
     if revision is not None and len(names) != 1:
@@ -114,7 +115,7 @@ def get_models(
     for found in prepared:
         with told_plainly(found.wanted, models), output_lock(found.target):
             texts.append(_install(found))
-    used = [model.name for family in ("sam", "clip") if (model := real_model(family, models)) is not None]
+    used = [model.name for family in ("sam", "clip") if (model := real_model(family)) is not None]
     return "\n\n".join([*texts, f"photographs use {' and '.join(used)}"])
 
 

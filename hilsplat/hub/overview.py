@@ -1,22 +1,20 @@
 """Tables for people: which models there are, and whether those that are here work."""
 
-from pathlib import Path
-
 from hilsplat.base.errors import HilsplatError
 from hilsplat.embed.model_check import check_model
-from hilsplat.models.store import MODELS, RECOMMENDED, RELEASES, present_models, real_model
+from hilsplat.models.store import RECOMMENDED, RELEASES, present_models, real_model, user_models
 
 COLUMNS = "{:<24} {:<5} {:>8}  {:<11} {:<14} {}"
 
 
-def models_table(models: Path = MODELS) -> str:
+def models_table() -> str:
     """Released models with size and licence, and models that are here; which of them photographs use."""
-    here = {model.folder.name: model for model in present_models(models)}
-    chosen = {str(real_model(family, models)) for family in ("sam", "clip")}
+    here = {model.folder.name: model for model in present_models()}
+    chosen = {str(real_model(family)) for family in ("sam", "clip")}
 
     def state(name: str) -> str:
         if name not in here:
-            return "part of it" if (models / f".{name}.part").is_dir() else ""
+            return "part of it" if (user_models() / f".{name}.part").is_dir() else ""
         return "here, in use" if str(here[name].folder) in chosen else "here"
 
     lines = [COLUMNS.format("name", "kind", "MB", "licence", "", "what for")]
@@ -36,21 +34,25 @@ def models_table(models: Path = MODELS) -> str:
         size = f"{sum(path.stat().st_size for path in files) / 1e6:.0f}"
         use = "the synthetic world alone" if model.embedded else ""
         lines.append(COLUMNS.format(name, model.family.upper(), size, "", state(name), use).rstrip())
-    lines += ["", "hilsplat models get NAME, or owner/name of the hub; without a name, the recommended pair"]
+    lines += [
+        "",
+        "hilsplat models get NAME, or owner/name of the hub; without a name, the recommended pair",
+        f"Fetched models go to {user_models()}; those in models/ of a project come first.",
+    ]
     return "\n".join(lines)
 
 
-def check_models(models: Path = MODELS) -> tuple[str, int]:
+def check_models() -> tuple[str, int]:
     """Check every model folder that is here.
 
     Returns:
         what `check_model` says about each, and how many do not work.
     """
     texts, num_failed = [], 0
-    for model in present_models(models):
+    for model in present_models():
         try:
             texts.append(check_model(model.folder))
         except HilsplatError as error:
             texts.append(f"{model.folder} does not work: {error}")
             num_failed += 1
-    return "\n\n".join(texts) or f"{models} does not hold any model", num_failed
+    return "\n\n".join(texts) or "there is no model", num_failed

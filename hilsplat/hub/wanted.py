@@ -14,7 +14,7 @@ class Wanted:
     """What is to be fetched.
 
     Attributes:
-        name: of the folder in `models/`.
+        name: of the folder.
         repository: owner/name on the hub.
         release: the line of the table, for a model that has one.
     """

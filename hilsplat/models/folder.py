@@ -14,7 +14,6 @@ from typing import Any
 
 from hilsplat.base.artifacts import read_json, sha256_of_file, sha256_of_json
 from hilsplat.base.errors import ArtifactError, ModelError
-from hilsplat.base.files import project_path
 from hilsplat.models.clip_split import whole_clip
 from hilsplat.models.layouts import (
     LAYOUTS,
@@ -26,6 +25,7 @@ from hilsplat.models.layouts import (
     layout_of,
 )
 from hilsplat.models.network import Network
+from hilsplat.models.store import model_path
 
 SWITCHES = ("do_resize", "do_rescale", "do_normalize")
 """Preprocessing steps that our code always performs."""
@@ -87,7 +87,7 @@ def open_model_folder(
     Raises:
         ModelError: the folder or some of its files are missing, or it holds another kind of model.
     """
-    folder = project_path(folder)
+    folder = model_path(folder)
     way_out = "name a folder in a layout that docs/models.md lists" + (f", or {fix}" if fix else "")
     if not folder.is_dir():
         raise ModelError(f"model folder {folder} is missing", fix=way_out)

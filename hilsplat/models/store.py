@@ -1,19 +1,25 @@
-"""The folder `models/`: the released models that it may hold, those that it does hold, and which answer.
+"""The folders of models: the released models that they may hold, those that they do hold, and which answer.
 
 Light enough to import when a run is planned: it opens no network.
 """
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import platformdirs
 
 from hilsplat.base.artifacts import parse_json
 from hilsplat.base.files import project_path
 from hilsplat.models.layouts import LAYOUTS, layout_of
 
 MODELS = Path("models")
-"""Folder of the models, relative to the folder in which a command or a run starts."""
+"""Folder of a project's own models, relative to the folder in which a command or a run starts."""
+
+FOLDER_VARIABLE = "HILSPLAT_MODELS"
+"""Environment variable that names `user_models`."""
 
 AUTO = "auto"
 """Value of a setting: a real model if there is one."""
@@ -27,7 +33,7 @@ class Release:
     """A released model that `hilsplat models get` knows by name.
 
     Attributes:
-        name: its folder in `models/`.
+        name: of its folder.
         family: "sam" or "clip".
         repository: on the model hub.
         megabytes: approximate size of the download; the hub's own number is reported before a transfer.
@@ -65,6 +71,7 @@ RELEASES = (
         "Apache-2.0",
         "between small and ViT-B",
     ),
+    Release("edgetam", "sam", "onnx-community/EdgeTAM-ONNX", 37, "Apache-2.0", "the fastest encoder"),
     Release("slimsam-77", "sam", "Xenova/slimsam-77-uniform", 40, "Apache-2.0", "little memory or time"),
     Release(
         "clip-vit-b-16-laion2b",
@@ -106,7 +113,7 @@ def is_embedded(config: Mapping[str, Any]) -> bool:
 
 def read_model(folder: Path) -> PresentModel | None:
     """What a folder holds, by its config.json; None if it has no network or is not a model that we read."""
-    place = project_path(folder)
+    place = model_path(folder)
     try:
         config = parse_json((place / "config.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -117,20 +124,49 @@ def read_model(folder: Path) -> PresentModel | None:
     return PresentModel(folder, LAYOUTS[layout].kind, is_embedded(config))
 
 
-def present_models(models: Path = MODELS) -> list[PresentModel]:
-    """Models in a folder, best first: released ones in their order, others by name, embedded ones last."""
+def user_models() -> Path:
+    """Return the folder of fetched models, which all projects of a user share."""
+    named = os.environ.get(FOLDER_VARIABLE)
+    return Path(named).expanduser() if named else platformdirs.user_data_path("hilsplat") / "models"
+
+
+def model_path(path: str | Path) -> Path:
+    """Return where a model folder of the settings is: as named, in the installation, or among the user's.
+
+    A folder that is in none of these is returned unchanged, so that messages name what the user wrote.
+    """
+    place = project_path(path)
+    of_user = user_models() / place.name
+    return of_user if not place.exists() and place.parent == MODELS and of_user.exists() else place
+
+
+def present_models(*stores: Path) -> list[PresentModel]:
+    """Models in folders, best first: released ones in their order, others by name, embedded ones last.
+
+    Args:
+        stores: folders of models; of models of one name, the first counts. Default: the project's, the
+            user's, and the embedded models of the installation.
+    """
     order = {release.name: number for number, release in enumerate(RELEASES)}
-    folders = sorted(path for path in models.glob("[!.]*") if path.is_dir())
-    found = [model for folder in folders if (model := read_model(folder)) is not None]
+    folders = [
+        path for store in stores or (MODELS, user_models()) for path in store.glob("[!.]*") if path.is_dir()
+    ]
+    if not stores:
+        folders += [project_path(path) for path in EMBEDDED.values()]
+    by_name: dict[str, PresentModel] = {}
+    for folder in folders:
+        if folder.name not in by_name and (model := read_model(folder)) is not None:
+            by_name[folder.name] = model
     return sorted(
-        found, key=lambda model: (model.embedded, order.get(model.folder.name, len(order)), model.folder.name)
+        by_name.values(),
+        key=lambda model: (model.embedded, order.get(model.folder.name, len(order)), model.folder.name),
     )
 
 
-def real_model(family: str, models: Path = MODELS) -> Path | None:
+def real_model(family: str) -> Path | None:
     """The model that `auto` means: the best one of a family that knows more than the synthetic world."""
     return next(
-        (each.folder for each in present_models(models) if each.family == family and not each.embedded), None
+        (each.folder for each in present_models() if each.family == family and not each.embedded), None
     )
 
 

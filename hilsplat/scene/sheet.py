@@ -13,6 +13,9 @@ from hilsplat.base.errors import SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, NAME_RULE, list_images, name_problem
 from hilsplat.scene.layouts import has_known_poses, photo_folder
 
+DEFAULT_SHEET = Path("config/scenes.tsv")
+"""Relative to the project."""
+
 COLUMNS = ("dataset", "scene", "group", "source", "unit")
 OPTIONAL_COLUMNS = ("gaussians",)
 NOTHING = ("", "-")

@@ -14,13 +14,13 @@ from types import SimpleNamespace
 from typing import Any
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.base.files import project_path
+from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.configuration import SECTIONS, UPSTREAM, RunSettings, StageSettings, parse_run, require_known
 from hilsplat.methods.registry import METHODS, OURS, require_method
 from hilsplat.models.digests import model_digest
-from hilsplat.models.store import read_model
+from hilsplat.models.store import model_path, read_model
 from hilsplat.scene.finished import KEY_VIEWS
-from hilsplat.scene.sheet import GROUPS, PHOTOS, SceneRow, choose_scenes, read_sheet
+from hilsplat.scene.sheet import DEFAULT_SHEET, GROUPS, PHOTOS, SceneRow, choose_scenes, read_sheet
 from hilsplat.workflow.jobs import Job, VariantJob, any_of, inert
 from hilsplat.workflow.models import check_device, check_models, describe_models, doubt_about_photographs
 from hilsplat.workflow.scene_data import SceneData, truth_argument
@@ -53,7 +53,7 @@ class Plan:
             require_method(run.stages(name).method.name)
         sheet = project_path(run.scenes)
         self.rows = tuple(read_sheet(sheet, run.groups, run.data_root))
-        require_known_scenes(run, self.rows)
+        require_known_scenes(run, [*self.rows, *read_sheet(INSTALLED / DEFAULT_SHEET, ())])
         self.data = SceneData(self.rows, run.data_root, self.path)
         chosen = choose_scenes(self.rows, run.groups, run.only)
         if more := {row.group for row in chosen} - set(run.groups):  # check their sources too
@@ -71,7 +71,7 @@ class Plan:
                         *(f"{name} is skipped: {reason}" for name, reason in self.absent.items()),
                     ]
                 ),
-                fix="name other groups or scenes, or set data_root",
+                fix="name a scene (hilsplat run photos/desk) or other groups, or set data_root",
             )
         # A thousand scenes have tens of thousands of jobs: settings are resolved and folders are read once.
         self.stages_of = functools.cache(lambda *which: run.stages(*which).with_models())
@@ -164,7 +164,7 @@ class Plan:
             stages = self.stages(job)
             if section == "masks" and stages.masks.segmenter != "sam":
                 return "none"
-            return model_digest(project_path(getattr(stages, section).model), self.results / ".cache")
+            return model_digest(model_path(getattr(stages, section).model), self.results / ".cache")
 
         return digest
 
@@ -314,6 +314,10 @@ class Plan:
 
 def require_known_scenes(run: RunSettings, rows: Iterable[SceneRow]) -> None:
     """Refuse a misspelt scene in `overrides`, `queries` or `sweep_scenes`.
+
+    Args:
+        run: the configuration.
+        rows: the sheet, and that of the default configuration, whose scenes another sheet need not have.
 
     Raises:
         SettingsError: the message has the name that was probably meant.

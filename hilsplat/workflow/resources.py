@@ -20,8 +20,7 @@ import numpy as np
 from PIL import Image
 
 from hilsplat.base.errors import ModelError
-from hilsplat.base.files import project_path
-from hilsplat.models.store import read_model
+from hilsplat.models.store import model_path, read_model
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.splat.ply import vertex_count
 from hilsplat.workflow.jobs import Job
@@ -156,7 +155,7 @@ class JobResources:
         if settings is None or getattr(settings, "segmenter", "sam") != "sam":
             return 0
         batch = settings.batch if rule == "clip" else settings.points_per_batch
-        return _model_memory_mb(project_path(settings.model), settings.variant, batch, threads)
+        return _model_memory_mb(model_path(settings.model), settings.variant, batch, threads)
 
 
 def _first_mp(images: Iterable[str], max_side_px: int) -> float:

@@ -22,10 +22,12 @@ from pathlib import Path
 
 import yaml
 
+from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import HilsplatError
-from hilsplat.base.files import INSTALLED
+from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.base.processes import jobs_end_with_this_process, remove_leftovers
-from hilsplat.configuration import CONFIG, merged_config
+from hilsplat.configuration import CONFIG, merged_config, parse_run
+from hilsplat.scene.sheet import DEFAULT_SHEET, SceneRow, read_sheet
 from hilsplat.workflow.forecast import forecasts
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.records import outdated
@@ -99,6 +101,21 @@ def _locked(name: str, kind: int) -> TextIOWrapper:
     return stream
 
 
+def start_project(folder: Path) -> list[Path]:
+    """Copy the default configuration and scene sheet into a folder, where they win over the installed ones.
+
+    Raises:
+        HilsplatError: one of them is there already; none is then written.
+    """
+    written = [Path(folder) / path for path in (CONFIG, DEFAULT_SHEET)]
+    for path in written:
+        if path.exists():
+            raise HilsplatError(f"{path} is there already", fix="edit it, or name another folder")
+    for path, installed in zip(written, (CONFIG, DEFAULT_SHEET), strict=True):
+        write_text(path, (INSTALLED / installed).read_text(encoding="utf-8"))
+    return written
+
+
 def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str]) -> int:
     """Run the workflow in the working folder.
 
@@ -117,15 +134,17 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
     parser.add_argument("--config", "-C", nargs="*", action="extend", default=[])
     parser.add_argument("--configfile", "--configfiles", nargs="+", action="extend", type=Path, default=[])
     given, others = parser.parse_known_args(list(options))
-    configs = [*configs, *given.configfile]
+    configs = [project_path(path) for path in (*configs, *given.configfile)]
     pairs = [word.partition("=") for word in given.config]
     settings = merged_config(configs, {key: yaml.safe_load(value) for key, _, value in pairs})
-    plan = Plan(settings)
-    scenes = [target for target in targets if any(target in (row.name, row.scene) for row in plan.rows)]
-    _require_known([target for target in targets if target not in scenes], plan)
+    chosen = parse_run(settings)
+    rows = read_sheet(project_path(chosen.scenes), chosen.groups, chosen.data_root)
+    scenes = [target for target in targets if any(target in (row.name, row.scene) for row in rows)]
+    _require_known([target for target in targets if target not in scenes], rows, chosen.scenes)
     if scenes:
         given.config.append(f"only={json.dumps(scenes)}")
-        plan = Plan({**settings, "only": scenes})
+        settings["only"] = scenes
+    plan = Plan(settings)
     command = ["snakemake", "--snakefile", str(_snakefile(configs)), *others]
     command += ["--configfile", *map(str, configs)] if configs else []
     command += ["--config", *given.config] if given.config else []
@@ -152,15 +171,15 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
         return status
 
 
-def _require_known(targets: Sequence[str], plan: Plan) -> None:
+def _require_known(targets: Sequence[str], rows: Sequence[SceneRow], sheet: str) -> None:
     """Refuse a target that is neither a scene nor a rule and cannot be a file of the results."""
-    known = [*TARGET_RULES, *(name for row in plan.rows for name in (row.scene, row.name))]
+    known = [*TARGET_RULES, *(name for row in rows for name in (row.scene, row.name))]
     for target in targets:
         near = difflib.get_close_matches(target, known, n=1)
         if target not in TARGET_RULES and (near or "/" not in target):
             raise HilsplatError(
                 f"there is no scene, rule or file {target!r}",
-                expected=f"did you mean {near[0]!r}?" if near else f"a scene of {plan.run.scenes}, or a file",
+                expected=f"did you mean {near[0]!r}?" if near else f"a scene of {sheet}, or a file",
             )
 
 

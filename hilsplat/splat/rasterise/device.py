@@ -35,7 +35,8 @@ def choose_device(wanted: Literal["auto", "cpu", "cuda"]) -> Device:
     Imports torch (1.3 to 3 s) only if gsplat is installed and `wanted` is not `cpu`; otherwise 0.01 s.
 
     Args:
-        wanted: `auto` takes CUDA if torch finds a device and gsplat can be imported.
+        wanted: `auto` takes CUDA if torch finds a device, gsplat can be imported, and a self-test agrees with
+            the CPU (`parity`).
 
     Raises:
         DeviceError: `cuda` was requested and cannot be used. There is no fallback.
@@ -48,6 +49,10 @@ def choose_device(wanted: Literal["auto", "cpu", "cuda"]) -> Device:
             found=problem,
             fix="pip install 'hilsplat[gpu]' on a machine with a CUDA device, or set device: auto or cpu",
         )
+    if wanted == "auto" and problem is None:
+        from hilsplat.splat.rasterise.parity import cuda_disagreement  # it draws on both
+
+        problem = cuda_disagreement()
     device: Device = "cuda" if wanted != "cpu" and not problem else "cpu"
     logger.info("rasterising on %s (device: %s%s)", device, wanted, f"; {problem}" if problem else "")
     return device

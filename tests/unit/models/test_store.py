@@ -6,7 +6,15 @@ from pathlib import Path
 import pytest
 
 from hilsplat.configuration import with_models
-from hilsplat.models.store import RECOMMENDED, RELEASES, present_models, read_model, real_model
+from hilsplat.models.store import (
+    RECOMMENDED,
+    RELEASES,
+    model_path,
+    present_models,
+    read_model,
+    real_model,
+    user_models,
+)
 from hilsplat.settings import ClipSettings, FieldSettings, MasksSettings
 
 AUTO = MasksSettings(segmenter="auto", model="auto")
@@ -85,6 +93,31 @@ def test_what_is_half_there_or_of_another_kind_is_passed_over(models):
     assert [model.folder.name for model in present_models()] == ["clip-tiny", "sam-tiny"]
     assert real_model("sam") is None
     assert present_models(Path("nowhere")) == []
+
+
+def test_models_of_the_user_are_found_from_any_folder_and_those_of_the_project_come_first(
+    models, tmp_path, monkeypatch
+):
+    of_user = tmp_path / "shared"
+    monkeypatch.setenv("HILSPLAT_MODELS", str(of_user))
+    lay(of_user / "sam-vit-base", "sam")
+    lay(of_user / "sam-vit-huge", "sam")
+    lay(models / "sam-vit-base", "sam")
+    assert real_model("sam") == of_user / "sam-vit-huge"
+    assert [model.folder for model in present_models()][:2] == [
+        of_user / "sam-vit-huge",
+        Path("models/sam-vit-base"),
+    ]
+    assert model_path("models/sam-vit-huge") == of_user / "sam-vit-huge"
+    assert model_path("models/sam-vit-base") == Path("models/sam-vit-base")
+    assert model_path("models/none") == Path("models/none")
+
+
+def test_without_a_variable_fetched_models_are_in_the_data_folder_of_the_user(monkeypatch, tmp_path):
+    monkeypatch.delenv("HILSPLAT_MODELS")
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    monkeypatch.setattr("sys.platform", "linux")
+    assert user_models() == tmp_path / "hilsplat/models"
 
 
 def test_the_recommended_pair_is_one_of_each_family():

@@ -1,0 +1,268 @@
+"""`hilsplat doctor`: what works on this machine, and what to do about what does not."""
+
+import importlib.metadata
+import os
+import platform
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Literal
+
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+
+from hilsplat.base.errors import HilsplatError
+from hilsplat.configuration import merged_config
+from hilsplat.models.memory import machine_mib
+from hilsplat.models.store import RECOMMENDED, present_models, user_models
+from hilsplat.workflow.plan import Plan
+from hilsplat.workflow.resources import COSTS, JobResources
+
+PACKAGE = "hilsplat"
+
+DISK_MIB_PER_MP = 35.0
+"""Results and caches of a scene per megapixel of its views (48 photographs of 0.5 megapixels: 0.8 GB)."""
+
+RULES = ("poses", "gaussians", "masks", "contributions", "semantic_tree", "clip", "field", "figures")
+"""Rules whose memory is compared with the machine's."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a check found.
+
+    Attributes:
+        check: its name.
+        state: "ok"; "note": something is missing that not everybody needs; "fault": runs fail or are wrong.
+        found: what there is.
+        fix: what to do; empty if nothing.
+    """
+
+    check: str
+    state: Literal["ok", "note", "fault"]
+    found: str
+    fix: str = ""
+
+
+def examine() -> Iterator[Finding]:
+    """Run every check; one that fails unexpectedly is a fault and does not stop the others."""
+    for check in CHECKS:
+        try:
+            yield from check()
+        except Exception as error:  # whatever a broken installation raises
+            yield Finding(check.__name__, "fault", f"{type(error).__name__}: {error}", "read the message")
+
+
+def python() -> Iterator[Finding]:
+    """The version of Python."""
+    wanted = importlib.metadata.metadata(PACKAGE)["Requires-Python"]
+    found = platform.python_version()
+    if SpecifierSet(wanted).contains(found):
+        yield Finding("python", "ok", f"{found} on {platform.system()} {platform.machine()}")
+    else:
+        yield Finding("python", "fault", f"{found}, but {wanted} is needed", "use another Python")
+
+
+def libraries() -> Iterator[Finding]:
+    """Versions of the libraries that the package requires."""
+    wrong, number = [], 0
+    for text in importlib.metadata.requires(PACKAGE) or ():
+        requirement = Requirement(text)
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
+            continue
+        number += 1
+        try:
+            found = importlib.metadata.version(requirement.name)
+        except importlib.metadata.PackageNotFoundError:
+            wrong.append(f"{requirement.name} is missing")
+            continue
+        if not requirement.specifier.contains(found, prereleases=True):
+            wrong.append(f"{requirement.name} {found} is not {requirement.specifier}")
+    if wrong:
+        fix = f"pip install --upgrade {PACKAGE}, with the constraints.txt of the repository"
+        yield Finding("libraries", "fault", "; ".join(wrong), fix)
+    else:
+        yield Finding("libraries", "ok", f"{number} libraries in the required versions")
+
+
+def onnx() -> Iterator[Finding]:
+    """Where onnxruntime runs networks, and whether two builds of it overwrite each other."""
+    import onnxruntime
+
+    both = [name for name in ("onnxruntime", "onnxruntime-gpu") if _installed(name)]
+    if len(both) == 2:
+        yield Finding(
+            "onnxruntime",
+            "fault",
+            "onnxruntime and onnxruntime-gpu are both installed; their files overwrite each other",
+            "pip uninstall onnxruntime onnxruntime-gpu, then pip install onnxruntime-gpu",
+        )
+        return
+    providers = onnxruntime.get_available_providers()
+    yield Finding("onnxruntime", "ok", f"{onnxruntime.__version__}: {', '.join(providers)}")
+
+
+def cuda() -> Iterator[Finding]:
+    """Whether torch and gsplat can use CUDA, and draw what the CPU draws."""
+    from hilsplat.splat.rasterise.device import cuda_problem
+    from hilsplat.splat.rasterise.parity import cuda_disagreement
+
+    if problem := cuda_problem():
+        yield Finding("cuda", "note", f"{problem}: everything runs on the CPU", "pip install 'hilsplat[gpu]'")
+    elif apart := cuda_disagreement():
+        yield Finding("cuda", "fault", apart, "set device: cpu, and report what this command prints")
+    else:
+        yield Finding("cuda", "ok", "gsplat draws what the CPU draws: image, gradients, pixel weights")
+
+
+def kernels() -> Iterator[Finding]:
+    """Compile the rasteriser's loops, or load them, and draw a small scene."""
+    from hilsplat.splat.rasterise.parity import disagreement
+
+    begin = time.monotonic()
+    if apart := disagreement("cpu", "cpu"):
+        yield Finding("kernels", "fault", apart, "reinstall numba and llvmlite")
+    else:
+        yield Finding(
+            "kernels", "ok", f"a small scene is drawn, {time.monotonic() - begin:.1f} s with compiling"
+        )
+
+
+def video() -> Iterator[Finding]:
+    """Whether PyAV reads and writes the usual videos."""
+    import av
+
+    missing = [
+        f"{mode} {name}"
+        for name, mode in (("h264", "r"), ("hevc", "r"), ("libx264", "w"))
+        if not _codec(name, mode)
+    ]
+    if missing:
+        yield Finding(
+            "video",
+            "fault",
+            f"PyAV {av.__version__} lacks {', '.join(missing)}",
+            "pip install --force-reinstall av",
+        )
+    else:
+        yield Finding("video", "ok", f"PyAV {av.__version__} reads H.264 and HEVC and writes H.264")
+
+
+def models() -> Iterator[Finding]:
+    """Run each model that photographs use."""
+    from hilsplat.embed.model_check import check_model
+
+    real = [model for model in present_models() if not model.embedded]
+    missing = {"sam", "clip"} - {model.family for model in real}
+    for model in real or present_models():
+        try:
+            check_model(model.folder)
+        except HilsplatError as error:
+            yield Finding("models", "fault", str(error), f"hilsplat models get {model.folder.name}")
+        else:
+            yield Finding("models", "ok", f"{model.folder} works")
+    if missing:
+        names = " and no ".join(family.upper() for family in sorted(missing))
+        yield Finding(
+            "models",
+            "note",
+            f"no {names} for photographs: answers about them mean nothing",
+            f"hilsplat models get ({' and '.join(RECOMMENDED)})",
+        )
+
+
+def space() -> Iterator[Finding]:
+    """Free disk and memory against what the configured scenes need."""
+    try:
+        plan = Plan(merged_config([]))
+    except HilsplatError as error:
+        yield Finding(
+            "configuration", "note", str(error), "choose scenes, or name them: hilsplat run photos/desk"
+        )
+        return
+    resources, disk_mib, memory = JobResources(plan), 0.0, (0.0, "", "")
+    for row in plan.scenes:
+        job = SimpleNamespace(dataset=row.dataset, scene=row.scene, variant="default")
+        views, view_mp = resources.size(row)
+        disk_mib += DISK_MIB_PER_MP * views * view_mp
+        needs = (
+            (resources.memory_mb(rule)(job, threads=1, attempt=1), rule, row.name)
+            for rule in RULES
+            if rule in COSTS
+        )
+        memory = max(memory, *needs)
+    folder = _existing(plan.results)
+    free, needed = shutil.disk_usage(folder).free / 2**30, disk_mib / 1024
+    text = f"{free:.1f} GiB free in {folder}; results of {len(plan.scenes)} scenes take about {needed:.1f}"
+    if free > needed:
+        yield Finding("disk", "ok", text)
+    else:
+        yield Finding("disk", "fault", text, "free space, or set results to a folder on another disk")
+    most, rule, scene = memory
+    text = (
+        f"{machine_mib() / 1024:.1f} GiB; the largest job, {rule} of {scene}, takes about {most / 1024:.1f}"
+    )
+    if machine_mib() > most:
+        yield Finding("memory", "ok", text)
+    else:
+        yield Finding("memory", "fault", text, "lower poses.max_side_px or gaussians.max_gaussians")
+
+
+def writing() -> Iterator[Finding]:
+    """Folders that are written to."""
+    kernels_folder = Path(__file__).resolve().parents[1] / "__pycache__"
+    for what, folder in (
+        ("working folder", Path.cwd()),
+        ("models", user_models()),
+        ("compiled kernels", kernels_folder),
+    ):
+        existing = _existing(folder)
+        if os.access(existing, os.W_OK):
+            yield Finding("writing", "ok", f"{what}: {folder}")
+        else:
+            state: Literal["note", "fault"] = "fault" if folder == Path.cwd() else "note"
+            yield Finding(
+                "writing",
+                state,
+                f"{what}: {existing} is read-only",
+                f"make {existing} writable for this user",
+            )
+
+
+CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
+    python,
+    libraries,
+    onnx,
+    cuda,
+    kernels,
+    video,
+    models,
+    space,
+    writing,
+)
+
+
+def _existing(folder: Path) -> Path:
+    """Return the folder, or the nearest one above it that exists."""
+    return next(path for path in (folder, *folder.resolve().parents) if path.exists())
+
+
+def _installed(name: str) -> bool:
+    try:
+        importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+def _codec(name: str, mode: str) -> bool:
+    import av
+
+    try:
+        av.codec.Codec(name, mode)
+    except (av.FFmpegError, ValueError):
+        return False
+    return True

@@ -1,0 +1,138 @@
+"""Each check of `hilsplat doctor` passes here and says what to do where it does not."""
+
+import importlib.metadata
+import json
+import os
+import shutil
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from hilsplat.base.errors import ModelError
+from hilsplat.cli.main import app
+from hilsplat.splat.rasterise import api, parity
+from hilsplat.workflow import doctor
+from tests.unit.models.test_store import lay
+
+
+def only(check):
+    (finding,) = check()
+    return finding
+
+
+def test_a_sound_machine_has_no_fault(project, monkeypatch):
+    monkeypatch.chdir(project)
+    findings = list(doctor.examine())
+    assert [finding for finding in findings if finding.state == "fault"] == []
+    assert {finding.check for finding in findings} >= {"python", "libraries", "kernels", "disk", "memory"}
+
+
+def test_an_old_python_is_a_fault(monkeypatch):
+    monkeypatch.setattr("platform.python_version", lambda: "3.9.1")
+    found = only(doctor.python)
+    assert found.state == "fault" and "3.9.1" in found.found
+
+
+def test_a_library_that_is_missing_or_old_is_named(monkeypatch):
+    versions = {"numpy": "1.20.0"}
+
+    def version(name: str) -> str:
+        if name == "scipy":
+            raise importlib.metadata.PackageNotFoundError(name)
+        return versions.get(name) or known(name)
+
+    known = importlib.metadata.version
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    found = only(doctor.libraries)
+    assert found.state == "fault"
+    assert "scipy is missing" in found.found and "numpy 1.20.0 is not >=2.1" in found.found
+
+
+def test_two_builds_of_onnxruntime_are_a_fault(monkeypatch):
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: "1.0")
+    found = only(doctor.onnx)
+    assert found.state == "fault" and "overwrite" in found.found
+
+
+@pytest.mark.parametrize(
+    ("problem", "apart", "state"),
+    [("no gsplat", None, "note"), (None, "cuda differs from cpu: image by 0.3", "fault"), (None, None, "ok")],
+)
+def test_cuda_is_optional_but_must_agree_with_the_cpu(monkeypatch, problem, apart, state):
+    monkeypatch.setattr("hilsplat.splat.rasterise.device.cuda_problem", lambda: problem)
+    monkeypatch.setattr("hilsplat.splat.rasterise.parity.cuda_disagreement", lambda: apart)
+    assert only(doctor.cuda).state == state
+
+
+def test_kernels_that_draw_something_else_are_a_fault(monkeypatch):
+    draw, calls = api.draw, []
+
+    def bent(*args, **options):
+        seen = draw(*args, **options)
+        calls.append(seen)
+        return seen if len(calls) == 1 else replace(seen, image=seen.image + np.float32(0.1))
+
+    monkeypatch.setattr(api, "draw", bent)
+    found = only(doctor.kernels)
+    assert found.state == "fault" and "image by 0.1" in found.found
+
+
+def test_a_missing_codec_is_named(monkeypatch):
+    monkeypatch.setattr(doctor, "_codec", lambda name, mode: name != "libx264")
+    found = only(doctor.video)
+    assert found.state == "fault" and "libx264" in found.found
+
+
+def test_a_broken_model_is_a_fault_and_missing_real_ones_are_noted(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    lay(tmp_path / "models/sam-vit-base", "sam")
+    states = {finding.state: finding.found for finding in doctor.models()}
+    assert "sam-vit-base" in states["fault"] and "no CLIP" in states["note"]
+
+
+@pytest.mark.parametrize(("what", "value"), [("disk", 2**20), ("memory", 100.0)])
+def test_too_little_disk_or_memory_is_a_fault(project, monkeypatch, what, value):
+    monkeypatch.chdir(project)
+    if what == "disk":
+        monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=value))
+    else:
+        monkeypatch.setattr(doctor, "machine_mib", lambda: value)
+    states = {finding.check: finding.state for finding in doctor.space()}
+    assert states.pop(what) == "fault" and set(states.values()) == {"ok"}
+
+
+def test_a_read_only_working_folder_is_a_fault(monkeypatch):
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    states = [finding.state for finding in doctor.writing()]
+    assert states == ["fault", "note", "note"]
+
+
+def test_the_command_prints_json_and_fails_with_a_fault(monkeypatch):
+    broken = doctor.Finding("models", "fault", "broken", "get it again")
+    monkeypatch.setattr(doctor, "examine", lambda: iter([broken]))
+    done = CliRunner().invoke(app, ["doctor", "--json"])
+    assert done.exit_code == 1
+    assert json.loads(done.output) == [
+        {"check": "models", "state": "fault", "found": "broken", "fix": "get it again"}
+    ]
+
+
+def test_a_check_that_fails_unexpectedly_does_not_stop_the_others(monkeypatch):
+    def check():
+        raise ModelError("no")
+
+    monkeypatch.setattr(doctor, "CHECKS", (check, doctor.python))
+    assert [finding.state for finding in doctor.examine()] == ["fault", "ok"]
+
+
+def test_the_self_test_of_cuda_is_drawn_once(monkeypatch, tmp_path):
+    drawn = []
+    monkeypatch.setattr(parity, "disagreement", lambda one, other: drawn.append(other))
+    monkeypatch.setattr("platformdirs.user_cache_path", lambda name: tmp_path)
+    monkeypatch.setitem(__import__("sys").modules, "gsplat", SimpleNamespace(__version__="1.5"))
+    monkeypatch.setattr("torch.cuda.get_device_name", lambda: "a GPU")
+    assert parity.cuda_disagreement() is None and parity.cuda_disagreement() is None
+    assert drawn == ["cuda"]
