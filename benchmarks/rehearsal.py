@@ -86,15 +86,15 @@ def make_project(folder: Path, models: dict[str, Path], precision: str) -> list[
 
 
 def rehearse(folder: Path, photographs: Path, options: list[str], cores: int) -> dict[str, float]:
-    """Run the project; seconds from `hilsplat new` to each announcement, and to the end."""
+    """Run the project; seconds from the end of `hilsplat new` to each announcement, and to the end."""
     environment = {**os.environ, "PYTHONPATH": f"{folder / 'patch'}:{PROJECT}"}
     command = [sys.executable, "-m", "hilsplat"]
     name = SCENE.partition("/")[2]
     # as `hilsplat models get` does: kernels are compiled and int8 networks made
     plain = {**os.environ, "PYTHONPATH": str(PROJECT)}
     subprocess.run([*command, "models", "check"], cwd=folder, env=plain, check=True)
-    begin, found = time.monotonic(), {}
     subprocess.run([*command, "new", name, str(photographs)], cwd=folder, env=environment, check=True)
+    begin, found = time.monotonic(), {}
     run = [*command, "run", SCENE, *options, "--", "--cores", str(cores)]
     with subprocess.Popen(
         run, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True

@@ -4,6 +4,7 @@ rule clip:
         scene="<results>/{dataset}/{scene}/scene",
         masks=PLAN.shared("masks", "masks"),
         semantic_tree=PLAN.crops_tree,  # empty if every mask is embedded
+        features=PLAN.data.features,  # empty, except for vectors of LangSplat
     output:
         clip=directory("<results>/{dataset}/{scene}/{variant}/clip"),
     log:
@@ -22,7 +23,7 @@ rule clip:
         model=PLAN.model("clip"),
         option=PLAN.crops_tree_option,
         cache=cache_folder,
-        code=PLAN.code("clip"),
+        code=PLAN.code(PLAN.clip_stage),
     shell:
         "python -m hilsplat --log {log:q} clip --scene {input.scene:q} --masks {input.masks:q} {params.option} --settings {params.settings:q}"
         " --threads {threads} --memory {resources.mem_mib} --cache {params.cache:q} --out {output.clip:q}"

@@ -7,6 +7,7 @@ rule masks:
         key_masks=lambda wildcards: PLAN.key_parts(wildcards, "masks"),
         key_tree=lambda wildcards: PLAN.key_parts(wildcards, "semantic_tree"),
         first=ancient(PLAN.first_answer),  # not read
+        features=PLAN.data.features,  # empty, except for masks of LangSplat
     output:
         masks=directory("<results>/{dataset}/{scene}/{variant}/masks"),
     log:

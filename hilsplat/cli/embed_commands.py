@@ -29,6 +29,9 @@ def clip(
         Path | None, typer.Option(help="embed only the crops that show its nodes best; default: every mask")
     ] = None,
     settings: Settings = "{}",
+    features: Annotated[
+        Path | None, typer.Option(help="LangSplat's folder of _s.npy and _f.npy: take its vectors instead")
+    ] = None,
     cache: Cache = DEFAULT_CACHE,
     threads: Threads = 1,
     memory: Memory = None,
@@ -37,34 +40,16 @@ def clip(
     section = section_of("clip", settings)
     inputs = {"scene": scene, "masks": masks, **model_input(section)}
     inputs |= {"semantic_tree": semantic_tree} if semantic_tree else {}
+    if features is not None:
+        with stage("langsplat", out, settings=section, inputs={**inputs, "features": features}):
+            from hilsplat.embed.langsplat_files import read_clip
+
+            read_clip(scene, features, out, section)
+        return
     with stage("clip", out, settings=section, threads=threads, inputs=inputs):
         from hilsplat.embed.stage import run_clip
 
         run_clip(scene, masks, semantic_tree, out, cache, section, threads, memory)
-
-
-@langsplat_app.command("read")
-def langsplat_read(
-    scene: PathIn,
-    files: Annotated[Path, typer.Option(help="LangSplat's folder of _s.npy and _f.npy", show_default=False)],
-    masks: Annotated[Path, typer.Option(help="masks artifact to write", show_default=False)],
-    clip: Annotated[Path, typer.Option(help="clip artifact to write", show_default=False)],
-    resize: Annotated[
-        bool, typer.Option(help="accept maps of another size and take the nearest pixel")
-    ] = False,
-    settings: Annotated[str, typer.Option(help="section clip as JSON; its model embeds the texts")] = "{}",
-) -> None:
-    """Import masks and CLIP vectors from LangSplat's preprocessing, instead of running masks and clip."""
-    section = section_of("clip", settings)
-    inputs = {"scene": scene, "files": files}
-    with stage("langsplat", masks, inputs=inputs):
-        from hilsplat.embed.langsplat_files import read_masks
-
-        read_masks(scene, files, masks, resize)
-    with stage("langsplat", clip, settings=section, inputs={**inputs, "masks": masks}):
-        from hilsplat.embed.langsplat_files import read_clip
-
-        read_clip(scene, files, clip, resize, section)
 
 
 @langsplat_app.command("write")

@@ -28,13 +28,32 @@ def new(
     ],
     sheet: Annotated[Path, typer.Option(help="scene sheet")] = Path("config/scenes.tsv"),
     frames: Annotated[int, typer.Option(min=3, max=1000, help="most frames taken from videos")] = 60,
+    gaussians: Annotated[
+        Path | None,
+        typer.Option(help="a 3DGS PLY instead of a fit; none: fit; default: what 3DGS left in the folder"),
+    ] = None,
+    features: Annotated[
+        Path | None,
+        typer.Option(
+            help="LangSplat's language_features instead of SAM and CLIP; none: compute them; default: "
+            "those in the folder"
+        ),
+    ] = None,
+    labels: Annotated[
+        Path | None,
+        typer.Option(help="LERF-OVS's label files, for scores; none; default: those beside the scene"),
+    ] = None,
 ) -> None:
-    """Add photographs, or the frames of a video, to the scene sheet, and say what is likely to fail."""
+    """Add photographs, a video, or a scene of COLMAP, 3DGS, nerfstudio or LangSplat to the scene sheet.
+
+    Says what was found, what is used, and what is likely to fail.
+    """
     start_logging()
     from hilsplat.photos.add import add_scene
     from hilsplat.workflow.models import models_of_photographs
 
-    report = add_scene(sheet, name, photos, frames=frames)
+    brought = {"gaussians": gaussians, "features": features, "labels": labels}
+    report = add_scene(sheet, name, photos, frames=frames, **brought)
     typer.echo(str(report))
     typer.echo(
         f"\nadded photos/{name} to {sheet}. Next:\n"

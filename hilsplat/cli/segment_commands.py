@@ -40,6 +40,9 @@ def masks(
         Path | None, typer.Option(help="tree of the key views, for masks.prompts: guided")
     ] = None,
     perturb: Annotated[str, typer.Option(help="faults of truth-perturbed, as JSON")] = "{}",
+    features: Annotated[
+        Path | None, typer.Option(help="LangSplat's folder of _s.npy and _f.npy: take its masks instead")
+    ] = None,
     cache: Cache = DEFAULT_CACHE,
     threads: Threads = 1,
     memory: Memory = None,
@@ -55,6 +58,12 @@ def masks(
             found=f"--truth {truth}",
             fix="leave out --truth, or set masks.segmenter: truth-perturbed, a diagnostic",
         )
+    if features is not None:
+        with stage("langsplat", out, inputs={"scene": scene, "features": features}):
+            from hilsplat.embed.langsplat_files import read_masks
+
+            read_masks(scene, features, out)
+        return
     inputs = {"scene": scene, **(model_input(section) if section.segmenter == "sam" else {})}
     if section.key_views < 1:
         if gaussians is None:

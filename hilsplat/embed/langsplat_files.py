@@ -7,6 +7,7 @@ The four maps are default, s, m, l: all heads mixed, then from fine to coarse. R
 four. File names are cut at their first dot.
 """
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,15 @@ from hilsplat.segment.digests import (
 from hilsplat.segment.masks import HierarchicalMasks, runs_of_labels
 from hilsplat.segment.stage import train_views
 from hilsplat.settings import ClipSettings
+
+logger = logging.getLogger(__name__)
+
+SHAPE_TOLERANCE = 0.01
+"""Relative difference between the shapes of maps and view that is rounding."""
+
+CHECKED_MASKS, LEAST_COSINE = 32, 0.8
+"""Masks that are embedded again, and the least median cosine of their vectors. The same CLIP reaches 0.99;
+another one of the same width about 0."""
 
 MAPS: tuple[Level | None, ...] = (None, Level.SUBPART, Level.PART, Level.WHOLE)
 """Levels of the four maps, in their order; the first mixes all levels."""
@@ -58,7 +68,7 @@ def _stems(views: list[str]) -> dict[str, str]:
 
 
 def read_view(
-    folder: Path, view: str, size_hw: tuple[int, int], resize: bool
+    folder: Path, view: str, size_hw: tuple[int, int]
 ) -> tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]:
     """Masks and vectors of one view, rows in `content_order`.
 
@@ -68,12 +78,12 @@ def read_view(
     Args:
         folder: holds `<stem>_s.npy` and `<stem>_f.npy`.
         view: its name.
-        size_hw: of the view.
-        resize: accept maps of another size and take the nearest pixel.
+        size_hw: of the view; maps of the same shape in another size, such as LangSplat's 1080 rows, are read
+            at the nearest pixel.
 
     Raises:
         ArtifactError: a file is missing, damaged, pickled, or not as described above.
-        MisalignedArtifactError: the maps are of another size, and `resize` is off.
+        MisalignedArtifactError: the maps are of another shape.
     """
     maps_path, vectors_path = (folder / f"{stem_of(view)}_{kind}.npy" for kind in "sf")
     maps, vectors = read_npy(maps_path), read_npy(vectors_path)
@@ -99,12 +109,13 @@ def read_view(
             fix="take both files from the same run of the preprocessing",
         )
     if labels.shape[1:] != size_hw:
-        if not resize:
+        height, width = labels.shape[1:]
+        if abs(height * size_hw[1] / (width * size_hw[0]) - 1) > SHAPE_TOLERANCE:
             raise MisalignedArtifactError(
-                f"{maps_path} and view {view} differ in size",
-                expected=f"{size_hw} (height, width)",
+                f"{maps_path} and view {view} differ in shape",
+                expected=f"the shape of {size_hw} (height, width)",
                 found=f"{labels.shape[1:]}",
-                fix="pass --resize (nearest pixel), or make both at one size; LangSplat shrinks to 1080 rows",
+                fix="make both from the same image; poses that undistort an image change its shape",
             )
         at = [
             ((np.arange(n) + 0.5) * m / n).astype(int) for n, m in zip(size_hw, labels.shape[1:], strict=True)
@@ -126,9 +137,7 @@ def read_view(
     return masks.take(order), unit(vectors[np.concatenate(rows)[order]].astype(np.float32)).astype(np.float16)
 
 
-def _read_all(
-    scene: Scene, folder: Path, resize: bool
-) -> dict[str, tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]]:
+def _read_all(scene: Scene, folder: Path) -> dict[str, tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]]:
     """Masks and vectors of every training view.
 
     Raises:
@@ -144,36 +153,36 @@ def _read_all(
             fix="pass the folder language_features that LangSplat made from the same images",
         )
     return {
-        view: read_view(folder, view, scene.cameras[view].size_hw, resize)
+        view: read_view(folder, view, scene.cameras[view].size_hw)
         for view in track(list(stems), "LangSplat's files")
     }
 
 
-def read_masks(scene_folder: Path, files: Path, out: Path, resize: bool) -> None:
+def read_masks(scene_folder: Path, files: Path, out: Path) -> None:
     """Write LangSplat's masks as the masks stage would: `<view>.npz` and `index.json`."""
     scene = Scene.load(scene_folder)
     with stage_log("langsplat masks", scene.name) as counts, atomic_folder(out) as folder:
         index = {}
-        for view, (masks, _) in _read_all(scene, files, resize).items():
+        for view, (masks, _) in _read_all(scene, files).items():
             masks.save(folder / f"{view}.npz")
             index[view] = index_entry(masks)
         write_index(folder, index, scene=scene.name, segmenter="langsplat", model=None, model_sha256=None)
         counts.update(views=len(index))
 
 
-def read_clip(scene_folder: Path, files: Path, out: Path, resize: bool, settings: ClipSettings) -> None:
+def read_clip(scene_folder: Path, files: Path, out: Path, settings: ClipSettings) -> None:
     """Write LangSplat's vectors as the clip stage would: `<view>.npy`, rows as in `read_masks`.
 
     Raises:
-        MisalignedArtifactError: the vectors have another width than those of `settings.model`, which
-            embeds the texts.
+        MisalignedArtifactError: the vectors are not those of `settings.model`, which embeds the texts.
     """
     scene = Scene.load(scene_folder)
     model = ClipModel.load(Path(settings.model), variant=settings.variant)
     with stage_log("langsplat clip", scene.name) as counts, atomic_folder(out) as folder:
         index = {}
-        for view, (masks, vectors) in _read_all(scene, files, resize).items():
-            model.require_width(vectors.shape[1], f"{files / stem_of(view)}_f.npy")
+        found = _read_all(scene, files)
+        _require_model(model, scene, files, found)
+        for view, (masks, vectors) in found.items():
             write_npy(folder / f"{view}.npy", vectors)
             index[view] = {MASKS_SHA256: digest_of(masks), "masks": len(vectors)}
         write_index(
@@ -188,6 +197,34 @@ def read_clip(scene_folder: Path, files: Path, out: Path, resize: bool, settings
             context=0.0,
         )
         counts.update(views=len(index), dim=model.width)
+
+
+def _require_model(
+    model: ClipModel,
+    scene: Scene,
+    files: Path,
+    found: dict[str, tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]],
+) -> None:
+    """Embed some masks of a view again, as LangSplat does, and compare the vectors.
+
+    Raises:
+        MisalignedArtifactError: they differ. The width alone does not tell one CLIP from another.
+    """
+    view = max(found, key=lambda view: len(found[view][0]))
+    masks, vectors = found[view]
+    model.require_width(vectors.shape[1], f"{files / stem_of(view)}_f.npy")
+    rows = np.arange(len(masks))[:: max(1, len(masks) // CHECKED_MASKS)]
+    own = model.embed_masks(scene.image(view), masks, ClipSettings(crop="langsplat"), rows).astype(np.float32)
+    cosine = float(np.median((own * vectors[rows].astype(np.float32)).sum(axis=1))) if len(rows) else 1.0
+    logger.info("the CLIP in %s agrees with %s: median cosine %.3f", model.model.folder, files, cosine)
+    if cosine < LEAST_COSINE:
+        raise MisalignedArtifactError(
+            f"the vectors in {files} are not of the CLIP in {model.model.folder}",
+            expected=f"a median cosine of at least {LEAST_COSINE} with its own vectors of the same masks",
+            found=f"{cosine:.3f} for {len(rows)} masks of {view}",
+            fix="set clip.model to the CLIP that made them; LangSplat's is clip-vit-b-16-laion2b: "
+            "hilsplat models get clip-vit-b-16-laion2b",
+        )
 
 
 def maps_of(

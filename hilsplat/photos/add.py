@@ -1,12 +1,14 @@
 """Your own photographs: what a folder holds, and adding it to the scene sheet."""
 
 import hashlib
+import shutil
 from collections import Counter, defaultdict
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 
+from hilsplat.base.artifacts import atomic_folder
 from hilsplat.base.errors import ImageError, SceneError
 from hilsplat.base.files import NAME_RULE, list_images, name_problem
 from hilsplat.base.images import open_image, read_image, resize_to_fit
@@ -14,7 +16,13 @@ from hilsplat.base.progress import track
 from hilsplat.photos.check import CHECK_SIDE_PX, CheckedPhoto, photo_doubts
 from hilsplat.photos.intake import brought_photographs
 from hilsplat.scene.features import EXIF_ORIENTATION, exif_focal_px
-from hilsplat.scene.layouts import has_known_poses, photo_folder
+from hilsplat.scene.layouts import (
+    has_known_poses,
+    label_files,
+    langsplat_features,
+    photo_folder,
+    trained_gaussians,
+)
 from hilsplat.scene.sheet import (
     COLUMNS,
     MIN_PHOTOS,
@@ -146,7 +154,20 @@ def inspect_photos(folder: Path) -> PhotoReport:
     )
 
 
-def add_scene(sheet: Path, name: str, photos: Path, unit: str = "arbitrary", frames: int = 60) -> PhotoReport:
+NONE = Path("none")
+"""What a user passes to leave out what was found."""
+
+
+def add_scene(
+    sheet: Path,
+    name: str,
+    photos: Path,
+    unit: str = "arbitrary",
+    frames: int = 60,
+    gaussians: Path | None = None,
+    features: Path | None = None,
+    labels: Path | None = None,
+) -> PhotoReport:
     """Append your own photographs to the sheet as scene `photos/<name>`; a missing sheet is created.
 
     A folder stays where it is: the sheet points to it, by a relative path if it is inside the project. The
@@ -158,6 +179,12 @@ def add_scene(sheet: Path, name: str, photos: Path, unit: str = "arbitrary", fra
         photos: folder of photographs or of videos, a video, or a zip of photographs.
         unit: unit of lengths, for a folder with metric poses.
         frames: largest number of frames taken from videos.
+        gaussians: a 3DGS PLY in the coordinates of the poses, used instead of a fit; None: the one that 3DGS
+            left in the folder, if there is one; `NONE`: never.
+        features: LangSplat's folder of masks and vectors, used instead of SAM and CLIP; None and `NONE`
+            likewise.
+        labels: folder of label files of LERF-OVS or of `hilsplat annotate`, which evaluation alone reads.
+            They are copied to `annotated/photos/<name>/` in the project. None and `NONE` likewise.
 
     Raises:
         SceneError: the name cannot be used or is taken, photographs cannot be read, or there are
@@ -183,10 +210,58 @@ def add_scene(sheet: Path, name: str, photos: Path, unit: str = "arbitrary", fra
         )
     root = project_root(sheet)
     with brought_photographs(photos, root / PHOTOS / name, frames) as brought:
-        report = replace(inspect_photos(brought.folder), notes=brought.notes)
+        extra = _trained(brought.folder, {"gaussians": gaussians, "features": features})
+        notes = [f"{what}: {path}" for what, path in extra.items()]
+        if skipped := sorted(brought.folder.rglob("*.pth"))[:3]:
+            notes.append(
+                f"not read, because a pickle can run code: {', '.join(path.name for path in skipped)}"
+            )
+        files = _labels(brought.folder, labels)
+        annotated = root / "annotated" / PHOTOS / name
+        if files and not annotated.exists():
+            notes.append(f"labels of {len(files)} photographs, for scores: {files[0].parent}")
+        report = replace(inspect_photos(brought.folder), notes=(*brought.notes, *notes))
         _check(report, brought.folder)
-        _append(sheet, name, brought.folder, unit)
+        if files and not annotated.exists():
+            with atomic_folder(annotated) as target:
+                for path in files:
+                    shutil.copy2(path, target / path.name)
+        _append(sheet, name, brought.folder, unit, extra)
     return report
+
+
+def _trained(folder: Path, asked: dict[str, Path | None]) -> dict[str, Path]:
+    """Gaussians and features of a scene: what the user names, or what 3DGS and LangSplat left in the folder.
+
+    Without known poses, Gaussians of another program are in coordinates that nobody knows.
+
+    Raises:
+        SceneError: a path that the user names does not exist.
+    """
+    found = {"gaussians": trained_gaussians(folder), "features": langsplat_features(folder)}
+    if not has_known_poses(folder):
+        found["gaussians"] = None
+    for what, path in asked.items():
+        if path is not None and path != NONE and not path.exists():
+            raise SceneError(f"--{what} {path} is missing", fix="correct the path, or pass none")
+    chosen = {what: asked[what] or path for what, path in found.items()}
+    return {what: path.resolve() for what, path in chosen.items() if path is not None and path != NONE}
+
+
+def _labels(folder: Path, asked: Path | None) -> list[Path]:
+    """Label files that the user names, or that are found.
+
+    Raises:
+        SceneError: the named folder holds none.
+    """
+    if asked is None or asked == NONE:
+        return label_files(folder) if asked is None else []
+    files = sorted(asked.glob("*.json"))
+    if not files:
+        raise SceneError(
+            f"--labels {asked} holds no label file", expected="a .json for each labelled photograph"
+        )
+    return files
 
 
 def _check(report: PhotoReport, photos: Path) -> None:
@@ -208,21 +283,31 @@ def _check(report: PhotoReport, photos: Path) -> None:
         )
 
 
-def _append(sheet: Path, name: str, photos: Path, unit: str) -> None:
-    """Write the row of a scene at the end of the sheet."""
+def _append(sheet: Path, name: str, photos: Path, unit: str, extra: dict[str, Path]) -> None:
+    """Write the row of a scene at the end of the sheet, with columns that it did not have yet."""
     from hilsplat.base.artifacts import write_text
 
     root = project_root(sheet)
-    source = photos.relative_to(root).as_posix() if photos.is_relative_to(root) else str(photos)
-    if not source.isprintable() or source.startswith("world:"):
-        raise SceneError(f"the path {source!r} cannot be written in the scene sheet", fix="rename the folder")
-    values = {"dataset": PHOTOS, "scene": name, "group": PHOTOS, "source": source, "unit": unit}
+    places = {
+        what: path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
+        for what, path in {"source": photos, **extra}.items()
+    }
+    for place in places.values():
+        if not place.isprintable() or place.startswith("world:"):
+            raise SceneError(
+                f"the path {place!r} cannot be written in the scene sheet", fix="rename the folder"
+            )
+    values = {"dataset": PHOTOS, "scene": name, "group": PHOTOS, "unit": unit, **places}
     if sheet.exists():
         text = sheet.read_text(encoding="utf-8-sig")
-        header = [cell.strip() for cell in content_lines(sheet)[0][1].split("\t")]
+        first = content_lines(sheet)[0][1]
+        header = [cell.strip() for cell in first.split("\t")]
+        if new := [column for column in extra if column not in header]:
+            header += new  # the rows so far may lack them
+            text = text.replace(first, "\t".join(header), 1)
         if not text.endswith("\n"):
             text += "\n"
     else:
-        header = list(COLUMNS)
+        header = [*COLUMNS, *extra]
         text = "\t".join(header) + "\n"
     write_text(sheet, text + "\t".join(values.get(column, NOTHING[1]) for column in header) + "\n")

@@ -4,6 +4,43 @@ from pathlib import Path
 
 from hilsplat.base.files import list_images
 
+TRAINED = ("output", "language_features")
+"""Folders beside photographs that 3DGS and LangSplat write."""
+
+
+def trained_gaussians(folder: Path) -> Path | None:
+    """Return the PLY that 3DGS or nerfstudio trained in a folder: of several, that of the most steps."""
+    found = [
+        path
+        for pattern in (
+            "output/*/point_cloud/iteration_*",
+            "output/point_cloud/iteration_*",
+            "point_cloud/iteration_*",
+        )
+        for path in Path(folder).glob(f"{pattern}/point_cloud.ply")
+    ]
+    found.sort(key=lambda path: (int(path.parent.name.partition("_")[2] or 0), path.stat().st_mtime_ns))
+    found = [
+        *(path for path in map(Path(folder).joinpath, ("splat.ply", "point_cloud.ply")) if path.is_file()),
+        *found,
+    ]
+    return found[-1] if found else None
+
+
+def langsplat_features(folder: Path) -> Path | None:
+    """Return the folder of masks and CLIP vectors that LangSplat's preprocessing wrote."""
+    features = Path(folder) / "language_features"
+    return features if any(features.glob("*_s.npy")) else None
+
+
+def label_files(folder: Path) -> list[Path]:
+    """Return the label files of a scene of LERF-OVS: in its `label/`, or in the one beside the scene."""
+    folder = Path(folder).resolve()
+    for place in (folder / "label", folder.parent / "label" / folder.name):
+        if found := sorted(place.glob("*.json")):
+            return found
+    return []
+
 
 def photo_folder(folder: Path) -> Path:
     """Where the photographs of a source are: the folder itself or, if it has none, where exports put them."""

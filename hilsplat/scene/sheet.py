@@ -17,7 +17,7 @@ DEFAULT_SHEET = Path("config/scenes.tsv")
 """Relative to the project."""
 
 COLUMNS = ("dataset", "scene", "group", "source", "unit")
-OPTIONAL_COLUMNS = ("gaussians",)
+OPTIONAL_COLUMNS = ("gaussians", "features")
 NOTHING = ("", "-")
 """Contents of an optional cell that is left empty."""
 GROUPS = (
@@ -57,6 +57,8 @@ class SceneRow:
         folder: the source folder, resolved; None for a world, and for `data:` without a data root.
         gaussians: a ready-made 3DGS PLY in the source's coordinates, used instead of a fit; None if the
             Gaussians are fitted, and for `data:` without a data root.
+        features: a folder of LangSplat's masks and CLIP vectors, used instead of SAM and CLIP; None if masks
+            are computed, and for `data:` without a data root.
     """
 
     dataset: str
@@ -66,6 +68,7 @@ class SceneRow:
     unit: str
     folder: Path | None
     gaussians: Path | None = None
+    features: Path | None = None
 
     @property
     def name(self) -> str:
@@ -90,7 +93,8 @@ def read_sheet(
 ) -> list[SceneRow]:
     """Read and check the scene sheet: tab-separated, one header line, `#` begins a comment line.
 
-    The column `gaussians` may be left out; if its cell is empty or "-", the Gaussians are fitted.
+    The columns `gaussians` and `features` may be left out, also at the end of a single row; empty or "-"
+    means that the Gaussians are fitted and the masks computed.
 
     Args:
         path: the sheet; relative sources start from its project root.
@@ -113,12 +117,14 @@ def read_sheet(
     line_of: dict[str, int] = {}
     for line, text in lines[1:]:
         cells = [cell.strip() for cell in text.split("\t")]
+        if len(COLUMNS) <= len(cells) and not set(header[len(cells) :]) - set(OPTIONAL_COLUMNS):
+            cells += [NOTHING[1]] * (len(header) - len(cells))
         if len(cells) != len(header):
             raise SceneError(
                 f"{path}, line {line}: wrong number of columns",
                 expected=f"{len(header)} columns, separated by tabs ({_joined(header)})",
                 found=f"{len(cells)}: {text!r}",
-                fix="separate the columns with one tab each, and leave none out",
+                fix="separate the columns with one tab each; only optional ones at the end may be missing",
             )
         row = _row(path, line, dict(zip(header, cells, strict=True)), checked_groups, data_root)
         # Names that differ only in case would share a folder on some file systems.
@@ -254,8 +260,17 @@ def _row(
             )
         if gaussians is not None and is_checked:
             _check_gaussians(where, gaussians)
+    features = None
+    if (cell := cells.get("features", "")) not in NOTHING:
+        features = _resolved(path, cell, data_root)
+        if features is not None and is_checked and not any(features.glob("*_s.npy")):
+            raise SceneError(
+                f"{path}, line {line}, column features: folder {features} holds no masks of LangSplat",
+                expected="<image>_s.npy and <image>_f.npy for each image",
+                fix='correct the path, or write "-" to have the masks computed',
+            )
     return SceneRow(
-        cells["dataset"], cells["scene"], cells["group"], source, cells["unit"], folder, gaussians
+        cells["dataset"], cells["scene"], cells["group"], source, cells["unit"], folder, gaussians, features
     )
 
 

@@ -258,7 +258,7 @@ def _installed(name: str) -> bool:
     return True
 
 
-def _codec(name: str, mode: str) -> bool:
+def _codec(name: str, mode: Literal["r", "w"]) -> bool:
     import av
 
     try:

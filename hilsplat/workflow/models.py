@@ -5,7 +5,8 @@ from pathlib import Path
 
 from hilsplat.base.device import compute_device
 from hilsplat.base.errors import HilsplatError
-from hilsplat.configuration import StageSettings, parse_run, read_config
+from hilsplat.base.files import INSTALLED
+from hilsplat.configuration import CONFIG, StageSettings, parse_run, read_config
 from hilsplat.models.store import RELEASES, meaningless, read_model
 from hilsplat.scene.sheet import PHOTOS
 
@@ -78,14 +79,12 @@ def models_of_photographs(config: Path, scene: str) -> list[str]:
     """Return lines about the models that a scene of photographs will use.
 
     Args:
-        config: configuration of the project; without one the result is empty.
+        config: configuration of the project; if there is none, the installed one counts.
         scene: name of the scene.
 
     Raises:
         SettingsError: the configuration cannot be used.
     """
-    if not config.is_file():
-        return []
-    run = parse_run(read_config(config))
+    run = parse_run(read_config(config if config.is_file() else INSTALLED / CONFIG))
     stages = run.stages("default", (PHOTOS, f"{PHOTOS}/{scene}")).with_models()
     return [line for line in (describe_models(stages), doubt_about_photographs(stages)) if line]

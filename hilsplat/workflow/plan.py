@@ -221,10 +221,12 @@ class Plan:
         return tuple(scope for scope in scopes_of(row) if scope in self.run.overrides)
 
     def masks_stage(self, job: VariantJob) -> str:
-        """Return the stage that makes the masks: the diagnostic segmenter and key views have their own."""
+        """Return the stage of the masks: imported ones, key views and the diagnostic have their own."""
         masks = self.stages(job).masks
         if masks.segmenter == "truth-perturbed":
             return "truth_masks"
+        if self.row(job).features:
+            return "langsplat"
         if masks.key_views < 1:
             return "key_masks"
         return "guided_masks" if masks.prompts == "guided" and self.first_answer(job) else "masks"
@@ -245,7 +247,12 @@ class Plan:
         It is the variant `key-views` of a scene of photographs whose masks take a real SAM minutes.
         """
         row, masks = self.row(job), self.stages(job).masks
-        if job.variant != "default" or row.group != PHOTOS or KEY_VIEWS not in self.run.variants:
+        if (
+            job.variant != "default"
+            or row.group != PHOTOS
+            or row.features
+            or KEY_VIEWS not in self.run.variants
+        ):
             return []
         model = read_model(Path(masks.model)) if masks.segmenter == "sam" else None
         files = self.data.image_files(job)
@@ -272,7 +279,9 @@ class Plan:
         return self.data.truth(job)
 
     def masks_option(self, job: VariantJob, input: Any) -> str:
-        """Options of key views or of the diagnostic segmenter, if they are chosen."""
+        """Options of key views, imported masks or the diagnostic segmenter, if they are chosen."""
+        if self.masks_stage(job) == "langsplat":
+            return self.data.features_option(job)
         if input.gaussians:
             named = {
                 "gaussians": input.gaussians,
@@ -287,12 +296,18 @@ class Plan:
 
     def crops_tree(self, job: VariantJob) -> list[str]:
         """Input of clip: the semantic tree whose nodes choose the crops; empty if every mask is embedded."""
-        by_node = self.stages(job).clip.crops == "nodes"
+        by_node = self.stages(job).clip.crops == "nodes" and not self.row(job).features
         return [self.shared("semantic_tree", "semantic_tree")(job)] if by_node else []
 
     def crops_tree_option(self, job: VariantJob, input: Any) -> str:
-        """Option of clip for `crops_tree`."""
+        """Option of clip for `crops_tree`, or for imported vectors."""
+        if self.row(job).features:
+            return self.data.features_option(job)
         return f"--semantic-tree {shlex.quote(str(input.semantic_tree))}" if input.semantic_tree else ""
+
+    def clip_stage(self, job: VariantJob) -> str:
+        """Return the stage that makes the CLIP vectors."""
+        return "langsplat" if self.row(job).features else "clip"
 
     def baseline(self, job: VariantJob) -> tuple[str, ...]:
         """The baseline that computes a variant's field."""

@@ -20,6 +20,7 @@ from hilsplat.datasets.sources import (
     label_files,
     label_sets,
 )
+from hilsplat.scene.layouts import TRAINED
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.workflow.jobs import Job
 
@@ -59,13 +60,16 @@ class SceneData:
         return self.path(job, "source") if is_exported(row.source) else self._folder_files(row)
 
     def _files_of(self, row: SceneRow) -> list[str]:
-        """Files of a folder of photographs, without labels."""
+        """Files of a folder of photographs, without labels and what other programs trained."""
         assert row.folder is not None, row.name  # scenes without data were skipped
         labels = set(self._label_files(row))
         return sorted(
             str(path)
             for path in row.folder.rglob("*")
-            if path.is_file() and not path.name.startswith(".") and str(path) not in labels
+            if path.is_file()
+            and not path.name.startswith(".")
+            and path.relative_to(row.folder).parts[0] not in TRAINED
+            and str(path) not in labels
         )
 
     def lens(self, job: Job) -> str:
@@ -76,7 +80,8 @@ class SceneData:
         """Refuse files in whose names Snakemake would see wildcards; it knows no way to quote them."""
         job = SimpleNamespace(dataset=row.dataset, scene=row.scene)
         files = self.image_files(job) if row.folder is not None else []
-        for path in [*([files] if isinstance(files, str) else files), *self.brought(job)]:
+        files = [files] if isinstance(files, str) else files
+        for path in [*files, *self.brought(job), *self.features(job)]:
             if "{" in path or "}" in path:
                 raise SettingsError(
                     f"{path} of {row.name} cannot be read by the workflow: its name has braces",
@@ -107,6 +112,16 @@ class SceneData:
         """Option that names such a PLY, if there is one."""
         ply = self.row(job).gaussians
         return f"--brought {shlex.quote(str(ply))}" if ply is not None else ""
+
+    def features(self, job: Job) -> list[str]:
+        """Input of masks and clip: LangSplat's files that replace SAM and CLIP; usually nothing."""
+        folder = self.row(job).features
+        return sorted(str(path) for path in folder.glob("*_[sf].npy")) if folder is not None else []
+
+    def features_option(self, job: Job) -> str:
+        """Option that names their folder, if there is one."""
+        folder = self.row(job).features
+        return f"--features {shlex.quote(str(folder))}" if folder is not None else ""
 
     def labels(self, row: SceneRow) -> tuple[str, ...]:
         """Labels of a scene, as `data set/scene`: published ones and your own annotations."""

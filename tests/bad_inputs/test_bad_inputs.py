@@ -337,10 +337,7 @@ ROWS = [
                 for kind in "sf"
             ),
         ],
-        (
-            *("langsplat", "read", "--scene", str(SCENE / "scene"), "--files", "theirs"),
-            *("--masks", "results/m", "--clip", "results/c", "--settings", '{"model": "models/colours"}'),
-        ),
+        (*("masks", "--scene", str(SCENE / "scene"), "--features", "theirs", "--out", "results/m"),),
         ("_s.npy cannot be read", "not numbers"),
     ),
     # ---- labels

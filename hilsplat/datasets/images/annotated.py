@@ -1,4 +1,4 @@
-"""Annotations of your own scenes, in the format of `hi.py`, as `hilsplat annotate` writes them.
+"""Labels of your own scenes: in the format of `hi.py`, as `hilsplat annotate` writes them, or of LERF-OVS.
 
 The photographs are the undistorted ones of the scene itself (`results/<dataset>/<scene>/scene/images`), so
 there is nothing beside the label files; evaluation compares their size with the scene's cameras.
@@ -9,7 +9,7 @@ from pathlib import Path
 from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.images.hi import regions_of
 from hilsplat.datasets.images.isat import read_isat
-from hilsplat.datasets.images.lerf_ovs import label_files
+from hilsplat.datasets.images.lerf_ovs import label_files, merged_regions
 from hilsplat.datasets.labelled import LabelledRegion, LabelledScene
 
 LAYOUT = """\
@@ -20,6 +20,8 @@ annotated/
 
 def open_scene(root: Path, scene: str) -> LabelledScene:
     """Read the annotations of a scene: one region per object that was drawn or accepted.
+
+    Files whose objects have no level are read as LERF-OVS's: one region per text.
 
     Args:
         root: the folder `annotated`.
@@ -34,7 +36,8 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     for view, path in label_files(Path(root) / scene).items():
         labels = read_isat(path)
         warnings.extend(labels.warnings)
-        views[view] = regions_of(labels, warnings)
+        has_levels = any("level" in thing.keys for thing in labels.objects)
+        views[view] = regions_of(labels, warnings) if has_levels else merged_regions(labels)
     prompts = tuple(sorted({region.text for regions in views.values() for region in regions}))
     return LabelledScene("annotated", scene, {}, None, views, prompts, tuple(warnings))
 

@@ -8,6 +8,7 @@ import pytest
 from hilsplat.base.artifacts import read_index, read_npy, write_index
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.images import write_png
+from hilsplat.embed.clip import ClipModel
 from hilsplat.embed.langsplat_files import maps_of, read_clip, read_masks, read_view, write_langsplat
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
@@ -98,13 +99,13 @@ def test_what_is_written_is_read_back(ours, scene, tmp_path):
     ]
     maps, vectors = (np.load(tmp_path / "files" / f"a_{kind}.npy", allow_pickle=False) for kind in "sf")
     assert (maps.shape, maps.dtype, vectors.shape, vectors.dtype) == ((4, *SIZE), "f4", (8, 512), "f4")
-    read_masks(scene, tmp_path / "files", tmp_path / "again", resize=False)
+    read_masks(scene, tmp_path / "files", tmp_path / "again")
     found = HierarchicalMasks.load(tmp_path / "again" / "a.png.npz")
     # masks of a level do not overlap here, so nothing was painted over
     for name in ("runs", "offsets", "level", "area_px", "box_xyxy"):
         np.testing.assert_array_equal(getattr(found, name), getattr(nested(), name), err_msg=name)
     assert read_index(tmp_path / "again")["views"]["a.png"] == index_entry(found)
-    _, clip = read_view(tmp_path / "files", "a.png", SIZE, resize=False)
+    _, clip = read_view(tmp_path / "files", "a.png", SIZE)
     np.testing.assert_allclose(clip.astype(float), unit_rows(4).astype(float), atol=1e-3)
 
 
@@ -114,7 +115,7 @@ def test_levels_run_the_other_way_in_the_files(tmp_path):
     maps[1, 0, 0], maps[2, 0, 1], maps[3, 0, 2] = 1, 2, 3
     np.save(tmp_path / "x_s.npy", maps)
     np.save(tmp_path / "x_f.npy", np.eye(4, 5, dtype=np.float32) * 3)
-    masks, vectors = read_view(tmp_path, "x.y.jpg", (2, 4), resize=False)
+    masks, vectors = read_view(tmp_path, "x.y.jpg", (2, 4))
     assert masks.level.tolist() == [1, 2, 3]
     assert masks.box_xyxy[:, 0].tolist() == [2, 1, 0]
     np.testing.assert_array_equal(vectors, np.eye(5, dtype=np.float16)[[3, 2, 1]])
@@ -123,15 +124,15 @@ def test_levels_run_the_other_way_in_the_files(tmp_path):
 def test_a_scene_without_any_mask_at_a_level_is_read(tmp_path):
     np.save(tmp_path / "x_s.npy", np.full((4, 2, 4), -1, np.float32))
     np.save(tmp_path / "x_f.npy", np.zeros((0, 5), np.float32))
-    masks, vectors = read_view(tmp_path, "x.jpg", (2, 4), resize=False)
+    masks, vectors = read_view(tmp_path, "x.jpg", (2, 4))
     assert (len(masks), vectors.shape) == (0, (0, 5))
 
 
-def test_maps_of_another_size_are_refused_or_resized(ours, tmp_path):
+def test_maps_of_another_size_are_resized_and_of_another_shape_refused(ours, tmp_path):
     write_langsplat(*ours, tmp_path / "files")
-    with pytest.raises(MisalignedArtifactError, match=r"\(12, 16\)(.|\n)*\(6, 8\)(.|\n)*--resize"):
-        read_view(tmp_path / "files", "a.png", (12, 16), resize=False)
-    masks, _ = read_view(tmp_path / "files", "a.png", (12, 16), resize=True)
+    with pytest.raises(MisalignedArtifactError, match=r"differ in shape(.|\n)*\(12, 12\)(.|\n)*\(6, 8\)"):
+        read_view(tmp_path / "files", "a.png", (12, 12))
+    masks, _ = read_view(tmp_path / "files", "a.png", (12, 16))
     np.testing.assert_array_equal(masks.area_px, 4 * nested().area_px)
 
 
@@ -151,14 +152,14 @@ def test_strange_files_are_refused_and_nothing_is_unpickled(tmp_path, maps, vect
     np.save(tmp_path / "a_s.npy", maps, allow_pickle=True)
     np.save(tmp_path / "a_f.npy", vectors)
     with pytest.raises(ArtifactError, match=words):
-        read_view(tmp_path, "a.png", SIZE, resize=False)
+        read_view(tmp_path, "a.png", SIZE)
 
 
 def test_missing_views_are_listed(ours, scene, tmp_path):
     write_langsplat(*ours, tmp_path / "files")
     (tmp_path / "files" / "b_s.npy").unlink()
     with pytest.raises(ArtifactError, match=r"lacks the maps of 1 of 2 training views(.|\n)*b_s.npy"):
-        read_masks(scene, tmp_path / "files", tmp_path / "out", resize=False)
+        read_masks(scene, tmp_path / "files", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -187,25 +188,43 @@ def test_vectors_of_another_clip_are_refused(ours, scene, tmp_path, project):
         for stem in "ab":
             vectors = np.load(tmp_path / "files" / f"{stem}_f.npy")[:, :100]
             np.save(tmp_path / "files" / f"{stem}_f.npy", vectors)
-        read_clip(scene, tmp_path / "files", tmp_path / "out", False, settings)
+        read_clip(scene, tmp_path / "files", tmp_path / "out", settings)
 
 
-def test_vectors_of_the_same_clip_are_taken(ours, scene, tmp_path, project):
-    from hilsplat.embed.clip import ClipModel
+@pytest.fixture
+def embedded(ours, scene, tmp_path, project) -> ClipModel:
+    """LangSplat's files of two noisy views, with vectors of clip-tiny."""
+    model = ClipModel.load(project / "models/clip-tiny")
+    masks_folder, clip_folder = ours
+    for seed, name in enumerate(("a.png", "b.png")):
+        image = np.random.default_rng(seed).integers(0, 255, (*SIZE, 3), np.uint8)
+        write_png(scene / "images" / name, image)
+        np.save(
+            clip_folder / f"{name}.npy", model.embed_masks(image, nested(), ClipSettings(crop="langsplat"))
+        )
+    write_langsplat(masks_folder, clip_folder, tmp_path / "files")
+    return model
 
-    write_langsplat(*ours, tmp_path / "files")
-    model = project / "models/clip-tiny"
-    width = ClipModel.load(model).width
-    for stem in "ab":
-        vectors = np.random.default_rng(0).normal(size=(8, width)).astype(np.float32)
-        np.save(tmp_path / "files" / f"{stem}_f.npy", vectors)
-    read_clip(scene, tmp_path / "files", tmp_path / "out", False, ClipSettings(model=str(model)))
+
+def test_vectors_of_the_same_clip_are_taken(embedded, scene, tmp_path):
+    settings = ClipSettings(model=str(embedded.model.folder))
+    read_clip(scene, tmp_path / "files", tmp_path / "out", settings)
     index = read_index(tmp_path / "out")
-    masks, _ = read_view(tmp_path / "files", "a.png", SIZE, resize=False)
+    masks, _ = read_view(tmp_path / "files", "a.png", SIZE)
     assert (index["dim"], index["model"], index["views"]["a.png"]) == (
-        width,
-        str(model),
+        embedded.width,
+        settings.model,
         {"masks_sha256": digest_of(masks), "masks": 4},
     )
     lengths = np.linalg.norm(read_npy(tmp_path / "out" / "a.png.npy").astype(float), axis=1)
     np.testing.assert_allclose(lengths, 1, atol=2e-3)
+
+
+def test_vectors_of_another_clip_of_the_same_width_are_refused(embedded, scene, tmp_path):
+    turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(embedded.width, embedded.width)))
+    for stem in "ab":
+        path = tmp_path / "files" / f"{stem}_f.npy"
+        np.save(path, (np.load(path) @ turn).astype(np.float32))
+    with pytest.raises(MisalignedArtifactError, match=r"are not of the CLIP in(.|\n)*laion2b"):
+        read_clip(scene, tmp_path / "files", tmp_path / "out", ClipSettings(model=str(embedded.model.folder)))
+    assert not (tmp_path / "out").exists()

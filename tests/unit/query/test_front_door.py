@@ -255,12 +255,13 @@ def test_langsplat_files_go_out_and_come_back(desk, elsewhere, project):
     assert maps.shape == (4, HEIGHT, WIDTH + NUM_VIEWS)
     assert np.array_equal(maps[3] >= 0, region_mask("mug") | region_mask("book"))  # the fourth map: wholes
     model = json.dumps({"model": str(desk / "models/colours")})
-    read = run_command(
-        project,
-        *("langsplat", "read", "--scene", str(desk / SCENE / "scene"), "--files", "language_features"),
-        *("--masks", "masks", "--clip", "clip", "--settings", model),
-    )
-    assert read.returncode == 0, read.stderr
+    taken = ("--scene", str(desk / SCENE / "scene"), "--features", "language_features")
+    for command in (
+        ("masks", *taken, "--out", "masks"),
+        ("clip", *taken, "--masks", "masks", "--settings", model, "--out", "clip"),
+    ):
+        read = run_command(project, *command)
+        assert read.returncode == 0, read.stderr
     for view in ("000.png", "004.png"):
         back, before = read_npy(Path(f"clip/{view}.npy")), read_npy(default / f"clip/{view}.npy")
         rows = [np.abs(before.astype(float) - vector).max(axis=1).argmin() for vector in back.astype(float)]

@@ -1,5 +1,7 @@
 """The scene sheet refuses what would fail later, and says where and how to fix it."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -119,6 +121,72 @@ def test_a_folder_of_unread_photographs_says_what_it_holds(tmp_path):
     with pytest.raises(SceneError, match=r"has no images(.|\n)*1 files \.dng"):
         read_sheet(write_sheet(tmp_path, row))
     assert len(read_sheet(write_sheet(tmp_path, row), checked_groups=())) == 1
+
+
+def langsplat_scene(folder: Path) -> Path:
+    """Photographs, and beside them what COLMAP, 3DGS and LangSplat write."""
+    write_photos(folder / "images", 3)
+    for path in (
+        "sparse/0/cameras.bin",
+        "output/a/point_cloud/iteration_7000/point_cloud.ply",
+        "output/a/point_cloud/iteration_30000/point_cloud.ply",
+        "output/a/chkpnt30000.pth",
+        "language_features/000_s.npy",
+        "label/photo_0.json",
+    ):
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_bytes(b"ply\n")
+    return folder
+
+
+def test_what_3dgs_and_langsplat_left_is_found_named_and_recorded(tmp_path):
+    folder = langsplat_scene(tmp_path / "theirs")
+    sheet = write_sheet(tmp_path, ("world", "a", "ci", "world:tabletop:1", "metre"))
+    report = str(add_scene(sheet, "desk", folder))
+    assert "iteration_30000/point_cloud.ply" in report and "language_features" in report
+    assert "not read, because a pickle can run code: chkpnt30000.pth" in report
+    assert "labels of 1 photographs" in report
+    assert (tmp_path / "annotated/photos/desk/photo_0.json").is_file()
+    old, new = read_sheet(sheet)
+    assert (old.gaussians, old.features) == (None, None)
+    assert new.features == folder / "language_features"
+    assert new.gaussians == folder / "output/a/point_cloud/iteration_30000/point_cloud.ply"
+
+
+def test_what_was_found_can_be_left_out_or_replaced(tmp_path):
+    folder = langsplat_scene(tmp_path / "theirs")
+    other = tmp_path / "other.ply"
+    other.write_bytes(b"ply\n")
+    sheet = write_sheet(tmp_path)
+    nothing = Path("none")
+    add_scene(sheet, "plain", folder, gaussians=nothing, features=nothing, labels=nothing)
+    assert not (tmp_path / "annotated").exists()
+    add_scene(sheet, "mixed", folder, gaussians=other, features=Path("none"))
+    plain, mixed = read_sheet(sheet)
+    assert (plain.gaussians, plain.features) == (None, None)
+    assert (mixed.gaussians, mixed.features) == (other, None)
+    with pytest.raises(SceneError, match="holds no label file"):
+        add_scene(sheet, "lost", folder, labels=tmp_path / "config")
+    with pytest.raises(SceneError, match="--features gone is missing"):
+        add_scene(sheet, "lost", folder, features=Path("gone"))
+
+
+def test_gaussians_without_known_poses_are_not_taken(tmp_path):
+    folder = langsplat_scene(tmp_path / "theirs")
+    (folder / "sparse/0/cameras.bin").unlink()
+    (folder / "sparse/0").rmdir()
+    (folder / "sparse").rmdir()
+    sheet = write_sheet(tmp_path)
+    add_scene(sheet, "desk", folder)
+    (row,) = read_sheet(sheet)
+    assert row.gaussians is None
+
+
+def test_optional_columns_may_be_missing_at_the_end_of_a_row(tmp_path):
+    header = "dataset\tscene\tgroup\tsource\tunit\tgaussians\tfeatures\n"
+    sheet = write_sheet(tmp_path, ("world", "a", "ci", "world:tabletop:1", "metre"), header=header)
+    (row,) = read_sheet(sheet)
+    assert (row.gaussians, row.features) == (None, None)
 
 
 def test_inspection_finds_damaged_turned_and_copied_photographs(tmp_path):

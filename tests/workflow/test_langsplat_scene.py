@@ -1,0 +1,69 @@
+"""A scene of LangSplat, with poses, Gaussians and features, needs two commands."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilsplat.base.artifacts import read_index
+from hilsplat.datasets.points.posed_images import PosedImage, write_posed_images
+from hilsplat.scene.scene import Scene
+from tests.workflow.conftest import SCENE, Project
+from tests.workflow.test_front_door import hilsplat
+
+
+@pytest.fixture
+def theirs(finished: Project, tmp_path: Path) -> Path:
+    """What 3DGS and LangSplat leave beside the photographs of the tiny scene."""
+    own = finished.root / SCENE
+    scene, folder = Scene.load(own / "scene"), tmp_path / "their scene"
+    images = [
+        PosedImage(view, scene.image_path(view), camera.cam_from_world, camera.K, camera.size_hw)
+        for view, camera in ((name, scene.cameras[name]) for name in scene.cameras.names)
+    ]
+    write_posed_images(folder, images, scene.points_xyz)
+    trained = folder / "output/tiny/point_cloud/iteration_30000"
+    trained.mkdir(parents=True)
+    shutil.copy2(own / "gaussians.ply", trained / "point_cloud.ply")
+    (folder / "output/tiny/chkpnt30000.pth").write_bytes(b"a pickle")
+    places = ("--masks", str(own / "default/masks"), "--clip", str(own / "paper/clip"))
+    hilsplat(finished, folder, "langsplat", "write", *places, "--out", "language_features")
+    return folder
+
+
+def test_a_scene_of_langsplat_answers_after_two_commands(
+    theirs: Path, finished: Project, fresh: Callable[[], Project]
+) -> None:
+    project = fresh()
+    said = hilsplat(project, project.root, "new", "theirs", str(theirs))
+    assert "iteration_30000/point_cloud.ply" in said and "language_features" in said
+    assert "chkpnt30000.pth" in said
+    hilsplat(project, project.root, "run", "theirs", "--", "--cores", "2")
+    results = project.root / "results/photos/theirs"
+    assert read_index(results / "default/masks")["segmenter"] == "langsplat"
+    assert json.loads((results / "gaussians/report.json").read_text())["origin"]["kind"] == "imported"
+    assert (results / "default/field.safetensors").is_file()
+    before = hilsplat(finished, finished.root, "query", "synthetic/tiny", "mug", "--out", str(theirs / "a"))
+    after = hilsplat(project, project.root, "query", "photos/theirs", "mug", "--out", str(theirs / "b"))
+    level = [text.split("\n")[2].split()[1] for text in (before, after)]
+    assert level[0] == level[1]
+    # a rerun of an early stage keeps what was brought
+    hilsplat(project, project.root, "run", "theirs", "--", "--cores", "2", "--forcerun", "poses")
+    assert read_index(results / "default/masks")["segmenter"] == "langsplat"
+
+
+def test_features_of_another_clip_stop_the_run_and_say_which_clip(
+    theirs: Path, fresh: Callable[[], Project]
+) -> None:
+    rng = np.random.default_rng(0)
+    for path in (theirs / "language_features").glob("*_f.npy"):
+        np.save(path, rng.normal(size=np.load(path).shape).astype(np.float32))
+    project = fresh()
+    hilsplat(project, project.root, "new", "theirs", str(theirs))
+    command = ("-c", "from hilsplat.cli.main import main; main()", "run", "theirs", "--", "--cores", "2")
+    failed = project.run("python", *command, check=False)
+    assert failed.returncode != 0
+    assert "clip-vit-b-16-laion2b" in failed.stdout + failed.stderr
