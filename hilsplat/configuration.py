@@ -9,7 +9,7 @@ from types import UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ValidationError, field_validator
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.files import NAME_RULE, name_problem, project_path
@@ -207,6 +207,12 @@ class RunSettings(StageSettings):
     queries: dict[str, tuple[str, ...]] = knob(
         {}, "texts in the panel of a scene without labels on its images, by dataset/scene or by data set"
     )
+
+    @field_validator("groups", "only", "sweep_scenes", mode="before")
+    @classmethod
+    def _names(cls, value: Any) -> Any:
+        """Accept a single name: `only=desk` on a command line is a text."""
+        return (value,) if isinstance(value, str) else value
 
     def every_variant(self) -> list[str]:
         """All variants, in any table or none: "default", then in the order of `variants`; per seed."""

@@ -138,3 +138,8 @@ def test_the_paper_configuration_holds_the_papers_numbers(project: Path) -> None
     assert (stages.coverage_tree.theta, stages.field.omega) == (0.9, 10)
     assert (stages.field.weight_instance, stages.field.weight_part) == (1e-6, 1e-5)
     assert stages.autoencoder.latent == 3
+
+
+def test_a_single_name_stands_for_a_list_of_one():
+    run = parse_run({"only": "desk", "groups": "photos"})
+    assert (run.only, run.groups) == (("desk",), ("photos",))
