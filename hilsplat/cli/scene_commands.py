@@ -52,8 +52,9 @@ def new(
     from hilsplat.photos.add import add_scene
     from hilsplat.workflow.models import models_of_photographs
 
-    brought = {"gaussians": gaussians, "features": features, "labels": labels}
-    report = add_scene(sheet, name, photos, frames=frames, **brought)
+    report = add_scene(
+        sheet, name, photos, frames=frames, gaussians=gaussians, features=features, labels=labels
+    )
     typer.echo(str(report))
     typer.echo(
         f"\nadded photos/{name} to {sheet}. Next:\n"

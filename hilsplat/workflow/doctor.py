@@ -135,11 +135,8 @@ def video() -> Iterator[Finding]:
     """Whether PyAV reads and writes the usual videos."""
     import av
 
-    missing = [
-        f"{mode} {name}"
-        for name, mode in (("h264", "r"), ("hevc", "r"), ("libx264", "w"))
-        if not _codec(name, mode)
-    ]
+    needed: tuple[tuple[str, Literal["r", "w"]], ...] = (("h264", "r"), ("hevc", "r"), ("libx264", "w"))
+    missing = [f"{mode} {name}" for name, mode in needed if not _codec(name, mode)]
     if missing:
         yield Finding(
             "video",
