@@ -2,6 +2,7 @@
 # make demo    set up, then run one scene with four methods: a panel and tables in a few minutes
 # make test    set up, then run lint and all tests
 # make lint    set up, then check style, imports and rules
+# make docs    set up, then build the site of the documentation in site/; a broken link fails
 # make bench   set up, then time the fast paths; tables go to results/benchmarks (docs/benchmarks.md)
 #              with BASE=<commit>: what got slower since then, by runs of both versions in turn
 # make chaos   set up, then kill, freeze and starve runs of the ci configuration, and compare tables (docs/workflow.md)
@@ -15,7 +16,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: run demo test lint bench chaos report setup
+.PHONY: run demo test lint docs bench chaos report setup
 
 run: $(STAMP)
 	hilsplat run -- --cores $(CORES)
@@ -32,8 +33,8 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $(STAMP)
 
 lint: $(STAMP)
-	ruff check hilsplat snakemake_logger_plugin_hilsplat tests benchmarks
-	ruff format --check hilsplat snakemake_logger_plugin_hilsplat tests benchmarks
+	ruff check hilsplat snakemake_logger_plugin_hilsplat tests benchmarks docs/site_hooks.py
+	ruff format --check hilsplat snakemake_logger_plugin_hilsplat tests benchmarks docs/site_hooks.py
 	lint-imports
 	mypy
 	snakefmt --check Snakefile workflow/Snakefile rules
@@ -41,6 +42,10 @@ lint: $(STAMP)
 
 test: lint
 	python -m pytest --numprocesses $(CORES) --dist loadfile --no-loadscope-reorder tests/workflow tests/browser tests/bad_inputs tests/unit
+
+# The variable turns off mkdocs-material's notice about MkDocs 2, which pyproject.toml excludes.
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 mkdocs build --strict
 
 bench: $(STAMP)
 	$(if $(BASE),python -m benchmarks.compare $(BASE),OMP_NUM_THREADS=1 python -m pytest -c benchmarks/pytest.ini benchmarks)
