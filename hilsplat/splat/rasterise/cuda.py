@@ -1,8 +1,8 @@
 """The CUDA backend: gsplat (extra `gpu`) behind the functions and conventions of the CPU backend.
 
-Written against the public interface of gsplat 1.5 and its CUDA sources. It has not been run on a
-device yet: the tests of the rasteriser cover it if torch finds one. Sums on CUDA are atomic, so
-gradients repeat to rounding, not to the bit.
+Written against the public interface of gsplat 1.5 and its CUDA sources. It has not been run on a device yet.
+Tests run it on the CPU with gsplat's reference implementation in torch, and on a device if there is one. Sums
+on CUDA are atomic, so gradients repeat to rounding, not to the bit.
 
 gsplat works in float32 throughout: a Gaussian wider than about 1e9 px overflows there.
 """
@@ -20,6 +20,9 @@ from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise.blend import MAX_ALPHA
 from hilsplat.splat.rasterise.cpu import Drawn, Gradients, refuse_broken
 from hilsplat.splat.rasterise.project import LOW_PASS_PX2, NEAR
+
+DEVICE = "cuda"
+"""Tests set it to `cpu`, with gsplat's reference implementation in torch."""
 
 TILE = 16
 """Side of gsplat's tiles, px."""
@@ -43,7 +46,7 @@ class OnDevice(NamedTuple):
         Raises:
             HilsplatError: parameters are not finite, or quaternions are zero.
         """
-        g = OnDevice(*(torch.from_numpy(getattr(gaussians, name)).cuda() for name in FIELDS))
+        g = OnDevice(*(torch.from_numpy(getattr(gaussians, name)).to(DEVICE) for name in FIELDS))
         broken = (g.quats == 0).all(dim=1)
         for values in g:
             broken |= ~values.isfinite().reshape(len(values), -1).all(dim=1)
@@ -64,8 +67,8 @@ def blend(
         g.log_scales.exp(),
         g.opacity_logits.sigmoid(),
         channels,
-        torch.tensor(camera.cam_from_world, dtype=torch.float32, device="cuda")[None],
-        torch.tensor(camera.K, dtype=torch.float32, device="cuda")[None],
+        torch.tensor(camera.cam_from_world, dtype=torch.float32, device=DEVICE)[None],
+        torch.tensor(camera.K, dtype=torch.float32, device=DEVICE)[None],
         width,
         height,
         near_plane=NEAR,
@@ -84,7 +87,7 @@ def colours(g: OnDevice, camera: Camera, degree: int) -> Float[Tensor, "N 3"]:
     """RGB in a view: max(0, 0.5 + spherical harmonics), on the device."""
     import gsplat
 
-    centre = torch.tensor(camera.centre, dtype=torch.float32, device="cuda")
+    centre = torch.tensor(camera.centre, dtype=torch.float32, device=DEVICE)
     return (gsplat.spherical_harmonics(degree, g.means - centre, g.sh) + 0.5).clamp_min(0.0)
 
 
@@ -102,11 +105,11 @@ def pixel_weights(gaussians: Gaussians, camera: Camera, min_weight: float) -> cs
         return csr_matrix(shape, dtype=np.float32)
     with torch.no_grad():
         g = OnDevice.of(gaussians)
-        _, _, notes = blend(g, camera, torch.zeros(len(g), 1, device="cuda"))
+        _, _, notes = blend(g, camera, torch.zeros(len(g.means), 1, device=DEVICE))
         who, pixel, _ = gsplat.rasterize_to_indices_in_range(
             0,
             EVERYTHING,
-            torch.ones(1, height, width, device="cuda"),
+            torch.ones(1, height, width, device=DEVICE),
             notes["means2d"],
             notes["conics"],
             notes["opacities"],
@@ -156,7 +159,7 @@ def draw(
     g = OnDevice(*leaves)
     blended = torch.from_numpy(
         np.zeros((len(gaussians), 0), np.float32) if features is None else features
-    ).cuda()
+    ).to(DEVICE)
     blended.requires_grad_()
     image, alpha, notes = blend(g, camera, torch.cat([colours(g, camera, degree), blended], dim=1))
 
@@ -164,7 +167,7 @@ def draw(
         grads = torch.autograd.grad(
             [image, alpha],
             [*leaves, blended, notes["means2d"]],
-            [torch.from_numpy(np.ascontiguousarray(grad)).cuda() for grad in (grad_image, grad_alpha)],
+            [torch.from_numpy(np.ascontiguousarray(grad)).to(DEVICE) for grad in (grad_image, grad_alpha)],
         )
         *by_field, by_features, by_mean_px = (grad.cpu().numpy() for grad in grads)
         by_name = dict(zip(FIELDS, by_field, strict=True))

@@ -1,6 +1,8 @@
 """Which backend draws: the CPU's own, or gsplat on CUDA."""
 
+import ctypes
 import logging
+import sys
 from functools import cache
 from importlib.util import find_spec
 from typing import Literal
@@ -15,8 +17,11 @@ Device = Literal["cpu", "cuda"]
 @cache
 def cuda_problem() -> str | None:
     """Why the CUDA backend cannot be used here; None if it can."""
-    if find_spec("gsplat") is None:  # first, because torch takes a second or two to import
+    # before torch, which takes a second or two to import
+    if find_spec("gsplat") is None:
         return "gsplat is not installed"
+    if not _has_driver():
+        return "no NVIDIA driver is installed"
     import torch
 
     if not torch.cuda.is_available():
@@ -28,11 +33,20 @@ def cuda_problem() -> str | None:
     return None
 
 
+def _has_driver() -> bool:
+    """Return whether the library of NVIDIA's driver can be loaded."""
+    try:
+        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return False
+    return True
+
+
 @cache
 def choose_device(wanted: Literal["auto", "cpu", "cuda"]) -> Device:
     """Return the device that a setting stands for on this machine, and log it the first time.
 
-    Imports torch (1.3 to 3 s) only if gsplat is installed and `wanted` is not `cpu`; otherwise 0.01 s.
+    Imports torch (1.3 to 3 s) only if `wanted` is not `cpu`, and gsplat and a driver are installed.
 
     Args:
         wanted: `auto` takes CUDA if torch finds a device, gsplat can be imported, and a self-test agrees with

@@ -121,6 +121,7 @@ def test_compiling_is_announced_once_and_only_when_it_happens(tmp_path):
 def no_cuda(monkeypatch):
     """A machine with gsplat but without CUDA, whatever this one has."""
     monkeypatch.setattr("hilsplat.splat.rasterise.device.find_spec", lambda name: name)
+    monkeypatch.setattr("hilsplat.splat.rasterise.device._has_driver", lambda: True)
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     for cached in (cuda_problem, choose_device):
         cached.cache_clear()
