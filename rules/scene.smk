@@ -42,11 +42,11 @@ rule poses:
     params:
         images=PLAN.data.images,
         unit=lambda wildcards: PLAN.row(wildcards).unit,
-        lens=PLAN.data.lens,
+        poses=PLAN.data.poses_option,
         settings=PLAN.settings("poses"),
         seed=PLAN.run.seed,
         code=PLAN.code("poses"),
     shell:
         "python -m hilsplat --log {log:q} poses --images {params.images:q} --name {wildcards.dataset:q}/{wildcards.scene:q}"
-        " --unit {params.unit:q} {params.lens} --settings {params.settings:q} --seed {params.seed:q}"
+        " --unit {params.unit:q} {params.poses} --settings {params.settings:q} --seed {params.seed:q}"
         " --threads {threads} --out {output.scene:q}"

@@ -6,6 +6,7 @@ or keep.
 
 import io
 import json
+import shutil
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,8 +14,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hilsplat.annotate.labels import Label, as_file
+from hilsplat.annotate.labels import Label, as_file, label_path, read_labels, traced
+from hilsplat.base.artifacts import atomic_folder, write_text
+from hilsplat.base.errors import SceneError
+from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.scene import Scene
 from hilsplat.viewer.exports import coco_counts
 
 Kind = Literal["hilsplat", "isat", "labelme", "coco"]
@@ -31,6 +36,75 @@ def exported(kind: Kind, known: Mapping[str, Sequence[Label]], cameras: Cameras)
         for view, labels in known.items():
             archive.writestr(f"{Path(view).stem}.json", write(view, cameras[view].size_hw, labels))
     return held.getvalue()
+
+
+def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int:
+    """Write a scene's annotations, or the true labels of a synthetic scene, as LERF-OVS's labels.
+
+    Args:
+        scene: the posed scene.
+        folder: `results/<dataset>/<scene>`.
+        data_root: holds `annotated/<dataset>/<scene>`.
+        out: folder to write.
+
+    Returns:
+        number of labelled views.
+
+    Raises:
+        SceneError: the scene has no labels.
+    """
+    annotated, truth = data_root / "annotated" / scene.name, folder / "world" / "truth"
+    views = scene.views()
+    if truth.is_dir():
+        known = labels_of_truth(HierarchyAnnotations.load(truth), views)
+    else:
+        read = {view: read_labels(label_path(annotated, view), scene.cameras[view].size_hw) for view in views}
+        known = {view: labels for view, labels in read.items() if labels}
+    if not known:
+        raise SceneError(
+            f"{scene.name} has no labels", expected=f"files in {annotated}", fix=f"hilsplat annotate {folder}"
+        )
+    write_lerf_labels(out, known, scene)
+    return len(known)
+
+
+def write_lerf_labels(out: Path, known: Mapping[str, Sequence[Label]], scene: Scene) -> None:
+    """Write the annotations of a scene as LERF-OVS's labels: `<view>.json` and the view's image.
+
+    An object per polygon, as LangSplat's evaluation needs; levels and parents are in keys that it ignores.
+
+    Args:
+        out: folder to write, such as `label/teatime`; replaced.
+        known: annotations by view.
+        scene: gives sizes and images.
+    """
+    with atomic_folder(out) as folder:
+        for view, labels in known.items():
+            write_text(
+                folder / f"{Path(view).stem}.json", _isat(view, scene.cameras[view].size_hw, labels) + "\n"
+            )
+            shutil.copyfile(scene.image_path(view), folder / view)
+
+
+def labels_of_truth(truth: HierarchyAnnotations, views: Sequence[str]) -> dict[str, list[Label]]:
+    """Return the true labels of a synthetic scene as annotations, in views that have any."""
+    known: dict[str, list[Label]] = {}
+    for view in views:
+        nodes = [truth.nodes[number] for number in truth.views.get(view, ())]
+        labels = [
+            Label(
+                id=node.id + 1,
+                level=node.level,
+                parent=node.parent + 1 if node.parent in truth.views[view] else None,
+                text=node.text,
+                polygons=traced(truth.mask(view, [node.id])),
+                origin="accepted",
+            )
+            for node in nodes
+        ]
+        if labels:
+            known[view] = labels
+    return known
 
 
 def _isat(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:

@@ -12,11 +12,7 @@ world_app = typer.Typer(help="Make and inspect scenes of the synthetic world.", 
 models_app = typer.Typer(help="Get, list, check, split and train models (SAM, CLIP).", no_args_is_help=True)
 datasets_app = typer.Typer(help="List, check and export published data sets.", no_args_is_help=True)
 cache_app = typer.Typer(help="Show or prune the caches of a results folder.", invoke_without_command=True)
-langsplat_app = typer.Typer(
-    help="Read or write LangSplat's files of masks and CLIP vectors.", no_args_is_help=True
-)
 app.add_typer(world_app, name="world")
 app.add_typer(models_app, name="models")
 app.add_typer(datasets_app, name="datasets")
 app.add_typer(cache_app, name="cache")
-app.add_typer(langsplat_app, name="langsplat")

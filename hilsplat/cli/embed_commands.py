@@ -1,11 +1,11 @@
-"""CLIP vectors of masks, and LangSplat's files."""
+"""CLIP vectors of masks."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hilsplat.cli.apps import app, langsplat_app
+from hilsplat.cli.apps import app
 from hilsplat.cli.stage import (
     DEFAULT_CACHE,
     Cache,
@@ -50,12 +50,3 @@ def clip(
         from hilsplat.embed.stage import run_clip
 
         run_clip(scene, masks, semantic_tree, out, cache, section, threads, memory)
-
-
-@langsplat_app.command("write")
-def langsplat_write(masks: PathIn, clip: PathIn, out: PathOut) -> None:
-    """Write masks and CLIP vectors in the format of LangSplat's preprocessing."""
-    with stage("langsplat", out, inputs={"masks": masks, "clip": clip}):
-        from hilsplat.embed.langsplat_files import write_langsplat
-
-        write_langsplat(masks, clip, out)

@@ -26,8 +26,8 @@ from hilsplat.cli.apps import app  # noqa: E402
 # isort: off
 from hilsplat.cli import run_command, scene_commands, segment_commands, embed_commands  # noqa: E402, F401
 from hilsplat.cli import field_commands  # noqa: E402, F401
-from hilsplat.cli import evaluate_commands, user_commands, view_command, cache_commands  # noqa: E402, F401
-from hilsplat.cli import world_commands, model_commands, dataset_commands  # noqa: E402, F401
+from hilsplat.cli import evaluate_commands, user_commands, export_command, view_command  # noqa: E402, F401
+from hilsplat.cli import world_commands, model_commands, dataset_commands, cache_commands  # noqa: E402, F401
 # isort: on
 
 

@@ -19,6 +19,11 @@ from hilsplat.cli.stage import (
     start_logging,
 )
 
+POSES_HELP = (
+    "a COLMAP model, a transforms.json, or a folder with either; none: structure from motion; default: the "
+    "poses in the folder"
+)
+
 
 @app.command()
 def new(
@@ -28,6 +33,7 @@ def new(
     ],
     sheet: Annotated[Path, typer.Option(help="scene sheet")] = Path("config/scenes.tsv"),
     frames: Annotated[int, typer.Option(min=3, max=1000, help="most frames taken from videos")] = 60,
+    poses: Annotated[Path | None, typer.Option(help=POSES_HELP)] = None,
     gaussians: Annotated[
         Path | None,
         typer.Option(help="a 3DGS PLY instead of a fit; none: fit; default: what 3DGS left in the folder"),
@@ -53,7 +59,14 @@ def new(
     from hilsplat.workflow.models import models_of_photographs
 
     report = add_scene(
-        sheet, name, photos, frames=frames, gaussians=gaussians, features=features, labels=labels
+        sheet,
+        name,
+        photos,
+        frames=frames,
+        poses=poses,
+        gaussians=gaussians,
+        features=features,
+        labels=labels,
     )
     typer.echo(str(report))
     typer.echo(
@@ -65,23 +78,25 @@ def new(
         typer.echo(line)
 
 
-@app.command()
-def poses(
+@app.command("poses")
+def find_poses(
     images: PathIn,
     out: PathOut,
     name: Annotated[str, typer.Option(help="dataset/scene, for messages")] = "scene",
     unit: Annotated[str, typer.Option(help="unit of length: metre or arbitrary")] = "arbitrary",
     render: Annotated[bool, typer.Option(help="the images are renders: an ideal pinhole lens")] = False,
+    poses: Annotated[Path | None, typer.Option(help=POSES_HELP)] = None,
     settings: Settings = "{}",
     seed: Seed = 0,
     threads: Threads = 1,
 ) -> None:
     """Find the cameras of photographs, or import a COLMAP model or transforms.json."""
     section = section_of("poses", settings)
-    with stage("poses", out, settings=section, seed=seed, threads=threads, inputs={"images": images}):
+    inputs = {"images": images, **({"poses": poses} if poses and poses.exists() else {})}
+    with stage("poses", out, settings=section, seed=seed, threads=threads, inputs=inputs):
         from hilsplat.scene.poses import run_poses
 
-        run_poses(images, out, name, unit, render, section, seed, threads)
+        run_poses(images, out, name, unit, render, section, seed, threads, poses)
 
 
 @app.command()
@@ -94,13 +109,21 @@ def gaussians(
         Path | None,
         typer.Option(help="a 3DGS PLY of your own, in the source's coordinates; replaces the fit"),
     ] = None,
+    dataparser: Annotated[
+        Path | None,
+        typer.Option(help="nerfstudio's dataparser_transforms.json, if that PLY is in its coordinates"),
+    ] = None,
+    transforms: Annotated[
+        Path | None, typer.Option(help="the transforms.json with the source's poses, for --dataparser")
+    ] = None,
     cache: Cache = DEFAULT_CACHE,
     seed: Seed = 0,
     threads: Threads = 1,
 ) -> None:
     """Fit 3D Gaussians to the training views, or take your own; a JSON beside them gives the coordinates."""
     section = section_of("gaussians", settings)
-    inputs = {"scene": scene, **({"brought": brought} if brought else {})}
+    optional = {"brought": brought, "dataparser": dataparser, "transforms": transforms}
+    inputs = {"scene": scene, **{name: path for name, path in optional.items() if path}}
     beside = (out.with_suffix(".json"), report)
     with stage(
         "gaussians",
@@ -114,4 +137,4 @@ def gaussians(
     ):
         from hilsplat.splat.fit import run_gaussians
 
-        run_gaussians(scene, out, report, cache, section, seed, threads, brought)
+        run_gaussians(scene, out, report, cache, section, seed, threads, brought, dataparser, transforms)

@@ -1,4 +1,4 @@
-"""Query and export a finished scene, and print the manual of the settings."""
+"""Query a finished scene, check results and machine, and print the manual of the settings."""
 
 import gc
 from pathlib import Path
@@ -74,23 +74,6 @@ def query(
             typer.echo(found)
     finally:
         gc.enable()
-
-
-@app.command()
-def export(
-    scene: SceneName,
-    variant: Annotated[str, typer.Option(help="variant whose tree to write")] = "default",
-    results: Results = Path("results"),
-    out: Annotated[
-        Path | None, typer.Option(help="folder to write; default: export/VARIANT in the scene's folder")
-    ] = None,
-    threads: Threads = 2,
-) -> None:
-    """Write the semantic tree of a finished scene as JSON, a picture, and a PLY with nodes per Gaussian."""
-    start_logging()
-    from hilsplat.query.tree_picture import export_tree
-
-    typer.echo(export_tree(scene_folder(scene, results), variant, out, threads))
 
 
 def scene_folder(scene: str, results: Path) -> Path:

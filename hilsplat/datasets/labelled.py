@@ -17,8 +17,8 @@ from hilsplat.base.files import list_images
 from hilsplat.base.images import open_image
 from hilsplat.base.levels import Level
 from hilsplat.datasets.dataset import SceneReport
-from hilsplat.scene.known_poses import KnownView, find_known_poses
-from hilsplat.scene.known_views import known_views
+from hilsplat.scene.importers.known_poses import KnownView, find_known_poses
+from hilsplat.scene.importers.known_views import known_views
 from hilsplat.scene.view_names import view_name
 
 ROUNDING_PX = 1.0

@@ -137,8 +137,8 @@ def export_images(name: str, data_root: Path, out: Path) -> int:
         SceneError: the scene's labels are on images, which need no export, or it cannot be read.
     """
     from hilsplat.datasets.points.labelled_points import PointScene
-    from hilsplat.datasets.points.posed_images import write_posed_images
     from hilsplat.datasets.registry import open_labels
+    from hilsplat.scene.posed_images import write_posed_images
 
     scene = open_labels(name, data_root)
     if not isinstance(scene, PointScene):

@@ -1,4 +1,4 @@
-"""Read and write LangSplat's masks and vectors (the `language_features/` of its preprocessing).
+"""Read LangSplat's masks and vectors (the `language_features/` of its preprocessing).
 
 An image `a.jpg` has two plain arrays:
     a_s.npy  float32 (4, H, W): row of `a_f.npy` at each pixel, -1 for none;
@@ -11,22 +11,18 @@ import logging
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float16, Float32, Int64
+from jaxtyping import Float16
 
-from hilsplat.base.artifacts import atomic_folder, read_index, read_npy, write_index, write_npy
+from hilsplat.base.artifacts import atomic_folder, read_npy, write_index, write_npy
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, unit
-from hilsplat.embed.vectors import require_every_vector
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import (
     MASKS_SHA256,
     digest_of,
-    digests_in,
     index_entry,
-    load_masks,
-    require_same_masks,
 )
 from hilsplat.segment.masks import HierarchicalMasks, runs_of_labels
 from hilsplat.segment.stage import train_views
@@ -50,7 +46,7 @@ def stem_of(view: str) -> str:
     return view.split(".")[0]
 
 
-def _stems(views: list[str]) -> dict[str, str]:
+def stems_of(views: list[str]) -> dict[str, str]:
     """Stem of each view.
 
     Raises:
@@ -143,7 +139,7 @@ def _read_all(scene: Scene, folder: Path) -> dict[str, tuple[HierarchicalMasks, 
     Raises:
         ArtifactError: a view has no files.
     """
-    stems = _stems(train_views(scene))
+    stems = stems_of(train_views(scene))
     missing = [view for view, stem in stems.items() if not (folder / f"{stem}_s.npy").is_file()]
     if missing:
         raise ArtifactError(
@@ -225,42 +221,3 @@ def _require_model(
             fix="set clip.model to the CLIP that made them; LangSplat's is clip-vit-b-16-laion2b: "
             "hilsplat models get clip-vit-b-16-laion2b",
         )
-
-
-def maps_of(
-    masks: HierarchicalMasks,
-) -> tuple[Float32[np.ndarray, "4 H W"], Int64[np.ndarray, " N"]]:
-    """LangSplat's four maps of a view, and the mask that each row of its vectors belongs to.
-
-    The map of mixed levels holds all masks, large to small.
-    """
-    maps, rows = [], []
-    count = 0
-    for level in MAPS:
-        mine = np.arange(len(masks)) if level is None else masks.rows_of(level)
-        labels = masks.label_map(level)
-        maps.append(np.where(labels >= 0, count + np.searchsorted(mine, labels), -1))
-        rows.append(mine)
-        count += len(mine)
-    return np.stack(maps).astype(np.float32), np.concatenate(rows)
-
-
-def write_langsplat(masks_folder: Path, clip_folder: Path, out: Path) -> None:
-    """Write `<stem>_s.npy` and `<stem>_f.npy` of every view that has masks.
-
-    Raises:
-        MisalignedArtifactError: the vectors were computed from other masks.
-        ArtifactError: a mask has no vector.
-    """
-    scene, digests = read_index(masks_folder)["scene"], digests_in(masks_folder)
-    require_same_masks(clip_folder, masks_folder)
-    stems = _stems(list(digests))
-    with stage_log("langsplat write", scene) as counts, atomic_folder(out) as folder:
-        for view, stem in stems.items():
-            masks = load_masks(masks_folder, view, digests)
-            vectors = read_npy(Path(clip_folder) / f"{view}.npy")
-            require_every_vector(vectors, clip_folder, "LangSplat's format")
-            maps, rows = maps_of(masks)
-            write_npy(folder / f"{stem}_s.npy", maps)
-            write_npy(folder / f"{stem}_f.npy", vectors[rows].astype(np.float32))
-        counts.update(views=len(stems))

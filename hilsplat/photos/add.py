@@ -16,7 +16,10 @@ from hilsplat.base.progress import track
 from hilsplat.photos.check import CHECK_SIDE_PX, CheckedPhoto, photo_doubts
 from hilsplat.photos.intake import brought_photographs
 from hilsplat.scene.features import EXIF_ORIENTATION, exif_focal_px
+from hilsplat.scene.importers.known_poses import find_known_poses
 from hilsplat.scene.layouts import (
+    NO_POSES,
+    dataparser_of,
     has_known_poses,
     label_files,
     langsplat_features,
@@ -90,8 +93,12 @@ class PhotoReport:
         return "\n".join(lines)
 
 
-def inspect_photos(folder: Path) -> PhotoReport:
+def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
     """Read every photograph of a folder (or of its `images/`) in full, report what is there, and doubt it.
+
+    Args:
+        folder: folder of the photographs.
+        poses: poses that replace those in the folder (`has_known_poses`).
 
     Raises:
         SceneError: there is no such folder, or two photographs differ only in their suffix.
@@ -150,11 +157,11 @@ def inspect_photos(folder: Path) -> PhotoReport:
         num_rotated=num_rotated,
         duplicates=tuple(tuple(names) for names in by_digest.values() if len(names) > 1),
         passed_over=dict(passed_over),
-        doubts=tuple(photo_doubts(distinct, have_poses=has_known_poses(folder))),
+        doubts=tuple(photo_doubts(distinct, have_poses=has_known_poses(folder, poses))),
     )
 
 
-NONE = Path("none")
+NONE = NO_POSES
 """What a user passes to leave out what was found."""
 
 
@@ -164,6 +171,7 @@ def add_scene(
     photos: Path,
     unit: str = "arbitrary",
     frames: int = 60,
+    poses: Path | None = None,
     gaussians: Path | None = None,
     features: Path | None = None,
     labels: Path | None = None,
@@ -179,8 +187,10 @@ def add_scene(
         photos: folder of photographs or of videos, a video, or a zip of photographs.
         unit: unit of lengths, for a folder with metric poses.
         frames: largest number of frames taken from videos.
-        gaussians: a 3DGS PLY in the coordinates of the poses, used instead of a fit; None: the one that 3DGS
-            left in the folder, if there is one; `NONE`: never.
+        poses: a COLMAP model or transforms file; None: the poses in the folder, if there are any; `NONE`:
+            structure from motion.
+        gaussians: a 3DGS PLY in the coordinates of the poses or in nerfstudio's training coordinates, used
+            instead of a fit; None: the one that 3DGS or nerfstudio left in the folder, if any; `NONE`: a fit.
         features: LangSplat's folder of masks and vectors, used instead of SAM and CLIP; None and `NONE`
             likewise.
         labels: folder of label files of LERF-OVS or of `hilsplat annotate`, which evaluation alone reads.
@@ -210,8 +220,8 @@ def add_scene(
         )
     root = project_root(sheet)
     with brought_photographs(photos, root / PHOTOS / name, frames) as brought:
-        extra = _trained(brought.folder, {"gaussians": gaussians, "features": features})
-        notes = [f"{what}: {path}" for what, path in extra.items()]
+        extra = _trained(brought.folder, {"poses": poses, "gaussians": gaussians, "features": features})
+        notes = _notes(brought.folder, extra)
         if skipped := sorted(brought.folder.rglob("*.pth"))[:3]:
             notes.append(
                 f"not read, because a pickle can run code: {', '.join(path.name for path in skipped)}"
@@ -220,8 +230,8 @@ def add_scene(
         annotated = root / "annotated" / PHOTOS / name
         if files and not annotated.exists():
             notes.append(f"labels of {len(files)} photographs, for scores: {files[0].parent}")
-        report = replace(inspect_photos(brought.folder), notes=(*brought.notes, *notes))
-        _check(report, brought.folder)
+        report = replace(inspect_photos(brought.folder, poses), notes=(*brought.notes, *notes))
+        _check(report, has_known_poses(brought.folder, poses))
         if files and not annotated.exists():
             with atomic_folder(annotated) as target:
                 for path in files:
@@ -230,22 +240,42 @@ def add_scene(
     return report
 
 
-def _trained(folder: Path, asked: dict[str, Path | None]) -> dict[str, Path]:
-    """Gaussians and features of a scene: what the user names, or what 3DGS and LangSplat left in the folder.
+def _trained(folder: Path, named: dict[str, Path | None]) -> dict[str, Path]:
+    """Return what the user names, or what other programs left in the folder, by column of the sheet.
 
-    Without known poses, Gaussians of another program are in coordinates that nobody knows.
+    Without known poses, Gaussians of another program are in unknown coordinates and are not used.
 
     Raises:
         SceneError: a path that the user names does not exist.
     """
-    found = {"gaussians": trained_gaussians(folder), "features": langsplat_features(folder)}
-    if not has_known_poses(folder):
-        found["gaussians"] = None
-    for what, path in asked.items():
+    for what, path in named.items():
         if path is not None and path != NONE and not path.exists():
             raise SceneError(f"--{what} {path} is missing", fix="correct the path, or pass none")
-    chosen = {what: asked[what] or path for what, path in found.items()}
-    return {what: path.resolve() for what, path in chosen.items() if path is not None and path != NONE}
+    found = {"gaussians": trained_gaussians(folder), "features": langsplat_features(folder)}
+    if not has_known_poses(folder, named["poses"]):
+        found["gaussians"] = None
+    chosen = {what: path or found.get(what) for what, path in named.items()}
+    if chosen["poses"] == NONE and not has_known_poses(folder):
+        chosen["poses"] = None
+    return {
+        what: path if path == NONE else path.resolve()
+        for what, path in chosen.items()
+        if path is not None and (path != NONE or what == "poses")
+    }
+
+
+def _notes(folder: Path, extra: dict[str, Path]) -> list[str]:
+    """Say what is used besides the photographs.
+
+    Raises:
+        SceneError: the poses in the folder are incomplete, or those named cannot be used.
+    """
+    known = find_known_poses(folder, extra.get("poses"))
+    notes = [f"poses: {', '.join(map(str, known.files)) if known else 'structure from motion'}"]
+    notes += [f"{what}: {path}" for what, path in extra.items() if what != "poses"]
+    if (ply := extra.get("gaussians")) and (dataparser := dataparser_of(ply, folder)):
+        notes.append(f"coordinates of the Gaussians: nerfstudio's, by {dataparser}")
+    return notes
 
 
 def _labels(folder: Path, asked: Path | None) -> list[Path]:
@@ -264,7 +294,7 @@ def _labels(folder: Path, asked: Path | None) -> list[Path]:
     return files
 
 
-def _check(report: PhotoReport, photos: Path) -> None:
+def _check(report: PhotoReport, have_poses: bool) -> None:
     """Refuse photographs that cannot be read, or too few of them."""
     if report.unreadable:
         raise SceneError(
@@ -272,7 +302,7 @@ def _check(report: PhotoReport, photos: Path) -> None:
             found="; ".join(f"{file}: {reason}" for file, reason in report.unreadable),
             fix="remove them from the folder or replace them with intact copies, then try again",
         )
-    if report.num_distinct < MIN_PHOTOS and not has_known_poses(photos):
+    if report.num_distinct < MIN_PHOTOS and not have_poses:
         found = [f"{report.num_distinct} different readable ones"]
         found += [f"{count} {suffix} files skipped" for suffix, count in sorted(report.passed_over.items())]
         raise SceneError(

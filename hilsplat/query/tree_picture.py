@@ -30,20 +30,19 @@ FONT = 0  # cv2.FONT_HERSHEY_SIMPLEX
 FONT_SCALE = 0.5
 
 
-def export_tree(folder: Path, variant: str, out: Path | None, threads: int) -> str:
+def export_tree(folder: Path, variant: str, out: Path, threads: int) -> str:
     """Write `tree.json`, `tree.ply` (a node per Gaussian and level) and `tree.png` of a finished scene.
 
     Args:
         folder: `results/<dataset>/<scene>`, or a copy of it anywhere.
         variant: named set of settings whose tree is written.
-        out: folder to write; None: `export/<variant>` in the scene's folder.
+        out: folder to write.
         threads: number of threads for rendering.
 
     Returns:
         what was written, for people.
     """
     found = FinishedScene.locate(folder, variant)
-    out = out or found.folder / "export" / variant
     scene = LanguageScene.of(found, threads=threads)
     write_json(out / "tree.json", {"scene": scene.scene.name, "nodes": readable_nodes(scene.tree)})
     write_tree_ply(found.parts.gaussians, scene.tree, out / "tree.ply")

@@ -4,8 +4,24 @@ from pathlib import Path
 
 from hilsplat.base.files import list_images
 
-TRAINED = ("output", "language_features")
-"""Folders beside photographs that 3DGS and LangSplat write."""
+TRAINED = ("output", "outputs", "exports", "language_features")
+"""Folders beside photographs that 3DGS, nerfstudio and LangSplat write."""
+
+MODELS = ("sparse/0", "sparse")
+"""Folders of COLMAP's model, in order of preference."""
+
+TRANSFORMS = ("transforms.json", "transforms_train.json")
+"""Files with poses that nerfstudio and others write, in order of preference."""
+
+NO_POSES = Path("none")
+"""In place of a path: poses that a folder brings are not used."""
+
+DATAPARSER = "dataparser_transforms.json"
+"""nerfstudio's record of the coordinates in which it trained."""
+
+
+EXPORTED = ("exports/*/splat.ply", "exports/splat.ply", "splat.ply", "point_cloud.ply")
+"""Places of a PLY that nerfstudio or a viewer exported; one of 3DGS's own is preferred."""
 
 
 def trained_gaussians(folder: Path) -> Path | None:
@@ -20,11 +36,32 @@ def trained_gaussians(folder: Path) -> Path | None:
         for path in Path(folder).glob(f"{pattern}/point_cloud.ply")
     ]
     found.sort(key=lambda path: (int(path.parent.name.partition("_")[2] or 0), path.stat().st_mtime_ns))
-    found = [
-        *(path for path in map(Path(folder).joinpath, ("splat.ply", "point_cloud.ply")) if path.is_file()),
-        *found,
-    ]
-    return found[-1] if found else None
+    others = [path for name in EXPORTED for path in sorted(Path(folder).glob(name))]
+    return [*others, *found][-1] if others or found else None
+
+
+def dataparser_of(ply: Path, source: Path) -> Path | None:
+    """Return the record of the coordinates of nerfstudio's PLY, or None for a PLY of another program.
+
+    It is in the PLY's folder, in the source's folder, or in that of the latest training run. The last two
+    count only for a PLY with the name that nerfstudio gives.
+    """
+    places = [ply.parent]
+    if ply.name == "splat.ply":
+        runs = sorted(Path(source).glob(f"outputs/*/*/*/{DATAPARSER}"))  # the last part is the time
+        places += [Path(source), *(run.parent for run in runs[-1:])]
+    return next((place / DATAPARSER for place in places if (place / DATAPARSER).is_file()), None)
+
+
+def transforms_of(folder: Path, named: Path | None = None) -> Path | None:
+    """Return the transforms file that poses a folder; None if a COLMAP model does, or nothing of the kind."""
+    if named is not None and named.suffix == ".json":
+        return named
+    folder = named or folder
+    if (folder / "sparse").is_dir():
+        return None
+    found = (path for path in map(folder.joinpath, TRANSFORMS) if path.is_file())
+    return next(found, None)
 
 
 def langsplat_features(folder: Path) -> Path | None:
@@ -56,8 +93,10 @@ def photo_folder(folder: Path) -> Path:
     return folder
 
 
-def has_known_poses(folder: Path) -> bool:
-    """Whether a folder brings its own poses, in any form that `find_known_poses` finds."""
+def has_known_poses(folder: Path, named: Path | None = None) -> bool:
+    """Whether a folder has poses in a form that `find_known_poses` finds, or others are named."""
+    if named is not None:
+        return named != NO_POSES
     return (
         (folder / "sparse").is_dir()
         or any(folder.glob("transforms*.json"))

@@ -24,8 +24,8 @@ from hilsplat.scene.features import (
     incremental_options,
     prepare_images,
 )
-from hilsplat.scene.importers import import_poses
-from hilsplat.scene.known_poses import find_known_poses
+from hilsplat.scene.importers.importing import import_poses
+from hilsplat.scene.importers.known_poses import find_known_poses
 from hilsplat.scene.layouts import photo_folder
 from hilsplat.scene.lost_views import name_neighbours, plot_lost
 from hilsplat.scene.model import camera_of, pose_matrix, reprojection_errors, sparse_points
@@ -56,6 +56,7 @@ def run_poses(
     settings: PosesSettings,
     seed: int,
     threads: int,
+    named: Path | None = None,
 ) -> None:
     """Pose the images of one scene and write its Scene artifact with a registration report.
 
@@ -75,6 +76,7 @@ def run_poses(
         settings: the `poses` section.
         seed: of RANSAC and of the mapper.
         threads: for feature extraction and matching.
+        named: poses to use instead of those in the folder (`find_known_poses`).
 
     Raises:
         SceneError: there are fewer than three images, or the folder cannot be used.
@@ -84,7 +86,7 @@ def run_poses(
     images, out = Path(images), Path(out)
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)  # COLMAP narrates each step on stderr
     with stage_log("poses", name) as counts, work_folder(out) as work:
-        known = find_known_poses(images) if images.is_dir() else None
+        known = find_known_poses(images, named) if images.is_dir() else None
         if known is None:
             report = _reconstruct(images, out, work, name, is_render, settings, seed, threads)
         else:

@@ -11,13 +11,13 @@ from pathlib import Path
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, NAME_RULE, list_images, name_problem
-from hilsplat.scene.layouts import has_known_poses, photo_folder
+from hilsplat.scene.layouts import NO_POSES, has_known_poses, photo_folder
 
 DEFAULT_SHEET = Path("config/scenes.tsv")
 """Relative to the project."""
 
 COLUMNS = ("dataset", "scene", "group", "source", "unit")
-OPTIONAL_COLUMNS = ("gaussians", "features")
+OPTIONAL_COLUMNS = ("gaussians", "features", "poses")
 NOTHING = ("", "-")
 """Contents of an optional cell that is left empty."""
 GROUPS = (
@@ -59,6 +59,8 @@ class SceneRow:
             Gaussians are fitted, and for `data:` without a data root.
         features: a folder of LangSplat's masks and CLIP vectors, used instead of SAM and CLIP; None if masks
             are computed, and for `data:` without a data root.
+        poses: a COLMAP model or transforms file used instead of the poses in the folder; `NO_POSES` if those
+            are ignored; None if they are used, and for `data:` without a data root.
     """
 
     dataset: str
@@ -69,6 +71,7 @@ class SceneRow:
     folder: Path | None
     gaussians: Path | None = None
     features: Path | None = None
+    poses: Path | None = None
 
     @property
     def name(self) -> str:
@@ -93,8 +96,8 @@ def read_sheet(
 ) -> list[SceneRow]:
     """Read and check the scene sheet: tab-separated, one header line, `#` begins a comment line.
 
-    The columns `gaussians` and `features` may be left out, also at the end of a single row; empty or "-"
-    means that the Gaussians are fitted and the masks computed.
+    The columns `gaussians`, `features` and `poses` may be left out, also at the end of a single row; an empty
+    cell or "-" has the same meaning.
 
     Args:
         path: the sheet; relative sources start from its project root.
@@ -269,8 +272,25 @@ def _row(
                 expected="<image>_s.npy and <image>_f.npy for each image",
                 fix='correct the path, or write "-" to have the masks computed',
             )
+    poses = None
+    if (cell := cells.get("poses", "")) not in NOTHING:
+        poses = NO_POSES if cell == str(NO_POSES) else _resolved(path, cell, data_root)
+        if poses not in (None, NO_POSES) and is_checked and not poses.exists():
+            raise SceneError(
+                f"{path}, line {line}, column poses: {poses} is missing",
+                expected=f"a COLMAP model, a transforms.json, or {NO_POSES}",
+                fix='correct the path, or write "-" to use the poses in the folder',
+            )
     return SceneRow(
-        cells["dataset"], cells["scene"], cells["group"], source, cells["unit"], folder, gaussians, features
+        cells["dataset"],
+        cells["scene"],
+        cells["group"],
+        source,
+        cells["unit"],
+        folder,
+        gaussians,
+        features,
+        poses,
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import ArtifactError
+from hilsplat.scene.importers.nerfstudio import source_from_dataparser
 from hilsplat.scene.scene import Scene
 from hilsplat.splat.coordinates import read_source_from_scene
 from hilsplat.splat.gaussians import Gaussians
@@ -19,11 +20,19 @@ logger = logging.getLogger(__name__)
 FIX = "export it again as an uncompressed 3DGS PLY, or correct column gaussians of the scene sheet"
 
 
-def bring_gaussians(ply: Path, scene: Scene) -> tuple[Gaussians, dict[str, Any]]:
+def bring_gaussians(
+    ply: Path, scene: Scene, dataparser: Path | None = None, transforms: Path | None = None
+) -> tuple[Gaussians, dict[str, Any]]:
     """Read a 3DGS PLY in the coordinates of the scene's source poses.
 
     A PLY written by this package is in the coordinates of its scene instead; it is first moved to the
-    source's, as the JSON file beside it describes.
+    source's, as the JSON file beside it describes. One of nerfstudio is moved as its data parser recorded.
+
+    Args:
+        ply: the file.
+        scene: scene that it belongs to.
+        dataparser: nerfstudio's `dataparser_transforms.json`, if the PLY is in its training coordinates.
+        transforms: the `transforms.json` with the source's poses, which `dataparser` needs.
 
     Returns:
         The Gaussians in the scene's coordinates, and their origin for the report.
@@ -46,6 +55,9 @@ def bring_gaussians(ply: Path, scene: Scene) -> tuple[Gaussians, dict[str, Any]]
     if source_from_ply is not None:
         transform = transform @ source_from_ply
         moved = "in the coordinates that the JSON file beside it describes"
+    elif dataparser is not None:
+        transform = transform @ source_from_dataparser(dataparser, transforms)
+        moved = f"in nerfstudio's training coordinates, by {dataparser.name}"
     logger.info("%s: %d Gaussians of %s, %s", scene.name, len(gaussians), ply, moved)
     origin = {
         "kind": "imported",

@@ -10,7 +10,8 @@ from hilsplat.base.artifacts import read_json, sha256_of_file, write_json
 from hilsplat.base.errors import ArtifactError
 from hilsplat.scene.scene import Scene
 from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.similarity import decompose
+from hilsplat.splat.ply import load_ply, save_ply
+from hilsplat.splat.similarity import decompose, move_gaussians
 
 AXES = "right-handed; cameras in OpenCV axes (x right, y down, z forward)"
 
@@ -78,3 +79,21 @@ def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
     if matrix.shape != (4, 4):
         raise ArtifactError(f"{path}: source_from_scene is not a 4 x 4 matrix", found=f"shape {matrix.shape}")
     return matrix
+
+
+def write_source_ply(ply: Path, out: Path) -> int:
+    """Write the Gaussians of a scene in the coordinates of its source, and return their number.
+
+    Args:
+        ply: `gaussians.ply` of a scene, beside its JSON file.
+        out: 3DGS PLY to write.
+
+    Raises:
+        ArtifactError: the PLY or its JSON file is missing or damaged.
+    """
+    source_from_scene = read_source_from_scene(ply)
+    if source_from_scene is None:
+        raise ArtifactError(f"{coordinates_path(ply)} is missing", fix=f"hilsplat run {ply}")
+    gaussians = move_gaussians(load_ply(ply), source_from_scene)
+    save_ply(out, gaussians)
+    return len(gaussians)

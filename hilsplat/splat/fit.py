@@ -188,6 +188,8 @@ def run_gaussians(
     seed: int,
     threads: int,
     brought: Path | None = None,
+    dataparser: Path | None = None,
+    transforms: Path | None = None,
 ) -> None:
     """Stage: fit Gaussians or take ready-made ones; write them, their coordinates and the report.
 
@@ -196,6 +198,7 @@ def run_gaussians(
 
     Args:
         brought: a 3DGS PLY in the coordinates of the scene's source, used instead of a fit.
+        dataparser, transforms: for a PLY in nerfstudio's training coordinates (`bring_gaussians`).
 
     Raises:
         SceneError: there are no training views to fit.
@@ -204,7 +207,7 @@ def run_gaussians(
     scene = Scene.load(scene_folder)
     with stage_log("gaussians", scene.name) as counts:
         if brought is not None:
-            gaussians, origin = bring_gaussians(brought, scene)
+            gaussians, origin = bring_gaussians(brought, scene, dataparser, transforms)
             curve = None
         else:
             # `auto` may choose CUDA once and the CPU later; their sums differ, so a fit stays on one device.

@@ -20,7 +20,7 @@ from hilsplat.datasets.sources import (
     label_files,
     label_sets,
 )
-from hilsplat.scene.layouts import TRAINED
+from hilsplat.scene.layouts import TRAINED, dataparser_of, transforms_of
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.workflow.jobs import Job
 
@@ -63,18 +63,23 @@ class SceneData:
         """Files of a folder of photographs, without labels and what other programs trained."""
         assert row.folder is not None, row.name  # scenes without data were skipped
         labels = set(self._label_files(row))
-        return sorted(
+        files = [
             str(path)
             for path in row.folder.rglob("*")
             if path.is_file()
             and not path.name.startswith(".")
             and path.relative_to(row.folder).parts[0] not in TRAINED
             and str(path) not in labels
-        )
+        ]
+        named = [] if row.poses is None else [row.poses, *row.poses.rglob("*")]
+        return sorted({*files, *(str(path) for path in named if path.is_file())})
 
-    def lens(self, job: Job) -> str:
-        """Option of poses: whether the images are renders."""
-        return "--render" if self.row(job).world else "--no-render"
+    def poses_option(self, job: Job) -> str:
+        """Options of poses: whether the images are renders, and poses that the sheet names."""
+        row = self.row(job)
+        if row.world:
+            return "--render"
+        return "--no-render" + (f" --poses {shlex.quote(str(row.poses))}" if row.poses else "")
 
     def require_no_braces(self, row: SceneRow) -> None:
         """Refuse files in whose names Snakemake would see wildcards; it knows no way to quote them."""
@@ -101,17 +106,33 @@ class SceneData:
         return readers_of([self.source_name(job)])
 
     def brought(self, job: Job) -> list[str]:
-        """Input: a PLY that replaces the fit, with the JSON beside it if there is one; usually nothing."""
+        """Input: a PLY that replaces the fit, and files about its coordinates; usually nothing."""
         ply = self.row(job).gaussians
         if ply is None:
             return []
         beside = ply.with_suffix(".json")
-        return [str(ply), *([str(beside)] if beside.is_file() else [])]
+        described = [beside] if beside.is_file() else self._nerfstudio(job).values()
+        return [str(path) for path in (ply, *described)]
 
     def brought_option(self, job: Job) -> str:
-        """Option that names such a PLY, if there is one."""
+        """Options that name such a PLY and nerfstudio's files for it, if there are any."""
         ply = self.row(job).gaussians
-        return f"--brought {shlex.quote(str(ply))}" if ply is not None else ""
+        if ply is None:
+            return ""
+        named = {"brought": ply, **self._nerfstudio(job)}
+        return " ".join(f"--{name} {shlex.quote(str(path))}" for name, path in named.items())
+
+    def _nerfstudio(self, job: Job) -> dict[str, Path]:
+        """Files that relate the coordinates of nerfstudio's PLY to those of the poses, by option."""
+        row = self.row(job)
+        if row.gaussians is None or row.folder is None:
+            return {}
+        dataparser = dataparser_of(row.gaussians, row.folder)
+        files = {
+            "dataparser": dataparser,
+            "transforms": transforms_of(row.folder, row.poses) if dataparser else None,
+        }
+        return {name: path for name, path in files.items() if path is not None}
 
     def features(self, job: Job) -> list[str]:
         """Input of masks and clip: LangSplat's files that replace SAM and CLIP; usually nothing."""

@@ -16,7 +16,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 from tokenizers import Tokenizer, models, pre_tokenizers
 
-from hilsplat.base.artifacts import write_index
+from hilsplat.base.artifacts import write_index, write_json
 from hilsplat.base.images import write_png
 from hilsplat.base.provenance import Inputs, write_provenance
 from hilsplat.cli.main import app
@@ -24,6 +24,7 @@ from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import index_entry
 from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.splat.coordinates import write_coordinates
 from hilsplat.splat.ply import save_ply
 from tests.unit.round_gaussians import round_gaussians
 
@@ -115,22 +116,18 @@ def _write_scene() -> None:
     cameras = Cameras(names, poses, np.tile(K, (NUM_VIEWS, 1, 1)), sizes)
     split = {name: "test" if name == names[-1] else "train" for name in names}
     points = np.zeros((0, 3), np.float32)
-    Scene(
-        SCENE / "scene",
-        "photos/desk",
-        "arbitrary",
-        cameras,
-        split,
-        points,
-        points.astype(np.uint8),
-        np.eye(4),
-    ).save()
+    colours = points.astype(np.uint8)
+    scene = Scene(SCENE / "scene", "photos/desk", "arbitrary", cameras, split, points, colours, np.eye(4))
+    scene.save()
+    write_json(SCENE / "scene/registration.json", {"poses": "given"})
     rows, columns = np.divmod(np.arange(HEIGHT * WIDTH), WIDTH)
     count = len(rows)
     colours = (canvas.reshape(-1, 3) / 255 - 0.5) / 0.28209479177387814
     means = np.stack([columns, rows, np.zeros(count)], axis=1)
     plain = round_gaussians(means, log_scale=np.log(0.25), opacity_logit=5.0)
-    save_ply(SCENE / "gaussians.ply", replace(plain, sh=colours.astype(np.float32)[:, None]))
+    gaussians = replace(plain, sh=colours.astype(np.float32)[:, None])
+    save_ply(SCENE / "gaussians.ply", gaussians)
+    write_coordinates(SCENE / "gaussians.ply", scene, gaussians, {"kind": "fitted"})
     masks, entries = SCENE / "default/masks", {}
     for shift, name in enumerate(names[:-1]):
         dense = np.stack([region_mask(region[0], shift) for region in REGIONS])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hilsplat.base.artifacts import read_index
-from hilsplat.datasets.points.posed_images import PosedImage, write_posed_images
+from hilsplat.scene.posed_images import PosedImage, write_posed_images
 from hilsplat.scene.scene import Scene
 from tests.workflow.conftest import SCENE, Project
 from tests.workflow.test_front_door import hilsplat

@@ -111,7 +111,7 @@ def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, .
 
 
 def by_id(labels: IsatFile) -> dict[int, IsatObject]:
-    """Objects of a file by `id`.
+    """Return the objects of a file by `id`; without ids, the pieces of an ISAT group are one object.
 
     Raises:
         SceneError: an id is missing or repeated, or a level is not 1, 2 or 3.
@@ -119,8 +119,12 @@ def by_id(labels: IsatFile) -> dict[int, IsatObject]:
     objects: dict[int, IsatObject] = {}
     for row, thing in enumerate(labels.objects):
         where = f"{labels.path}, object {row} ({thing.category})"
-        number, level = thing.keys.get("id"), thing.keys.get("level")
-        if type(number) is not int or number in objects:
+        level = thing.keys.get("level")
+        is_group = "id" not in thing.keys
+        number = thing.keys.get("group" if is_group else "id")
+        same = objects.get(number) if isinstance(number, int) else None
+        is_piece = same is not None and is_group and same.category == thing.category
+        if type(number) is not int or (same is not None and not is_piece):
             raise SceneError(
                 f"{where}: id cannot be used",
                 expected="a whole number, unique in the file",
@@ -134,8 +138,16 @@ def by_id(labels: IsatFile) -> dict[int, IsatObject]:
                 found=repr(level),
                 fix="correct it; plain LERF-OVS labels have no levels and belong below lerf_ovs/label",
             )
-        objects[number] = thing
+        objects[number] = thing if same is None else joined(same, thing)
     return objects
+
+
+def joined(one: IsatObject, other: IsatObject) -> IsatObject:
+    """Return two pieces of an object as one."""
+    low = np.minimum(one.box_xyxy[:2], other.box_xyxy[:2])
+    high = np.maximum(one.box_xyxy[2:], other.box_xyxy[2:])
+    polygons = (*one.polygons, *other.polygons)
+    return replace(one, polygons=polygons, box_xyxy=np.concatenate([low, high]))
 
 
 def parents_of(

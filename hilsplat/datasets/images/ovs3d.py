@@ -21,7 +21,7 @@ from hilsplat.datasets.labelled import (
     unlisted_texts,
 )
 from hilsplat.datasets.published import FRAMES, PROMPTS
-from hilsplat.scene.llff import POSES_BOUNDS
+from hilsplat.scene.importers.llff import POSES_BOUNDS
 from hilsplat.scene.view_names import view_name
 
 FOREGROUND = 255

@@ -13,7 +13,7 @@ from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_15, SCANNET_19
 from hilsplat.datasets.classes.scannet200 import SCANNET200, SCANNET200_INSTANCES
 from hilsplat.datasets.classes.waymo import WAYMO_22
 from hilsplat.datasets.dataset import SceneReport
-from hilsplat.datasets.points.posed_images import PosedImage
+from hilsplat.scene.posed_images import PosedImage
 
 LABELLINGS: dict[str, tuple[ClassSet, ...]] = {
     "nyu40": (SCANNET_20, SCANNET_19, SCANNET_15, SCANNET_10),

@@ -24,8 +24,8 @@ from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.datasets.points.numbered import by_number, size_of_image
 from hilsplat.datasets.points.point_files import UNPACK_AGAIN, listing, read_json_object, read_numbers
-from hilsplat.datasets.points.posed_images import HALF_PIXEL, PosedImage, cam_from_world_of
 from hilsplat.datasets.points.replica_mesh import read_labelled_mesh, read_semantic_mesh
+from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage, cam_from_world_of
 
 logger = logging.getLogger(__name__)
 

@@ -30,7 +30,7 @@ from hilsplat.datasets.points.point_files import (
     read_ply,
     require_file,
 )
-from hilsplat.datasets.points.posed_images import HALF_PIXEL, PosedImage, cam_from_world_of
+from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage, cam_from_world_of
 
 logger = logging.getLogger(__name__)
 

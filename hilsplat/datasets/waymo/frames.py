@@ -9,8 +9,8 @@ from jaxtyping import Float, Float32, Int32
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.classes.waymo import WAYMO_22
 from hilsplat.datasets.points.labelled_points import LabelledPoints
-from hilsplat.datasets.points.posed_images import PosedImage
 from hilsplat.datasets.waymo.geometry import WaymoCamera, range_image_points, to_world
+from hilsplat.scene.posed_images import PosedImage
 
 CAMERAS = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
 """Numbered from 1 in the files."""

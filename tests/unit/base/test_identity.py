@@ -275,7 +275,7 @@ def edit_function(root: Path, place: str) -> None:
         ("segment/coverage_stage.py:run_coverage_tree", {"coverage_tree"}),
         ("field/losses/part.py:part_loss_literal", {"field"}),
         ("field/reference_trainer.py:run_reference", {"field_reference"}),
-        ("embed/langsplat_files.py:write_langsplat", {"langsplat"}),
+        ("embed/langsplat_files.py:read_clip", {"langsplat"}),
         ("evaluate/tables/html_page.py:as_html", {"table"}),
         ("query/field_answers.py:field_colours", {"evaluate", "figures", "comparison"}),
         ("segment/graph.py:segment_graph", {"masks", "key_masks", "guided_masks"}),

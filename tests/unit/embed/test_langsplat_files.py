@@ -9,7 +9,8 @@ from hilsplat.base.artifacts import read_index, read_npy, write_index
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.images import write_png
 from hilsplat.embed.clip import ClipModel
-from hilsplat.embed.langsplat_files import maps_of, read_clip, read_masks, read_view, write_langsplat
+from hilsplat.embed.langsplat_export import maps_of, write_langsplat
+from hilsplat.embed.langsplat_files import read_clip, read_masks, read_view
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import digest_of, index_entry

@@ -14,15 +14,18 @@ import numpy as np
 import pytest
 
 import hilsplat
+from hilsplat.annotate.labels import NO_FILE, Label, label_path, write_labels
 from hilsplat.base.artifacts import provenance_path, read_npy
 from hilsplat.base.errors import ArtifactError, ModelError, SettingsError
 from hilsplat.base.provenance import Inputs, write_provenance
+from hilsplat.datasets.registry import open_labelled
 from hilsplat.evaluate.figures.comparison import open_variants
 from hilsplat.evaluate.figures.panel import run_figures
 from hilsplat.field.code import autoencoder_file
 from hilsplat.models.folder import open_model_folder
 from hilsplat.query.names import NodeNames
 from hilsplat.scene.finished import FinishedScene
+from hilsplat.scene.scene import Scene
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, build_finished_desk, region_mask
 
@@ -246,11 +249,48 @@ def test_export_writes_the_tree_from_any_folder(desk, elsewhere, project):
     assert (elsewhere / "tree/tree.ply").stat().st_size > (desk / SCENE / "gaussians.ply").stat().st_size
 
 
+def test_an_export_replaces_no_folder_that_holds_something(desk, elsewhere, project):
+    (elsewhere / "mine").mkdir()
+    (elsewhere / "mine/thesis.txt").write_text("years of work")
+    done = run_command(project, "export", str(desk / SCENE), "--as", "colmap", "--out", "mine")
+    assert done.returncode == 1 and "--out mine exists" in done.stderr
+    assert (elsewhere / "mine/thesis.txt").read_text() == "years of work"
+
+
+def test_labels_go_out_in_lerfs_layout_and_come_back(desk, elsewhere, project):
+    shutil.copytree(desk, elsewhere / "copy")
+    scene = Scene.load(elsewhere / "copy" / SCENE / "scene")
+    (view,), size_hw = scene.views()[:1], scene.cameras[scene.views()[0]].size_hw
+    ring = [(1, 1), (5, 1), (5, 4), (1, 4)]
+    labels = [
+        Label(id=3, level=1, text="mug", polygons=[ring, [(7, 1), (8, 1), (8, 2)]]),
+        Label(id=9, level=2, parent=3, text="handle", polygons=[ring]),
+    ]
+    source = elsewhere / "annotated/photos/desk"
+    write_labels(label_path(source, view), view, size_hw, labels, NO_FILE)
+    done = run_command(project, "export", str(Path("copy") / SCENE), "--as", "labels", "--data-root", ".")
+    assert done.returncode == 0 and "labels of 1 views" in done.stdout, done.stderr
+    out = elsewhere / "copy" / SCENE / "export/labels"
+    assert {path.name for path in out.iterdir()} == {view, f"{Path(view).stem}.json"}
+    shutil.copytree(out, elsewhere / "back/annotated/photos/desk")
+    before, after = (open_labelled("annotated/photos/desk", root) for root in (elsewhere, elsewhere / "back"))
+    for one, other in zip(before.views[view], after.views[view], strict=True):
+        assert (one.text, one.level, one.path) == (other.text, other.level, other.path)
+        assert np.array_equal(one.mask(), other.mask())
+        assert np.array_equal(one.boxes(), other.boxes())
+
+
 def test_langsplat_files_go_out_and_come_back(desk, elsewhere, project):
     default = desk / SCENE / "default"
-    places = ["--masks", str(default / "masks"), "--clip", str(default / "clip")]
-    written = run_command(project, "langsplat", "write", *places, "--out", "language_features")
+    written = run_command(project, "export", str(desk / SCENE), "--as", "langsplat", "--out", "theirs")
     assert written.returncode == 0, written.stderr
+    assert {path.name for path in (elsewhere / "theirs").iterdir()} == {
+        "images",
+        "sparse",
+        "point_cloud.ply",
+        "language_features",
+    }
+    shutil.move(elsewhere / "theirs/language_features", elsewhere)
     maps = read_npy(elsewhere / "language_features/000_s.npy")
     assert maps.shape == (4, HEIGHT, WIDTH + NUM_VIEWS)
     assert np.array_equal(maps[3] >= 0, region_mask("mug") | region_mask("book"))  # the fourth map: wholes

@@ -1,6 +1,7 @@
 """Known poses: COLMAP models, transforms.json and exports of phones become the same scene artifact."""
 
 import json
+import shutil
 import zipfile
 
 import numpy as np
@@ -9,8 +10,12 @@ from PIL import Image
 
 from hilsplat.base.errors import RegistrationError, SceneError
 from hilsplat.photos.add import add_scene
-from hilsplat.scene import phone_exports
 from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.exporting import write_colmap as export_colmap
+from hilsplat.scene.exporting import write_nerfstudio
+from hilsplat.scene.importers import phone_exports
+from hilsplat.scene.importers.known_poses import find_known_poses
+from hilsplat.scene.layouts import NO_POSES
 from hilsplat.scene.poses import run_poses
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import PosesSettings
@@ -88,6 +93,62 @@ def test_an_incomplete_colmap_folder_is_refused(tmp_path):
     (tmp_path / "in" / "sparse" / "0" / "points3D.bin").unlink()
     with pytest.raises(SceneError, match="does not hold a complete COLMAP model"):
         import_scene(tmp_path / "in", tmp_path / "scene")
+
+
+@pytest.mark.parametrize("write", [export_colmap, write_nerfstudio])
+def test_an_exported_scene_is_read_back_in_the_sources_coordinates(tmp_path, write):
+    write_colmap(tmp_path / "in")
+    scene = import_scene(tmp_path / "in", tmp_path / "scene", unit="arbitrary")
+    assert not np.allclose(scene.scene_from_source, np.eye(4))  # it was normalised
+    write(scene, tmp_path / "out")
+    again = import_scene(tmp_path / "out", tmp_path / "again", unit="arbitrary")
+    assert again.cameras.names == scene.cameras.names
+    # sparse points are float32, and their median is the origin
+    np.testing.assert_allclose(again.scene_from_source, scene.scene_from_source, atol=1e-7)
+    np.testing.assert_allclose(again.cameras.cam_from_world, scene.cameras.cam_from_world, atol=1e-7)
+    np.testing.assert_allclose(again.cameras.K, scene.cameras.K)
+    np.testing.assert_allclose(again.points_xyz, scene.points_xyz, atol=1e-6)
+    np.testing.assert_array_equal(again.points_rgb, scene.points_rgb)
+    assert again.image_path("a.png").read_bytes() == scene.image_path("a.png").read_bytes()
+
+
+def test_pycolmap_reads_an_exported_model(tmp_path):
+    write_colmap(tmp_path / "in")
+    export_colmap(import_scene(tmp_path / "in", tmp_path / "scene", unit="arbitrary"), tmp_path / "out")
+    before, after = (pycolmap.Reconstruction(tmp_path / name / "sparse/0") for name in ("in", "out"))
+    assert (after.num_reg_images(), after.num_points3D()) == (3, 2)
+    for number in (1, 2, 3):
+        np.testing.assert_allclose(
+            after.images[number].cam_from_world().matrix(),
+            before.images[number].cam_from_world().matrix(),
+            atol=1e-9,
+        )
+        np.testing.assert_allclose(
+            after.images[number].camera.calibration_matrix(), [[50, 0, 19], [0, 51, 16], [0, 0, 1]]
+        )
+
+
+@pytest.mark.parametrize("place", ["poses", "poses/sparse/0", "poses/transforms.json"])
+def test_poses_named_by_the_user_replace_those_in_the_folder(tmp_path, place):
+    write_colmap(tmp_path / "in")
+    scene = import_scene(tmp_path / "in", tmp_path / "scene")
+    (export_colmap if "json" not in place else write_nerfstudio)(scene, tmp_path / "poses")
+    shutil.copytree(tmp_path / "poses/images", tmp_path / "photos/images")
+    shutil.copytree(tmp_path / "in/sparse", tmp_path / "photos/sparse")
+    (tmp_path / "photos/sparse/0/images.bin").write_bytes(b"")
+    out = tmp_path / "out"
+    run_poses(tmp_path / "photos", out, "a/b", "metre", False, PosesSettings(), 0, 1, tmp_path / place)
+    np.testing.assert_allclose(
+        Scene.load(out).cameras.cam_from_world, scene.cameras.cam_from_world, atol=1e-6
+    )
+
+
+def test_poses_that_are_not_there_are_refused_and_none_ignores_those_in_the_folder(tmp_path):
+    write_colmap(tmp_path / "in")
+    with pytest.raises(SceneError, match="images has no poses for"):
+        find_known_poses(tmp_path / "in", tmp_path / "in/images")
+    assert find_known_poses(tmp_path / "in").kind == "colmap"
+    assert find_known_poses(tmp_path / "in", NO_POSES) is None
 
 
 def write_transforms(folder, **more):

@@ -1,5 +1,6 @@
 """The scene sheet refuses what would fail later, and says where and how to fix it."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,9 @@ from PIL import Image
 
 from hilsplat.base.errors import SceneError
 from hilsplat.photos.add import add_scene, inspect_photos
+from hilsplat.scene.layouts import NO_POSES
 from hilsplat.scene.sheet import choose_scenes, read_sheet
+from hilsplat.workflow.scene_data import SceneData
 
 HEADER = "dataset\tscene\tgroup\tsource\tunit\n"
 
@@ -128,6 +131,8 @@ def langsplat_scene(folder: Path) -> Path:
     write_photos(folder / "images", 3)
     for path in (
         "sparse/0/cameras.bin",
+        "sparse/0/images.bin",
+        "sparse/0/points3D.bin",
         "output/a/point_cloud/iteration_7000/point_cloud.ply",
         "output/a/point_cloud/iteration_30000/point_cloud.ply",
         "output/a/chkpnt30000.pth",
@@ -165,17 +170,49 @@ def test_what_was_found_can_be_left_out_or_replaced(tmp_path):
     plain, mixed = read_sheet(sheet)
     assert (plain.gaussians, plain.features) == (None, None)
     assert (mixed.gaussians, mixed.features) == (other, None)
+    assert (plain.poses, mixed.poses) == (None, None)
     with pytest.raises(SceneError, match="holds no label file"):
         add_scene(sheet, "lost", folder, labels=tmp_path / "config")
     with pytest.raises(SceneError, match="--features gone is missing"):
         add_scene(sheet, "lost", folder, features=Path("gone"))
 
 
+def test_poses_can_be_ignored_or_named_and_are_recorded(tmp_path):
+    folder, other = langsplat_scene(tmp_path / "theirs"), langsplat_scene(tmp_path / "other")
+    sheet = write_sheet(tmp_path)
+    assert "poses: structure from motion" in str(add_scene(sheet, "own", folder, poses=Path("none")))
+    report = str(add_scene(sheet, "named", folder, poses=other / "sparse/0"))
+    assert f"poses: {other / 'sparse/0'}" in report
+    own, named = read_sheet(sheet)
+    assert (own.poses, own.gaussians) == (NO_POSES, None)  # Gaussians are in the coordinates of those poses
+    assert named.poses == other / "sparse/0" and named.gaussians is not None
+    shutil.rmtree(other)
+    with pytest.raises(SceneError, match=r"line 3, column poses: .*sparse/0 is missing"):
+        read_sheet(sheet)
+
+
+def test_nerfstudios_export_is_found_with_the_record_of_its_coordinates(tmp_path):
+    folder = tmp_path / "theirs"
+    write_photos(folder / "images", 3)
+    for path in ("exports/splat/splat.ply", *(f"outputs/desk/splatfacto/2026-0{n}-01/x" for n in (2, 1))):
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_bytes(b"ply\n")
+    (folder / "transforms.json").write_text("{}")
+    for run in (folder / "outputs/desk/splatfacto").iterdir():
+        (run / "dataparser_transforms.json").write_text("{}")
+    sheet = write_sheet(tmp_path)
+    report = str(add_scene(sheet, "desk", folder))
+    latest = folder / "outputs/desk/splatfacto/2026-02-01/dataparser_transforms.json"
+    assert f"nerfstudio's, by {latest}" in report
+    (row,) = read_sheet(sheet)
+    data = SceneData([row], "", str)
+    assert data.brought(row) == [str(row.gaussians), str(latest), str(folder / "transforms.json")]
+    assert f"--dataparser {latest}" in data.brought_option(row)
+
+
 def test_gaussians_without_known_poses_are_not_taken(tmp_path):
     folder = langsplat_scene(tmp_path / "theirs")
-    (folder / "sparse/0/cameras.bin").unlink()
-    (folder / "sparse/0").rmdir()
-    (folder / "sparse").rmdir()
+    shutil.rmtree(folder / "sparse")
     sheet = write_sheet(tmp_path)
     add_scene(sheet, "desk", folder)
     (row,) = read_sheet(sheet)

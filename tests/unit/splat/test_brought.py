@@ -1,5 +1,6 @@
 """Ready-made Gaussians replace a fit: as other programs write them, in the source's coordinates."""
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -10,10 +11,11 @@ from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 
 from hilsplat.base.artifacts import read_json, write_json
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.brought import bring_gaussians
+from hilsplat.splat.coordinates import write_source_ply
 from hilsplat.splat.fit import run_gaussians
 from hilsplat.splat.ply import load_ply, save_ply
 from hilsplat.splat.similarity import move_gaussians
@@ -100,6 +102,71 @@ def test_a_ply_of_this_package_returns_through_the_json_beside_it(turned_scene, 
     write_json(out / "g.json", {"something": "else"})
     again, origin = bring_gaussians(out / "g.ply", turned_scene)
     assert "JSON" not in origin["taken_as"]
+
+
+def nerfstudio_run(folder: Path, how: str) -> tuple[np.ndarray, dict[str, Path]]:
+    """Training coordinates as nerfstudio's data parser chooses and records them.
+
+    Returns:
+        training_from_source, and the files that describe it.
+    """
+    orient = np.eye(4)  # of the poses in transforms.json: turned upright and centred
+    orient[:3, :3] = Rotation.from_rotvec([0.7, 0.2, -1.1]).as_matrix()
+    orient[:3, 3] = (3.0, -1.0, 0.5)
+    scale = 0.21  # so that all cameras are in the unit cube
+    applied = np.eye(4)
+    applied[:3] = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]  # by ns-process-data, from COLMAP
+    applied_scale = 2.5 if how == "applied" else 1.0
+    content = {} if how != "applied" else {"applied_transform": applied[:3].tolist(), "applied_scale": 2.5}
+    if how == "old":
+        (folder / "colmap/sparse/0").mkdir(parents=True)
+    if how == "colmap":
+        applied = np.eye(4)
+    write_json(folder / "transforms.json", {**content, "frames": []})
+    recorded = {"transform": (orient @ applied)[:3].tolist(), "scale": scale * applied_scale}
+    write_json(folder / "dataparser_transforms.json", recorded)
+    training_from_source = np.diag([scale, scale, scale, 1.0]) @ orient
+    files = {"dataparser": folder / "dataparser_transforms.json"}
+    return training_from_source, files if how == "colmap" else {
+        **files,
+        "transforms": folder / "transforms.json",
+    }
+
+
+@pytest.mark.parametrize("how", ["applied", "old", "colmap"])
+def test_nerfstudios_ply_is_as_sharp_as_its_source(turned_scene, source_ply, tmp_path, how):
+    training_from_source, files = nerfstudio_run(tmp_path / "run", how)
+    save_ply(tmp_path / "splat.ply", move_gaussians(load_ply(source_ply), training_from_source))
+    brought, origin = bring_gaussians(tmp_path / "splat.ply", turned_scene, **files)
+    direct, _ = bring_gaussians(source_ply, turned_scene)
+    np.testing.assert_allclose(brought.means, direct.means, atol=1e-5)
+    assert mean_psnr(turned_scene, brought) == pytest.approx(mean_psnr(turned_scene, direct), abs=0.01)
+    assert "nerfstudio" in origin["taken_as"]
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["[", "[]", {"transform": [[1, 0]], "scale": 1}, {"transform": np.eye(3, 4).tolist(), "scale": 0}],
+)
+def test_a_damaged_record_of_nerfstudio_is_named(turned_scene, source_ply, tmp_path, content):
+    path = tmp_path / "dataparser_transforms.json"
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    with pytest.raises(SceneError, match=r"dataparser_transforms\.json"):
+        bring_gaussians(source_ply, turned_scene, path)
+
+
+def test_exported_gaussians_are_in_the_sources_coordinates(turned_scene, source_ply, tmp_path):
+    out = tmp_path / "out"
+    run_gaussians(
+        turned_scene.folder, out / "g.ply", out / "r", tmp_path, GaussiansSettings(), 0, 1, brought=source_ply
+    )
+    assert write_source_ply(out / "g.ply", tmp_path / "exported.ply") == len(three_gaussians())
+    exported, theirs = load_ply(tmp_path / "exported.ply"), load_ply(source_ply)
+    for name in ("means", "log_scales", "opacity_logits", "sh"):
+        np.testing.assert_allclose(getattr(exported, name), getattr(theirs, name), atol=1e-4)
+    (out / "g.json").unlink()
+    with pytest.raises(ArtifactError, match=r"g\.json is missing"):
+        write_source_ply(out / "g.ply", tmp_path / "again.ply")
 
 
 def rewritten(source: Path, target: Path, change, *, text: bool = False) -> Path:

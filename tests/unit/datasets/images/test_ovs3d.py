@@ -8,7 +8,7 @@ from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
 from hilsplat.datasets.images.ovs3d import open_scene, read_classes
 from hilsplat.datasets.labelled import posed_images
-from hilsplat.scene.llff import read_poses_bounds
+from hilsplat.scene.importers.llff import read_poses_bounds
 from hilsplat.scene.poses import run_poses
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import PosesSettings

@@ -9,7 +9,6 @@ from PIL import Image
 
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.classes.replica import REPLICA_48, REPLICA_51
-from hilsplat.datasets.points.posed_images import PosedImage
 from hilsplat.datasets.points.replica import open_scene, read_images
 from hilsplat.datasets.points.replica_mesh import (
     class_of_objects,
@@ -19,6 +18,7 @@ from hilsplat.datasets.points.replica_mesh import (
     triangles_of,
 )
 from hilsplat.datasets.registry import DATASETS
+from hilsplat.scene.posed_images import PosedImage
 from tests.unit.datasets.writers.ply import write_ply
 from tests.unit.datasets.writers.replica import write_semantic_mesh, write_sequence
 

@@ -11,12 +11,12 @@ from hilsplat.base.errors import MisalignedArtifactError, SceneError
 from hilsplat.datasets.classes.replica import REPLICA_48
 from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_19
 from hilsplat.datasets.classes.scannet200 import SCANNET200, SCANNET200_INSTANCES
-from hilsplat.datasets.points.posed_images import PosedImage, write_posed_images
 from hilsplat.datasets.points.scannet import LABEL_TABLE, open_scan, read_label_table
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.sources import export_images
-from hilsplat.scene.known_poses import find_known_poses
-from hilsplat.scene.known_views import read_transforms
+from hilsplat.scene.importers.known_poses import find_known_poses
+from hilsplat.scene.importers.known_views import read_transforms
+from hilsplat.scene.posed_images import PosedImage, write_posed_images
 from tests.unit.datasets.writers.scannet import write_label_table, write_scan
 
 SCAN = "scene0000_00"

@@ -14,7 +14,7 @@ from jaxtyping import Float64
 from hilsplat.base.artifacts import write_json, write_text
 from hilsplat.base.errors import SceneError
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.scene.llff import POSES_BOUNDS
+from hilsplat.scene.importers.llff import POSES_BOUNDS
 from tests.unit.datasets.writers.polygons import polygons_of
 from tests.unit.datasets.writers.true_world import (
     TrueWorld,

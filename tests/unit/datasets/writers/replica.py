@@ -9,8 +9,8 @@ from jaxtyping import Float32, Int32
 
 from hilsplat.base.artifacts import atomic_folder, write_json, write_text
 from hilsplat.datasets.classes.replica import NAMES
-from hilsplat.datasets.points.posed_images import HALF_PIXEL, PosedImage
 from hilsplat.datasets.points.replica import NICE_SLAM
+from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage
 from tests.unit.datasets.writers.ply import write_ply
 
 UNDEFINED, NO_OBJECT = -1, -2

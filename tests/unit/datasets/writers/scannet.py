@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from hilsplat.base.artifacts import atomic_folder, atomic_path, write_text
-from hilsplat.datasets.points.posed_images import HALF_PIXEL, PosedImage
 from hilsplat.datasets.points.scannet import LABEL_TABLE
+from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage
 from tests.unit.datasets.writers.ply import write_ply
 
 SEGMENT_STEP = 7

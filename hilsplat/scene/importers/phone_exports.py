@@ -14,7 +14,7 @@ from hilsplat.base.errors import SceneError
 from hilsplat.base.files import list_images
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.colmap import pycolmap
-from hilsplat.scene.known_poses import KnownPoses, KnownView
+from hilsplat.scene.importers.known_poses import KnownPoses, KnownView
 
 MAX_VIEWS = 300
 """A recording has many more frames than a scene needs; views are then taken at even distances (nerfstudio:

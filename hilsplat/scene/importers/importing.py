@@ -17,8 +17,8 @@ from hilsplat.scene.assemble import PosedView, split_views, undistort, write_sce
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.features import EXIF_ORIENTATION
 from hilsplat.scene.first_points import MIN_TRIANGULATED, NUM_RANDOM_POINTS, random_points, triangulate
-from hilsplat.scene.known_poses import KnownPoses, KnownView
-from hilsplat.scene.known_views import known_views, read_colmap, read_transforms
+from hilsplat.scene.importers.known_poses import KnownPoses, KnownView
+from hilsplat.scene.importers.known_views import known_views, read_colmap, read_transforms
 from hilsplat.scene.view_names import view_names
 from hilsplat.settings import PosesSettings
 
@@ -96,7 +96,10 @@ def import_poses(
     observed = [(entry["observations"], entry["reprojection_error_px"]) for entry in errors.values()]
     num_observations = sum(count for count, error in observed if error is not None)
     total_error = sum(count * error for count, error in observed if error is not None)
-    source = ", ".join(path.relative_to(known.root).as_posix() for path in known.files)
+    source = ", ".join(
+        path.relative_to(known.root).as_posix() if path.is_relative_to(known.root) else path.name
+        for path in known.files
+    )
     report = {
         "scene": name,
         "poses": f"imported from {source}",

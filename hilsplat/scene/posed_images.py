@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from plyfile import PlyData, PlyElement
 
 from hilsplat.base.artifacts import atomic_folder, write_text
@@ -63,7 +63,10 @@ def cam_from_world_of(world_from_cam: Float[np.ndarray, "4 4"], where: str) -> F
 
 
 def write_posed_images(
-    folder: Path, images: Sequence[PosedImage], points: Float[np.ndarray, "P 3"] | None = None
+    folder: Path,
+    images: Sequence[PosedImage],
+    points: Float[np.ndarray, "P 3"] | None = None,
+    colours: UInt8[np.ndarray, "P 3"] | None = None,
 ) -> None:
     """Write `images/` and `transforms.json` (OpenGL axes, intrinsics per frame): a source for `poses`.
 
@@ -73,7 +76,8 @@ def write_posed_images(
     Args:
         folder: written completely or not at all; an existing one is replaced.
         images: at least one, names all different.
-        points: positions known from the data set, metres.
+        points: positions known from the data set, in the unit of the poses.
+        colours: their colours, if known.
 
     Raises:
         SceneError: two images share a name, or there are none.
@@ -99,9 +103,12 @@ def write_posed_images(
         content: dict[str, object] = {"frames": frames}
         if points is not None:
             content["ply_file_path"] = "points.ply"
-            table = np.empty(len(points), [(axis, "<f4") for axis in "xyz"])
-            for axis, values in zip("xyz", np.asarray(points).T, strict=True):
-                table[axis] = values
+            columns = {axis: ("<f4", np.asarray(points)[:, k]) for k, axis in enumerate("xyz")}
+            if colours is not None:
+                columns |= {name: ("u1", colours[:, k]) for k, name in enumerate(("red", "green", "blue"))}
+            table = np.empty(len(points), [(name, kind) for name, (kind, _) in columns.items()])
+            for name, (_, values) in columns.items():
+                table[name] = values
             PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(temporary / "points.ply")
         write_text(temporary / "transforms.json", json.dumps(content, indent=1) + "\n")
 

@@ -14,10 +14,10 @@ from hilsplat.base.files import IMAGE_SUFFIXES, list_images
 from hilsplat.base.images import open_image
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.colmap import pycolmap
-from hilsplat.scene.known_poses import KnownPoses, KnownView
-from hilsplat.scene.llff import llff_views
+from hilsplat.scene.importers.known_poses import KnownPoses, KnownView
+from hilsplat.scene.importers.llff import llff_views
+from hilsplat.scene.importers.phone_exports import OPENGL_TO_OPENCV, read_polycam, read_record3d
 from hilsplat.scene.model import camera_of, pose_matrix, reprojection_errors, sparse_points
-from hilsplat.scene.phone_exports import OPENGL_TO_OPENCV, read_polycam, read_record3d
 
 
 def known_views(known: KnownPoses) -> list[KnownView]:
@@ -129,8 +129,8 @@ def read_transforms(
                 raise SceneError(f"{file}, frame {number} is not an object", fix="export it again")
             views.append(_read_frame(known, file, number, {**content, **frame}))
         if points is None and isinstance(content.get("ply_file_path"), str):
-            _check_inside(known.root, content["ply_file_path"])
-            points = _read_ply_points(known.root / content["ply_file_path"])
+            _check_inside(file.parent, content["ply_file_path"])
+            points = _read_ply_points(file.parent / content["ply_file_path"])
     return views, points
 
 

@@ -8,12 +8,10 @@ from jaxtyping import Float64
 
 from hilsplat.base.errors import SceneError
 from hilsplat.scene.colmap import pycolmap
-from hilsplat.scene.layouts import polycam_folders, record3d_export
-from hilsplat.scene.llff import POSES_BOUNDS
+from hilsplat.scene.importers.llff import POSES_BOUNDS
+from hilsplat.scene.layouts import MODELS, NO_POSES, TRANSFORMS, polycam_folders, record3d_export
 
-MODEL_FOLDERS = ("sparse/0", "sparse")
 MODEL_FILES = ("cameras", "images", "points3D")
-TRANSFORMS = ("transforms.json", "transforms_train.json")
 
 
 @dataclass(frozen=True)
@@ -21,7 +19,7 @@ class KnownPoses:
     """Where a folder has its poses.
 
     Attributes:
-        root: the folder.
+        root: folder of the images.
         kind: "colmap", "transforms", "llff", "polycam" or "record3d".
         files: the model folder; the transforms files (training first, then testing); LLFF's file; Polycam's
             folders of images and cameras; Record3D's folder of images and its file of poses.
@@ -53,14 +51,23 @@ class KnownView:
     border_px: int = 0
 
 
-def find_known_poses(folder: Path) -> KnownPoses | None:
+def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | None:
     """Look for a COLMAP model, transforms, LLFF's file, Polycam or Record3D, in this order; None if none.
 
+    Args:
+        folder: folder of the images.
+        named: a COLMAP model, a transforms file, or a folder with either, used instead of the poses in
+            `folder`; `layouts.NO_POSES`: none are used.
+
     Raises:
-        SceneError: there is a `sparse/` folder without a complete model in it.
+        SceneError: there is a `sparse/` folder without a complete model in it, or `named` has no poses.
     """
     folder = Path(folder)
-    for place in MODEL_FOLDERS:
+    if named == NO_POSES:
+        return None
+    if named is not None:
+        return _named_poses(folder, named)
+    for place in MODELS:
         if _is_model(folder / place):
             return KnownPoses(folder, "colmap", (folder / place,))
     for name in TRANSFORMS:
@@ -82,6 +89,22 @@ def find_known_poses(folder: Path) -> KnownPoses | None:
             fix="complete the model, or rename sparse/ to have the poses computed",
         )
     return None
+
+
+def _named_poses(folder: Path, named: Path) -> KnownPoses:
+    """Poses that a user names for the images of a folder."""
+    if named.is_file() and named.suffix == ".json":
+        return KnownPoses(folder, "transforms", (named,))
+    if _is_model(named):
+        return KnownPoses(folder, "colmap", (named,))
+    found = find_known_poses(named) if named.is_dir() else None
+    if found is None or found.kind not in ("colmap", "transforms"):
+        raise SceneError(
+            f"{named} has no poses for {folder}",
+            expected="a COLMAP model, a transforms.json, or a folder with either",
+            fix="correct the path, or leave it out to use what is beside the images",
+        )
+    return KnownPoses(folder, found.kind, found.files)
 
 
 def _is_model(folder: Path) -> bool:

@@ -1,0 +1,58 @@
+"""Write a scene for other programs: COLMAP, nerfstudio. All coordinates are those of the scene's source."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from hilsplat.base.artifacts import atomic_folder
+from hilsplat.scene.assemble import move_cameras
+from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.posed_images import PosedImage, write_posed_images
+from hilsplat.scene.scene import Scene
+
+
+def source_images(scene: Scene) -> list[PosedImage]:
+    """Return the undistorted images of a scene with their poses in the source's coordinates."""
+    poses = move_cameras(scene.cameras.cam_from_world, np.linalg.inv(scene.scene_from_source))
+    return [
+        PosedImage(name, scene.image_path(name), pose, scene.cameras[name].K, scene.cameras[name].size_hw)
+        for name, pose in zip(scene.cameras.names, poses, strict=True)
+    ]
+
+
+def source_points(scene: Scene) -> Float64[np.ndarray, "P 3"]:
+    """Return the sparse points of a scene in the source's coordinates."""
+    source_from_scene = np.linalg.inv(scene.scene_from_source)
+    return scene.points_xyz.astype(np.float64) @ source_from_scene[:3, :3].T + source_from_scene[:3, 3]
+
+
+def write_colmap(scene: Scene, out: Path) -> None:
+    """Write `images/` and a COLMAP model in `sparse/0` (binary; points without tracks)."""
+    with atomic_folder(out) as folder:
+        add_colmap(scene, folder)
+
+
+def add_colmap(scene: Scene, folder: Path) -> None:
+    """Write `images/` and `sparse/0` into a folder that is being written."""
+    (folder / "images").mkdir()
+    model = pycolmap.Reconstruction()
+    for number, posed in enumerate(source_images(scene), start=1):
+        shutil.copyfile(scene.image_path(posed.name), folder / "images" / posed.name)
+        (height, width), K = posed.size_hw, posed.K
+        lens = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(model="PINHOLE", width=width, height=height, params=lens, camera_id=number)
+        )
+        image = pycolmap.Image(name=posed.name, camera_id=number, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(posed.cam_from_world[:3]))
+    for xyz, rgb in zip(source_points(scene), scene.points_rgb, strict=True):
+        model.add_point3D(xyz, pycolmap.Track(), rgb)
+    (folder / "sparse" / "0").mkdir(parents=True)
+    model.write_binary(folder / "sparse" / "0")
+
+
+def write_nerfstudio(scene: Scene, out: Path) -> None:
+    """Write `images/`, `transforms.json` and the sparse points in `points.ply`."""
+    write_posed_images(out, source_images(scene), source_points(scene), scene.points_rgb)

@@ -1,0 +1,75 @@
+"""Coordinates in which nerfstudio trains: its data parser turns, centres and scales the poses."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from hilsplat.base.artifacts import parse_json
+from hilsplat.base.errors import SceneError
+
+BEFORE_APPLIED_TRANSFORM = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+"""What `ns-process-data` did to COLMAP's coordinates before it recorded `applied_transform`."""
+
+
+def source_from_dataparser(dataparser: Path, transforms: Path | None) -> Float64[np.ndarray, "4 4"]:
+    """Return the similarity from nerfstudio's training coordinates to those of the source's poses.
+
+    `dataparser_transforms.json` maps original coordinates, usually COLMAP's, to training coordinates:
+    `x_training = scale * (transform @ [x_original, 1])`. The poses in `transforms.json` are in a third
+    system, which `applied_transform` and `applied_scale` in that file relate to the original one.
+
+    Args:
+        dataparser: the `dataparser_transforms.json` of the training run.
+        transforms: the `transforms.json` with the source's poses; None if COLMAP's model has them.
+
+    Raises:
+        SceneError: a file is damaged, or a transform cannot be inverted.
+    """
+    content = _read(dataparser)
+    applied, applied_scale = np.eye(4), 1.0
+    if transforms is not None:
+        saved = _read(transforms)
+        if "applied_transform" in saved:
+            applied = _matrix(transforms, "applied_transform", saved)
+        elif (transforms.parent / "colmap/sparse/0").is_dir():
+            applied[:3] = BEFORE_APPLIED_TRANSFORM
+        applied_scale = _scale(transforms, "applied_scale", saved)
+    training_from_source = _matrix(dataparser, "transform", content) @ np.linalg.inv(applied)
+    training_from_source[:3] *= _scale(dataparser, "scale", content) / applied_scale
+    return np.linalg.inv(training_from_source)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        content = parse_json(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise SceneError(f"{path} cannot be read: {error}", fix="copy it again from nerfstudio") from error
+    if not isinstance(content, dict):
+        raise SceneError(f"{path} is not a JSON object", fix="copy it again from nerfstudio")
+    return content
+
+
+def _matrix(path: Path, key: str, content: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
+    matrix = np.eye(4)
+    try:
+        matrix[:3] = np.array(content[key], np.float64)[:3]
+        usable = bool(np.isfinite(matrix).all()) and abs(np.linalg.det(matrix)) > 1e-12
+    except (KeyError, TypeError, ValueError, IndexError):
+        usable = False
+    if not usable:
+        raise SceneError(
+            f"{path}: {key} cannot be used",
+            expected="a 3 x 4 matrix that can be inverted",
+            found=repr(content.get(key))[:80],
+            fix="copy it again from nerfstudio",
+        )
+    return matrix
+
+
+def _scale(path: Path, key: str, content: dict[str, Any]) -> float:
+    value = content.get(key, 1.0)
+    if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value < float("inf"):
+        raise SceneError(f"{path}: {key} is not a positive number", found=repr(value)[:80])
+    return float(value)
