@@ -53,6 +53,8 @@ onstart:
 
 
 onsuccess:
+    for line in targets.summary(PLAN):
+        logger.info(line)
     unmark_run()
 
 

@@ -18,6 +18,7 @@ rule clip:
     resources:
         mem_mb=RESOURCES.memory_mb("clip"),
         runtime=RESOURCES.minutes("clip"),
+        gpu=RESOURCES.gpus("clip"),
     params:
         settings=PLAN.settings("clip"),
         model=PLAN.model("clip"),

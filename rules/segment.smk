@@ -21,6 +21,7 @@ rule masks:
     resources:
         mem_mb=RESOURCES.memory_mb("masks"),
         runtime=RESOURCES.minutes("masks"),
+        gpu=RESOURCES.gpus("masks"),
     params:
         settings=PLAN.settings("masks"),
         model=PLAN.model("masks"),

@@ -1,5 +1,6 @@
 """The device of the sparse algebra after the fit: our kernels on the CPU, or torch on CUDA."""
 
+import importlib.metadata
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,6 +12,16 @@ from hilsplat.base.errors import DeviceError
 logger = logging.getLogger(__name__)
 
 ComputeDevice = Literal["cpu", "cuda"]
+
+
+@cache
+def is_installed(distribution: str) -> bool:
+    """Return whether a distribution is installed, such as `onnxruntime-gpu`."""
+    try:
+        importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    return True
 
 
 @cache

@@ -56,6 +56,7 @@ def new(
     """
     start_logging()
     from hilsplat.photos.add import add_scene
+    from hilsplat.scene.sheet import read_sheet
     from hilsplat.workflow.models import models_of_photographs
 
     report = add_scene(
@@ -74,7 +75,8 @@ def new(
         f"  hilsplat run photos/{name}\n"
         f"  hilsplat query photos/{name} 'bear nose'"
     )
-    for line in models_of_photographs(sheet.with_name("config.yaml"), name):
+    features = read_sheet(sheet, checked_groups=())[-1].features
+    for line in models_of_photographs(sheet.with_name("config.yaml"), name, features):
         typer.echo(line)
 
 

@@ -105,7 +105,7 @@ def run_contributions(
         "gaussians": gaussians_sha256,
         "min_weight": settings.min_weight,
     }
-    names = digests if read_index(masks_folder).get("key_views") else scene.views("train")
+    names = digests if read_index(masks_folder).get("partial") else scene.views("train")
     cameras = [scene.cameras[name] for name in names]
     keys = [_key(camera, digests, about) for camera in cameras]
     store = ViewCache(Path(cache) / "contributions", compressed=False)

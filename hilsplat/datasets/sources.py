@@ -4,6 +4,7 @@ labels.
 The workflow uses this module at start-up, so it reads no data and imports nothing heavy at the top.
 """
 
+from collections.abc import Collection
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
@@ -46,6 +47,26 @@ def absence(source: str, data_root: str) -> str | None:
     except SceneError as error:
         return _one_line(error)
     return None
+
+
+def unlisted(sources: Collection[str], groups: Collection[str], data_root: str) -> list[str]:
+    """Return scenes on disk that no row lists, of data sets whose scenes differ between users (Waymo).
+
+    Args:
+        sources: of all rows of the scene sheet.
+        groups: groups that are run; such a data set has the name of its group.
+        data_root: folder of the data sets; empty if not set.
+    """
+    from hilsplat.datasets.registry import DATASETS, dataset_of
+
+    open_ended = [dataset_of(name) for name in groups if data_root and name in DATASETS]
+    found = [
+        f"{dataset.name}/{scene}"
+        for dataset in open_ended
+        if not dataset.scenes
+        for scene in dataset.found(Path(data_root).expanduser() / dataset.folder)
+    ]
+    return [name for name in found if DATA_PREFIX + name not in sources]
 
 
 def label_sets(source: str, data_root: str, row: str) -> tuple[str, ...]:

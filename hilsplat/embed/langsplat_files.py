@@ -33,6 +33,9 @@ logger = logging.getLogger(__name__)
 SHAPE_TOLERANCE = 0.01
 """Relative difference between the shapes of maps and view that is rounding."""
 
+LEAST_SHARE = 0.5
+"""Share of the training views that must have files; fewer are likely to be those of another scene."""
+
 CHECKED_MASKS, LEAST_COSINE = 32, 0.8
 """Masks that are embedded again, and the least median cosine of their vectors. The same CLIP reaches 0.99;
 another one of the same width about 0."""
@@ -134,23 +137,27 @@ def read_view(
 
 
 def _read_all(scene: Scene, folder: Path) -> dict[str, tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]]:
-    """Masks and vectors of every training view.
+    """Masks and vectors of the training views that have files.
 
     Raises:
-        ArtifactError: a view has no files.
+        ArtifactError: fewer than half of the views have files.
     """
     stems = stems_of(train_views(scene))
-    missing = [view for view, stem in stems.items() if not (folder / f"{stem}_s.npy").is_file()]
-    if missing:
+    views = [view for view, stem in stems.items() if (folder / f"{stem}_s.npy").is_file()]
+    missing = [f"{stem}_s.npy" for view, stem in stems.items() if view not in views]
+    lacking = f"{folder} lacks the maps of {len(missing)} of {len(stems)} training views of {scene.name}"
+    if len(views) < LEAST_SHARE * len(stems):
         raise ArtifactError(
-            f"{folder} lacks the maps of {len(missing)} of {len(stems)} training views of {scene.name}",
-            expected=", ".join(f"{stems[view]}_s.npy" for view in missing[:5]),
+            lacking,
+            expected=", ".join(missing[:5]),
             found=", ".join(sorted(path.name for path in folder.glob("*_s.npy"))[:5]) or "none",
             fix="pass the folder language_features that LangSplat made from the same images",
         )
+    if missing:
+        logger.warning("%s: %s", lacking, ", ".join(missing[:5]))
     return {
         view: read_view(folder, view, scene.cameras[view].size_hw)
-        for view in track(list(stems), "LangSplat's files")
+        for view in track(views, "LangSplat's files")
     }
 
 
@@ -162,7 +169,15 @@ def read_masks(scene_folder: Path, files: Path, out: Path) -> None:
         for view, (masks, _) in _read_all(scene, files).items():
             masks.save(folder / f"{view}.npz")
             index[view] = index_entry(masks)
-        write_index(folder, index, scene=scene.name, segmenter="langsplat", model=None, model_sha256=None)
+        write_index(
+            folder,
+            index,
+            scene=scene.name,
+            partial=len(index) < len(train_views(scene)),
+            segmenter="langsplat",
+            model=None,
+            model_sha256=None,
+        )
         counts.update(views=len(index))
 
 

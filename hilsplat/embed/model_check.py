@@ -9,11 +9,14 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.embed.clip import ClipModel
 from hilsplat.models.folder import ModelFolder, input_side_px, open_model_folder
 from hilsplat.models.int8 import int8_network, may_be_int8
-from hilsplat.models.network import require_one_space
+from hilsplat.models.network import execution_providers, require_one_space
 from hilsplat.segment.sam import SamModel
 
 CACHE = Path("results/.cache")
 """Stores measured seconds, and int8 networks if the models are read-only."""
+
+LARGEST_PROVIDER_DIFFERENCE = 0.02
+"""Relative difference that rounding explains: TF32 products on CUDA."""
 
 Seconds = dict[str, float]
 """SAM: per "image", and per prompt for its "masks" and, if there is one, its "preview". CLIP: per "crop"."""
@@ -62,6 +65,31 @@ def check_model(folder: Path, variant: str = "") -> str:
         _remember(folder, variant, precision, each)
     lines += [f"time       {times}", f"runs on    {', '.join(providers)}", f"digest     {model.digest}"]
     return "\n".join(lines)
+
+
+def provider_disagreement(folder: Path) -> str | None:
+    """Return how the image network differs between onnxruntime's providers on a random image, or None.
+
+    Raises:
+        ModelError: as for `open_model_folder` and `Network`.
+    """
+    model = open_model_folder(folder)
+    name = "vision_encoder" if model.kind == "sam" else "vision_model"
+    side = input_side_px(model)
+    pixels = np.random.default_rng(0).normal(size=(1, 3, side, side)).astype(np.float32)
+    providers = execution_providers()
+    if len(providers) < 2:
+        return None
+    outputs = {
+        provider: model.network(name, provider=provider)(pixel_values=pixels) for provider in providers
+    }
+    reference = outputs.pop("CPUExecutionProvider")
+    for provider, found in outputs.items():
+        pairs = zip(reference, found, strict=True)
+        apart = max(float(np.linalg.norm(a - b)) / max(float(np.linalg.norm(a)), 1e-12) for a, b in pairs)
+        if not apart <= LARGEST_PROVIDER_DIFFERENCE:
+            return f"{provider} differs from the CPU by {apart:.2g} of the output's norm"
+    return None
 
 
 def seconds_of(folder: Path, variant: str, precision: str, cache: Path) -> Seconds:

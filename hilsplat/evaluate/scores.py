@@ -1,6 +1,6 @@
 """Rows of `scores.csv`: one number each, in long form."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -90,3 +90,28 @@ def read_scores(paths: Iterable[Path]) -> "pd.DataFrame":
         frames.append(pd.DataFrame(columns=list(COLUMNS), dtype=str))
     scores = pd.concat(frames, ignore_index=True)
     return scores.assign(value=scores["value"].astype(float), n=scores["n"].astype(int))
+
+
+def score_summary(scene: str, files: Mapping[str, Path]) -> list[str]:
+    """Return a table of mean IoU and localization for people: a line per variant, answerer and protocol.
+
+    Args:
+        scene: name of the scene.
+        files: score files, by name of the variant.
+
+    Raises:
+        ArtifactError: a file cannot be read.
+    """
+    lines = []
+    for name, path in files.items():
+        scores = read_scores([path])
+        for (method, protocol), rows in scores.groupby(["method", "protocol"]):
+            means = rows.groupby("metric")["value"].mean()
+            if "iou" not in means:
+                continue
+            localized = f"{means['localization_mask']:>9.1%}" if "localization_mask" in means else f"{'-':>9}"
+            queries = int((rows["metric"] == "iou").sum())
+            label = f"{name}, {method}"
+            lines.append(f"  {label:<26} {means['iou']:>7.1%} {localized} {queries:>9}  {protocol}")
+    heading = f"  {'':<26} {'mIoU':>7} {'localized':>9} {'queries':>9}  protocol"
+    return [f"scores of {scene} against your labels:", heading, *lines] if lines else []

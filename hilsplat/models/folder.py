@@ -68,9 +68,11 @@ class ModelFolder:
             [(path.relative_to(self.folder).as_posix(), sha256_of_file(path)) for path in self.files]
         )
 
-    def network(self, name: str, threads: int = 1, graph: bytes | None = None) -> Network:
+    def network(
+        self, name: str, threads: int = 1, graph: bytes | None = None, provider: str | None = None
+    ) -> Network:
         """Open one of the model's networks and check its inputs and outputs (see `Network`)."""
-        return Network(self.networks[name], LAYOUTS[self.layout].usable[name], threads, graph)
+        return Network(self.networks[name], LAYOUTS[self.layout].usable[name], threads, graph, provider)
 
 
 def open_model_folder(

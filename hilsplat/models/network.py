@@ -39,7 +39,14 @@ class Network:
     sums inside a call then do not depend on the number of threads. Several threads may call it.
     """
 
-    def __init__(self, path: Path, spec: NetworkSpec, threads: int = 1, graph: bytes | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        spec: NetworkSpec,
+        threads: int = 1,
+        graph: bytes | None = None,
+        provider: str | None = None,
+    ) -> None:
         """Open a network.
 
         Args:
@@ -47,6 +54,7 @@ class Network:
             spec: its inputs and outputs.
             threads: of one call.
             graph: a changed graph that takes the file's place (`onnx_graph`).
+            provider: the only execution provider to use; None: the first that works.
 
         Raises:
             ModelError: it cannot be read, or its inputs or outputs have other names or axes than expected.
@@ -65,7 +73,7 @@ class Network:
             )
         try:
             self.session = onnxruntime.InferenceSession(
-                graph or str(path), options, providers=execution_providers()
+                graph or str(path), options, providers=[provider] if provider else execution_providers()
             )
         except Exception as error:  # onnxruntime's errors share no public base class
             raise ModelError(

@@ -114,7 +114,7 @@ def run_masks(
             for view, masks in zip(views, track(found, "masks of views", len(views)), strict=True):
                 masks.save(folder / f"{view}.npz")
                 index[view] = index_entry(masks)
-            write_index(folder, index, scene=scene.name, key_views=key_views is not None, **identity)
+            write_index(folder, index, scene=scene.name, partial=key_views is not None, **identity)
         total = {level.label: sum(entry[level.label] for entry in index.values()) for level in LEVELS}
         for level, number in total.items():
             if not number:

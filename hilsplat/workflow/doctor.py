@@ -14,6 +14,7 @@ from typing import Literal
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
+from hilsplat.base.device import is_installed
 from hilsplat.base.errors import HilsplatError
 from hilsplat.configuration import merged_config
 from hilsplat.models.memory import machine_mib
@@ -74,6 +75,8 @@ def libraries() -> Iterator[Finding]:
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue
         number += 1
+        if requirement.name == "onnxruntime" and is_installed("onnxruntime-gpu"):
+            continue  # it takes its place
         try:
             found = importlib.metadata.version(requirement.name)
         except importlib.metadata.PackageNotFoundError:
@@ -92,8 +95,7 @@ def onnx() -> Iterator[Finding]:
     """Where onnxruntime runs networks, and whether two builds of it overwrite each other."""
     import onnxruntime
 
-    both = [name for name in ("onnxruntime", "onnxruntime-gpu") if _installed(name)]
-    if len(both) == 2:
+    if is_installed("onnxruntime") and is_installed("onnxruntime-gpu"):
         yield Finding(
             "onnxruntime",
             "fault",
@@ -149,18 +151,23 @@ def video() -> Iterator[Finding]:
 
 
 def models() -> Iterator[Finding]:
-    """Run each model that photographs use."""
-    from hilsplat.embed.model_check import check_model
+    """Run each model that photographs use, on each of onnxruntime's providers."""
+    from hilsplat.embed.model_check import check_model, provider_disagreement
+    from hilsplat.models.network import execution_providers
 
     real = [model for model in present_models() if not model.embedded]
     missing = {"sam", "clip"} - {model.family for model in real}
     for model in real or present_models():
         try:
             check_model(model.folder)
+            apart = provider_disagreement(model.folder)
         except HilsplatError as error:
             yield Finding("models", "fault", str(error), f"hilsplat models get {model.folder.name}")
+            continue
+        if apart:
+            yield Finding("models", "fault", f"{model.folder}: {apart}", "pip install onnxruntime instead")
         else:
-            yield Finding("models", "ok", f"{model.folder} works")
+            yield Finding("models", "ok", f"{model.folder} works on {' and '.join(execution_providers())}")
     if missing:
         names = " and no ".join(family.upper() for family in sorted(missing))
         yield Finding(
@@ -245,14 +252,6 @@ CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
 def _existing(folder: Path) -> Path:
     """Return the folder, or the nearest one above it that exists."""
     return next(path for path in (folder, *folder.resolve().parents) if path.exists())
-
-
-def _installed(name: str) -> bool:
-    try:
-        importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return False
-    return True
 
 
 def _codec(name: str, mode: Literal["r", "w"]) -> bool:

@@ -59,8 +59,10 @@ def _require_model(folder: Path, kind: str, variant: str) -> None:
     )
 
 
-def describe_models(stages: StageSettings) -> str:
-    """Name the segmenter and the CLIP of settings without `auto`."""
+def describe_models(stages: StageSettings, features: Path | None = None) -> str:
+    """Name the segmenter and the CLIP of settings without `auto`, or LangSplat's files in place of both."""
+    if features is not None:
+        return f"masks and their vectors from {features}; text queries by {Path(stages.clip.model).name}"
     masks = {
         "sam": f"masks by {Path(stages.masks.model).name}",
         "graph": "masks by the graph segmenter, regions of even colour",
@@ -75,16 +77,17 @@ def doubt_about_photographs(stages: StageSettings) -> str:
     return meaningless(clip.folder.name) if clip is not None and clip.embedded else ""
 
 
-def models_of_photographs(config: Path, scene: str) -> list[str]:
+def models_of_photographs(config: Path, scene: str, features: Path | None = None) -> list[str]:
     """Return lines about the models that a scene of photographs will use.
 
     Args:
         config: configuration of the project; if there is none, the installed one counts.
         scene: name of the scene.
+        features: LangSplat's files in place of SAM and CLIP.
 
     Raises:
         SettingsError: the configuration cannot be used.
     """
     run = parse_run(read_config(config if config.is_file() else INSTALLED / CONFIG))
     stages = run.stages("default", (PHOTOS, f"{PHOTOS}/{scene}")).with_models()
-    return [line for line in (describe_models(stages), doubt_about_photographs(stages)) if line]
+    return [line for line in (describe_models(stages, features), doubt_about_photographs(stages)) if line]

@@ -16,6 +16,7 @@ from typing import Any
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.configuration import SECTIONS, UPSTREAM, RunSettings, StageSettings, parse_run, require_known
+from hilsplat.datasets.sources import unlisted
 from hilsplat.methods.registry import METHODS, OURS, require_method
 from hilsplat.models.digests import model_digest
 from hilsplat.models.store import model_path, read_model
@@ -39,6 +40,7 @@ class Plan:
         rows: every scene of the sheet.
         scenes: scenes that are run.
         absent: chosen scenes that are skipped -> the reason.
+        unlisted: scenes below the data root that the sheet does not list.
     """
 
     def __init__(self, config: Mapping[str, Any]) -> None:
@@ -61,6 +63,7 @@ class Plan:
         reasons = {row.name: self.data.absence(row) for row in chosen}
         self.absent = {name: reason for name, reason in reasons.items() if reason is not None}
         self.scenes = tuple(row for row in chosen if row.name not in self.absent)
+        self.unlisted = unlisted({row.source for row in self.rows}, run.groups, run.data_root)
         if not self.scenes:
             raise SettingsError(
                 "there is no scene to run",
@@ -69,6 +72,7 @@ class Plan:
                     [
                         f"groups {list(run.groups)}, only {list(run.only)}, data_root {run.data_root!r}",
                         *(f"{name} is skipped: {reason}" for name, reason in self.absent.items()),
+                        *(f"{name} has no row" for name in self.unlisted),
                     ]
                 ),
                 fix="name a scene (hilsplat run photos/desk) or other groups, or set data_root",
@@ -173,7 +177,8 @@ class Plan:
         scenes: dict[tuple[str, str], list[str]] = {}
         for row in self.scenes:
             stages = self.stages_of("default", self.scopes(row))
-            key = (describe_models(stages), "" if row.world else doubt_about_photographs(stages))
+            described = describe_models(stages, row.features)
+            key = (described, "" if row.world else doubt_about_photographs(stages))
             scenes.setdefault(key, []).append(row.name)
         return [
             line

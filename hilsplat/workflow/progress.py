@@ -216,11 +216,14 @@ class RunProgress:
         Key views answer first; the line after the rest is shorter.
         """
         variant = job.wildcards.get("variant")
-        if job.rule != "clip" or variant not in ("default", KEY_VIEWS):
+        needed = {"clip": "semantic_tree", "semantic_tree": "clip"}.get(job.rule)
+        if needed is None or job.log is None or variant not in ("default", KEY_VIEWS):
+            return []
+        if not (job.log.parents[1] / needed / "index.json").is_file():
             return []
         scene = f"{job.wildcards['dataset']}/{job.wildcards['scene']}"
         commands = [] if self._hint_given else [f'  hilsplat query {scene} "..."', f"  hilsplat view {scene}"]
-        if variant == KEY_VIEWS and job.log is not None:
+        if variant == KEY_VIEWS:
             self._refined.add(scene)
             commands = [refining(job.log.parents[2]), *commands]
         elif scene in self._refined:

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image
 
+from hilsplat.base.device import is_installed
 from hilsplat.base.errors import ModelError
 from hilsplat.models.store import model_path, read_model
 from hilsplat.scene.sheet import SceneRow
@@ -108,8 +109,16 @@ class JobResources:
         return needed
 
     def gpus(self, section: str) -> Callable[[Job], int]:
-        """Resource `gpu` of a rule: 1 if its section says `device: cuda`."""
-        return lambda wildcards: int(getattr(self.plan.stages(wildcards), section).device == "cuda")
+        """Resource `gpu` of a rule: 1 for `device: cuda`, and for networks of onnxruntime's GPU build."""
+
+        def needed(wildcards: Any) -> int:
+            settings = getattr(self.plan.stages(wildcards), section)
+            if section not in ("masks", "clip"):
+                return int(settings.device == "cuda")
+            runs = not self.plan.row(wildcards).features and getattr(settings, "segmenter", "sam") == "sam"
+            return int(runs and is_installed("onnxruntime-gpu"))
+
+        return needed
 
     def core_seconds(self, rule: str, job: Job) -> float:
         """Return the estimated core seconds of a scene's job."""

@@ -1,8 +1,10 @@
 """The targets of a run: tables, the scores that they are built from, and pictures."""
 
 import shlex
+from pathlib import Path
 
 from hilsplat.datasets.sources import published
+from hilsplat.evaluate.scores import score_summary
 from hilsplat.evaluate.tables.build import TABLES
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.workflow.plan import Plan, some
@@ -74,9 +76,38 @@ def default(plan: Plan) -> list[str]:
         if getattr(plan.run, TABLES[name].variants)
     ]
     own = [row for row in labelled(plan) if not data_of(row)]
-    scores = [plan.path(row, "default", "scores.csv") for row in own]
+    scores = [path for row in own for path in own_scores(plan, row).values()]
     has_tables = len(labelled(plan)) > len(own)
     return [*figures(plan), *scores, *(tables(plan) + plots if has_tables else [])]
+
+
+def own_scores(plan: Plan, row: SceneRow) -> dict[str, str]:
+    """Scores of a scene with labels of your own, by the variant's name in tables.
+
+    A scene of LangSplat's features is compared with LangSplat on the same Gaussians, masks and vectors.
+    """
+    variants = ["default"]
+    if row.features:
+        variants += [
+            name for name in plan.run.main_variants if plan.stages_of(name).method.name == "langsplat"
+        ]
+    return {
+        plan.run.labels.get(name, name): plan.path(row, name, "scores.csv")
+        for name in dict.fromkeys(variants)
+    }
+
+
+def summary(plan: Plan) -> list[str]:
+    """Return the scores of finished scenes with labels of your own, for people."""
+    own = [row for row in labelled(plan) if not data_of(row)]
+    return [
+        line
+        for row in own
+        for line in score_summary(
+            row.name,
+            {name: Path(path) for name, path in own_scores(plan, row).items() if Path(path).is_file()},
+        )
+    ]
 
 
 def figures(plan: Plan) -> list[str]:

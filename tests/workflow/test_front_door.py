@@ -1,6 +1,5 @@
 """The finished tiny scene, queried as by a user: from other folders, and after the results moved."""
 
-import json
 import shutil
 import sys
 from pathlib import Path
@@ -46,17 +45,3 @@ def test_another_clip_is_refused(finished: Project, tmp_path: Path) -> None:
         "the CLIP that embedded the masks in results/synthetic/tiny/default/clip was not found"
         in refused.stderr
     )
-
-
-def test_langsplat_files_go_out_and_come_back(finished: Project, tmp_path: Path) -> None:
-    default = finished.root / SCENE / "paper"  # its vectors are of every mask
-    places = ("--masks", str(default.with_name("default") / "masks"), "--clip", str(default / "clip"))
-    hilsplat(finished, tmp_path, "langsplat", "write", *places, "--out", "language_features")
-    model = json.dumps({"model": str(finished.root / "models/clip-tiny")})
-    taken = ("--scene", str(finished.root / SCENE / "scene"), "--features", "language_features")
-    hilsplat(finished, tmp_path, "masks", *taken, "--out", "masks")
-    hilsplat(finished, tmp_path, "clip", *taken, "--masks", "masks", "--settings", model, "--out", "clip")
-    index = json.loads((tmp_path / "clip/index.json").read_text())
-    before = json.loads((default / "clip/index.json").read_text())
-    assert index["model_sha256"] == before["model_sha256"]
-    assert index["views"].keys() == before["views"].keys()

@@ -1,36 +1,36 @@
 """A scene of LangSplat, with poses, Gaussians and features, needs two commands."""
 
 import json
-import shutil
+import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from hilsplat.base.artifacts import read_index
-from hilsplat.scene.posed_images import PosedImage, write_posed_images
-from hilsplat.scene.scene import Scene
 from tests.workflow.conftest import SCENE, Project
 from tests.workflow.test_front_door import hilsplat
 
 
 @pytest.fixture
 def theirs(finished: Project, tmp_path: Path) -> Path:
-    """What 3DGS and LangSplat leave beside the photographs of the tiny scene."""
-    own = finished.root / SCENE
-    scene, folder = Scene.load(own / "scene"), tmp_path / "their scene"
-    images = [
-        PosedImage(view, scene.image_path(view), camera.cam_from_world, camera.K, camera.size_hw)
-        for view, camera in ((name, scene.cameras[name]) for name in scene.cameras.names)
-    ]
-    write_posed_images(folder, images, scene.points_xyz)
+    """What 3DGS and LangSplat leave beside the photographs of the tiny scene, with LERF-OVS's labels."""
+    own, folder = str(finished.root / SCENE), tmp_path / "their scene"
+    export = ("export", own, "--as")
+    hilsplat(finished, tmp_path, *export, "langsplat", "--out", str(folder))
+    hilsplat(finished, tmp_path, *export, "labels", "--out", str(folder / "label"))
+    for path in (folder / "label").glob("*.json"):  # levels are ours: LERF-OVS has none
+        labels = json.loads(path.read_text())
+        for thing in labels["objects"]:
+            del thing["level"], thing["parent"], thing["origin"]
+        path.write_text(json.dumps(labels))
     trained = folder / "output/tiny/point_cloud/iteration_30000"
     trained.mkdir(parents=True)
-    shutil.copy2(own / "gaussians.ply", trained / "point_cloud.ply")
+    (folder / "point_cloud.ply").rename(trained / "point_cloud.ply")
     (folder / "output/tiny/chkpnt30000.pth").write_bytes(b"a pickle")
-    places = ("--masks", str(own / "default/masks"), "--clip", str(own / "paper/clip"))
-    hilsplat(finished, folder, "langsplat", "write", *places, "--out", "language_features")
     return folder
 
 
@@ -41,11 +41,19 @@ def test_a_scene_of_langsplat_answers_after_two_commands(
     said = hilsplat(project, project.root, "new", "theirs", str(theirs))
     assert "iteration_30000/point_cloud.ply" in said and "language_features" in said
     assert "chkpnt30000.pth" in said
-    hilsplat(project, project.root, "run", "theirs", "--", "--cores", "2")
+    told = project.run(sys.executable, "-m", "hilsplat", "run", "theirs", "--", "--cores", "2").stderr
+    assert re.search(r"hilsplat \(tree\) +[0-9.]+%", told) and re.search(
+        r"LangSplat \(ours\) \(field\)", told
+    )
     results = project.root / "results/photos/theirs"
     assert read_index(results / "default/masks")["segmenter"] == "langsplat"
     assert json.loads((results / "gaussians/report.json").read_text())["origin"]["kind"] == "imported"
     assert (results / "default/field.safetensors").is_file()
+    for variant in ("default", "langsplat"):
+        scores = pd.read_csv(results / variant / "scores.csv")
+        field = scores[(scores["protocol"] == "lerf/langsplat@2") & (scores["metric"] == "iou")]
+        assert field["value"].mean() > 0.1, variant
+    assert (project.root / "results/figures/photos/theirs/panel.png").is_file()
     before = hilsplat(finished, finished.root, "query", "synthetic/tiny", "mug", "--out", str(theirs / "a"))
     after = hilsplat(project, project.root, "query", "photos/theirs", "mug", "--out", str(theirs / "b"))
     level = [text.split("\n")[2].split()[1] for text in (before, after)]
@@ -64,6 +72,6 @@ def test_features_of_another_clip_stop_the_run_and_say_which_clip(
     project = fresh()
     hilsplat(project, project.root, "new", "theirs", str(theirs))
     command = ("-c", "from hilsplat.cli.main import main; main()", "run", "theirs", "--", "--cores", "2")
-    failed = project.run("python", *command, check=False)
+    failed = project.run(sys.executable, *command, check=False)
     assert failed.returncode != 0
     assert "clip-vit-b-16-laion2b" in failed.stdout + failed.stderr

@@ -156,12 +156,16 @@ def test_strange_files_are_refused_and_nothing_is_unpickled(tmp_path, maps, vect
         read_view(tmp_path, "a.png", SIZE)
 
 
-def test_missing_views_are_listed(ours, scene, tmp_path):
+def test_views_without_files_are_named_and_most_must_have_them(ours, scene, tmp_path, caplog):
     write_langsplat(*ours, tmp_path / "files")
     (tmp_path / "files" / "b_s.npy").unlink()
-    with pytest.raises(ArtifactError, match=r"lacks the maps of 1 of 2 training views(.|\n)*b_s.npy"):
-        read_masks(scene, tmp_path / "files", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
+    read_masks(scene, tmp_path / "files", tmp_path / "out")
+    assert "lacks the maps of 1 of 2 training views of set/scene: b_s.npy" in caplog.text
+    assert list(read_index(tmp_path / "out")["views"]) == ["a.png"]
+    (tmp_path / "files" / "a_s.npy").unlink()
+    with pytest.raises(ArtifactError, match=r"lacks the maps of 2 of 2 training views(.|\n)*b_s.npy"):
+        read_masks(scene, tmp_path / "files", tmp_path / "other")
+    assert not (tmp_path / "other").exists()
 
 
 def test_views_that_differ_after_a_dot_only_are_refused(ours, tmp_path):

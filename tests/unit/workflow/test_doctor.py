@@ -11,11 +11,23 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from hilsplat.base.device import is_installed
 from hilsplat.base.errors import ModelError
 from hilsplat.cli.main import app
+from hilsplat.models.folder import ModelFolder
 from hilsplat.splat.rasterise import api, parity
 from hilsplat.workflow import doctor
 from tests.unit.models.test_store import lay
+
+CPU = "CPUExecutionProvider"
+
+
+@pytest.fixture(autouse=True)
+def fresh():
+    """Each test looks for distributions anew."""
+    is_installed.cache_clear()
+    yield
+    is_installed.cache_clear()
 
 
 def only(check):
@@ -91,6 +103,36 @@ def test_a_broken_model_is_a_fault_and_missing_real_ones_are_noted(tmp_path, mon
     lay(tmp_path / "models/sam-vit-base", "sam")
     states = {finding.state: finding.found for finding in doctor.models()}
     assert "sam-vit-base" in states["fault"] and "no CLIP" in states["note"]
+
+
+@pytest.mark.parametrize(("shift", "state"), [(0.0, "ok"), (0.1, "fault")])
+def test_a_model_must_give_the_same_on_every_provider(project, monkeypatch, shift, state):
+    monkeypatch.chdir(project)
+    cuda = "CUDAExecutionProvider"
+    monkeypatch.setattr("hilsplat.embed.model_check.check_model", lambda folder: "")
+    monkeypatch.setattr("hilsplat.models.network.execution_providers", lambda: [cuda])
+    monkeypatch.setattr("hilsplat.embed.model_check.execution_providers", lambda: [cuda, CPU])
+    opened = ModelFolder.network
+
+    def network(model: ModelFolder, name: str, provider: str):
+        run = opened(model, name, provider=CPU)
+        return lambda **feeds: [out * (1 + shift * (provider == cuda)) for out in run(**feeds)]
+
+    monkeypatch.setattr(ModelFolder, "network", network)
+    findings = [finding for finding in doctor.models() if finding.state != "note"]
+    assert {finding.state for finding in findings} == {state} and len(findings) == 2
+
+
+def test_the_gpu_build_of_onnxruntime_takes_the_place_of_the_other(monkeypatch):
+    known = importlib.metadata.version
+
+    def version(name: str) -> str:
+        if name == "onnxruntime":
+            raise importlib.metadata.PackageNotFoundError(name)
+        return "1.20" if name == "onnxruntime-gpu" else known(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    assert only(doctor.libraries).state == "ok"
 
 
 @pytest.mark.parametrize(("what", "value"), [("disk", 2**20), ("memory", 100.0)])

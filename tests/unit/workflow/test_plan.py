@@ -201,9 +201,9 @@ def test_each_photograph_is_an_input_and_hidden_files_are_not(tmp_path):
     found = plan(tmp_path, groups=["photos"])
     files = found.data.image_files(Job("photos", "desk"))
     assert [Path(file).name for file in files] == ["0.jpg", "1.jpg"]
-    assert found.data.lens(Job("photos", "desk")) == "--no-render"
+    assert found.data.poses_option(Job("photos", "desk")) == "--no-render"
     assert found.data.image_files(Job("synthetic", "one")) == "results/synthetic/one/world/images"
-    assert found.data.lens(Job("synthetic", "one")) == "--render"
+    assert found.data.poses_option(Job("synthetic", "one")) == "--render"
 
 
 def test_labels_of_a_published_scene_bring_their_reader_and_their_options(tmp_path):
@@ -349,7 +349,7 @@ def test_names_match_themselves_alone():
     assert some(["a", "b", "c", "d", "e"]) == "a, b, c and 2 more"
 
 
-READY = {"params.truth", "params.option", "params.brought", "params.absent", "params.lens"}
+READY = {"params.truth", "params.option", "params.brought", "params.absent", "params.poses"}
 READY |= {"resources.mem_mib", "threads"}
 """What commands take unquoted: options that the plan has quoted, and numbers."""
 

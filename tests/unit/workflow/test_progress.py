@@ -93,11 +93,14 @@ def test_a_finished_stage_is_one_plain_line(run, clock):
     assert stream.getvalue() == "Job stats\nphotos/desk gaussians: 290 s (1 of 3 done, about 2 min left)\n"
 
 
-def test_the_query_commands_are_printed_once(run):
-    stream = io.StringIO()
+@pytest.mark.parametrize("order", [("semantic_tree", "clip"), ("clip", "semantic_tree")])
+def test_the_query_commands_are_printed_once_tree_and_vectors_exist(run, tmp_path, order):
+    variant, stream = tmp_path / "photos/desk/default", io.StringIO()
     shown = display(run, stream)
-    for _ in range(2):
-        start(shown, 2, "clip")
+    for rule in (*order, *order):
+        assert "ready" not in stream.getvalue() or (variant / rule).exists()
+        write_index(variant / rule, {})
+        start(shown, 2, rule, variant / f"logs/{rule}.log")
         tell(shown, "job_finished", job_id=2)
     assert stream.getvalue().count("photos/desk is ready to query:") == 1
     assert stream.getvalue().count('hilsplat query photos/desk "..."') == 1
@@ -110,6 +113,7 @@ def test_answers_of_key_views_are_announced_and_then_those_of_all(run, tmp_path)
     stream = io.StringIO()
     shown = display(run, stream)
     for number, variant in enumerate(("key-views", "default")):
+        write_index(scene / variant / "semantic_tree", {})
         start(shown, number, "clip", scene / variant / "logs/clip.log", variant)
         tell(shown, "job_finished", job_id=number)
     lines = stream.getvalue().splitlines()

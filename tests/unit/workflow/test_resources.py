@@ -90,6 +90,18 @@ def test_a_gpu_is_asked_for_where_the_settings_say_so(tmp_path):
     assert [found.gpus(section)(wildcards()) for section in ("gaussians", "contributions")] == [1, 0]
 
 
+@pytest.mark.parametrize(
+    ("segmenter", "build", "expected"),
+    [("sam", True, [1, 1]), ("graph", True, [0, 1]), ("sam", False, [0, 0])],
+)
+def test_networks_ask_for_a_gpu_with_onnxruntimes_gpu_build(
+    tmp_path, monkeypatch, segmenter, build, expected
+):
+    monkeypatch.setattr("hilsplat.workflow.resources.is_installed", lambda name: build)
+    found = JobResources(plan(tmp_path, masks={"segmenter": segmenter}))
+    assert [found.gpus(section)(wildcards()) for section in ("masks", "clip")] == expected
+
+
 def test_a_ply_that_replaces_the_fit_says_how_many_gaussians_there_are(tmp_path):
     header = b"ply\nformat binary_little_endian 1.0\nelement vertex 812430\nproperty float x\nend_header\n"
     (tmp_path / "brought.ply").write_bytes(header + bytes(10))
