@@ -14,6 +14,7 @@ from hilsplat.datasets.sources import (
     label_files,
     label_sets,
     published,
+    unlisted,
 )
 
 
@@ -49,6 +50,14 @@ def test_only_known_data_sets_are_published_ones():
 def test_what_is_there_is_not_absent(root):
     assert absence("data:lerf_ovs/figurines", str(root)) is None
     assert absence("world:tabletop:201", "") is None
+
+
+def test_segments_on_disk_without_a_row_are_listed(root):
+    for segment in ("one", "two"):
+        touch(root / f"waymo/validation/lidar_segmentation/{segment}.parquet")
+    sources = {"data:waymo/one", "data:lerf_ovs/figurines"}
+    assert unlisted(sources, ["lerf", "waymo"], str(root)) == ["waymo/two"]
+    assert unlisted(sources, ["lerf"], str(root)) == unlisted(sources, ["waymo"], "") == []
 
 
 def test_without_a_data_root_everything_is_absent():
