@@ -71,9 +71,7 @@ def new(
     )
     typer.echo(str(report))
     typer.echo(
-        f"\nadded photos/{name} to {sheet}. Next:\n"
-        f"  hilsplat run photos/{name}\n"
-        f"  hilsplat query photos/{name} 'bear nose'"
+        f"\nadded photos/{name} to {sheet}. Next:\n  hilsplat run {name}\n  hilsplat query {name} 'bear nose'"
     )
     features = read_sheet(sheet, checked_groups=())[-1].features
     for line in models_of_photographs(sheet.with_name("config.yaml"), name, features):

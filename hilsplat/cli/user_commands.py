@@ -1,11 +1,13 @@
 """Query a finished scene, check results and machine, and print the manual of the settings."""
 
 import gc
+import glob
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from hilsplat.base.errors import SettingsError
 from hilsplat.cli.apps import app
 from hilsplat.cli.stage import (
     Results,
@@ -15,7 +17,7 @@ from hilsplat.cli.stage import (
 
 SceneName = Annotated[
     str,
-    typer.Argument(help="dataset/scene in the results folder, such as photos/desk, or a path to its folder"),
+    typer.Argument(help="scene in the results folder, such as desk or photos/desk, or a path to its folder"),
 ]
 
 
@@ -77,8 +79,21 @@ def query(
 
 
 def scene_folder(scene: str, results: Path) -> Path:
-    """Folder of a scene, given as dataset/scene or as a path."""
+    """Return the folder of a scene, given as a name, as dataset/scene, or as a path.
+
+    Raises:
+        SettingsError: several data sets have a scene of this name.
+    """
     named, path = results / scene, Path(scene)
+    if "/" not in scene:
+        found = sorted(folder.parent for folder in results.glob(f"*/{glob.escape(scene)}/scene"))
+        if len(found) > 1:
+            raise SettingsError(
+                f"{scene!r} names several scenes",
+                expected=f"one of {', '.join(f'{folder.parent.name}/{scene}' for folder in found)}",
+            )
+        if found:
+            return found[0]
     return path if path.is_dir() and not named.is_dir() else named
 
 

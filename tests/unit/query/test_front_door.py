@@ -18,6 +18,7 @@ from hilsplat.annotate.labels import NO_FILE, Label, label_path, write_labels
 from hilsplat.base.artifacts import provenance_path, read_npy
 from hilsplat.base.errors import ArtifactError, ModelError, SettingsError
 from hilsplat.base.provenance import Inputs, write_provenance
+from hilsplat.cli.user_commands import scene_folder
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.evaluate.figures.comparison import open_variants
 from hilsplat.evaluate.figures.panel import run_figures
@@ -230,6 +231,16 @@ def test_query_takes_data_set_and_scene_with_the_results_folder(desk, elsewhere,
     assert asked.returncode == 0, asked.stderr
     assert "doubtful: nothing here answers to 'unicorn' better than to a generic word" in asked.stdout
     assert (elsewhere / "copy" / SCENE / "queries/unicorn--handle/panel.png").is_file()
+
+
+def test_a_scene_is_found_by_its_name_alone(desk, tmp_path):
+    results = desk / "results"
+    assert scene_folder("desk", results) == scene_folder("photos/desk", results) == results / "photos/desk"
+    assert scene_folder(str(results / "photos/desk"), Path("elsewhere")) == results / "photos/desk"
+    for dataset in ("photos", "synthetic"):
+        (tmp_path / dataset / "desk/scene").mkdir(parents=True)
+    with pytest.raises(SettingsError, match=r"several scenes(.|\n)*photos/desk, synthetic/desk"):
+        scene_folder("desk", tmp_path)
 
 
 def test_query_says_what_is_missing(elsewhere, project):
