@@ -1,4 +1,4 @@
-"""Images with the pose and lens given by a data set, and the folder from which `poses` imports them."""
+"""Images with known pose and lens, and the folder from which `poses` imports them."""
 
 import json
 import shutil
@@ -21,12 +21,12 @@ HALF_PIXEL = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """One image and its camera, as the data set describes it.
+    """One image and its camera.
 
     Attributes:
         name: file name in the folder that is imported.
         image: the file, or its encoded bytes if the data set keeps images inside other files.
-        cam_from_world: world-to-camera transform, OpenCV axes, metres.
+        cam_from_world: world-to-camera transform, OpenCV axes, in the unit of the scene.
         K: intrinsics, px; the centre of the first pixel is (0.5, 0.5).
         size_hw: height and width, px.
         distortion: k1, k2, p1, p2, k3 as OpenCV defines them.

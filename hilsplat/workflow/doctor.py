@@ -113,7 +113,8 @@ def cuda() -> Iterator[Finding]:
     from hilsplat.splat.rasterise.parity import cuda_disagreement
 
     if problem := cuda_problem():
-        yield Finding("cuda", "note", f"{problem}: everything runs on the CPU", "pip install 'hilsplat[gpu]'")
+        fix = "on a machine with an NVIDIA GPU: pip install 'hilsplat[gpu]'"
+        yield Finding("cuda", "note", f"{problem}: everything runs on the CPU", fix)
     elif apart := cuda_disagreement():
         yield Finding("cuda", "fault", apart, "set device: cpu, and report what this command prints")
     else:
