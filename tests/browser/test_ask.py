@@ -333,3 +333,4 @@ def test_a_scene_that_was_made_anew_is_told_and_loaded_again_without_the_old_cho
         answers(page).first.wait_for()  # the question is asked again
         assert page.locator("#text").input_value() == "mug > handle"
         assert not page.locator("#overlay path.chosen").count()
+        page.close()  # before its server ends: it asks for changes
