@@ -22,10 +22,10 @@ mkdir "$work/moved"
 mv results/synthetic/tiny "$work/moved/"
 cd "$work"
 python -m hilsplat query moved/tiny mug | grep -E "whole|part"
-hilsplat view moved/tiny --port 8471 --no-browser &
-for _ in $(seq 60); do
+hilsplat view moved/tiny --no-browser > view.log &
+for _ in $(seq 120); do
     sleep 0.5
-    page=$(python -c 'import urllib.request as r; print(r.urlopen("http://127.0.0.1:8471/").read().decode())' 2> /dev/null) && break
+    address=$(grep -oE "http://127[^ ]+" view.log) && break
 done
-grep -q hilsplat <<< "$page"
+python -c 'import sys, urllib.request as r; print(r.urlopen(sys.argv[1]).read().decode())' "$address" | grep hilsplat > /dev/null
 echo "the wheel works"
