@@ -19,7 +19,14 @@ const own = () => labels().find((label) => label.id === chosen) ?? null;
 const tool = () => document.querySelector("[name=tool]:checked").value;
 const radius = () => Number($("radius").value);
 // One after the other: a region is made from the one before.
-const soon = (work) => { working = working.then(work).catch((error) => tell(error.message, true)); return working; };
+let waiting = 0;   // requests after which something may have to be saved
+const soon = (work) => {
+  waiting++;
+  markSaved();
+  working = working.then(work).catch((error) => tell(error.message, true)).finally(() => { waiting--; markSaved(); });
+  return working;
+};
+function markSaved() { document.body.dataset.saved = String(!store.unsaved && !waiting); }
 
 // -- showing ---------------------------------------------------------------------------------------
 
@@ -39,7 +46,7 @@ function refresh() {
   $("redo").disabled = !store.future.length;
   $("carry").disabled = !scene.carries;
   $("saved").textContent = store.unsaved ? "Saving…" : `Saved in ${scene.folder}.`;
-  document.body.dataset.saved = String(!store.unsaved);
+  markSaved();
   sheet.things(labels(), chosen);
   draw();
 }
