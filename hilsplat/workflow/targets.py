@@ -82,7 +82,7 @@ def default(plan: Plan) -> list[str]:
 
 
 def own_scores(plan: Plan, row: SceneRow) -> dict[str, str]:
-    """Scores of a scene with labels of your own, by the variant's name in tables.
+    """Return the score files of a scene with your own labels, by the variant's name in tables.
 
     A scene of LangSplat's features is compared with LangSplat on the same Gaussians, masks and vectors.
     """
@@ -98,7 +98,7 @@ def own_scores(plan: Plan, row: SceneRow) -> dict[str, str]:
 
 
 def summary(plan: Plan) -> list[str]:
-    """Return the scores of finished scenes with labels of your own, for people."""
+    """Return a readable table of scores for each finished scene with your own labels."""
     own = [row for row in labelled(plan) if not data_of(row)]
     return [
         line
