@@ -108,7 +108,7 @@ def cloud_address(browser, cloud) -> Iterator[str]:
 
 @pytest.fixture
 def opened(browser) -> Iterator[Callable]:
-    """Opens an address, waits for the first picture, and checks at the end that nothing went wrong.
+    """Opens an address, waits until everything is loaded, and checks at the end that nothing went wrong.
 
     A console error, an uncaught exception or a request to another address fails the test, except for what
     the test has put into `opened.expected`.
@@ -131,6 +131,7 @@ def opened(browser) -> Iterator[Callable]:
         )
         page.goto(f"{address}&painter={painter}{fragment}")
         page.locator("body[data-ready=yes]").wait_for()
+        page.evaluate("hilsplat.begun")  # the tree is loaded, and what the address asks for is answered
         return page
 
     open_page.expected = []

@@ -49,7 +49,8 @@ function deeper(nodes) {
 export async function tapped(x, y) {
   host.focus({ preventScroll: true });
   const at = paneAt(x);
-  if (!outlines.get(variantOf(panes[at.k])) || variantOf(panes[at.k]) !== variantOf(panes[0])) return;
+  if (!main()) { tell("Nothing to choose yet: the semantic tree is not loaded."); return; }
+  if (variantOf(panes[at.k]) !== variantOf(panes[0])) { tell("This side shows another tree: choose on the left."); return; }
   try { choose(deeper(api.offline ? quickPick(at, y) : await exactPick(at, y))); } catch (error) { failed(error); }
 }
 

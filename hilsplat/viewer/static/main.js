@@ -73,11 +73,13 @@ function onlyWhatIsHere() {
   document.body.append(make("datalist", { id: "texts" }, ...api.texts.map((text) => make("option", { value: text }))));
   $("text").placeholder = api.texts[0] ?? "";
 }
+
+attachHands();
+const begun = begin().catch((error) => { $("loading").textContent = error.message; $("loading").dataset.kept = "yes"; document.body.dataset.ready = "failed"; });
+
 // What tests and benchmarks read.
 globalThis.hilsplat = {
+  begun,
   get camera() { return page.camera; }, get painter() { return page.painter; }, painted, redraw, quickPick: (x, y) => quickPick(paneAt(x), y),
   pixels: () => ({ width: host.clientWidth, height: host.clientHeight, data: Array.from(page.painter.pixels(page.camera, painted(), host.clientWidth, host.clientHeight)) }),
 };
-
-attachHands();
-begin().catch((error) => { $("loading").textContent = error.message; $("loading").dataset.kept = "yes"; document.body.dataset.ready = "failed"; });
