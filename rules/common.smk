@@ -25,12 +25,12 @@ gc.set_threshold(200_000, 50, 100)
 LOCK = prepare_process()
 
 
-def runs_here():
-    """Return whether this machine runs the jobs: a cluster is given --jobs instead of --cores."""
+def own_cores():
+    """Return the cores of this machine if it runs the jobs; None on a cluster, which is given --jobs instead."""
     try:
-        return workflow.cores > 0
+        return workflow.cores or None
     except WorkflowError:
-        return False
+        return None
 
 
 def cache_folder(wildcards, input):
@@ -40,7 +40,7 @@ def cache_folder(wildcards, input):
 
 try:
     PLAN = Plan(merged_config([], config))
-    PLAN.require_usable(devices=runs_here())
+    PLAN.require_usable(devices=own_cores() is not None)
 except HilsplatError as error:  # an error that a user can fix needs no traceback
     raise WorkflowError(str(error)) from None
 for name, reason in PLAN.absent.items():
@@ -49,5 +49,5 @@ for name in PLAN.unlisted:
     logger.warning(f"data:{name} is not run: add a row for it to {PLAN.run.scenes}")
 
 ENVIRONMENT = "../workflow/envs/hilsplat.yaml"
-RESOURCES = JobResources(PLAN)
+RESOURCES = JobResources(PLAN, own_cores())
 estimates.resources = RESOURCES

@@ -20,7 +20,7 @@ rule evaluate:
     priority: 2
     conda:
         ENVIRONMENT
-    threads: RESOURCES.threads
+    threads: RESOURCES.variant_threads
     resources:
         mem_mb=RESOURCES.memory_mb("evaluate"),
         runtime=RESOURCES.minutes("evaluate"),

@@ -43,7 +43,7 @@ rule field:
     priority: 4
     conda:
         ENVIRONMENT
-    threads: RESOURCES.threads
+    threads: RESOURCES.variant_threads
     resources:
         mem_mb=RESOURCES.memory_mb("field"),
         runtime=RESOURCES.minutes("field"),

@@ -17,7 +17,7 @@ rule method:
     priority: 6
     conda:
         ENVIRONMENT
-    threads: RESOURCES.threads
+    threads: RESOURCES.variant_threads
     resources:
         mem_mb=RESOURCES.memory_mb("method"),
         runtime=RESOURCES.minutes("method"),

@@ -38,7 +38,7 @@ rule figures:
         "<results>/{dataset}/{scene}/benchmarks/figures.jsonl"
     conda:
         ENVIRONMENT
-    threads: RESOURCES.threads
+    threads: RESOURCES.variant_threads
     resources:
         mem_mb=RESOURCES.memory_mb("figures"),
         runtime=RESOURCES.minutes("figures"),
@@ -127,7 +127,7 @@ rule comparison:
         "<results>/{dataset}/{scene}/benchmarks/comparison.jsonl"
     conda:
         ENVIRONMENT
-    threads: RESOURCES.threads
+    threads: RESOURCES.variant_threads
     resources:
         mem_mb=RESOURCES.memory_mb("comparison"),
         runtime=RESOURCES.minutes("comparison"),

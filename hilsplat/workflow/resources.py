@@ -66,19 +66,30 @@ class Size(NamedTuple):
 class JobResources:
     """Resources of the jobs of a plan, as functions of wildcards that Snakemake calls.
 
-    They depend on nothing that differs between machines: a cluster job computes them again on its node.
+    Args:
+        plan: of the run.
+        cores: of this machine, if it runs the jobs: they get one thread each where there are jobs for all
+            cores. On a cluster nothing may depend on the machine, because a job computes its resources again
+            on its node.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: Plan, cores: int | None = None) -> None:
         self.plan = plan
+        self._per_scene = math.inf if cores is None else max(1, cores // max(1, len(plan.scenes)))
+        many = cores is not None and len(plan.run.variant_names()) >= cores
+        self._per_variant = 1 if many else self._per_scene
         self.size = functools.cache(self._size)
         self.gaussians = functools.cache(self._gaussians)
         self._seconds = functools.cache(self._estimate)
 
     def threads(self, wildcards: Job) -> int:
-        """Return as many threads as the scene's pixels keep busy; Snakemake lowers it to `--max-threads`."""
+        """Return as many threads as the scene's pixels keep busy, within its share of the cores."""
         views, view_mp = self.size(self.plan.row(wildcards))
-        return max(1, math.ceil(views * view_mp / MP_PER_THREAD))
+        return int(min(max(1, math.ceil(views * view_mp / MP_PER_THREAD)), self._per_scene))
+
+    def variant_threads(self, wildcards: Job) -> int:
+        """Return the threads of a rule with many short jobs per scene, which run side by side."""
+        return int(min(self.threads(wildcards), self._per_variant))
 
     def memory_mb(self, rule: str) -> Callable[..., int]:
         """Resource `mem_mb` of a rule."""

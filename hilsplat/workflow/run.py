@@ -40,9 +40,6 @@ STATE = Path(".hilsplat")
 UNREGISTERED = "HILSPLAT_UNREGISTERED"
 """Environment variable of a Snakemake that takes no lock of ours, such as the one that unlocks."""
 
-VARIANT_RULES = ("field", "method", "evaluate", "figures", "comparison")
-"""Rules with many short jobs per scene, which run side by side rather than with several threads."""
-
 TARGET_RULES = ("all", "tables", "efficiency", "train_models")
 """Rules that can be targets: the others have wildcards."""
 
@@ -149,7 +146,8 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
     command += ["--configfile", *map(str, configs)] if configs else []
     command += ["--config", *given.config] if given.config else []
     if not _has(others, *ELSEWHERE):
-        command += _local_options(plan, others)
+        if not _has(others, "--cores", "-c", "--jobs", "-j"):
+            command += ["--cores", str(_all_cores())]
     if _has(others, "-n", "--dry-run", "--dryrun"):
         return _start(command, plan, targets, scenes)
     try:
@@ -237,19 +235,6 @@ def _cores_of(command: Sequence[str]) -> int:
 
 def _all_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _local_options(plan: Plan, others: Sequence[str]) -> list[str]:
-    """Return cores and threads for this machine: one thread per job where there are jobs for all cores."""
-    words = []
-    cores = _all_cores()
-    if not _has(others, "--cores", "-c", "--jobs", "-j"):
-        words += ["--cores", str(cores)]
-    if not _has(others, "--max-threads"):
-        words += ["--max-threads", str(max(1, cores // len(plan.scenes)))]
-    if not _has(others, "--set-threads") and len(plan.run.variant_names()) >= cores:
-        words += ["--set-threads", *(f"{rule}=1" for rule in VARIANT_RULES)]
-    return words
 
 
 def _recover(command: Sequence[str], results: Path) -> None:

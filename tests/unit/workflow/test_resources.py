@@ -85,6 +85,19 @@ def test_threads_grow_with_the_pixels_of_a_scene(tmp_path):
     assert JobResources(tiny).threads(wildcards()) == 1
 
 
+def test_cores_go_to_jobs_before_threads(tmp_path):
+    scene = plan(tmp_path, world={"views": 40, "image_px": 384})
+    threads = {cores: JobResources(scene, cores).threads(wildcards()) for cores in (1, 2, 8)}
+    assert threads == {1: 1, 2: 2, 8: 3}
+    variants = len(scene.run.variant_names())
+    assert JobResources(scene, variants).variant_threads(wildcards()) == 1
+    few = JobResources(scene, variants + 1)
+    assert few.variant_threads(wildcards()) == few.threads(wildcards())
+    many = plan(tmp_path, scenes=2, world={"views": 40, "image_px": 384})
+    assert JobResources(many, 2).threads(wildcards()) == 1
+    assert JobResources(many).threads(wildcards()) == 3, "a cluster doesn't know the cores of its nodes"
+
+
 def test_a_gpu_is_asked_for_where_the_settings_say_so(tmp_path):
     found = JobResources(plan(tmp_path, gaussians={"device": "cuda"}))
     assert [found.gpus(section)(wildcards()) for section in ("gaussians", "contributions")] == [1, 0]

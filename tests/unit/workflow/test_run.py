@@ -70,12 +70,11 @@ def value(command: list[str], option: str) -> str:
     return command[command.index(option) + 1]
 
 
-def test_cores_and_threads_follow_the_machine_and_the_scenes(folder, started):
+def test_a_run_takes_the_cores_of_the_machine(folder, started):
     assert runs.run([], [], []) == 3, "Snakemake's exit status"
     [command] = started
-    assert value(command, "--cores") == "4" and value(command, "--max-threads") == "2"
+    assert value(command, "--cores") == "4"
     assert value(command, "--snakefile") == str(folder / "Snakefile")
-    assert "--set-threads" not in command, "one variant keeps all threads"
 
 
 def test_scenes_become_a_configuration_and_other_targets_stay(folder, started):
@@ -85,7 +84,6 @@ def test_scenes_become_a_configuration_and_other_targets_stay(folder, started):
     assert options[:2] == ["seed=1", 'only=["two"]']
     assert command[-2:] == ["--", "tables"]
     assert "--cores=1" in command and "--cores" not in command and "--keep-going" in command
-    assert value(command, "--max-threads") == "4"
 
 
 def test_a_misspelt_scene_is_refused(folder, started):
@@ -98,7 +96,7 @@ def test_a_misspelt_scene_is_refused(folder, started):
 
 def test_a_cluster_sets_its_own_cores(folder, started):
     runs.run([], [], ["--workflow-profile", "profiles/slurm"])
-    assert not {"--cores", "--max-threads"} & set(started[0])
+    assert "--cores" not in started[0]
 
 
 def test_what_the_targets_need_and_does_not_match_is_made_again(folder, started, monkeypatch):
