@@ -24,7 +24,7 @@ from hilsplat.base.lanes import (
     store,
     transpose,
 )
-from hilsplat.segment.lane_products import MOST_ROWS, WIDE_COLUMNS, rows_of_products
+from hilsplat.base.lane_products import MOST_ROWS, WIDE_COLUMNS, rows_of_products
 
 LEAST = np.float32(-126)
 """Lowest exponent of a normal float32."""

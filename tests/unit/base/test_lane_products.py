@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from hilsplat.base.lanes import WIDTH
-from hilsplat.segment.lane_products import WIDE_COLUMNS, rows_of_products
+from hilsplat.base.lane_products import WIDE_COLUMNS, rows_of_products
 
 
 @pytest.mark.parametrize("rows", [1, 3, 8])
