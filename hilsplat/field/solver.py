@@ -19,7 +19,7 @@ def solve_field(
     """Lift, conjugate gradient, then L-BFGS if a contrastive loss has a weight.
 
     Returns:
-        the features, and a report: every loss before and after each part, and gradient norms at the lift.
+        the features, and a report: every loss before and after each part.
     """
     weights = (settings.weight_instance, settings.weight_part)
     total = problem.total_pixels
@@ -45,10 +45,7 @@ def solve_field(
 
     lifted = problem.lifted
     at_lift = problem.quadratic.product(lifted)
-    report: dict[str, object] = {
-        "lifted": problem.terms(lifted) | contrast.values(lifted),
-        "gradient_norms": gradient_norms(problem, contrast, inverse_root[:, :, None], at_lift),
-    }
+    report: dict[str, object] = {"lifted": problem.terms(lifted, at_lift) | contrast.values(lifted)}
     if settings.cg_steps and any(problem.weights):
         features = conjugate_gradient(problem, lifted, settings.cg_steps, at_lift)
         report["after_cg"] = problem.terms(features) | contrast.values(features)
@@ -65,26 +62,6 @@ def solve_field(
 def _rows(features: Float32[np.ndarray, "N 3 D"]) -> Float32[np.ndarray, "R D"]:
     """One row for each Gaussian and level, in the same memory."""
     return features.reshape(-1, features.shape[2])
-
-
-def gradient_norms(
-    problem: QuadraticProblem,
-    contrast: Contrast,
-    inverse_root: Float32[np.ndarray, "N 3 1"],
-    curved: Float32[np.ndarray, "N 3 D"],
-) -> dict[str, float]:
-    """Gradient norm of each unweighted loss at the lift, whose product with G is `curved`, in mass-scaled
-    variables.
-    """
-    lifted, factor = problem.lifted, np.float32(2 / problem.total_pixels)
-    means = problem.masks.means(lifted)
-    gradients = {
-        "language": factor * (curved - problem.masks.spread(problem.pixels[:, None] * problem.latents)),
-        "clustering": factor * (curved - problem.masks.spread(problem.pixels[:, None] * means)),
-        "instance": contrast.weighted(lifted, (1.0, 0.0))[1],
-        "part": contrast.weighted(lifted, (0.0, 1.0))[1],
-    }
-    return {name: float(np.sqrt(dot(g * inverse_root, g * inverse_root))) for name, g in gradients.items()}
 
 
 def keep_labelled(
