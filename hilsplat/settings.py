@@ -23,7 +23,7 @@ def knob(default: Any, what: str, *, unit: str = "", origin: str = "ours", **lim
 class Section(BaseModel):
     """Settings of one stage; frozen. Unknown keys and numbers that are not finite are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
     @property
     def is_random(self) -> bool:
