@@ -191,6 +191,9 @@ def compare_decoders(models: Path, photograph: Path, points: int) -> dict[str, f
 
     The plain network decodes 64 prompts in calls of 8; the factored decoder previews them all and decodes as
     many again as `KEPT` says. A random SAM is sure of no mask, so the preview rule itself is not run.
+
+    Masks of both are compared pixel by pixel: `unequal_px` of `mask_px` differ, and none of these has a logit
+    above `tie`. Random logits crowd around 0, where the border of a trained SAM's mask is steep.
     """
     from hilsplat.base.images import read_image, resize_to_fit
     from hilsplat.segment.sam import SamModel, ask_network, in_input, point_grid
@@ -214,8 +217,13 @@ def compare_decoders(models: Path, photograph: Path, points: int) -> dict[str, f
         logits = np.concatenate([model.factored.logits(encoded.terms, kept) for _, _, kept in calls])
         found["masks_ms"].append(time.process_time() - clock)
         iou = np.concatenate([call[0] for call in calls])
+        plain_logits = np.concatenate([each[1] for each in plain])
         apart["iou"] = float(np.abs(iou - np.concatenate([each[0] for each in plain])).max())
-        apart["logits"] = float(np.abs(logits - np.concatenate([each[1] for each in plain])).max())
+        apart["logits"] = float(np.abs(logits - plain_logits).max())
+    unequal = (logits > 0) != (plain_logits > 0)
+    apart |= {"mask_px": unequal.size, "unequal_px": int(unequal.sum())}
+    apart["tie"] = float(np.abs(plain_logits[unequal]).max(initial=0))
+    apart["spread"] = float(plain_logits.std())
     medians = {name: 1e3 * float(np.median(each)) / many for name, each in found.items()}
     mean = medians["preview_ms"] + KEPT * medians["masks_ms"]
     return {**medians, "mean_ms": mean, "ratio": medians["plain_ms"] / mean, **apart}
@@ -271,7 +279,7 @@ def main() -> None:
         if not (places[kind] / done).is_file():
             _run(step, places[kind], asked.photographs)
     photographs = sorted(asked.photographs.iterdir())[: asked.views]
-    steps = [(photographs[0], "sam", "decoders")]
+    steps = [(photograph, "sam", "decoders") for photograph in photographs]
     steps += [(photograph, kind, kind) for photograph in photographs for kind in ("sam", "clip")]
     for photograph, kind, step in steps:
         line = json.loads(_run(step, places[kind], photograph, asked.points).splitlines()[-1])

@@ -105,7 +105,7 @@ class GaussiansSettings(Section):
         0.15, "share of the iterations on images of a quarter of the size", ge=0, le=1, origin="3DGS: 0"
     )
     half_until: float = knob(
-        0.5, "share of the iterations after which images have their full size", ge=0, le=1, origin="3DGS: 0"
+        0.75, "share of the iterations after which images have their full size", ge=0, le=1, origin="3DGS: 0"
     )
     sh_degree: int = knob(2, "degree of the spherical harmonics of the colours", ge=0, le=3, origin="3DGS: 3")
     ssim_weight: float = knob(
@@ -463,8 +463,8 @@ class FieldSettings(Section):
         lt=1,
         origin="paper, LangSplat: 0",
     )
-    cg_steps: int = knob(10, "conjugate-gradient steps on the quadratic losses", ge=0)
-    lbfgs_steps: int = knob(10, "L-BFGS steps, taken if L_ins or L_part has a weight", ge=0)
+    cg_steps: int = knob(6, "conjugate-gradient steps on the quadratic losses", ge=0)
+    lbfgs_steps: int = knob(6, "L-BFGS steps, taken if L_ins or L_part has a weight", ge=0)
     min_mask_px: int = knob(50, "smaller masks take no part in L_ins and L_part", unit="px", ge=1)
     prune_cosine: float = knob(
         1.0,
