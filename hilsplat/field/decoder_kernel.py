@@ -1,7 +1,7 @@
 """A chain of dense layers with ReLU between them as one compiled loop; values stay in the fastest cache.
 
-Rows are the lanes of vectors, and as many outputs are summed together as the registers hold. The sums of a row
-run in the same order whatever rows it is decoded with.
+Rows are the lanes of vectors, and as many outputs are summed together as the registers hold. The sums of a
+row run in the same order whatever rows it is decoded with.
 """
 
 from collections.abc import Sequence

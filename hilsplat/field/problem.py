@@ -99,8 +99,8 @@ class QuadraticProblem:
     ) -> dict[str, float]:
         """Unweighted means over labelled pixels of the language loss, L_h and the ridge.
 
-        Both losses are small differences of large sums, so everything is summed in float64; `curved` is G F if
-        it is known.
+        Both losses are small differences of large sums, so everything is summed in float64. `curved` is G F
+        if it is known.
         """
         curved = self.quadratic.product(features) if curved is None else curved
         form = dot(features, curved)

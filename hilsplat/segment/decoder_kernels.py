@@ -10,6 +10,7 @@ from typing import no_type_check
 import numpy as np
 
 from hilsplat.base.compiled import compiled
+from hilsplat.base.lane_products import MOST_ROWS, WIDE_COLUMNS, rows_of_products
 from hilsplat.base.lanes import (
     WIDTH,
     exp2_negative,
@@ -24,7 +25,6 @@ from hilsplat.base.lanes import (
     store,
     transpose,
 )
-from hilsplat.base.lane_products import MOST_ROWS, WIDE_COLUMNS, rows_of_products
 
 LEAST = np.float32(-126)
 """Lowest exponent of a normal float32."""

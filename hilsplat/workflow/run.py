@@ -145,9 +145,8 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
     command = ["snakemake", "--snakefile", str(_snakefile(configs)), *others]
     command += ["--configfile", *map(str, configs)] if configs else []
     command += ["--config", *given.config] if given.config else []
-    if not _has(others, *ELSEWHERE):
-        if not _has(others, "--cores", "-c", "--jobs", "-j"):
-            command += ["--cores", str(_all_cores())]
+    if not _has(others, *ELSEWHERE, "--cores", "-c", "--jobs", "-j"):
+        command += ["--cores", str(_all_cores())]
     if _has(others, "-n", "--dry-run", "--dryrun"):
         return _start(command, plan, targets, scenes)
     try:
