@@ -3,7 +3,7 @@
 # make test    set up, then run lint and all tests
 # make lint    set up, then check style, imports and rules
 # make docs    set up, then build the site of the documentation in site/; a broken link fails
-# make bench   set up, then time the fast paths; tables go to results/benchmarks (docs/benchmarks.md)
+# make bench   set up, then time the fast paths and a run on photographs; tables go to results/benchmarks (docs/benchmarks.md)
 #              with BASE=<commit>: what got slower since then, by runs of both versions in turn
 # make chaos   set up, then kill, freeze and starve runs of the ci configuration, and compare tables (docs/workflow.md)
 # make report  set up, run, and write results/report.html
@@ -48,7 +48,13 @@ docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 mkdocs build --strict
 
 bench: $(STAMP)
-	$(if $(BASE),python -m benchmarks.compare $(BASE),OMP_NUM_THREADS=1 python -m pytest -c benchmarks/pytest.ini benchmarks)
+ifdef BASE
+	python -m benchmarks.compare $(BASE)
+else
+	OMP_NUM_THREADS=1 python -m pytest -c benchmarks/pytest.ini benchmarks
+	rm -rf results/benchmarks/rehearsal
+	python -m benchmarks.rehearsal results/benchmarks/rehearsal
+endif
 
 chaos: $(STAMP)
 	python -m tests.chaos --kills $(KILLS)

@@ -138,6 +138,9 @@ def main() -> None:
     if asked.export:
         export(asked.folder, asked.export)
         return
+    if not asked.photographs.is_dir():
+        print(f"skipped: there are no photographs in {asked.photographs}; name a folder")
+        return
     if asked.folder.exists():
         sys.exit(f"{asked.folder} exists; name a new folder, since its caches would answer")
     models = make_models(asked.models.resolve(), asked.sam)
