@@ -11,13 +11,13 @@ from jaxtyping import Float16, Float32, Int64, UInt8
 from tokenizers import Tokenizer
 
 from hilsplat.base.artifacts import read_full_index, read_json
-from hilsplat.base.crops import crop_to_square
 from hilsplat.base.errors import MisalignedArtifactError, ModelError
 from hilsplat.base.files import INSTALLED
 from hilsplat.base.parallel import in_order
 from hilsplat.models.folder import ModelFolder, input_side_px, open_model_folder
 from hilsplat.models.network import Network, require_one_space
 from hilsplat.models.store import MODELS, user_models
+from hilsplat.segment.crops import crop_to_square
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ClipSettings
 
@@ -174,7 +174,7 @@ class ClipModel:
         settings: ClipSettings | None = None,
         rows: Int64[np.ndarray, " m"] | None = None,
     ) -> Float16[np.ndarray, "m C"]:
-        """Return a unit vector for each mask of a view, computed from its crop (`base.crops`).
+        """Return a unit vector for each mask of a view, computed from its crop (`segment.crops`).
 
         Args:
             image: the view.

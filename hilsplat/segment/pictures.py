@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Int32, UInt8
 
 from hilsplat.base.artifacts import read_index, read_npz
-from hilsplat.base.crops import square_crop
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.scene.scene import Scene
+from hilsplat.segment.crops import square_crop
 from hilsplat.segment.digests import require_same_masks
 from hilsplat.segment.masks import HierarchicalMasks
 

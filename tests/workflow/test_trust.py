@@ -149,7 +149,7 @@ def job_of(project: Project, log: str, *words: str, freeze: bool = False) -> Ite
 def test_the_next_run_recovers_from_a_kill(drawn: Project) -> None:
     before = drawn.files(IMAGES)
     log = f"{SCENE}/logs/world.log"
-    with job_of(drawn, log, *RUN, IMAGES, "--", "--forcerun", IMAGES) as run:
+    with job_of(drawn, log, *RUN, IMAGES, "--", "--forcerun", IMAGES, freeze=True) as run:
         refused = drawn.hilsplat_run(IMAGES, check=False)
         assert refused.returncode == 1 and "another hilsplat run" in refused.stderr
         run.kill()

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
 from scipy import ndimage
 
-from hilsplat.base.crops import square_crop
 from hilsplat.base.levels import LEVELS, NONE
+from hilsplat.segment.crops import square_crop
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.world.tiny.clip import CANONICAL, CROP_PX
 from hilsplat.world.tiny.data import LabelledViews

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hilsplat.base.crops import square_crop
+from hilsplat.segment.crops import square_crop
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.world.tiny.clip import CANONICAL, CROP_PX
 from hilsplat.world.tiny.crops import Captioner, best_node, list_crops, list_segmented, roughen

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hilsplat.base.crops import crop_to_square, square_crop
 from hilsplat.base.errors import EmptyMaskError
+from hilsplat.segment.crops import crop_to_square, square_crop
 
 
 def two_colours() -> tuple[np.ndarray, np.ndarray]:
