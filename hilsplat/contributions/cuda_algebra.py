@@ -125,6 +125,11 @@ class DeviceQuadratic:
                 parts.append(backward[0] @ rendered)
         return torch.stack(parts, dim=1).cpu().numpy()
 
+    def form(self, features: Float[np.ndarray, "N 3 D"]) -> float:
+        """Sum over levels of tr F'GF, in float64."""
+        features = features.astype(np.float64)
+        return float((features * self.product(features)).sum())
+
 
 def shared_pairs_on(
     weighted: sp.csr_matrix,

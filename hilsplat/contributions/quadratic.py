@@ -75,6 +75,10 @@ class Gram:
             total[begin:] += rest
         return np.ascontiguousarray(total[:, :, :channels])
 
+    def form(self, features: Float32[np.ndarray, "N 3 D"]) -> float:
+        """Sum over levels of tr F'GF, in float64 but for the product, whose millions of roundings cancel."""
+        return float(np.multiply(features, self.product(features), dtype=np.float64).sum())
+
     def save(self, folder: Path) -> None:
         """Write the folder `G`, whose arrays are mapped when read."""
         _save(folder / "G", indptr=self.indptr, indices=self.indices, values=self.values)
@@ -115,6 +119,11 @@ class StackedWeights:
         )
         return out
 
+    def form(self, features: Float32[np.ndarray, "N 3 D"]) -> float:
+        """Sum over levels of tr F'GF, summed in float64."""
+        features = features.astype(np.float64)
+        return float((features * self.product(features)).sum())
+
     def save(self, folder: Path) -> None:
         """Write the folder `W`, whose arrays are mapped when read."""
         _save(
@@ -136,6 +145,9 @@ class QuadraticProduct(Protocol):
 
     def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
         """G_l F_l for every level."""
+
+    def form(self, features: Float32[np.ndarray, "N 3 D"]) -> float:
+        """Sum over levels of tr F'GF, summed in float64."""
 
 
 def level_mass(quadratic: Quadratic) -> Float32[np.ndarray, "N 3"]:

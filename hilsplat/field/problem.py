@@ -18,7 +18,6 @@ from jaxtyping import Float32, Float64
 
 from hilsplat.contributions.mask_operator import MaskOperator, MaskProducts, lifted_average, lifted_median
 from hilsplat.contributions.quadratic import Quadratic, QuadraticProduct, level_mass
-from hilsplat.field.minimise import dot
 from hilsplat.field.one_pass import (
     add_by_channel,
     add_scaled,
@@ -94,16 +93,12 @@ class QuadraticProblem:
         add_scaled(np.float32(ridge), self.mass, self.lifted, target)
         return target
 
-    def terms(
-        self, features: Float32[np.ndarray, "N 3 D"], curved: Float32[np.ndarray, "N 3 D"] | None = None
-    ) -> dict[str, float]:
+    def terms(self, features: Float32[np.ndarray, "N 3 D"]) -> dict[str, float]:
         """Unweighted means over labelled pixels of the language loss, L_h and the ridge.
 
-        Both losses are small differences of large sums, so everything is summed in float64. `curved` is G F
-        if it is known.
+        Both losses are small differences of large sums, so everything is summed in float64.
         """
-        curved = self.quadratic.product(features) if curved is None else curved
-        form = dot(features, curved)
+        form = self.quadratic.form(features)
         means = self.masks.means(features.astype(np.float64))
         pixels = self.pixels[:, None].astype(np.float64)
         linear = float((pixels * means * self.latents).sum())

@@ -131,7 +131,7 @@ def opened(browser) -> Iterator[Callable]:
         )
         page.goto(f"{address}&painter={painter}{fragment}")
         page.locator("body[data-ready=yes]").wait_for()
-        page.evaluate("hilsplat.begun")  # the tree is loaded, and what the address asks for is answered
+        page.evaluate("hilsplat.begun")  # the tree is loaded, and a query in the address is answered
         return page
 
     open_page.expected = []

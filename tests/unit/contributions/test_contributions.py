@@ -113,6 +113,8 @@ def test_gram_and_weights_give_the_quadratic_form_of_every_level():
     expected = np.einsum("lij,jld->ild", dense, features)
     assert gram.product(features) == pytest.approx(expected, abs=1e-5)
     assert everything.product(features) == pytest.approx(expected, abs=1e-5)
+    for each in (gram, everything):
+        assert each.form(features) == pytest.approx((features * expected).sum(), rel=1e-6)
     # entry by entry: unit vectors pick columns
     columns = np.repeat(np.eye(40, dtype=np.float32)[:, None], 3, axis=1)
     assert gram.product(columns).transpose(1, 0, 2) == pytest.approx(dense, abs=1e-6)
