@@ -137,7 +137,9 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
     chosen = parse_run(settings)
     rows = read_sheet(project_path(chosen.scenes), chosen.groups, chosen.data_root)
     scenes = [target for target in targets if any(target in (row.name, row.scene) for row in rows)]
-    _require_known([target for target in targets if target not in scenes], rows, chosen.scenes)
+    files = f"{chosen.results}/"
+    named = [each for each in targets if each not in scenes and not each.startswith(files)]
+    _require_known(named, rows, chosen.scenes)
     if scenes:
         given.config.append(f"only={json.dumps(scenes)}")
         settings["only"] = scenes

@@ -86,6 +86,12 @@ def test_scenes_become_a_configuration_and_other_targets_stay(folder, started):
     assert "--cores=1" in command and "--cores" not in command and "--keep-going" in command
 
 
+def test_a_file_of_the_results_is_no_misspelt_scene(folder, started):
+    file = "results/synthetic/two/scene"  # much like the name of a scene
+    runs.run([file], [], [])
+    assert started[0][-2:] == ["--", file]
+
+
 def test_a_misspelt_scene_is_refused(folder, started):
     with pytest.raises(HilsplatError, match="did you mean 'two'"):
         runs.run(["twoo"], [], [])
