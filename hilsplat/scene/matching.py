@@ -5,7 +5,7 @@ of two descriptors is taken, in whole numbers, in a third of the time.
 """
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
@@ -30,7 +30,7 @@ MIN_MATCHES = 15
 
 _CHANNELS = 128
 _LENGTH = 512.0  # of a descriptor, as COLMAP stores it
-_BLOCK = 256  # descriptors whose products are taken at once: they stay in the processor's cache
+_BLOCK = 128  # descriptors whose products are taken at once: they stay in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,10 +112,11 @@ def mutual_matches(one: ViewFeatures, other: ViewFeatures) -> UInt32[np.ndarray,
     rows, columns = len(one.descriptors), len(other.descriptors)
     if not rows or not columns:
         return np.zeros((0, 2), np.uint32)
+    products_of = _multiplier(other.columns)
     best, second, column = (np.empty(rows, np.int32) for _ in range(3))
     best_of_column, second_of_column, row_of_column = (np.full(columns, -1, np.int32) for _ in range(3))
     for first in range(0, rows, _BLOCK):
-        products = _products(one.descriptors[first : first + _BLOCK], other.columns)
+        products = products_of(one.descriptors[first : first + _BLOCK])
         _nearest(products, first, best, second, column, best_of_column, second_of_column, row_of_column)
     clear = _is_clear(best, second)
     clear &= _is_clear(best_of_column, second_of_column)[column]
@@ -129,20 +130,20 @@ def _is_clear(best: Int32[np.ndarray, " N"], second: Int32[np.ndarray, " N"]) ->
     return (nearest <= MAX_ANGLE) & (nearest < MAX_RATIO * next_nearest)
 
 
-def _products(
-    rows: UInt8[np.ndarray, "R 128"], columns: Int8[np.ndarray, "128 N"]
-) -> Int32[np.ndarray, "R N"]:
-    """Inner products of descriptors, exactly."""
-    session, is_exact = _multiplier()
-    if is_exact:
-        return session.run(None, {"rows": rows, "columns": columns})[0]
+def _multiplier(columns: Int8[np.ndarray, "128 N"]) -> Callable[[UInt8[np.ndarray, "R 128"]], np.ndarray]:
+    """What takes inner products of up to `_BLOCK` descriptors with these columns: whole numbers, exactly."""
+    session = _integer_products()
+    if session is not None:
+        return lambda rows: session.run(None, {"rows": rows, "columns": columns})[0]
     whole = columns.astype(np.float32) + 128
-    return (rows.astype(np.float32) @ whole).astype(np.int32)  # below 2**24, so exact
+    space = np.empty((_BLOCK, whole.shape[1]), np.float32)  # fresh memory costs more than the products
+    # below 2**24, so exact in float32
+    return lambda rows: np.matmul(rows.astype(np.float32), whole, out=space[: len(rows)])
 
 
 @cache
-def _multiplier() -> tuple[onnxruntime.InferenceSession, bool]:
-    """A product of 8-bit matrices, and whether it is exact: without VNNI, x86 saturates sums of two."""
+def _integer_products() -> onnxruntime.InferenceSession | None:
+    """A product of 8-bit matrices; None where it is not exact: without VNNI, x86 saturates sums of two."""
     from onnx import TensorProto, helper
 
     graph = helper.make_graph(
@@ -164,7 +165,7 @@ def _multiplier() -> tuple[onnxruntime.InferenceSession, bool]:
     rows = np.full((_BLOCK, _CHANNELS), 255, np.uint8)
     columns = np.repeat(np.array([[-128, 127]], np.int8), _CHANNELS, axis=0)
     found = session.run(None, {"rows": rows, "columns": columns})[0]
-    return session, bool((found == [0, 255 * 255 * _CHANNELS]).all())
+    return session if (found == [0, 255 * 255 * _CHANNELS]).all() else None
 
 
 @compiled
@@ -176,15 +177,16 @@ def _nearest(products, first, best, second, column, best_of_column, second_of_co
         row, i = products[r], np.int32(first + r)
         largest = np.int32(-1)
         for j in range(columns):
-            value, before = row[j], best_of_column[j]
+            value, before = np.int32(row[j]), best_of_column[j]
             second_of_column[j] = max(second_of_column[j], min(before, value))
             row_of_column[j] = i if value > before else row_of_column[j]
             best_of_column[j] = max(before, value)
             largest = max(largest, value)
         below, place, ties = np.int32(-1), np.int32(columns), np.int32(0)
         for j in range(columns):
-            is_largest = row[j] == largest
-            below = max(below, np.int32(-1) if is_largest else row[j])
+            value = np.int32(row[j])
+            is_largest = value == largest
+            below = max(below, np.int32(-1) if is_largest else value)
             place = min(place, np.int32(j) if is_largest else np.int32(columns))
             ties = np.int32(ties + (np.int32(1) if is_largest else np.int32(0)))
         best[i], second[i], column[i] = largest, largest if ties > 1 else below, place

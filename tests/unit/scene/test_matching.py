@@ -50,7 +50,7 @@ def compared_one_by_one(one, other):
 @pytest.mark.parametrize("multiplied", ("as this processor does best", "in float32"))
 def test_matches_are_the_mutual_nearest_of_all(monkeypatch, multiplied):
     if multiplied == "in float32":
-        monkeypatch.setattr(matching, "_multiplier", lambda: (None, False))
+        monkeypatch.setattr(matching, "_integer_products", lambda: None)
     one, other = two_views(np.random.default_rng(3), 300, 290)
     matches = mutual_matches(one, other).tolist()
     assert matches == compared_one_by_one(one, other) and 200 < len(matches) <= 300
