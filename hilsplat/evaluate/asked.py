@@ -12,7 +12,7 @@ from hilsplat.datasets.registry import dataset_of, open_labels
 from hilsplat.evaluate.protocols.cards import ProtocolCard, card_named
 
 SCANNET = ("scannet/opengaussian-19", "scannet/opengaussian-15", "scannet/opengaussian-10")
-SCANNET200 = ("scannet200/opengaussian", "scannet200/instances")
+SCANNET200 = ("scannet200/opengaussian", "scannet200/benchmark", "scannet200/instances")
 REPLICA = ("replica/per-scene",)
 WAYMO = ("waymo/segmentation",)
 

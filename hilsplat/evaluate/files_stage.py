@@ -2,7 +2,7 @@
 
 import difflib
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,7 @@ from jaxtyping import Bool
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.base.progress import stage_log
-from hilsplat.datasets.labelled import LabelledScene
+from hilsplat.datasets.labelled import LabelledScene, image_size_hw
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
 from hilsplat.datasets.synthetic.world_labels import labelled_points
 from hilsplat.evaluate.asked import Asked
@@ -29,7 +29,7 @@ from hilsplat.evaluate.protocols.cards import (
     OVS_NODES,
     ProtocolCard,
 )
-from hilsplat.evaluate.protocols.flat_views import eighth
+from hilsplat.evaluate.protocols.flat_views import eighth_truth
 from hilsplat.evaluate.protocols.masks import MASK_METRICS, measure_class_maps, measure_masks
 from hilsplat.evaluate.protocols.measured import Measured
 from hilsplat.evaluate.protocols.points import measure_points
@@ -133,7 +133,12 @@ def run_evaluate_files(
 
 def _label_truths(known: LabelledScene) -> dict[str, Callable[[], ViewTruth]]:
     return {
-        view: partial(ViewTruth.of_regions, regions, regions[0].size_hw)
+        view: partial(
+            ViewTruth.of_regions,
+            regions,
+            regions[0].size_hw,
+            image_size_hw(known.images[view]) if view in known.images else None,
+        )
         for view, regions in known.views.items()
         if regions
     }
@@ -146,15 +151,12 @@ def _mask_rows(
     found = {view: read_view_masks(predictions, view) for view in views}
     truths = {view: load() for view, load in views.items()}
     levels = {level for masks in found.values() for level, _ in masks}
-    if not levels:
-        raise ArtifactError(
-            f"{predictions} holds no mask",
-            expected="<view>/<text>.png, or <view>.npz",
-            fix="check the folder",
-        )
+    if not levels:  # every folder is empty: nothing was found anywhere
+        levels = {query.level.label for truth in truths.values() for query in truth.queries if query.level}
+        levels.add("")
     texts: dict[str, set[str]] = {}
     for each in truths.values():
-        for query in (*each.categories, *each.queries):
+        for query in (*each.categories, *each.absent, *each.queries):
             texts.setdefault(query.level.label if query.level else "", set()).add(query.text)
     for view, truth in truths.items():
         masks = found[view]
@@ -197,7 +199,7 @@ def _flat_rows(masks: Masks, truth: ViewTruth, asked: Asked) -> Iterator[Measure
             yield from _text_rows(card, query, masks.get(("", query.text)), [WORDS])
     words = [*(["wholes"] if asked.level is Level.WHOLE else []), WORDS]
     queries = [query for query in truth.queries if query.level is asked.level]
-    flat = truth.categories if asked.level is None else queries
+    flat = [*truth.categories, *truth.absent] if asked.level is None else queries
     for card in asked.flat:
         if card is OVS_NODES:  # masks of files are no nodes of a tree
             continue
@@ -211,9 +213,9 @@ def _flat_rows(masks: Masks, truth: ViewTruth, asked: Asked) -> Iterator[Measure
 def _text_rows(
     card: ProtocolCard, query: Query, mask: Bool[np.ndarray, "H W"] | None, words: list[str]
 ) -> Iterator[Measured]:
-    region = query.truth
-    if card.truth == "any grey" and query.any_grey is not None:
-        region = query.any_grey
+    region = query.any_grey_region if card.truth == "any grey" else query.truth
+    if not region.any():
+        return  # the view doesn't show it
     metrics = tuple(metric for metric in card.metrics if metric in MASK_METRICS)
     for row in measure_masks(
         replace(card, metrics=metrics), METHOD, {query.text: mask}, {query.text: region}
@@ -223,14 +225,13 @@ def _text_rows(
 
 
 def _argmax_rows(
-    queries: tuple[Query, ...] | list[Query], masks: Masks, words: list[str], labelled: bool
+    queries: Sequence[Query], masks: Masks, words: list[str], labelled: bool
 ) -> Iterator[Measured]:
     """3D-OVS by argmax: a pixel in several masks counts for the first text, one in none is a miss."""
     if not queries:
         return
     ordered = sorted(queries, key=lambda query: query.text)
-    rows, columns = eighth(ordered[0].truth.shape)
-    truth = np.stack([query.truth[np.ix_(rows, columns)] for query in ordered])
+    rows, columns, truth = eighth_truth(ordered)
     nothing = np.zeros(ordered[0].truth.shape, bool)
     given = [masks.get(("", query.text), nothing)[np.ix_(rows, columns)] for query in ordered]
     similarity = np.where(np.stack(given), 1.0, -np.inf)
@@ -251,7 +252,7 @@ def _level_rows(masks: Masks, truth: ViewTruth) -> Iterator[Measured]:
 
     def mask_of(path: tuple[str, ...]) -> Bool[np.ndarray, "H W"]:
         found = masks.get((Level(len(path)).label, path[-1]))
-        return np.zeros_like(truth.regions[path]) if found is None else found
+        return np.zeros_like(truth.regions[path]) if found is None else truth.own_part(path, found)
 
     yield from consistency_rows(METHOD, protocol, truth, mask_of)
 

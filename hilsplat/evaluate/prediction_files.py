@@ -29,10 +29,17 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
         view: its name, such as "frame_00041.png"; folders and files carry it without the suffix.
 
     Raises:
-        ArtifactError: the view has neither folder nor file, or one of them cannot be used.
+        ArtifactError: the view has neither folder nor file, or both, or one of them cannot be used.
     """
     stem = Path(view).stem
     place, packed = Path(folder) / stem, Path(folder) / f"{stem}.npz"
+    if packed.is_file() and place.is_dir():
+        raise ArtifactError(
+            f"view {stem} has predictions twice",
+            expected=f"{packed.name} or {place.name}/",
+            found="both",
+            fix="remove the one that you don't mean",
+        )
     if packed.is_file():
         return {_key(name): _as_mask(array, f"{packed}: {name}") for name, array in _arrays(packed).items()}
     if not place.is_dir():

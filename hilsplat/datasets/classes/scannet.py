@@ -1,8 +1,7 @@
-"""NYU40 labels and the 20, 19, 15 and 10 classes that ScanNet is evaluated on.
+"""NYU40 labels and the 19, 15 and 10 classes that ScanNet is evaluated on.
 
-Sources: the 20 are ScanNet's benchmark (ScanNet/ScanNet `evaluate_semantic_label.py`), the 19, 15 and 10
-OpenGaussian's (yanmin-wu/OpenGaussian `scripts/eval_scannet.py`), which the paper lists too. Labels are
-those of `<scan>_vh_clean_2.labels.ply`.
+They are OpenGaussian's (yanmin-wu/OpenGaussian `scripts/eval_scannet.py`), which the paper lists too. Labels
+are those of `<scan>_vh_clean_2.labels.ply`.
 """
 
 from hilsplat.datasets.classes.class_set import ClassSet
@@ -57,13 +56,13 @@ OPENGAUSSIAN_SCENES: tuple[str, ...] = tuple(
 """The ten scans of OpenGaussian's table. All but the last are in the train split."""
 
 BENCHMARK_20 = (*range(1, 13), 14, 16, 24, 28, 33, 34, 36, 39)
+"""Of ScanNet's own benchmark."""
 
 
 def _classes(name: str, source: str, ids: tuple[int, ...]) -> ClassSet:
     return ClassSet(name, source, ids, tuple(NYU40[label] for label in ids))
 
 
-SCANNET_20 = _classes("scannet-20", "ScanNet benchmark", BENCHMARK_20)
 SCANNET_19 = _classes(
     "scannet-19", "OpenGaussian, paper: without otherfurniture", tuple(i for i in BENCHMARK_20 if i != 39)
 )

@@ -222,7 +222,12 @@ SCANNET200_INSTANCES = ClassSet(
     tuple(label for label, _, _ in CLASSES if label not in (WALL, FLOOR)),
     tuple(name for label, name, _ in CLASSES if label not in (WALL, FLOOR)),
 )
-SPLITS: dict[str, tuple[bool, ...]] = {
-    split: tuple(each == split for _, _, each in CLASSES) for split in ("head", "common", "tail")
-}
-"""Which of the 200 classes belong to a split, in their order."""
+
+
+def splits_of(classes: ClassSet) -> dict[str, tuple[bool, ...]]:
+    """Which classes of a set belong to head, common and tail, in their order."""
+    split_of = {label: split for label, _, split in CLASSES}
+    return {
+        split: tuple(split_of[label] == split for label in classes.ids)
+        for split in ("head", "common", "tail")
+    }

@@ -9,14 +9,14 @@ from jaxtyping import Bool, Float, Int32
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.datasets.classes.class_set import ClassSet
 from hilsplat.datasets.classes.replica import REPLICA_48, REPLICA_51
-from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_15, SCANNET_19, SCANNET_20
+from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_15, SCANNET_19
 from hilsplat.datasets.classes.scannet200 import SCANNET200, SCANNET200_INSTANCES
 from hilsplat.datasets.classes.waymo import WAYMO_22
 from hilsplat.datasets.dataset import SceneReport
 from hilsplat.scene.posed_images import PosedImage
 
 LABELLINGS: dict[str, tuple[ClassSet, ...]] = {
-    "nyu40": (SCANNET_20, SCANNET_19, SCANNET_15, SCANNET_10),
+    "nyu40": (SCANNET_19, SCANNET_15, SCANNET_10),
     "scannet200": (SCANNET200, SCANNET200_INSTANCES),
     "replica": (REPLICA_51, REPLICA_48),
     "waymo": (WAYMO_22,),

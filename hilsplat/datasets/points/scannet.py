@@ -339,6 +339,7 @@ DATASET = Dataset(
         "scannet/opengaussian-15",
         "scannet/opengaussian-10",
         "scannet200/opengaussian",
+        "scannet200/benchmark",
         "scannet200/instances",
     ),
     label_places=lambda scan: (

@@ -15,6 +15,7 @@ from hilsplat.base.artifacts import atomic_path, read_index
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.registry import open_labelled
+from hilsplat.evaluate.metrics.localization import peak_points
 from hilsplat.evaluate.metrics.masks import iou
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
@@ -40,6 +41,8 @@ from hilsplat.settings import EvaluateSettings, FiguresSettings
 logger = logging.getLogger(__name__)
 
 WIDTH_IN = 13.0
+RING = {"markersize": 9, "markerfacecolor": "none", "markeredgecolor": "white", "markeredgewidth": 1.8}
+"""Mark of the localization point."""
 
 
 @dataclass(frozen=True)
@@ -216,7 +219,8 @@ def draw_queries(
 ) -> None:
     """One row per query: truth, answers of tree and field, relevancy of the field at the three levels.
 
-    Titles give IoU with the truth and the highest relevancy; the level that answered is framed.
+    Titles give IoU with the truth and the highest relevancy; the level that answered is framed. A ring marks
+    the localization point of the field.
     """
     grid = figure.subplots(len(rows), columns, squeeze=False)
     rule = rule_of(evaluate)
@@ -226,7 +230,9 @@ def draw_queries(
         relevancy = np.asarray(answers.field_relevancy([last], row.view))[0]
         hits = row.hits(answers)
         level = row.level or hits.level
-        field_mask, _ = relevancy_mask(SmoothedRelevancy.of(relevancy, rule), level, rule)
+        smoothed = SmoothedRelevancy.of(relevancy, rule)
+        field_mask, _ = relevancy_mask(smoothed, level, rule)
+        points, _ = peak_points(smoothed.filtered, level)
         pictures = [("tree", answers.node_masks(row.view, hits.ids))]
         if columns == 7:
             pictures.append(("tree, path", row.tree_mask(answers, by_path=True)))
@@ -237,6 +243,7 @@ def draw_queries(
         for place, (name, mask) in zip(axes[1:], pictures, strict=False):
             score = f": IoU {iou(mask, row.truth):.2f}" if row.truth is not None else ""
             show(place, paint_answer(image, mask, row.truth), name + score)
+        axes[len(pictures)].plot(*points[0], "o", **RING)
         low, high = float(relevancy.min()), float(relevancy.max())
         for each in LEVELS:
             top = float(relevancy[each.index].max())

@@ -21,22 +21,15 @@ class ClassCounts:
         hits: points of the class predicted as such.
         truth: points of the class; those predicted 0 are among them.
         predicted: points predicted as the class.
-        left_out: points of the class that are in no IoU because nothing was predicted there; they are misses
-            of its accuracy.
     """
 
     hits: Int64[np.ndarray, " K"]
     truth: Int64[np.ndarray, " K"]
     predicted: Int64[np.ndarray, " K"]
-    left_out: Int64[np.ndarray, " K"]
 
     @staticmethod
     def of(
-        truth: Int[np.ndarray, " P"],
-        prediction: Int[np.ndarray, " P"],
-        num_classes: int,
-        *,
-        leave_out: bool = False,
+        truth: Int[np.ndarray, " P"], prediction: Int[np.ndarray, " P"], num_classes: int
     ) -> "ClassCounts":
         """Count points; predictions on points whose truth is 0 are ignored.
 
@@ -44,7 +37,6 @@ class ClassCounts:
             truth: labels 0 .. K.
             prediction: labels 0 .. K.
             num_classes: K.
-            leave_out: points predicted 0 are in no IoU (OpenScene); otherwise they are misses.
         """
         known = truth > 0
         truth, prediction = truth[known], prediction[known]
@@ -54,9 +46,7 @@ class ClassCounts:
             assert len(counts) == num_classes, f"a label is above {num_classes}"
             return counts
 
-        silent = per_class(truth[prediction == 0]) if leave_out else np.zeros(num_classes, np.int64)
-        hits = per_class(truth[truth == prediction])
-        return ClassCounts(hits, per_class(truth), per_class(prediction), silent)
+        return ClassCounts(per_class(truth[truth == prediction]), per_class(truth), per_class(prediction))
 
     def __add__(self, other: "ClassCounts") -> "ClassCounts":
         """Counts of both point sets together."""
@@ -65,8 +55,8 @@ class ClassCounts:
 
     @property
     def union(self) -> Int64[np.ndarray, " K"]:
-        """Points of the class or predicted as such, without those left out."""
-        return self.truth - self.left_out + self.predicted - self.hits
+        """Points of the class or predicted as such."""
+        return self.truth + self.predicted - self.hits
 
 
 def pooled(counts: Iterable[ClassCounts]) -> ClassCounts:
@@ -113,12 +103,12 @@ def miou_over_occurring(counts: ClassCounts, among: Bool[np.ndarray, " K"] | Non
 
 
 def miou_over_all(counts: ClassCounts) -> float:
-    """Mean IoU over all K classes; a class that occurs nowhere counts 0 (OpenScene)."""
+    """Mean IoU over all K classes; a class that occurs nowhere counts 0 (OpenNeRF)."""
     return _mean(np.nan_to_num(class_iou(counts), nan=0.0))
 
 
 def macc_over_all(counts: ClassCounts) -> float:
-    """Mean accuracy over all K classes; a class without truth counts 0 (OpenScene)."""
+    """Mean accuracy over all K classes; a class without truth counts 0 (OpenNeRF)."""
     return _mean(np.nan_to_num(class_accuracy(counts), nan=0.0))
 
 

@@ -71,4 +71,7 @@ METRICS: dict[str, Metric] = {
     "ap": Metric("instances.ap", False, SHARE, SCANS),
     "ap50": Metric("instances.ap50", False, SHARE, SCANS),
     "ap25": Metric("instances.ap25", False, SHARE, SCANS),
+    "ap_head": Metric("instances.ap", False, SHARE, SCANS),
+    "ap_common": Metric("instances.ap", False, SHARE, SCANS),
+    "ap_tail": Metric("instances.ap", False, SHARE, SCANS),
 }

@@ -46,10 +46,7 @@ pooled: counts of all scenes are added first, so scenes weigh by their points.
 
 
 Missing = Literal["zero", "left out"]
-"""A (view, query) pair without a prediction: it counts 0, or is dropped, which flatters a method.
-
-A point without a predicted class: a miss, or in no IoU (its accuracy still counts it).
-"""
+"""A (view, query) pair without a prediction: it counts 0, or is dropped, which flatters a method."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +109,6 @@ PRESENT = ("class_iou", "class_accuracy", "miou_present", "macc_present")
 
 OPENGAUSSIAN = "yanmin-wu/OpenGaussian@b70dcc6 scripts/eval_scannet.py"
 GAUSSIAN_GROUPING = "lkeab/gaussian-grouping@c93f24b script/eval_lerf_mask.py"
-OPENSCENE = "pengsongyou/openscene@ab35b89 util/metric.py:evaluate"
 ARGMAX = "argmax of the cosine over the classes, no canonical phrases"
 PAPER = "none: Hi-LSplat, implementation details"
 OURS = "none: ours"
@@ -141,7 +137,7 @@ TREE_NODES = ProtocolCard(
 )
 LEVEL_GIVEN = ProtocolCard(
     "hierarchy/level-given",
-    4,
+    5,
     (*MASK, *LOCALIZATION, "best_threshold_iou", *CONSISTENCY),
     "levels",
     "as lerf/langsplat for maps and lerf/tree-nodes for nodes, at the level of the annotation",
@@ -150,7 +146,7 @@ LEVEL_GIVEN = ProtocolCard(
 )
 LEVEL_AUTO = ProtocolCard(
     "hierarchy/level-auto",
-    5,
+    6,
     (*MASK, *LOCALIZATION, *CONSISTENCY),
     "levels",
     "as lerf/langsplat for maps and lerf/tree-nodes for nodes, level chosen by the method",
@@ -168,7 +164,7 @@ PATH = ProtocolCard(
 )
 SCENE_WIDE = ProtocolCard(
     "hierarchy/scene-wide",
-    1,
+    2,
     (*MASK, *CONSISTENCY),
     "levels",
     "as hierarchy/level-given for nodes, but those of the whole scene compete: one answer for all views",
@@ -223,17 +219,18 @@ OVS_NODES = ProtocolCard(
 )
 OVS_ARGMAX = ProtocolCard(
     "3d-ovs/argmax",
-    2,
+    3,
     ("iou", "pixel_accuracy"),
     "pairs",
     f"{ARGMAX} and over the levels, at an eighth of the image's size",
-    "3D-OVS; departs: the highest cosine of three levels (there one); a pixel that none answers is a miss",
+    "3D-OVS; departs: the highest cosine of three levels (there one); a pixel that none answers is a miss. "
+    "Up to version 2 a text that the view lacks didn't compete",
     public="Kunhao-Liu/3D-OVS@80e512c renderer.py:evaluation_segmentation_test",
 )
 INSTANCES = ProtocolCard(
     "scannet200/instances",
     1,
-    ("ap", "ap50", "ap25"),
+    ("ap", "ap50", "ap25", "ap_head", "ap_common", "ap_tail"),
     "pooled",
     "predicted instances with class and confidence; fewer than 100 points are left out",
     "OpenMask3D's copy of ScanNet's script; departs: confidence is the cosine (there 1 for all). Predictions "
@@ -245,12 +242,13 @@ INSTANCES = ProtocolCard(
 
 OVS_LANGSPLAT_V2 = ProtocolCard(
     "3d-ovs/langsplat-v2",
-    2,
+    3,
     MASK,
     "pairs",
     "min-max of the smoothed relevancy above 0.625, 7 x 7 majority; whole or part, by the highest mean in "
     "its mask, an empty mask first; truth: any non-zero grey; wood wall is united with wood table",
-    f"{LANGSPLAT_V2}, with the threshold of its .sh; departs: a text without a true pixel is not asked",
+    f"{LANGSPLAT_V2}, with the threshold of its .sh; departs: a text without a true pixel is not asked. "
+    "Up to version 2 a mask of greys of 1 to 127 alone was none",
     RelevancyRule(
         filter_px=29,
         threshold=0.25,
@@ -278,14 +276,10 @@ def _points(
     source: str,
     metrics: tuple[str, ...] = PRESENT,
     averaging: Averaging = "scenes",
-    version: int = 1,
-    missing: Missing = "zero",
     public: str = "",
 ) -> ProtocolCard:
     """A protocol of points."""
-    return ProtocolCard(
-        name, version, metrics, averaging, ARGMAX, source, missing=missing, classes=classes, public=public
-    )
+    return ProtocolCard(name, 1, metrics, averaging, ARGMAX, source, classes=classes, public=public)
 
 
 def card_named(name: str) -> ProtocolCard:
@@ -362,33 +356,6 @@ CARDS: tuple[ProtocolCard, ...] = (
     _points("scannet/opengaussian-19", "scannet-19", "OpenGaussian", public=OPENGAUSSIAN),
     _points("scannet/opengaussian-15", "scannet-15", "OpenGaussian", public=OPENGAUSSIAN),
     _points("scannet/opengaussian-10", "scannet-10", "OpenGaussian", public=OPENGAUSSIAN),
-    _points(
-        "scannet/benchmark",
-        "scannet-20",
-        "ScanNet; departs: a class that occurs nowhere is left out (there the script stops)",
-        (*PER_CLASS, "miou_occurring"),
-        "pooled",
-        public="ScanNet/ScanNet@66ba107 BenchmarkScripts/3d_evaluation/evaluate_semantic_label.py:get_iou",
-    ),
-    _points(
-        "scannet/openscene",
-        "scannet-20",
-        "OpenScene, where a point without a feature is in no IoU; departs: a class of which no point has a "
-        "feature counts 0 (there the script stops)",
-        (*PER_CLASS, "miou_all", "macc_all"),
-        "pooled",
-        version=2,
-        missing="left out",
-        public=OPENSCENE,
-    ),
-    _points(
-        "scannet/openscene-all-points",
-        "scannet-20",
-        "OpenScene; departs: a point without a feature is a miss",
-        (*PER_CLASS, "miou_all", "macc_all"),
-        "pooled",
-        public=OPENSCENE,
-    ),
     _points(
         "scannet200/opengaussian", "scannet200", "OpenGaussian; departs: 200 classes", public=OPENGAUSSIAN
     ),

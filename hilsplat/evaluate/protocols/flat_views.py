@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
-from PIL import Image
 
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.metrics.localization import peak_points
@@ -33,11 +32,9 @@ from hilsplat.evaluate.protocols.cards import (
 from hilsplat.evaluate.protocols.masks import measure_class_maps, measure_masks
 from hilsplat.evaluate.protocols.measured import Measured
 from hilsplat.evaluate.protocols.view_rows import mask_rows
-from hilsplat.evaluate.protocols.view_truth import Query
+from hilsplat.evaluate.protocols.view_truth import Query, eighth_of, kept_by_pillow
 
 MASKS = (LERF_MASK, LERF_MASK_SKIPPING)
-EIGHTH = 8
-"""3D-OVS compares at an eighth of the image's size."""
 
 
 class FlatProtocols:
@@ -53,7 +50,7 @@ class FlatProtocols:
         self.cards, self.level = tuple(cards), level
         self.words = [*(["wholes"] if level is Level.WHOLE else []), *words]
         self._maps: dict[str, ViewMaps] = {}
-        self._truths: dict[str, Bool[np.ndarray, "H W"]] = {}
+        self._queries: dict[str, Query] = {}
 
     def add(
         self,
@@ -90,15 +87,16 @@ class FlatProtocols:
 
         for card in self.cards:
             label = card.labelled(self.words)
-            if card is OVS_NODES and nodes_mask is None:
-                continue  # a field has no nodes
+            region = flat.any_grey_region if card.truth == "any grey" else flat.truth
+            if not region.any() or (card is OVS_NODES and nodes_mask is None):
+                continue  # the view doesn't show it; a field has no nodes
             if card in (*MASKS, OVS_NODES):
                 mask = nodes_mask
                 if mask is None:
                     rule = LERF_LANGSPLAT.rule
                     assert rule is not None
                     mask, _ = relevancy_mask(smoothed_for(rule), None, rule)
-                for row in measure_masks(card, method, {flat.text: mask}, {flat.text: flat.truth}):
+                for row in measure_masks(card, method, {flat.text: mask}, {flat.text: region}):
                     yield replace(row, protocol=label)
             elif card.rule is not None:
                 smoothed = smoothed_for(card.rule)
@@ -106,27 +104,23 @@ class FlatProtocols:
                 united = None if other is None else maps.relevancy((other,))[0]
                 mask, _ = relevancy_mask(smoothed, None, card.rule, united)
                 points, _ = peak_points(smoothed.filtered, None)
-                scored = flat
-                if card.truth == "any grey" and flat.any_grey is not None:
-                    scored = replace(flat, truth=flat.any_grey)
-                yield from mask_rows(method, scored, label, mask, points, card.metrics)
+                yield from mask_rows(method, replace(flat, truth=region), label, mask, points, card.metrics)
         if OVS_ARGMAX in self.cards:
             self._maps[method] = maps
-            self._truths[flat.text] = flat.truth
+            self._queries[flat.text] = flat
 
     def finish(self) -> Iterator[Measured]:
         """Rows that need all texts of the view: 3D-OVS by argmax over texts and levels."""
-        texts = sorted(self._truths)  # ties go to the first
+        texts = sorted(self._queries)  # ties go to the first
         if not texts:
             return
-        rows, columns = eighth(self._truths[texts[0]].shape)
-        truth = np.stack([self._truths[text][np.ix_(rows, columns)] for text in texts])
+        rows, columns, truth = eighth_truth([self._queries[text] for text in texts])
         asked = np.full(truth.shape[1:], True)
         words = ["best level", *self.words]
         if self.level is not None:  # the surroundings of the objects have no text
             words = ["labelled pixels", *words]
             asked &= truth.any(axis=0)
-        width = self._truths[texts[0]].shape[1]
+        width = self._queries[texts[0]].truth.shape[1]
         pixels = (rows[:, None] * width + columns)[asked]
         if not len(pixels):
             return
@@ -136,15 +130,13 @@ class FlatProtocols:
                 yield replace(row, protocol=OVS_ARGMAX.labelled(words))
 
 
-def eighth(size_hw: tuple[int, int]) -> tuple[Int64[np.ndarray, " h"], Int64[np.ndarray, " w"]]:
-    """Rows and columns that Pillow's nearest neighbour keeps of an image at an eighth of its size.
-
-    3D-OVS resizes with it. They are 8 i + 4 where a side is a multiple of 8.
-    """
-
-    def kept(side: int) -> Int64[np.ndarray, " n"]:
-        line = Image.fromarray(np.arange(side, dtype=np.int32)[None])
-        small = line.resize((max(1, side // EIGHTH), 1), Image.Resampling.NEAREST)
-        return np.asarray(small)[0].astype(np.int64)
-
-    return kept(size_hw[0]), kept(size_hw[1])
+def eighth_truth(
+    queries: Sequence[Query],
+) -> tuple[Int64[np.ndarray, " h"], Int64[np.ndarray, " w"], Bool[np.ndarray, "K h w"]]:
+    """Rows and columns of a prediction at an eighth of the image's size, and the queries' regions there."""
+    size_hw, small = queries[0].truth.shape, queries[0].eighth
+    rows, columns = kept_by_pillow(size_hw, eighth_of(size_hw) if small is None else small.shape)
+    masks = [
+        query.truth[np.ix_(rows, columns)] if query.eighth is None else query.eighth for query in queries
+    ]
+    return rows, columns, np.stack(masks)

@@ -11,7 +11,7 @@ from jaxtyping import Int
 
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.datasets.classes.class_set import ClassSet
-from hilsplat.datasets.classes.scannet200 import SPLITS
+from hilsplat.datasets.classes.scannet200 import SCANNET200_INSTANCES, splits_of
 from hilsplat.evaluate.metrics.instances import InstanceMatches, ap, ap25, ap50, average_precision
 from hilsplat.evaluate.metrics.point_classes import (
     ClassCounts,
@@ -63,8 +63,7 @@ def measure_points(
         card: a protocol of points; its classes are `classes`.
         method: what answered.
         truth: labels 1 .. K in the order of `classes`; 0 is ignored.
-        prediction: the same; 0 is a miss, or in no IoU if the card leaves such points out. None if the scene
-            has no prediction: all 0.
+        prediction: the same; 0 is a miss. None if the scene has no prediction: all 0.
         classes: what was queried.
         carried: mode of `carry.CarriedPoints`, or another way by which predictions reached the points.
 
@@ -85,7 +84,7 @@ def measure_points(
             found=len(prediction),
             fix="carry the predictions to the points of the ground truth",
         )
-    counts = ClassCounts.of(truth, prediction, len(classes), leave_out=card.missing == "left out")
+    counts = ClassCounts.of(truth, prediction, len(classes))
     protocol = point_label(card, carried)
     for metric, values, points in (
         ("class_iou", class_iou(counts), counts.union),
@@ -112,17 +111,14 @@ def pooled_points(
     """
     counts = pooled(_counts_of(rows, classes) for rows in scenes)
     means = {metric: MEANS[metric](counts) for metric in card.metrics if metric in MEANS}
-    for split, members in SPLITS.items():
-        if f"miou_{split}" in card.metrics:
+    if "miou_head" in card.metrics:
+        for split, members in splits_of(classes).items():
             means[f"miou_{split}"] = miou_over_occurring(counts, np.array(members))
     return means
 
 
 def _counts_of(rows: Sequence[Measured], classes: ClassSet) -> ClassCounts:
-    """Counts from class rows. Values carry six decimals in a file: exact up to a million points per class.
-
-    Points left out are subtracted from those predicted, because the rows tell only their sum with the union.
-    """
+    """Counts from class rows. Values carry six decimals in a file: exact up to a million points per class."""
     hits, truth, union = np.zeros((3, len(classes)), dtype=np.int64)
     place = {text: row for row, text in enumerate(classes.texts)}
     for row in rows:
@@ -131,13 +127,13 @@ def _counts_of(rows: Sequence[Measured], classes: ClassSet) -> ClassCounts:
             hits[place[row.query]] = round(row.value * row.n)
         elif row.metric == "class_accuracy":
             truth[place[row.query]] = row.n
-    return ClassCounts(hits, truth, union - truth + hits, np.zeros_like(truth))
+    return ClassCounts(hits, truth, union - truth + hits)
 
 
 def measure_instances(
     method: str, scans: Mapping[str, InstanceMatches], carried: str, card: ProtocolCard = INSTANCES
 ) -> Iterator[Measured]:
-    """AP, AP50 and AP25 of all scans together, one row each; `n` is the number of scans.
+    """AP, AP50 and AP25 of all scans together, and AP of each split; `n` is the number of scans.
 
     Include scans without predictions: their instances are misses. Yields nothing if no scan has an instance
     of any class.
@@ -145,5 +141,8 @@ def measure_instances(
     precisions = average_precision(list(scans.values()))
     if np.isnan(precisions).all():
         return
-    for metric, function in (("ap", ap), ("ap50", ap50), ("ap25", ap25)):
-        yield Measured(method, "", "", metric, point_label(card, carried), function(precisions), len(scans))
+    values = {"ap": ap(precisions), "ap50": ap50(precisions), "ap25": ap25(precisions)}
+    for split, members in splits_of(SCANNET200_INSTANCES).items():
+        values[f"ap_{split}"] = ap(precisions[np.array(members)])
+    for metric, value in values.items():
+        yield Measured(method, "", "", metric, point_label(card, carried), value, len(scans))

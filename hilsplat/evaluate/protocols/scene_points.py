@@ -152,6 +152,7 @@ def measure_scene_points(
     """
     scale = float(np.cbrt(np.linalg.det(scene_from_points[:3, :3])))
     answers: dict[int, PointAnswers] = {}  # labellings of a mesh share its vertices
+    labels_of: dict[tuple[int, str, str], np.ndarray] = {}  # and protocols their classes
     for card in cards:
         labelling, classes = class_set(card.classes)
         if labelling not in truth:
@@ -168,5 +169,7 @@ def measure_scene_points(
         labels = asked.carried.truth(points.labels(classes))
         for method in ("tree", "field"):
             if method in methods:
-                predicted = asked.classes(method, classes.texts)
-                yield from measure_points(card, method, labels, predicted, classes, asked.carried.mode)
+                key = (id(points.xyz), method, classes.name)
+                if key not in labels_of:
+                    labels_of[key] = asked.classes(method, classes.texts)
+                yield from measure_points(card, method, labels, labels_of[key], classes, asked.carried.mode)

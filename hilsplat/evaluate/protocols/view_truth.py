@@ -4,13 +4,17 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int, Int64
+from PIL import Image
 
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.labelled import LabelledRegion
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.evaluate.metrics.localization import box_of
+
+EIGHTH = 8
+"""3D-OVS compares at an eighth of the image's size."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,7 @@ class Query:
         truth: true region.
         boxes_xyxy: box of each annotated node, borders included.
         any_grey: true region of protocols that take any grey of a mask file; None: the same as `truth`.
+        eighth: true region at an eighth of the image's size, straight from the label; None: from `truth`.
     """
 
     text: str
@@ -32,6 +37,12 @@ class Query:
     truth: Bool[np.ndarray, "H W"]
     boxes_xyxy: Int[np.ndarray, "B 4"]
     any_grey: Bool[np.ndarray, "H W"] | None = None
+    eighth: Bool[np.ndarray, "h w"] | None = None
+
+    @property
+    def any_grey_region(self) -> Bool[np.ndarray, "H W"]:
+        """True region of protocols that take any grey."""
+        return self.truth if self.any_grey is None else self.any_grey
 
 
 @dataclass(frozen=True)
@@ -42,11 +53,14 @@ class ViewTruth:
         queries: one per (text, level).
         categories: one per text, levels united.
         regions: true region of each path that is large enough.
+        absent: texts that the labels list although the view doesn't show them. They compete in an argmax,
+            and protocols that take any grey may find a region.
     """
 
     queries: tuple[Query, ...]
     categories: tuple[Query, ...]
     regions: dict[tuple[str, ...], Bool[np.ndarray, "H W"]]
+    absent: tuple[Query, ...] = ()
 
     @staticmethod
     def of(
@@ -86,22 +100,25 @@ class ViewTruth:
         return ViewTruth(tuple(queries), _united(queries), large)
 
     @staticmethod
-    def of_regions(regions: Iterable[LabelledRegion], size_hw: tuple[int, int]) -> "ViewTruth":
+    def of_regions(
+        regions: Iterable[LabelledRegion], size_hw: tuple[int, int], image_hw: tuple[int, int] | None = None
+    ) -> "ViewTruth":
         """Truth of a view of a published data set, with or without levels.
 
-        Regions of one text and level are united; all their boxes are kept. A region without a pixel (a
-        class of 3D-OVS that the view does not show) is not a query. A region whose chain of parents is
+        Regions of one text and level are united; all their boxes are kept. A region whose chain of parents is
         broken is queried but belongs to no family.
 
         Args:
             regions: the labels of the view.
             size_hw: size of the predictions; labels of another size are resized by nearest neighbour.
+            image_hw: size of the image, if it differs.
         """
+        small_hw = eighth_of(image_hw or size_hw)
         masks = [(region, region.mask(size_hw)) for region in regions]
         groups: dict[tuple[str, Level | None], list[tuple[LabelledRegion, np.ndarray]]] = {}
         by_path: dict[tuple[str, ...], np.ndarray] = {}
         for region, mask in masks:
-            if not mask.any():
+            if not mask.any() and region.level is not None:
                 continue
             groups.setdefault((region.text, region.level), []).append((region, mask))
             if region.level is not None and len(region.path) == int(region.level):
@@ -117,11 +134,22 @@ class ViewTruth:
                 np.any([region.mask(size_hw, any_grey=True) for region, _ in same], axis=0)
                 if any(region.any_grey for region, _ in same)
                 else None,
+                np.any(
+                    [
+                        region.pixels()[np.ix_(*kept_by_pillow(region.size_hw, small_hw))]
+                        for region, _ in same
+                    ],
+                    axis=0,
+                ),
             )
             for (text, level), same in groups.items()
         ]
+        united = _united(queries)
         return ViewTruth(
-            tuple(query for query in queries if query.level is not None), _united(queries), by_path
+            tuple(query for query in queries if query.level is not None),
+            tuple(query for query in united if query.truth.any()),
+            by_path,
+            tuple(query for query in united if not query.truth.any()),
         )
 
     @staticmethod
@@ -140,6 +168,23 @@ class ViewTruth:
             for text, truth in truths.items()
         )
         return ViewTruth((), categories, {})
+
+    def own_part(self, path: tuple[str, ...], answer: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+        """The answer to a path's last text, without what lies in other wholes that have a part of this text.
+
+        "leg" answers with the legs of chair and table; those in the annotated table are not the chair's.
+        """
+        named_alike = (
+            other for other in self.regions if len(other) == len(path) > 1 and other[-1] == path[-1]
+        )
+        others = [
+            self.regions[other[:-1]]
+            for other in named_alike
+            if other[:-1] in self.regions.keys() - {path[:-1]}
+        ]
+        if not others or path[:-1] not in self.regions:
+            return answer
+        return answer & ~(np.any(others, axis=0) & ~self.regions[path[:-1]])
 
     def families(self) -> list[list[tuple[tuple[str, ...], list[tuple[str, ...]]]]]:
         """(parent path, child paths) per transition whole -> part, part -> subpart."""
@@ -166,9 +211,36 @@ def _united(queries: Iterable[Query]) -> tuple[Query, ...]:
             tuple(path for query in same for path in query.paths),
             np.any([query.truth for query in same], axis=0),
             np.concatenate([query.boxes_xyxy for query in same]),
-            np.any([query.truth if query.any_grey is None else query.any_grey for query in same], axis=0)
+            np.any([query.any_grey_region for query in same], axis=0)
             if any(query.any_grey is not None for query in same)
             else None,
+            _union(query.eighth for query in same),
         )
         for text, same in by_text.items()
     )
+
+
+def _union(masks: Iterable[np.ndarray | None]) -> np.ndarray | None:
+    """Union of the masks that exist; None if there is none."""
+    known = [mask for mask in masks if mask is not None]
+    return np.any(known, axis=0) if known else None
+
+
+def eighth_of(size_hw: tuple[int, int]) -> tuple[int, int]:
+    """Height and width at which 3D-OVS compares an image of this size."""
+    return max(1, size_hw[0] // EIGHTH), max(1, size_hw[1] // EIGHTH)
+
+
+def kept_by_pillow(
+    old_hw: tuple[int, int], new_hw: tuple[int, int]
+) -> tuple[Int64[np.ndarray, " h"], Int64[np.ndarray, " w"]]:
+    """Rows and columns that Pillow's nearest neighbour keeps when it resizes, as 3D-OVS does.
+
+    They are 8 i + 4 at an eighth of a size that 8 divides.
+    """
+
+    def kept(old: int, new: int) -> Int64[np.ndarray, " n"]:
+        line = Image.fromarray(np.arange(old, dtype=np.int32)[None])
+        return np.asarray(line.resize((new, 1), Image.Resampling.NEAREST))[0].astype(np.int64)
+
+    return kept(old_hw[0], new_hw[0]), kept(old_hw[1], new_hw[1])

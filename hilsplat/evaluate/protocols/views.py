@@ -20,6 +20,7 @@ from functools import partial
 
 import numpy as np
 
+from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.evaluate.metrics.hierarchy import (
     READINGS,
@@ -152,7 +153,7 @@ def measure_view(
     field_maps = maps_of(scene.field_relevancy, scene.field_cosine)
     node_maps = maps_of(scene.node_relevancy_map, scene.node_cosine)
 
-    texts = [query.text for query in truth.categories]
+    texts = [query.text for query in (*truth.categories, *(truth.absent if also else ()))]
     per_chunk = max(1, int(RELEVANCY_CHUNK_MIB * 2**20 / (2 * 3 * 4 * size_hw[0] * size_hw[1])))
     for start in range(0, len(texts), per_chunk):
         chunk = texts[start : start + per_chunk]
@@ -160,8 +161,14 @@ def measure_view(
         asks_nodes = {"tree", "tree-path"} & set(settings.methods)
         nodes = _relevancy(scene.node_relevancy_map, chunk, view) if asks_nodes else None
         for row, text in enumerate(chunk):
-            category = truth.categories[start + row]
+            category = (*truth.categories, *truth.absent)[start + row]
             queries = [query for query in truth.queries if query.text == text]
+            if not category.truth.any():
+                assert also is not None
+                for method, found, maps in (("field", fields, field_maps), ("tree", nodes, node_maps)):
+                    if found is not None and method in settings.methods:
+                        yield from also.add(method, found[row], None, category, queries, maps)
+                continue
             if fields is not None:
                 smoothed = SmoothedRelevancy.of(fields[row], rule)
                 yield from _answer_rows(
@@ -193,7 +200,14 @@ def measure_view(
 
 
 def _relevancy(render, texts: Sequence[str], view: str) -> np.ndarray:
-    return np.asarray(render(tuple(texts), view), dtype=np.float32)
+    found = np.asarray(render(tuple(texts), view), dtype=np.float32)
+    if np.isnan(found).any():
+        raise ArtifactError(
+            f"the relevancy of view {view} is not a number at {np.isnan(found).sum()} pixels",
+            expected="a finite relevancy everywhere",
+            fix="check the field and the vectors of the scene for NaN",
+        )
+    return found
 
 
 def _best_row(method: str, query: Query, protocol: str, mixed: np.ndarray) -> Measured:
@@ -299,7 +313,10 @@ def _consistency_rows(truth: ViewTruth, masks: PackedMasks, settings: EvaluateSe
         rest_of["tree-path", label_of(PATH, "tree-path", settings)] = lambda path: (path,)
 
     def mask_of(answer: tuple[str, str], path: tuple[str, ...]) -> np.ndarray:
-        return truth.regions[path] if answer[0] == "truth" else masks.get((*answer, *rest_of[answer](path)))
+        if answer[0] == "truth":
+            return truth.regions[path]
+        mask = masks.get((*answer, *rest_of[answer](path)))
+        return mask if answer[0] == "tree-path" else truth.own_part(path, mask)
 
     for answer in rest_of:
         yield from consistency_rows(*answer, truth, partial(mask_of, answer))

@@ -42,14 +42,20 @@ COLUMNS_NOTE = (
 
 
 def ablation_table(sources: Sources) -> Table:
-    """The paper's ablation: parts of the method switched on one after the other."""
+    """The paper's ablation: parts of its method switched on one after the other, in its own reading."""
     footnotes = (
         COLUMNS_NOTE,
-        "Initial-2D: levels of the 2D masks. 3D-HC: 3D hierarchical clustering. Instance, Part: contrastive "
-        "losses. Our rows name the losses that are switched on; d is the size of a latent.",
+        "Initial-2D: levels of the 2D masks by the coverage tree. 3D-HC: 3D hierarchical clustering (L_h). "
+        "Instance, Part: contrastive losses (L_ins, L_part). docs/paper.md says how each was read.",
     )
     blocks = [reported(sources, "ablation"), *component_blocks(sources)]
     return sources.finished("ablation", "Ablation", blocks, footnotes)
+
+
+def component_table(sources: Sources) -> Table:
+    """Our own ablation: what each part of the default field and of its code adds."""
+    footnotes = (COLUMNS_NOTE, "Rows name the losses that are switched on; d is the size of a latent.")
+    return sources.finished("components", "Parts of the default field", component_blocks(sources), footnotes)
 
 
 def theta_table(sources: Sources) -> Table:

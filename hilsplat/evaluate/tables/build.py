@@ -11,7 +11,7 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.base.files import project_path
 from hilsplat.evaluate.instance_files import read_instances
 from hilsplat.evaluate.scores import read_scores
-from hilsplat.evaluate.tables.ablation import ablation_table, omega_table, theta_table
+from hilsplat.evaluate.tables.ablation import ablation_table, component_table, omega_table, theta_table
 from hilsplat.evaluate.tables.cost_tables import SECONDS, cost_table, efficiency_table, pruning_table
 from hilsplat.evaluate.tables.costs import read_costs
 from hilsplat.evaluate.tables.frame_tables import hi_3dovs_frames, hi_lerf_frames
@@ -62,6 +62,7 @@ TABLES: dict[str, TableKind] = {
     "waymo": TableKind(waymo_table, ("street", "waymo")),
     "hierarchy": TableKind(hierarchy_table, ("tabletop", "room", "street", "lerf_ovs", "3d_ovs")),
     "ablation": TableKind(ablation_table, LEVELLED, "ablation_variants"),
+    "components": TableKind(component_table, LEVELLED, "component_variants"),
     "cost": TableKind(cost_table, LEVELLED, shows_costs=True),
     "cost-seconds": TableKind(partial(cost_table, seconds=True), LEVELLED, shows_costs=True),
     "pruning": TableKind(pruning_table, LEVELLED, "pruning_variants", shows_costs=True),

@@ -3,9 +3,10 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from hilsplat.evaluate.protocols.cards import INSTANCES, card_of
+from hilsplat.evaluate.protocols.cards import INSTANCES, card_named, card_of
 from hilsplat.evaluate.protocols.measured import Measured
 from hilsplat.evaluate.protocols.totals import table_value
+from hilsplat.evaluate.tables.intervals import interval_cells
 from hilsplat.evaluate.tables.measured import (
     in_order,
     kind_and_title,
@@ -29,7 +30,14 @@ SCANNET_COLUMNS: Mapping[str, str] = {
 }
 """Protocol -> the paper's column."""
 
-AP_COLUMNS = {"ap": "ScanNet200 AP", "ap25": "ScanNet200 AP@25", "ap50": "ScanNet200 AP@50"}
+BENCHMARK = "scannet200/benchmark"
+SPLIT_COLUMNS = {f"miou_{split}": f"ScanNet200 {split} mIoU" for split in ("head", "common", "tail")}
+AP_COLUMNS = {
+    "ap": "ScanNet200 AP",
+    "ap25": "ScanNet200 AP@25",
+    "ap50": "ScanNet200 AP@50",
+    **{f"ap_{split}": f"ScanNet200 {split} AP" for split in ("head", "common", "tail")},
+}
 
 MODE_NOTE = (
     "Points get their class from the Gaussians by the mode named after 'points:' (nearest: the nearest "
@@ -38,26 +46,40 @@ MODE_NOTE = (
     "still competes."
 )
 
+INTERVAL_NOTE = (
+    "95 %: bootstrap interval of the mIoU over scenes and the names in them. Names: true names, and the "
+    "number of scenes. Rows with overlapping intervals cannot be ranked by these scenes."
+)
+
 
 def replica_table(sources: Sources) -> Table:
     """mIoU and mAcc per scene (paper: Replica, semantic segmentation)."""
 
     def columns_of(of_data: "pd.DataFrame") -> list[str]:
         scenes = [*sorted(set(of_data["scene"])), "Mean"]
-        return [f"{scene} {name}" for scene in scenes for name in ("mIoU", "mAcc")]
+        return [
+            *(f"{scene} {name}" for scene in scenes for name in ("mIoU", "mAcc")),
+            "Mean 95 %",
+            "Mean names",
+        ]
+
+    def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
+        means = scene_cells(part, {"mIoU": "miou_present", "mAcc": "macc_present"}, "Mean")
+        return {**means, **interval_cells(part, "Mean", pooled=False)}
 
     blocks = [reported_block(sources.published, "Replica", "Reported in the paper: Replica")]
     blocks += measured_blocks(
         sources.scores,
         sources.labels,
         ("replica/per-scene",),
-        lambda part: scene_cells(part, {"mIoU": "miou_present", "mAcc": "macc_present"}, "Mean"),
+        cells_of,
         columns_of,
     )
     footnotes = (
         "All in %. Mean over the classes present in a scene, vertices of other classes ignored. The paper "
         "speaks of 48 classes and names no code: this is our reading.",
         MODE_NOTE,
+        INTERVAL_NOTE,
         "*: reproduced by the paper's authors.",
     )
     return sources.finished("replica", "Replica: semantic segmentation of points", blocks, footnotes)
@@ -67,13 +89,15 @@ def scannet_table(sources: Sources) -> Table:
     """ScanNet with 19, 15, 10 classes, ScanNet200 with 200, instances of ScanNet200: one row per method."""
     blocks = [reported_block(sources.published, "ScanNet", "Reported in the paper: ScanNet, ScanNet200")]
     scores = with_seeds(sources.scores)
-    names = tuple(SCANNET_COLUMNS)
+    names = (*SCANNET_COLUMNS, BENCHMARK)
     wanted = scores[scores["protocol"].str.startswith(names)] if len(scores) else scores
-    columns = [f"{name} {metric}" for name in SCANNET_COLUMNS.values() for metric in ("mIoU", "mAcc")]
-    columns += AP_COLUMNS.values()
+    columns = [
+        f"{name} {what}" for name in SCANNET_COLUMNS.values() for what in ("mIoU", "95 %", "names", "mAcc")
+    ]
+    columns += [*SPLIT_COLUMNS.values(), *AP_COLUMNS.values()]
 
     def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
-        return {**semantic_cells(part), **instance_cells(sources, part)}
+        return {**semantic_cells(part), **split_cells(part), **instance_cells(sources, part)}
 
     for data, of_data in wanted.groupby("dataset", sort=True):
         rows = []
@@ -89,6 +113,9 @@ def scannet_table(sources: Sources) -> Table:
         "All in %. 19, 15 and 10 classes and ScanNet200 follow OpenGaussian's code: mean over the classes "
         "present in a scene, then over scenes; vertices of other classes are ignored.",
         MODE_NOTE,
+        INTERVAL_NOTE,
+        "Head, common, tail: the benchmark's splits; mIoU with the counts of all scenes pooled, over the "
+        "classes that occur in truth or prediction.",
         "AP, AP@25, AP@50: OpenMask3D's copy of ScanNet's script, over all scans together; an instance is a "
         "node of the tree at level whole, its class the best of 198, its confidence that cosine. A field has "
         "no instances.",
@@ -104,7 +131,20 @@ def semantic_cells(part: "pd.DataFrame") -> dict[str, Cell]:
         of_protocol = part[part["protocol"].str.startswith(protocol)]
         for metric, key in (("mIoU", "miou_present"), ("mAcc", "macc_present")):
             cells[f"{name} {metric}"] = Cell.percent(table_value(of_protocol, key))
+        cells |= interval_cells(of_protocol, name, pooled=False)
     return cells
+
+
+def split_cells(part: "pd.DataFrame") -> dict[str, Cell]:
+    """mIoU of ScanNet200's head, common and tail classes, all scenes pooled."""
+    of_benchmark = part[part["protocol"].str.startswith(BENCHMARK)]
+    if of_benchmark.empty:
+        return {}
+    from hilsplat.datasets.classes.scannet200 import SCANNET200
+    from hilsplat.evaluate.protocols.points import pooled_points
+
+    means = pooled_points(card_named(BENCHMARK), measured_scenes(of_benchmark), SCANNET200)
+    return {column: Cell.percent(means[metric]) for metric, column in SPLIT_COLUMNS.items()}
 
 
 def instance_cells(sources: Sources, part: "pd.DataFrame") -> dict[str, Cell]:
@@ -137,6 +177,7 @@ def waymo_table(sources: Sources) -> Table:
         return {
             "mIoU": Cell.percent(means["miou_absent_as_one"]),
             "mIoU, present classes": Cell.percent(means["miou_present"]),
+            **interval_cells(part, "Present classes", pooled=True),
             "Classes present": Cell(str(classes), float(classes)),
         }
 
@@ -146,13 +187,19 @@ def waymo_table(sources: Sources) -> Table:
         sources.labels,
         ("waymo/",),
         cells_of,
-        lambda _: ("mIoU", "mIoU, present classes", "Classes present"),
+        lambda _: (
+            "mIoU",
+            "mIoU, present classes",
+            "Present classes 95 %",
+            "Classes present",
+        ),
         unranked=frozenset({"Classes present"}),
     )
     footnotes = (
         "All in %. mIoU: Waymo's official metric over 22 classes, in which a class without a point counts "
         "100; present classes leaves those out. Counts of all scenes are pooled.",
         MODE_NOTE,
+        INTERVAL_NOTE,
         "*: reproduced by the paper's authors.",
     )
     return sources.finished("waymo", "Waymo: segmentation of lidar points", blocks, footnotes)

@@ -25,11 +25,10 @@ def test_ids_and_texts_are_unique(classes):
 
 
 def test_scannet_sets_nest():
-    sets = [scannet.SCANNET_20, scannet.SCANNET_19, scannet.SCANNET_15, scannet.SCANNET_10]
-    assert [len(classes) for classes in sets] == [20, 19, 15, 10]
+    sets = [scannet.SCANNET_19, scannet.SCANNET_15, scannet.SCANNET_10]
+    assert [len(classes) for classes in sets] == [19, 15, 10]
     for larger, smaller in itertools.pairwise(sets):
         assert set(smaller.ids) < set(larger.ids)
-    assert set(scannet.SCANNET_20.ids) - set(scannet.SCANNET_19.ids) == {39}
     assert scannet.SCANNET_10.texts == (
         *("wall", "floor", "bed", "chair", "sofa", "table", "door", "window", "bookshelf", "toilet"),
     )
@@ -39,7 +38,9 @@ def test_scannet_sets_nest():
 
 def test_scannet200_has_its_splits():
     assert len(scannet200.SCANNET200) == 200
-    assert {split: sum(members) for split, members in scannet200.SPLITS.items()} == {
+    assert {
+        split: sum(members) for split, members in scannet200.splits_of(scannet200.SCANNET200).items()
+    } == {
         "head": 66,
         "common": 68,
         "tail": 66,
@@ -79,7 +80,6 @@ def test_classes_equal_the_companion_lists(listed):
     nyu40 = listed("nyu40_classes.csv")
     assert {int(row["nyu40id"]): row["query_name"] for row in nyu40} == scannet.NYU40
     for column, classes in (
-        ("in20", scannet.SCANNET_20),
         ("in19", scannet.SCANNET_19),
         ("in15", scannet.SCANNET_15),
         ("in10", scannet.SCANNET_10),

@@ -7,8 +7,8 @@ from PIL import Image
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.protocols.answers import ViewMaps
 from hilsplat.evaluate.protocols.cards import LERF_MASK, OVS_ARGMAX, OVS_NODES, card_named
-from hilsplat.evaluate.protocols.flat_views import FlatProtocols, eighth
-from hilsplat.evaluate.protocols.view_truth import Query
+from hilsplat.evaluate.protocols.flat_views import FlatProtocols
+from hilsplat.evaluate.protocols.view_truth import Query, eighth_of, kept_by_pillow
 from hilsplat.query.relevancy import relevancy_of_margins
 
 SIZE = (16, 32)
@@ -48,9 +48,9 @@ def cosines(**of_text):
 
 
 def test_an_eighth_takes_the_pixels_that_pillow_takes():
-    rows, columns = eighth(SIZE)
+    rows, columns = kept_by_pillow(SIZE, eighth_of(SIZE))
     assert (rows.tolist(), columns.tolist()) == ([4, 12], [4, 12, 20, 28])
-    rows, columns = eighth((728, 986))  # sides that 8 does not divide
+    rows, columns = kept_by_pillow((728, 986), eighth_of((728, 986)))  # sides that 8 does not divide
     picture = np.arange(728 * 986, dtype=np.int32).reshape(728, 986)
     small = Image.fromarray(picture).resize((123, 91), Image.Resampling.NEAREST)
     np.testing.assert_array_equal(picture[np.ix_(rows, columns)], np.asarray(small))
@@ -69,7 +69,7 @@ def test_argmax_compares_labelled_pixels_of_a_stand_in_alone():
     assert rows["iou", "cup"].value == 0.5
     assert rows["iou", "plate"].value == 0.5
     assert rows["pixel_accuracy", ""].value == pytest.approx(2 / 3)
-    assert rows["iou", "cup"].protocol == "3d-ovs/argmax@2 (labelled pixels, best level, wholes)"
+    assert rows["iou", "cup"].protocol == "3d-ovs/argmax@3 (labelled pixels, best level, wholes)"
 
 
 def test_without_levels_every_pixel_is_compared():
@@ -78,7 +78,7 @@ def test_without_levels_every_pixel_is_compared():
     list(flat.add("tree", maps((0, 16)), None, cup, [], cosines(cup=maps((0, 16)))))
     rows = {row.metric: row for row in flat.finish()}
     assert rows["pixel_accuracy"].value == 0.5  # the only text wins everywhere
-    assert rows["iou"].protocol == "3d-ovs/argmax@2 (best level)"
+    assert rows["iou"].protocol == "3d-ovs/argmax@3 (best level)"
 
 
 def test_canonical_phrases_do_not_choose_the_level():
@@ -97,6 +97,17 @@ def test_canonical_phrases_do_not_choose_the_level():
         list(flat.add("field", relevancy[each.text], None, each, [], cosines(**cosine)))
     rows = {(row.metric, row.query): row.value for row in flat.finish()}
     assert rows == {("iou", "one"): 1.0, ("iou", "two"): 0.0, ("pixel_accuracy", ""): 1.0}
+
+
+def test_a_text_that_the_view_lacks_competes_and_counts_zero():
+    cup, fork = query("cup", (0, 16), level=None), query("fork", (0, 0), level=None)
+    flat = FlatProtocols([OVS_ARGMAX, card_named("3d-ovs/langsplat")], None)
+    found = cosines(cup=maps((0, 16)), fork=maps((8, 32), 0.95))
+    rows = list(flat.add("field", maps((0, 16)), None, cup, [], found))
+    assert {row.query for row in rows} == {"cup"}
+    assert not list(flat.add("field", maps((8, 32)), None, fork, [], found))
+    values = {(row.metric, row.query): row.value for row in flat.finish()}
+    assert values == {("iou", "cup"): 0.5, ("iou", "fork"): 0.0, ("pixel_accuracy", ""): 0.25}
 
 
 def test_a_pixel_that_no_level_answers_is_a_miss():

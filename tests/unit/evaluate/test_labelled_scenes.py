@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.levels import Level
@@ -108,7 +109,8 @@ def test_regions_of_one_text_unite_and_keep_their_boxes():
 
 
 def test_regions_without_a_pixel_are_not_queries():
-    assert ViewTruth.of_regions([region_of(np.zeros((4, 6), bool), "ring")], (4, 6)).categories == ()
+    truth = ViewTruth.of_regions([region_of(np.zeros((4, 6), bool), "ring")], (4, 6))
+    assert truth.categories == () and [query.text for query in truth.absent] == ["ring"]
 
 
 def test_a_region_with_a_broken_chain_is_queried_but_belongs_to_no_family():
@@ -126,6 +128,34 @@ def test_labels_are_resized_to_the_view():
     mask[2, 3] = True
     (dot,) = ViewTruth.of_regions([region_of(mask, "dot")], (8, 12)).categories
     assert np.argwhere(dot.truth).tolist() == [[4, 6], [4, 7], [5, 6], [5, 7]]
+
+
+def test_labels_shrink_as_public_evaluators_shrink_them():
+    # OpenCV's nearest takes the pixel under the corner; at an eighth, Pillow takes the one under the centre.
+    mask = np.zeros((48, 48), bool)
+    mask[0::3, 0::3] = True
+    (dots,) = ViewTruth.of_regions([region_of(mask, "dots")], (16, 16), (32, 32)).categories
+    assert dots.truth.all()
+    assert dots.eighth.shape == (4, 4)
+    small = Image.fromarray(mask).resize((4, 4), Image.Resampling.NEAREST)
+    np.testing.assert_array_equal(dots.eighth, np.asarray(small))
+
+
+def test_the_answer_to_a_repeated_text_is_shared_out_by_the_annotated_wholes():
+    chair, table = np.zeros((4, 6), bool), np.zeros((4, 6), bool)
+    chair[:, :3], table[:, 3:] = True, True
+    legs = np.zeros((4, 6), bool)
+    legs[3] = True
+    regions = [
+        region_of(whole & part, path[-1], Level(len(path)), path)
+        for name, whole in (("chair", chair), ("table", table))
+        for path, part in (((name,), whole), ((name, "leg"), legs))
+    ]
+    truth = ViewTruth.of_regions(regions, (4, 6))
+    (leg,) = [query for query in truth.queries if query.text == "leg"]
+    for name, whole in (("chair", chair), ("table", table)):
+        np.testing.assert_array_equal(truth.own_part((name, "leg"), leg.truth), legs & whole)
+        np.testing.assert_array_equal(truth.own_part((name,), legs), legs)
 
 
 @pytest.mark.parametrize(("name", "found"), [("lerf_ovs", "no scene"), ("scannet/scene0000_00", "on points")])

@@ -130,6 +130,9 @@ CASES = {
     "ap": of_instances(ap),
     "ap50": of_instances(ap50),
     "ap25": of_instances(ap25),
+    "ap_head": of_instances(ap),
+    "ap_common": of_instances(ap),
+    "ap_tail": of_instances(ap),
 }
 
 label_images = hnp.arrays(np.int64, (4, 5), elements=st.integers(0, 3))

@@ -34,28 +34,25 @@ DECIDED = {
     "lerf/opengaussian@1": "68a14e17",
     "lerf-mask/gaussian-grouping@1": "34874a8b",
     "lerf-mask/gaussian-grouping-skipping@1": "b146f4ac",
-    "3d-ovs/argmax@2": "44dac158",
+    "3d-ovs/argmax@3": "44dac158",
     "3d-ovs/langsplat@2": "f962ef1a",
     "3d-ovs/langsplat-raw@2": "7797b61a",
-    "3d-ovs/langsplat-v2@2": "107e57a0",
+    "3d-ovs/langsplat-v2@3": "107e57a0",
     "3d-ovs/tree-nodes@1": "3fb8af27",
     "scannet/opengaussian-19@1": "ced31f5d",
     "scannet/opengaussian-15@1": "df507111",
     "scannet/opengaussian-10@1": "e9893d38",
-    "scannet/benchmark@1": "fe414350",
-    "scannet/openscene@2": "03d96f4a",
-    "scannet/openscene-all-points@1": "1341871a",
     "scannet200/opengaussian@1": "367d9a7d",
     "scannet200/benchmark@1": "af79327f",
-    "scannet200/instances@1": "623d86d6",
+    "scannet200/instances@1": "e9f60d74",
     "replica/per-scene@1": "5160df43",
     "replica/opennerf@1": "2368b7a9",
     "replica/conceptgraphs@1": "d89e022d",
     "waymo/segmentation@1": "06e4086c",
-    "hierarchy/level-given@4": "50a68907",
-    "hierarchy/level-auto@5": "674d16a2",
+    "hierarchy/level-given@5": "50a68907",
+    "hierarchy/level-auto@6": "674d16a2",
     "hierarchy/path@3": "d6216e2a",
-    "hierarchy/scene-wide@1": "2150c519",
+    "hierarchy/scene-wide@2": "2150c519",
     "hierarchy/annotations@1": "b5a6aa09",
     "world/view-consistency@2": "c057895c",
 }
@@ -135,11 +132,11 @@ def test_rows_name_what_settings_change():
     )
     assert label_of(TREE_NODES, "tree", EvaluateSettings(ancestors=0)) == "lerf/tree-nodes@5 (ancestors 0)"
     # nodes are not thresholded, so the scale of the threshold changes nothing of theirs
-    expected = "hierarchy/level-given@4 (filter 20, node share 0.7, relevancy scale 5)"
+    expected = "hierarchy/level-given@5 (filter 20, node share 0.7, relevancy scale 5)"
     assert label_of(LEVEL_GIVEN, "tree", changed) == expected
-    assert label_of(LEVEL_GIVEN, "truth", changed) == "hierarchy/level-given@4"
+    assert label_of(LEVEL_GIVEN, "truth", changed) == "hierarchy/level-given@5"
     other = EvaluateSettings(canonical=("object", "scene"))
-    assert label_of(LEVEL_GIVEN, "tree", other) == "hierarchy/level-given@4 (canonical object+scene)"
+    assert label_of(LEVEL_GIVEN, "tree", other) == "hierarchy/level-given@5 (canonical object+scene)"
 
 
 def test_rows_lead_back_to_their_protocol():
@@ -156,11 +153,11 @@ def test_published_rules_differ_as_stated():
     assert literal.departures(reading) == ("raw",)
     assert (reading.level_rule, reading.mix, reading.majority) == ("mean_in_mask", False, False)
     released = RelevancyRule(filter_px=29, threshold=0.25, border="inside", empty_wins=True)
-    assert rules["3d-ovs/langsplat-v2@2"].departures(released) == ("mean_in_mask", "levels whole+part")
+    assert rules["3d-ovs/langsplat-v2@3"].departures(released) == ("mean_in_mask", "levels whole+part")
 
 
 def test_skipping_protocol_differs_in_nothing_but_missing_predictions():
     assert (LERF_MASK.missing, LERF_MASK_SKIPPING.missing) == ("zero", "left out")
     assert LERF_MASK.metrics == LERF_MASK_SKIPPING.metrics
     left_out = {card.name for card in CARDS if card.missing == "left out"}
-    assert left_out == {LERF_MASK_SKIPPING.name, "scannet/openscene"}
+    assert left_out == {LERF_MASK_SKIPPING.name}

@@ -100,7 +100,7 @@ def test_class_maps_give_a_row_per_class_and_the_accuracy_of_the_view():
         ("", "pixel_accuracy", 0.75, 4),
     ]
     ious = {("v", row.query): row.value for row in rows if row.metric == "iou"}
-    assert scene_value(PROTOCOLS["3d-ovs/argmax@2"], ious) == pytest.approx(0.666667, abs=1e-6)
+    assert scene_value(PROTOCOLS["3d-ovs/argmax@3"], ious) == pytest.approx(0.666667, abs=1e-6)
 
 
 def test_view_without_class_maps_counts_zero():

@@ -7,8 +7,8 @@ import pytest
 
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.datasets.classes.class_set import ClassSet
-from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_19, SCANNET_20
-from hilsplat.datasets.classes.scannet200 import SCANNET200, SPLITS
+from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_19
+from hilsplat.datasets.classes.scannet200 import SCANNET200, SCANNET200_INSTANCES, splits_of
 from hilsplat.datasets.classes.waymo import WAYMO_22
 from hilsplat.evaluate.metrics.instances import InstanceScan, match_instances
 from hilsplat.evaluate.protocols.cards import PROTOCOLS
@@ -46,40 +46,6 @@ def test_scene_without_predictions_counts_zero():
     rows = list(measure_points(OPENGAUSSIAN, "tree", TRUTH, None, SCANNET_19, "frozen"))
     assert {row.value for row in rows} == {0.0}
     assert {row.query for row in rows} == {"", "wall", "floor", "cabinet"}
-
-
-def test_openscene_leaves_points_without_a_feature_out_of_the_iou():
-    truth, prediction = np.array([1, 1, 2]), np.array([1, 0, 2])
-    for name, wall in (("scannet/openscene@2", 1.0), ("scannet/openscene-all-points@1", 0.5)):
-        rows = list(measure_points(PROTOCOLS[name], "tree", truth, prediction, SCANNET_20, "nearest"))
-        values = {(row.query, row.metric): row.value for row in rows}
-        assert (values["wall", "class_iou"], values["floor", "class_iou"]) == (wall, 1.0)
-        assert values["wall", "class_accuracy"] == 0.5  # a miss under both
-        means = pooled_points(PROTOCOLS[name], [rows], SCANNET_20)
-        assert means == {"miou_all": pytest.approx((wall + 1) / 20), "macc_all": pytest.approx(1.5 / 20)}
-
-
-def test_openscene_is_its_confusion_matrix_without_the_row_of_no_feature():
-    rng, card, num = np.random.default_rng(1), PROTOCOLS["scannet/openscene@2"], len(SCANNET_20)
-    scenes = [(rng.integers(0, 12, 500), rng.integers(0, 15, 500)) for _ in range(3)]
-    confusion, in_truth = np.zeros((num, num)), np.zeros(num)
-    for truth, prediction in scenes:
-        for true, predicted in zip(truth, prediction, strict=True):
-            if true:
-                in_truth[true - 1] += 1
-                if predicted:
-                    confusion[predicted - 1, true - 1] += 1
-    ious = [
-        confusion[k, k] / (confusion[k].sum() + confusion[:, k].sum() - confusion[k, k])
-        for k in range(num)
-        if in_truth[k]
-    ]
-    accuracies = [confusion[k, k] / in_truth[k] for k in range(num) if in_truth[k]]
-    rows = [list(measure_points(card, "tree", *scene, SCANNET_20, "nearest")) for scene in scenes]
-    assert pooled_points(card, rows, SCANNET_20) == {
-        "miou_all": pytest.approx(sum(ious) / num),
-        "macc_all": pytest.approx(sum(accuracies) / num),
-    }
 
 
 def test_scene_without_truth_has_no_rows():
@@ -120,7 +86,7 @@ def test_pooled_rows_equal_points_put_together_also_after_a_file(tmp_path):
 
 def test_scannet200_is_split_into_head_common_and_tail():
     card = PROTOCOLS["scannet200/benchmark@1"]
-    places = [SPLITS[split].index(True) + 1 for split in ("head", "common", "tail")]
+    places = [members.index(True) + 1 for members in splits_of(SCANNET200).values()]
     truth = np.repeat(places, 2)
     prediction = truth * np.array([1, 1, 1, 0, 0, 0])  # head right, common half, tail missed
     rows = list(measure_points(card, "tree", truth, prediction, SCANNET200, "nearest"))
@@ -150,13 +116,22 @@ def test_instance_rows_are_of_all_scans_together():
     mask = np.repeat([[True, False]], 4, axis=1)
     found = InstanceScan(truth, mask, np.array([4]), np.ones(1))
     missed = InstanceScan(truth, mask[:0], np.zeros(0, int), np.zeros(0))
-    scans = {name: match_instances(scan, (4,), 1) for name, scan in (("a", found), ("b", missed))}
+    scans = {
+        name: match_instances(scan, SCANNET200_INSTANCES.ids, 1)
+        for name, scan in (("a", found), ("b", missed))
+    }
     rows = list(measure_instances("tree", scans, "nearest"))
-    assert [(row.metric, row.value, row.n) for row in rows] == [
-        ("ap", pytest.approx(0.5), 2),
-        ("ap50", pytest.approx(0.5), 2),
-        ("ap25", pytest.approx(0.5), 2),
-    ]
+    assert {row.n for row in rows} == {2}
+    values = {row.metric: row.value for row in rows}
+    half, none = pytest.approx(0.5), pytest.approx(np.nan, nan_ok=True)  # 4 is a class of the head
+    assert values == {
+        "ap": half,
+        "ap50": half,
+        "ap25": half,
+        "ap_head": half,
+        "ap_common": none,
+        "ap_tail": none,
+    }
     assert rows[0].protocol == "scannet200/instances@1 (points: nearest)"
-    nothing = {"a": match_instances(found, (9,), 1)}
+    nothing = {"a": match_instances(found, SCANNET200_INSTANCES.ids[5:], 1)}
     assert list(measure_instances("tree", nothing, "nearest")) == []

@@ -120,9 +120,9 @@ def test_consistency_rows_match_the_worked_example(tmp_path):
     scene, truth = worked_example(tmp_path)
     values = measured(scene, truth, methods=("tree", "tree-path"))
     for method, protocol in (
-        ("tree", "level-given@4"),
-        ("tree", "level-auto@5"),
-        ("tree", "scene-wide@1"),
+        ("tree", "level-given@5"),
+        ("tree", "level-auto@6"),
+        ("tree", "scene-wide@2"),
         ("tree-path", "path@3"),
     ):
         key = (method, f"hierarchy/{protocol}", "", "")
@@ -140,9 +140,9 @@ def test_consistency_rows_match_the_worked_example(tmp_path):
 def test_missing_answer_counts_zero_and_breaks_consistency(tmp_path):
     scene, truth = worked_example(tmp_path, without=("x",))
     values = measured(scene, truth, methods=("tree",))
-    assert values["tree", "hierarchy/level-given@4", "x", "subpart", "iou"] == 0
-    assert values["tree", "hierarchy/level-given@4", "A", "whole", "iou"] == 1
-    assert values["tree", "hierarchy/level-given@4", "", "", "hc_containment"] == pytest.approx(0.4375)
+    assert values["tree", "hierarchy/level-given@5", "x", "subpart", "iou"] == 0
+    assert values["tree", "hierarchy/level-given@5", "A", "whole", "iou"] == 1
+    assert values["tree", "hierarchy/level-given@5", "", "", "hc_containment"] == pytest.approx(0.4375)
 
 
 def test_scene_wide_answers_do_not_depend_on_the_view(tmp_path):
@@ -153,11 +153,11 @@ def test_scene_wide_answers_do_not_depend_on_the_view(tmp_path):
     }  # b1 is more like it, in another view
     values = measured(scene, truth, methods=("tree", "tree-path"))
     assert values["tree-path", "hierarchy/path@3", "x", "subpart", "iou"] == 1
-    assert values["tree", "hierarchy/level-given@4", "x", "subpart", "iou"] == 1
-    assert values["tree", "hierarchy/scene-wide@1", "x", "subpart", "iou"] == 0
-    assert values["tree", "hierarchy/scene-wide@1", "A", "whole", "iou"] == 1
+    assert values["tree", "hierarchy/level-given@5", "x", "subpart", "iou"] == 1
+    assert values["tree", "hierarchy/scene-wide@2", "x", "subpart", "iou"] == 0
+    assert values["tree", "hierarchy/scene-wide@2", "A", "whole", "iou"] == 1
     # as if x had no answer: no pixel of its mask lies inside a1
-    assert values["tree", "hierarchy/scene-wide@1", "", "", "hc_containment"] == pytest.approx(0.4375)
+    assert values["tree", "hierarchy/scene-wide@2", "", "", "hc_containment"] == pytest.approx(0.4375)
 
 
 def test_regions_with_the_same_text_are_united(tmp_path):
@@ -169,7 +169,7 @@ def test_regions_with_the_same_text_are_united(tmp_path):
     assert truth.queries[0].boxes_xyxy.tolist() == [[0, 0, 3, 3], [6, 6, 9, 9]]
     scene = HandMade([mask_of((0, 4), (0, 4))], {("cup", Level.WHOLE): [0], ("cup", None): [0]})
     values = measured(scene, truth, methods=("tree",))
-    assert values["tree", "hierarchy/level-given@4", "cup", "whole", "iou"] == pytest.approx(0.5)
+    assert values["tree", "hierarchy/level-given@5", "cup", "whole", "iou"] == pytest.approx(0.5)
 
 
 def test_text_at_two_levels_is_one_category_and_two_queries(tmp_path):
@@ -218,7 +218,7 @@ def test_automatic_level_of_the_field_follows_the_highest_value(tmp_path):
     values = measured(scene, truth, methods=("field",), filter_px=1, majority=False)
     given, auto, lerf = (
         f"{name} (filter 1, no majority)"
-        for name in ("hierarchy/level-given@4", "hierarchy/level-auto@5", "lerf/langsplat@2")
+        for name in ("hierarchy/level-given@5", "hierarchy/level-auto@6", "lerf/langsplat@2")
     )
     key = ("cup", "whole", "iou")
     assert values["field", given, *key] == 1
@@ -258,6 +258,26 @@ def test_other_protocols_are_measured_with_their_own_rules():
     assert own == {"iou", "boundary_iou"}
 
 
+def test_a_relevancy_that_is_not_a_number_is_an_error():
+    relevancy = np.full((3, *SIZE), 0.1, np.float32)
+    relevancy[1, 2, 3] = np.nan
+    truth = ViewTruth.flat({"cup": mask_of((2, 6), (2, 6))})
+    with pytest.raises(ArtifactError, match=r"relevancy of view v\.png is not a number at 1 pixels"):
+        measured(HandMade([], {}, {"cup": relevancy}), truth, methods=("field",))
+
+
+def test_a_repeated_text_nests_in_each_of_its_wholes(tmp_path):
+    nodes = [("chair", 1, -1), ("table", 1, -1), ("leg", 2, 0), ("leg", 2, 1)]
+    regions = [((0, 10), (0, 5)), ((0, 10), (5, 10)), ((8, 10), (0, 5)), ((8, 10), (5, 10))]
+    truth = ViewTruth.of(annotations_of(tmp_path, nodes, regions), "v.png", SIZE, 1)
+    answers = {("chair", None): [0], ("table", None): [1], ("leg", None): [2, 3]}
+    answers |= {("chair", Level.WHOLE): [0], ("table", Level.WHOLE): [1], ("leg", Level.PART): [2, 3]}
+    values = measured(HandMade([mask_of(*each) for each in regions], answers), truth, methods=("tree",))
+    perfect = values["truth", "hierarchy/annotations@1", "", "", "hc_containment"]
+    assert values["tree", "hierarchy/level-given@5", "", "", "hc_containment"] == perfect == 0.5
+    assert values["tree", "hierarchy/level-given@5", "", "", "hc_anchored"] == 0.5
+
+
 def test_path_localization_looks_inside_the_parent(tmp_path):
     nodes = [("bear", 1, -1), ("nose", 2, 0)]
     regions = [((0, 10), (0, 5)), ((2, 4), (2, 4))]
@@ -268,7 +288,7 @@ def test_path_localization_looks_inside_the_parent(tmp_path):
     answers = {("bear",): [0], ("bear", "nose"): [1], ("nose", Level.PART): [1]}
     scene = HandMade([mask_of(*each) for each in regions], answers, {"nose": relevancy})
     values = measured(scene, truth, methods=("tree", "tree-path"), filter_px=1)
-    assert values["tree", "hierarchy/level-given@4 (filter 1)", "nose", "part", "localization_box"] == 0
+    assert values["tree", "hierarchy/level-given@5 (filter 1)", "nose", "part", "localization_box"] == 0
     assert values["tree-path", "hierarchy/path@3 (filter 1)", "nose", "part", "localization_box"] == 1
 
 
@@ -278,7 +298,7 @@ def test_perfect_tree_of_the_block_world_scores_one(block_world):
     truth = ViewTruth.of(block_world.annotations, view, size_hw, settings.min_region_px)
     selections = Selections(block_world.answers)
     rows = list(measure_view(block_world.answers, selections, truth, view, size_hw, settings))
-    given = [row for row in rows if row.method == "tree" and row.protocol == "hierarchy/level-given@4"]
+    given = [row for row in rows if row.method == "tree" and row.protocol == "hierarchy/level-given@5"]
     ious = {row.query: row.value for row in given if row.metric == "iou"}
     assert ious == dict.fromkeys(("bear", "chest", "head", "lid", "nose"), 1.0)
     assert {row.value for row in given if row.metric in ("localization_box", "hc_containment")} == {1.0}
@@ -287,7 +307,7 @@ def test_perfect_tree_of_the_block_world_scores_one(block_world):
     field = {
         row.query: row.value
         for row in rows
-        if (row.method, row.protocol, row.metric) == ("field", "hierarchy/level-given@4", "iou")
+        if (row.method, row.protocol, row.metric) == ("field", "hierarchy/level-given@5", "iou")
     }
     assert field["bear"] > 0.9  # exact features; the filter rounds the corners
 
@@ -303,7 +323,7 @@ def score(**changes):
         "query": "cup",
         "level": "whole",
         "metric": "iou",
-        "protocol": "hierarchy/level-given@4",
+        "protocol": "hierarchy/level-given@5",
         "value": 0.5,
         "n": 1,
     }

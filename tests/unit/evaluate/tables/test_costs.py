@@ -48,7 +48,7 @@ def scene(tmp_path):
         scores = variant / "scores.csv"
         row = Score(
             "synthetic", "table-1", variant.name, "sam-tiny", "field", "v", "cup", "whole", "iou",
-            "hierarchy/level-given@4", 0.5, 1,
+            "hierarchy/level-given@5", 0.5, 1,
         )  # fmt: skip
         write_scores(scores, [row])
         write_json(provenance_path(scores), {"inputs": inputs})

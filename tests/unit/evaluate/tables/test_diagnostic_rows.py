@@ -16,7 +16,7 @@ TRUE_MASKS = "truth-perturbed (merge 0.2)"
 
 
 def score(masks: str, value: float, variant: str = "default") -> Score:
-    protocol = "hierarchy/level-given@4"
+    protocol = "hierarchy/level-given@5"
     return Score(
         "synthetic", "one", variant, masks, "tree", "v.png", "cup", "whole", "iou", protocol, value, 1
     )

@@ -21,7 +21,7 @@ PUBLISHED = PROJECT / "config" / "published"
 
 def score(metric, value, *, scene="one", variant="default", method="tree", protocol=None, **more):
     fields = {"dataset": "synthetic", "view": "v.png", "query": "cup", "level": "whole", "masks": "sam-tiny"}
-    protocol = protocol or "hierarchy/level-given@4"
+    protocol = protocol or "hierarchy/level-given@5"
     return Score(
         **{**fields, **more},
         scene=scene,

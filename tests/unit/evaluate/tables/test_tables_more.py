@@ -1,13 +1,17 @@
 """Tables of points, seeds, consistency and frames, from rows small enough to add up by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from hilsplat.configuration import RunSettings
+from hilsplat.datasets.classes.scannet200 import SCANNET200_INSTANCES
 from hilsplat.evaluate.instance_files import write_instances
 from hilsplat.evaluate.metrics.instances import InstanceScan, match_instances
 from hilsplat.evaluate.scores import write_scores
 from hilsplat.evaluate.tables.build import TABLES, published_values, run_table
+from hilsplat.evaluate.tables.intervals import bootstrap_mean
 from tests.conftest import PROJECT
 from tests.unit.evaluate.tables.test_tables import PUBLISHED, built, measured, score
 
@@ -24,12 +28,17 @@ def test_scannet_shows_all_sets_of_classes_in_one_row_and_instances_of_all_scans
         point_score("scannet/opengaussian-19", "miou_present", 0.2, scene="room-1"),
         point_score("scannet/opengaussian-19", "miou_present", 0.4, scene="room-2"),
         point_score("scannet200/opengaussian", "macc_present", 0.1, scene="room-1"),
+        *(
+            replace(point_score("scannet200/benchmark", metric, 0.6, scene="room-1", query="chair"), n=10)
+            for metric in ("class_iou", "class_accuracy")
+        ),
     ]
     # one scan finds its only instance, the other misses it: precision 1 up to recall 1/2
     truth = np.full(100, 2001)
-    hit = match_instances(InstanceScan(truth, np.ones((1, 100), bool), np.array([2]), np.array([0.5])), (2,))
+    ids = SCANNET200_INSTANCES.ids
+    hit = match_instances(InstanceScan(truth, np.ones((1, 100), bool), np.array([2]), np.array([0.5])), ids)
     missed = match_instances(
-        InstanceScan(truth, np.zeros((0, 100), bool), np.zeros(0, int), np.zeros(0)), (2,)
+        InstanceScan(truth, np.zeros((0, 100), bool), np.zeros(0, int), np.zeros(0)), ids
     )
     key = ("default", "sam-tiny", "tree")
     matches = {
@@ -41,6 +50,8 @@ def test_scannet_shows_all_sets_of_classes_in_one_row_and_instances_of_all_scans
     row = measured(rows, method="hilsplat (tree)")
     assert (row["19 classes mIoU"], row["ScanNet200 mAcc"]) == ("30.00", "10.00")
     assert (row["ScanNet200 AP"], row["ScanNet200 AP@25"]) == ("50.00", "50.00")
+    assert (row["ScanNet200 head AP"], row["ScanNet200 tail AP"]) == ("50.00", "")
+    assert (row["ScanNet200 head mIoU"], row["ScanNet200 tail mIoU"]) == ("60.00", "")
     assert row["protocol"] == "points: nearest"
 
 
@@ -92,7 +103,7 @@ def test_annotations_are_one_row_whatever_the_seeds(tmp_path):
 def test_view_consistency_is_shown_beside_the_level_given_rows(tmp_path):
     scores = [
         score("iou", 0.5),
-        score("iou", 0.5, protocol="hierarchy/level-auto@5"),
+        score("iou", 0.5, protocol="hierarchy/level-auto@6"),
         score("view_consistency", 0.8, protocol="world/view-consistency@2"),
         score("view_consistency", 0.6, protocol="world/view-consistency@2", query="mug"),
         score("view_consistency", 0.1, protocol="world/view-consistency@2", level="part"),
@@ -154,3 +165,28 @@ def test_names_from_a_configuration_are_text_in_every_format(tmp_path):
         assert "alert(1)" in text
         assert "<script" not in text
     assert "](java" not in out.with_suffix(".md").read_text()
+
+
+def test_intervals_widen_with_fewer_scenes_and_names():
+    # half of the names are found: the mean is 0.5, and its interval shrinks as names are added
+    def interval(scenes, names, pooled=False):
+        hits = np.tile(np.arange(names) % 2 * 10.0, (scenes, 1))
+        return bootstrap_mean(hits, np.full_like(hits, 10), np.ones(hits.shape, bool), pooled)
+
+    few, many = interval(1, 6), interval(8, 40)
+    assert few[0] < many[0] < 0.5 < many[1] < few[1]
+    assert many[1] - many[0] < 0.2 < few[1] - few[0]
+    assert interval(8, 40) == many
+    low, high = interval(8, 40, pooled=True)  # the same names in every scene: no better known than from one
+    assert high - low > many[1] - many[0]
+
+
+def test_point_tables_show_intervals_and_the_number_of_names(tmp_path):
+    scores = [
+        replace(point_score("waymo/segmentation", metric, value, scene="street-1", query=name), n=100)
+        for name, value in (("car", 1.0), ("pedestrian", 0.0), ("bus", 1.0), ("truck", 0.0))
+        for metric in ("class_iou", "class_accuracy")
+    ]
+    rows, _ = built(tmp_path, "waymo", [replace(each, dataset="synthetic-streets") for each in scores])
+    row = measured(rows, method="hilsplat (tree)")
+    assert (row["mIoU, present classes"], row["Present classes 95 %"]) == ("50.00", "0 to 100")
