@@ -1,15 +1,17 @@
 """The coverage tree of a view: which mask lies in which (paper, Sec. III-B)."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Int32, Int64, UInt8
 
 from hilsplat.base.errors import EmptyMaskError
-from hilsplat.base.levels import NONE
+from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.segment.masks import HierarchicalMasks
 
 
 def coverage_parents(
-    overlap_px: Int64[np.ndarray, "M M"], level: UInt8[np.ndarray, " M"], theta: float
+    overlap_px: Int64[np.ndarray, "M M"], level: UInt8[np.ndarray, " M"] | None, theta: float
 ) -> Int32[np.ndarray, " M"]:
     """Find the parent of every mask of one view (paper, Sec. III-B).
 
@@ -22,7 +24,7 @@ def coverage_parents(
 
     Args:
         overlap_px: pixels that each pair of masks shares; the diagonal holds their areas.
-        level: `Level` of each mask.
+        level: `Level` of each mask; None: a parent may come from any level, as printed.
         theta: coverage threshold, a share in (0, 1); the paper uses 0.9.
 
     Returns:
@@ -46,7 +48,9 @@ def coverage_parents(
     if not len(area_px):
         return np.zeros(0, dtype=np.int32)
     share = overlap_px / area_px[:, None]  # [a, b]: share of a inside b
-    covered = (share > theta) & (share < theta).T & (level[None, :] < level[:, None])
+    covered = (share > theta) & (share < theta).T
+    if level is not None:
+        covered &= level[None, :] < level[:, None]
     # covered[a, b] implies area[a] < area[b]: chains of parents cannot form a cycle.
     area_of_cover = np.where(covered, area_px[None, :], np.inf)
     parents = np.where(covered.any(axis=1), area_of_cover.argmin(axis=1), NONE)
@@ -70,3 +74,14 @@ def coverage_tree(
     """Parent (row or `NONE`) and depth (roots 1) of every mask of a view, always a forest."""
     parent = coverage_parents(masks.overlaps_px(), masks.level, theta)
     return parent, depths(parent)
+
+
+def with_tree_levels(masks: HierarchicalMasks, theta: float) -> HierarchicalMasks:
+    """Masks whose level is their depth in the view's tree, in `content_order`.
+
+    Roots become wholes, their children parts, all other descendants subparts (a comment in the source of the
+    paper, Sec. III-B); the heads that made the masks don't count.
+    """
+    depth = depths(coverage_parents(masks.overlaps_px(), None, theta))
+    found = replace(masks, level=np.minimum(depth, len(LEVELS)).astype(np.uint8))
+    return found.take(found.content_order())

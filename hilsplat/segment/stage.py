@@ -25,12 +25,13 @@ from hilsplat.models.int8 import CHECKED_VIEWS
 from hilsplat.models.memory import available_mib, needs_of
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.candidates import Candidates, candidates_key, decode_candidates
+from hilsplat.segment.coverage import with_tree_levels
 from hilsplat.segment.digests import digests_in, index_entry, load_masks
 from hilsplat.segment.generate import masks_from_candidates
 from hilsplat.segment.graph import segment_graph
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.sam import SamModel
-from hilsplat.settings import MasksSettings
+from hilsplat.settings import CoverageTreeSettings, MasksSettings
 
 logger = logging.getLogger(__name__)
 
@@ -99,14 +100,14 @@ def run_masks(
             def segment(view: str) -> HierarchicalMasks:
                 if finished and view in taken:
                     return load_masks(finished, view, taken)
-                return sam_masks(scene, view, model, view_cache, settings, prompts(view))
+                return at_levels(sam_masks(scene, view, model, view_cache, settings, prompts(view)), settings)
 
         else:
             logger.info("masks %s: graph segmenter, without a model; levels are three scales", scene.name)
             identity = {"segmenter": "graph", "model": None, "model_sha256": None}
 
             def segment(view: str) -> HierarchicalMasks:
-                return graph_masks(scene, view, view_cache, settings)
+                return at_levels(graph_masks(scene, view, view_cache, settings), settings)
 
         index: dict[str, Any] = {}
         with atomic_folder(out) as folder:
@@ -120,6 +121,13 @@ def run_masks(
             if not number:
                 logger.warning("masks %s: no view has a mask at level %s", scene.name, level)
         counts.update(views=len(views), **total, from_cache=view_cache.hits)
+
+
+def at_levels(masks: HierarchicalMasks, settings: MasksSettings) -> HierarchicalMasks:
+    """The masks at the levels of the segmenter, or of their tree."""
+    if settings.levels == "head":
+        return masks
+    return with_tree_levels(masks, settings.theta or CoverageTreeSettings().theta)
 
 
 def sam_masks(

@@ -8,7 +8,7 @@ from hypothesis.extra import numpy as hnp
 
 from hilsplat.base.errors import EmptyMaskError
 from hilsplat.base.levels import NONE
-from hilsplat.segment.coverage import coverage_parents, coverage_tree, depths
+from hilsplat.segment.coverage import coverage_parents, coverage_tree, depths, with_tree_levels
 from hilsplat.segment.masks import HierarchicalMasks
 
 shapes = st.tuples(st.integers(1, 8), st.just(3), st.just(4))
@@ -103,3 +103,28 @@ def test_the_tree_of_run_lengths_equals_a_loop_over_pairs(masks, data):
 def test_a_view_without_masks_has_an_empty_tree():
     parent, depth = coverage_tree(HierarchicalMasks.concatenate([], (2, 2)), theta=0.9)
     assert parent.shape == depth.shape == (0,)
+
+
+def test_levels_by_the_tree_are_depths_whatever_head_made_a_mask():
+    masks = rows("##########", "######....", "###.......", "##........", ".......##.")
+    found = HierarchicalMasks.from_dense(
+        masks, np.array([3, 3, 1, 2, 2], np.uint8), np.ones(5, np.float32), np.ones(5, np.float32)
+    )
+    by_tree = with_tree_levels(found, 0.9)
+    assert sorted(zip(by_tree.area_px.tolist(), by_tree.level.tolist(), strict=True)) == [
+        (2, 2),  # a child of the root
+        (2, 3),  # fourth generation
+        (3, 3),
+        (6, 2),
+        (10, 1),
+    ]
+    assert (by_tree.content_order() == np.arange(5)).all()
+
+
+def test_theta_decides_levels_by_the_tree():
+    # 3 of the second mask's 4 px lie in the first
+    found = HierarchicalMasks.from_dense(
+        rows("########..", ".....####."), np.array([1, 1], np.uint8), *[np.ones(2, np.float32)] * 2
+    )
+    assert with_tree_levels(found, 0.9).level.tolist() == [1, 1]
+    assert with_tree_levels(found, 0.7).level.tolist() == [1, 2]
