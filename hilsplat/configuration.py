@@ -28,7 +28,6 @@ from hilsplat.settings import (
     MethodSettings,
     PerturbSettings,
     PosesSettings,
-    ReferenceSettings,
     Section,
     SemanticTreeSettings,
     TrainingSettings,
@@ -55,22 +54,30 @@ class StageSettings(Section):
     autoencoder: AutoencoderSettings = AutoencoderSettings()
     field: FieldSettings = FieldSettings()
     method: MethodSettings = MethodSettings()
-    reference: ReferenceSettings = ReferenceSettings()
     evaluate: EvaluateSettings = EvaluateSettings()
     figures: FiguresSettings = FiguresSettings()
     training: TrainingSettings = TrainingSettings()
 
     def with_models(self) -> "StageSettings":
-        """All sections with the models that are there, and the crops that the field's targets need."""
-        clip = with_models(self.clip)
+        """All sections with what they take from others: models, crops for the field's targets, one theta."""
+        clip, masks = with_models(self.clip), with_models(self.masks)
+        if masks.levels == "tree" and masks.theta is None:
+            masks = masks.model_copy(update={"theta": self.coverage_tree.theta})
         if clip.crops == AUTO:
             crops = "masks" if self.autoencoder.targets == "mask" else "nodes"
             clip = clip.model_copy(update={"crops": crops})
-        return self.model_copy(update={"masks": with_models(self.masks), "clip": clip})
+        return self.model_copy(update={"masks": masks, "clip": clip})
+
+    def upstream(self, stage: str) -> tuple[str, ...]:
+        """Sections that a stage depends on, directly or through its inputs."""
+        sections = UPSTREAM[stage]
+        if "semantic_tree" in sections and self.semantic_tree.evidence == "features":
+            return tuple(name for name in VARIANT_SECTIONS if name in {*sections, "coverage_tree", "field"})
+        return sections
 
     def depends_on_seed(self, stage: str) -> bool:
         """Whether the result of a stage, or of one that it reads, depends on the variant's seed."""
-        return any(getattr(self, section).is_random for section in UPSTREAM[stage])
+        return any(getattr(self, section).is_random for section in self.upstream(stage))
 
 
 SECTIONS: dict[str, type[Section]] = {name: type(section) for name, section in StageSettings()}
@@ -160,7 +167,7 @@ UPSTREAM: dict[str, tuple[str, ...]] = {
     "field": VARIANT_SECTIONS[:-1],
     "evaluate": VARIANT_SECTIONS,
 }
-"""Sections that each stage of a variant depends on, directly or through its inputs."""
+"""Sections that each stage of a variant depends on, directly or through its inputs; see `upstream`."""
 
 
 SEEDED = re.compile(r"(.+)\.seed([0-9]+)")
@@ -184,7 +191,8 @@ class RunSettings(StageSettings):
         pattern="^[^<>]*$",  # it stands in the report's parameters
     )
     main_variants: tuple[str, ...] = knob(("default",), "variants in the main tables")
-    ablation_variants: tuple[str, ...] = knob((), "variants in the ablation table")
+    ablation_variants: tuple[str, ...] = knob((), "variants in the paper's ablation table")
+    component_variants: tuple[str, ...] = knob((), "variants in the table of the default field's parts")
     theta_variants: tuple[str, ...] = knob((), "variants in the sweep over theta")
     omega_variants: tuple[str, ...] = knob((), "variants in the sweep over Omega")
     pruning_variants: tuple[str, ...] = knob((), "variants in the table of pruned pairs")
@@ -225,6 +233,7 @@ class RunSettings(StageSettings):
         names = (
             *self.main_variants,
             *self.ablation_variants,
+            *self.component_variants,
             *self.theta_variants,
             *self.omega_variants,
             *self.pruning_variants,

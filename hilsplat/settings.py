@@ -7,7 +7,7 @@ stage, or a family of stages, depends on, so a changed knob reruns exactly the s
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 LARGEST = 2_000_000_000
 """Largest whole number of any knob: the libraries take 32 bits, and a run adds up to 10 to its seed."""
@@ -204,6 +204,15 @@ class MasksSettings(Section):
         "grid points that none explains",
         origin="SAM, LangSplat: grid",
     )
+    levels: Literal["head", "tree"] = knob(
+        "head",
+        "what gives a mask its level; head: the head of SAM that made it; tree: its depth in the tree of all "
+        "masks of the view, by which theta decides levels",
+        origin="paper: three levels by theta; LangSplat: head",
+    )
+    theta: float | None = knob(
+        None, "with levels: tree, threshold of that tree; empty: coverage_tree.theta", gt=0.5, lt=1
+    )
     points_per_side: int = knob(32, "point prompts per image side", ge=1, le=128, origin="LangSplat: 32")
     points_per_batch: Annotated[int, Field(ge=1, le=4096)] | Auto = knob(
         "auto",
@@ -383,6 +392,14 @@ class ContributionsSettings(Section):
 class SemanticTreeSettings(Section):
     """3D semantic tree: masks linked across views by the Gaussians they share."""
 
+    evidence: Literal["masks", "features"] = knob(
+        "masks",
+        "what nodes are made from; masks: linked across views; features: Gaussians clustered by features "
+        "that L alone trains, with the weights and readings of section field",
+        origin="paper: features",
+    )
+    feature_size: int = knob(6, "features: numbers of a feature", ge=2, le=64, origin="OpenGaussian: 6")
+    feature_steps: int = knob(60, "features: L-BFGS steps", ge=1)
     link_threshold: float = knob(
         0.3, "clusters of masks are joined while their pooled IoU is at least this", gt=0, lt=1
     )
@@ -399,6 +416,11 @@ class SemanticTreeSettings(Section):
     device: Literal["cpu", "cuda"] = knob(
         "cpu", "device that compares masks; cuda: by torch, equal up to rounding"
     )
+
+    @property
+    def is_random(self) -> bool:
+        """Linked masks involve nothing random; features start at random."""
+        return self.evidence == "features"
 
 
 class AutoencoderSettings(Section):
@@ -452,10 +474,26 @@ class FieldSettings(Section):
         10.0, "similarity degree Omega: base of the distances that L_ins aims at", gt=1, origin="paper: 10"
     )
     tau: float = knob(0.1, "temperature of L_part", gt=0, origin="paper: not given; VCH: 0.1")
-    start: Literal["average", "median"] = knob(
-        "average", "how mask latents are lifted to Gaussians: average, or geometric median (robust, like L1)"
+    start: Literal["average", "median", "random", "langsplat"] = knob(
+        "average",
+        "first features of Gaussians; average, median: of the latents of the masks that show them (the "
+        "geometric median is robust, like L1); random: in [-1, 1); langsplat: those of a variant with "
+        "method.name langsplat and the same autoencoder",
     )
-    ridge: float = knob(0.1, "weight of the pull towards the lifted latents, per visible mass", ge=0)
+    ridge: float = knob(0.1, "weight of the pull towards the first features, per visible mass", ge=0)
+    trainer: Literal["fast", "literal"] = knob(
+        "fast",
+        "fast: sparse products of frozen geometry (cg_steps, lbfgs_steps); literal: render a view, step by "
+        "Adam (iterations, rate), the same objective in hours",
+        origin="paper: literal",
+    )
+    iterations: int = knob(30_000, "steps of the literal trainer, each on one view", ge=1, origin="paper")
+    rate: float = knob(0.0025, "Adam step size of the literal trainer", gt=0, origin="LangSplat")
+    language: Literal["squared", "l1"] = knob(
+        "squared",
+        "regression to the latents; l1: LangSplat's, which the literal trainer alone can take",
+        origin="LangSplat: l1",
+    )
     min_labelled_share: float = knob(
         0.3,
         "a Gaussian gets a latent at a level if masks of the level hold this share of its weight; 0: always",
@@ -478,15 +516,16 @@ class FieldSettings(Section):
         "cpu", "device that multiplies matrices; cuda: by torch, equal up to rounding"
     )
 
+    @property
+    def is_random(self) -> bool:
+        """The solver draws nothing; the literal trainer draws views, and a field may start at random."""
+        return self.trainer == "literal" or self.start in ("random", "langsplat")
 
-class ReferenceSettings(Section):
-    """Reference trainer of the field, which renders one random view per step, as LangSplat does."""
-
-    steps: int = knob(30_000, "steps, each on one view", ge=1, origin="LangSplat, paper")
-    rate: float = knob(0.0025, "Adam step size", gt=0, origin="LangSplat")
-    loss: Literal["l1", "squared"] = knob(
-        "l1", "l1: LangSplat's masked L1; squared: the language loss of the solver", origin="LangSplat"
-    )
+    @model_validator(mode="after")
+    def _l1_is_literal(self) -> "FieldSettings":
+        if self.language == "l1" and self.trainer != "literal":
+            raise ValueError("language l1 needs trainer literal: frozen geometry makes only squares cheap")
+        return self
 
 
 class MethodSettings(Section):

@@ -45,8 +45,6 @@ except HilsplatError as error:  # an error that a user can fix needs no tracebac
     raise WorkflowError(str(error)) from None
 for name, reason in PLAN.absent.items():
     logger.warning(f"{name} is skipped: {reason}")
-for name in PLAN.unlisted:
-    logger.warning(f"data:{name} is not run: add a row for it to {PLAN.run.scenes}")
 
 ENVIRONMENT = "../workflow/envs/hilsplat.yaml"
 RESOURCES = JobResources(PLAN, own_cores())

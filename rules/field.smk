@@ -32,6 +32,8 @@ rule field:
         contributions=PLAN.shared("contributions", "contributions"),
         coverage_tree=PLAN.shared("coverage_tree", "coverage_tree"),
         autoencoder=PLAN.shared("autoencoder", "autoencoder"),
+        rendered=PLAN.rendered,  # empty, except for trainer: literal
+        start=PLAN.first_field,  # empty, except for start: langsplat
     output:
         field="<results>/{dataset}/{scene}/{variant}/field.safetensors",
     log:
@@ -50,8 +52,10 @@ rule field:
         gpu=RESOURCES.gpus("field"),
     params:
         settings=PLAN.settings("field"),
+        option=PLAN.field_option,
+        seed=PLAN.field_seed,
         code=PLAN.code("field"),
     shell:
         "python -m hilsplat --log {log:q} field --contributions {input.contributions:q} --coverage-tree {input.coverage_tree:q}"
-        " --autoencoder {input.autoencoder:q} --settings {params.settings:q}"
+        " --autoencoder {input.autoencoder:q} --settings {params.settings:q} {params.option} --seed {params.seed:q}"
         " --threads {threads} --out {output.field:q}"

@@ -3,6 +3,7 @@ rule semantic_tree:
     input:
         contributions=PLAN.shared("contributions", "contributions"),
         masks=PLAN.shared("masks", "masks"),
+        coverage_tree=PLAN.tree_parents,  # empty, except for evidence: features
     output:
         semantic_tree=directory("<results>/{dataset}/{scene}/{variant}/semantic_tree"),
     log:
@@ -19,7 +20,8 @@ rule semantic_tree:
         gpu=RESOURCES.gpus("semantic_tree"),
     params:
         settings=PLAN.settings("semantic_tree"),
-        code=PLAN.code("semantic_tree"),
+        option=PLAN.tree_option,
+        code=PLAN.code(PLAN.tree_stage),
     shell:
         "python -m hilsplat --log {log:q} semantic-tree --contributions {input.contributions:q} --masks {input.masks:q}"
-        " --settings {params.settings:q} --threads {threads} --out {output.semantic_tree:q}"
+        " --settings {params.settings:q} {params.option} --threads {threads} --out {output.semantic_tree:q}"

@@ -1,9 +1,11 @@
 """Contributions, semantic tree, language field, baselines."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from hilsplat.base.errors import SettingsError
 from hilsplat.cli.apps import app
 from hilsplat.cli.stage import (
     DEFAULT_CACHE,
@@ -43,15 +45,32 @@ def semantic_tree(
     masks: PathIn,
     out: PathOut,
     settings: Settings = "{}",
+    coverage_tree: Annotated[Path | None, typer.Option(help="for evidence: features")] = None,
+    field_settings: Annotated[str, typer.Option(help="section field as JSON, for evidence: features")] = "{}",
+    seed: Seed = 0,
     threads: Threads = 1,
 ) -> None:
-    """Link the masks of all views into nodes at three levels."""
+    """Make nodes at three levels: the masks of all views linked, or Gaussians clustered by features."""
     section = section_of("semantic_tree", settings)
     inputs = {"contributions": contributions, "masks": masks}
-    with stage("semantic_tree", out, settings=section, threads=threads, inputs=inputs):
-        from hilsplat.semantic_tree.tree import run_semantic_tree
+    if (section.evidence == "features") != (coverage_tree is not None):
+        raise SettingsError(
+            "semantic_tree.evidence and the options don't fit together",
+            expected="--coverage-tree with evidence: features, and only there",
+        )
+    if coverage_tree is None:
+        with stage("semantic_tree", out, settings=section, threads=threads, inputs=inputs):
+            from hilsplat.semantic_tree.tree import run_semantic_tree
 
-        run_semantic_tree(contributions, masks, out, section, threads)
+            run_semantic_tree(contributions, masks, out, section, threads)
+        return
+    inputs["coverage_tree"] = coverage_tree
+    of_field = section_of("field", field_settings)
+    both = {"semantic_tree": section, "field": of_field}
+    with stage("feature_tree", out, settings=both, seed=seed, threads=threads, inputs=inputs):
+        from hilsplat.methods.feature_tree import run_feature_tree
+
+        run_feature_tree(contributions, masks, coverage_tree, out, section, of_field, seed, threads)
 
 
 @app.command()
@@ -79,45 +98,24 @@ def field(
     autoencoder: PathIn,
     out: PathOut,
     settings: Settings = "{}",
+    scene: Annotated[Path | None, typer.Option(help="posed scene, for trainer: literal")] = None,
+    gaussians: Annotated[Path | None, typer.Option(help="3DGS PLY, for trainer: literal")] = None,
+    masks: Annotated[Path | None, typer.Option(help="masks of the views, for trainer: literal")] = None,
+    start: Annotated[Path | None, typer.Option(help="first field, for start: langsplat")] = None,
+    seed: Seed = 0,
     threads: Threads = 1,
 ) -> None:
     """Solve the language field: regression, L_h, L_ins and L_part over three levels."""
     section = section_of("field", settings)
     inputs = {"contributions": contributions, "coverage_tree": coverage_tree, "autoencoder": autoencoder}
-    with stage("field", out, settings=section, threads=threads, inputs=inputs):
+    more = {"scene": scene, "gaussians": gaussians, "masks": masks, "start": start}
+    inputs |= {name: path for name, path in more.items() if path is not None}
+    own_seed = seed if section.is_random else None
+    rendered = (scene, gaussians, masks) if scene and gaussians and masks else None
+    with stage("field", out, settings=section, seed=own_seed, threads=threads, inputs=inputs):
         from hilsplat.field.field import run_field
 
-        run_field(contributions, coverage_tree, autoencoder, out, section, threads)
-
-
-@app.command("field-reference")
-def field_reference(
-    scene: PathIn,
-    gaussians: PathIn,
-    masks: PathIn,
-    contributions: PathIn,
-    autoencoder: PathIn,
-    out: PathOut,
-    settings: Settings = "{}",
-    device: Annotated[str, typer.Option(help="rasteriser: auto, cpu or cuda")] = "auto",
-    seed: Seed = 0,
-    threads: Threads = 1,
-) -> None:
-    """Train a field by rendering one random view per step: the slow reference for the solver."""
-    section = section_of("reference", settings)
-    inputs = {
-        "scene": scene,
-        "gaussians": gaussians,
-        "masks": masks,
-        "contributions": contributions,
-        "autoencoder": autoencoder,
-    }
-    with stage("field_reference", out, settings=section, seed=seed, threads=threads, inputs=inputs):
-        from hilsplat.field.reference_trainer import run_reference
-
-        run_reference(
-            scene, gaussians, masks, contributions, autoencoder, out, section, device, seed, threads
-        )
+        run_field(contributions, coverage_tree, autoencoder, out, section, threads, seed, rendered, start)
 
 
 @app.command()

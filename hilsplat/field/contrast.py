@@ -108,6 +108,17 @@ def distinct(
     return np.flatnonzero(kept)
 
 
+def compared(relations: list[ViewRelations]) -> tuple[int, int]:
+    """Views that L_ins averages over, and pairs of view and level that L_part averages over."""
+    instance = sum(len(view.rows) > 1 for view in relations)
+    part = sum(
+        len(rows) > 1 and bool((parent != NONE).any())
+        for view in relations
+        for rows, parent in zip(view.part_rows, view.part_parent, strict=True)
+    )
+    return instance, part
+
+
 def instance_term(
     means: Float64[np.ndarray, "M D"], relations: list[ViewRelations], settings: FieldSettings
 ) -> tuple[float, Float64[np.ndarray, "M D"]]:

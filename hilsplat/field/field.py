@@ -12,6 +12,7 @@ import numpy as np
 
 from hilsplat.base.artifacts import read_index, read_npz, sha256_of_file, write_json
 from hilsplat.base.device import compute_device
+from hilsplat.base.errors import MisalignedArtifactError, SettingsError
 from hilsplat.base.progress import stage_log
 from hilsplat.contributions.mask_operator import MaskOperator, MaskProducts
 from hilsplat.contributions.rows import Contributions
@@ -33,15 +34,34 @@ def run_field(
     out: Path,
     settings: FieldSettings,
     threads: int,
+    seed: int = 0,
+    rendered: tuple[Path, Path, Path] | None = None,
+    start: Path | None = None,
 ) -> None:
     """Solve the language field of a scene: `field.safetensors` and `field.report.json` beside it.
 
-    Nothing is random (the view's name seeds the halves of masks), and the result does not depend on `threads`
-    (sums have one order).
+    Nothing is random with `trainer: fast` unless it starts at random (the view's name seeds the halves of
+    masks), and the result does not depend on `threads` (sums have one order).
+
+    Args:
+        seed: of a random start, and of the order of views of `trainer: literal`.
+        rendered: scene, Gaussians and masks, which `trainer: literal` renders.
+        start: the field that `start: langsplat` begins with.
 
     Raises:
-        MisalignedArtifactError: coverage trees or latents belong to other masks.
+        MisalignedArtifactError: an input belongs to other masks, Gaussians or codes.
+        SettingsError: an input that the settings need is not given.
     """
+    if (settings.trainer == "literal") != (rendered is not None):
+        raise SettingsError(
+            "field.trainer and the options don't fit together",
+            expected="--scene, --gaussians and --masks with trainer: literal, and only there",
+        )
+    if (settings.start == "langsplat") != (start is not None):
+        raise SettingsError(
+            "field.start and the options don't fit together",
+            expected="--start <field.safetensors> with start: langsplat, and only there",
+        )
     contributions = Contributions.load(contributions_folder)
     scene = read_index(contributions_folder)["scene"]
     latents = load_latents(autoencoder_folder, contributions)
@@ -58,7 +78,8 @@ def run_field(
             pixels,
             latents,
             (settings.weight_language, settings.weight_clustering, settings.ridge),
-            settings.start,
+            _first_features(start, contributions, autoencoder_folder) if start else settings.start,
+            seed,
         )
         relations = view_relations(contributions, parents, settings, masks.means(problem.lifted))
         products: tuple[MaskProducts, MaskProducts] = masks, half_masks
@@ -69,7 +90,14 @@ def run_field(
             problem = replace(problem, masks=products[0], quadratic=DeviceQuadratic.of(quadratic, device))
         half_pixels = contributions.half_pixels.astype(np.float32)
         contrast = Contrast(*products, pixels, half_pixels, relations, settings)
-        features, report = solve_field(problem, contrast, settings)
+        if rendered is None:
+            features, report = solve_field(problem, contrast, settings)
+        else:
+            from hilsplat.field.literal_trainer import Rendered, train_literally
+
+            features, report = train_literally(
+                problem, contrast, contributions, Rendered(*rendered), settings, seed, threads
+            )
         total_mass = contributions.mass().sum(axis=0, dtype=np.float64)
         features = keep_labelled(features, problem.mass, total_mass, settings.min_labelled_share)
         field = LanguageField(
@@ -90,6 +118,18 @@ def run_field(
             },
         )
         counts |= {"masks": len(contributions), "Gaussians": len(features), "unseen": unseen}
+
+
+def _first_features(path: Path, contributions: Contributions, autoencoder_folder: Path) -> np.ndarray:
+    """Features of a field of the same Gaussians and the same code."""
+    field = LanguageField.load(path)
+    digest = sha256_of_file(autoencoder_file(autoencoder_folder))
+    if (field.gaussians_sha256, field.autoencoder_sha256) != (contributions.gaussians_sha256, digest):
+        raise MisalignedArtifactError(
+            f"{path} belongs to other Gaussians, or to another code",
+            fix="compute both fields from the same Gaussians and autoencoder",
+        )
+    return field.features
 
 
 def read_parents(tree_folder: Path, contributions: Contributions) -> dict[str, np.ndarray]:

@@ -38,7 +38,7 @@ class QuadraticProblem:
         mass: G 1, the visible mass of each Gaussian at each level, px.
         pixels: n.
         latents: h.
-        lifted: the lifted average or median that the ridge pulls towards.
+        lifted: what the field starts from, and the ridge pulls towards.
         weights: of the language loss, the clustering loss and the ridge.
     """
 
@@ -57,13 +57,24 @@ class QuadraticProblem:
         pixels: Float32[np.ndarray, " M"],
         latents: Float32[np.ndarray, "M D"],
         weights: tuple[float, float, float],
-        start: Literal["average", "median"] = "average",
+        start: Literal["average", "median", "random", "langsplat"] | np.ndarray = "average",
+        seed: int = 0,
     ) -> "QuadraticProblem":
-        """Compute the mass and the lifted latents."""
+        """Compute the mass and what the field starts from, which the ridge pulls towards.
+
+        `start` is a way to make it, or the features (N, 3, D) themselves, as for "langsplat"; `seed` is for
+        "random".
+        """
         mass = level_mass(quadratic)
-        lifted = lifted_average(masks, mass, pixels, latents)
-        if start == "median":
-            lifted = lifted_median(masks, pixels, latents, lifted)
+        if isinstance(start, np.ndarray):
+            lifted = start
+        elif start == "random":
+            draws = np.random.default_rng(seed)
+            lifted = draws.uniform(-1, 1, (*mass.shape, latents.shape[1])).astype(np.float32)
+        else:
+            lifted = lifted_average(masks, mass, pixels, latents)
+            if start == "median":
+                lifted = lifted_median(masks, pixels, latents, lifted)
         return QuadraticProblem(masks, quadratic, mass, pixels, latents, lifted, weights)
 
     @property

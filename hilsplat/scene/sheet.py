@@ -142,6 +142,13 @@ def read_sheet(
     return rows
 
 
+def row_of_data(name: str, data_root: str) -> SceneRow:
+    """The row of a scene that no sheet lists, such as `waymo/<segment>`, of a data set in metres."""
+    dataset, _, scene = name.partition("/")
+    folder = Path(data_root).expanduser() / name
+    return SceneRow(dataset, scene, dataset, f"{DATA_PREFIX}{name}", "metre", folder)
+
+
 def choose_scenes(
     rows: Sequence[SceneRow], groups: Collection[str], only: Sequence[str]
 ) -> tuple[SceneRow, ...]:

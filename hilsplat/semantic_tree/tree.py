@@ -8,6 +8,7 @@ ranks the nodes.
 """
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -34,7 +35,7 @@ from hilsplat.segment.digests import MASKS_SHA256, digests_in, require_same_mask
 from hilsplat.semantic_tree.boxes import node_boxes
 from hilsplat.semantic_tree.crops import crop_ranks
 from hilsplat.semantic_tree.export import readable_nodes
-from hilsplat.semantic_tree.level_nodes import level_nodes
+from hilsplat.semantic_tree.level_nodes import LevelNodes, level_nodes
 from hilsplat.semantic_tree.nodes import (
     mask_fits,
     nest_nodes,
@@ -49,6 +50,9 @@ MIN_VISIBLE_PX = 0.3
 
 LEAST_IOU = 1e-3
 """Of a mask with the node that it was linked into, in its `crop_score`."""
+
+NodesOf = Callable[[Level, Int64[np.ndarray, " m"]], LevelNodes]
+"""A level and the rows of its masks -> its nodes."""
 
 logger = logging.getLogger(__name__)
 
@@ -178,6 +182,7 @@ def build_tree(
     settings: SemanticTreeSettings,
     threads: int = 1,
     join_wholes: bool = False,
+    nodes_of: NodesOf | None = None,
 ) -> SemanticTree:
     """Link masks into nodes, give the nodes Gaussians, parents and boxes, and score the crops that show them.
 
@@ -190,6 +195,7 @@ def build_tree(
         settings: thresholds.
         threads: number of threads for the evidence; results do not depend on it.
         join_wholes: the masks know no things: wholes are joined from nodes that touch in 3D.
+        nodes_of: finds the nodes of a level; None: linked masks.
     """
     visible = mass > MIN_VISIBLE_PX
     num_visible = visible.sum(axis=0)
@@ -203,8 +209,12 @@ def build_tree(
     membership = np.zeros((S.shape[1], len(LEVELS)), np.float32)
     for each in LEVELS:
         rows = contributions.rows_of(each)
-        found = level_nodes(
-            S[rows], contributions.view[rows], mass, visible, importance, total_mass, settings, threads
+        found = (
+            nodes_of(each, rows)
+            if nodes_of
+            else level_nodes(
+                S[rows], contributions.view[rows], mass, visible, importance, total_mass, settings, threads
+            )
         )
         if join_wholes and each is Level.WHOLE:
             whole = joined_regions(found.of_gaussian, len(found.quality), means, mass, settings.whole_side)
@@ -271,8 +281,11 @@ def run_semantic_tree(
     out: Path,
     settings: SemanticTreeSettings,
     threads: int = 1,
+    nodes_of: NodesOf | None = None,
 ) -> None:
     """Write the 3D semantic tree of a scene: `tree.npz`, the readable `tree.json`, `index.json`.
+
+    `nodes_of` finds the nodes of a level; None: linked masks.
 
     Raises:
         MisalignedArtifactError: the contributions belong to other masks.
@@ -291,6 +304,7 @@ def run_semantic_tree(
             settings,
             threads,
             join_wholes=read_full_index(masks_folder, "segmenter")["segmenter"] == "graph",
+            nodes_of=nodes_of,
         )
         per_level = {level.label: len(tree.nodes_of(level)) for level in LEVELS}
         orphans = {

@@ -15,13 +15,21 @@ from typing import Any
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.files import INSTALLED, project_path
-from hilsplat.configuration import SECTIONS, UPSTREAM, RunSettings, StageSettings, parse_run, require_known
+from hilsplat.configuration import SECTIONS, RunSettings, StageSettings, parse_run, require_known
 from hilsplat.datasets.sources import unlisted
 from hilsplat.methods.registry import METHODS, OURS, require_method
 from hilsplat.models.digests import model_digest
 from hilsplat.models.store import model_path, read_model
 from hilsplat.scene.finished import KEY_VIEWS
-from hilsplat.scene.sheet import DEFAULT_SHEET, GROUPS, PHOTOS, SceneRow, choose_scenes, read_sheet
+from hilsplat.scene.sheet import (
+    DEFAULT_SHEET,
+    GROUPS,
+    PHOTOS,
+    SceneRow,
+    choose_scenes,
+    read_sheet,
+    row_of_data,
+)
 from hilsplat.workflow.jobs import Job, VariantJob, any_of, inert
 from hilsplat.workflow.models import check_device, check_models, describe_models, doubt_about_photographs
 from hilsplat.workflow.scene_data import SceneData, truth_argument
@@ -37,10 +45,9 @@ class Plan:
     Attributes:
         run: the validated configuration.
         results: results folder.
-        rows: every scene of the sheet.
+        rows: every scene of the sheet, and those on disk of data sets whose scenes differ between users.
         scenes: scenes that are run.
         absent: chosen scenes that are skipped -> the reason.
-        unlisted: scenes below the data root that the sheet does not list.
     """
 
     def __init__(self, config: Mapping[str, Any]) -> None:
@@ -54,7 +61,9 @@ class Plan:
         for name in run.every_variant():
             require_method(run.stages(name).method.name)
         sheet = project_path(run.scenes)
-        self.rows = tuple(read_sheet(sheet, run.groups, run.data_root))
+        rows = read_sheet(sheet, run.groups, run.data_root)
+        found = unlisted({row.source for row in rows}, run.groups, run.data_root)
+        self.rows = (*rows, *(row_of_data(name, run.data_root) for name in found))
         require_known_scenes(run, [*self.rows, *read_sheet(INSTALLED / DEFAULT_SHEET, ())])
         self.data = SceneData(self.rows, run.data_root, self.path)
         chosen = choose_scenes(self.rows, run.groups, run.only)
@@ -63,7 +72,6 @@ class Plan:
         reasons = {row.name: self.data.absence(row) for row in chosen}
         self.absent = {name: reason for name, reason in reasons.items() if reason is not None}
         self.scenes = tuple(row for row in chosen if row.name not in self.absent)
-        self.unlisted = unlisted({row.source for row in self.rows}, run.groups, run.data_root)
         if not self.scenes:
             raise SettingsError(
                 "there is no scene to run",
@@ -72,7 +80,6 @@ class Plan:
                     [
                         f"groups {list(run.groups)}, only {list(run.only)}, data_root {run.data_root!r}",
                         *(f"{name} is skipped: {reason}" for name, reason in self.absent.items()),
-                        *(f"{name} has no row" for name in self.unlisted),
                     ]
                 ),
                 fix="name a scene (hilsplat run photos/desk) or other groups, or set data_root",
@@ -216,7 +223,7 @@ class Plan:
         seed = self.run.seed_of(variant) if wanted.depends_on_seed(stage) else None
         for name in self.run.every_variant():
             other = self.stages_of(name, scopes)
-            same = all(getattr(other, part) == getattr(wanted, part) for part in UPSTREAM[stage])
+            same = all(getattr(other, part) == getattr(wanted, part) for part in wanted.upstream(stage))
             if same and seed in (None, self.run.seed_of(name)):
                 return name
         return variant
@@ -309,6 +316,62 @@ class Plan:
         if self.row(job).features:
             return self.data.features_option(job)
         return f"--semantic-tree {shlex.quote(str(input.semantic_tree))}" if input.semantic_tree else ""
+
+    def tree_stage(self, job: VariantJob) -> str:
+        """Return the stage of the semantic tree: linked masks, or clustered features."""
+        return "feature_tree" if self.stages(job).semantic_tree.evidence == "features" else "semantic_tree"
+
+    def tree_parents(self, job: VariantJob) -> list[str]:
+        """Input of semantic_tree: the coverage trees, if features are trained for it."""
+        by_features = self.tree_stage(job) == "feature_tree"
+        return [self.shared("coverage_tree", "coverage_tree")(job)] if by_features else []
+
+    def tree_option(self, job: VariantJob, input: Any) -> str:
+        """Options of semantic-tree for `tree_parents`."""
+        if not input.coverage_tree:
+            return ""
+        field = shlex.quote(self._section("field", *self.which(job))[0])
+        tree = shlex.quote(str(input.coverage_tree))
+        return f"--coverage-tree {tree} --field-settings {field} --seed {self.seed(job)}"
+
+    def rendered(self, job: VariantJob) -> list[str]:
+        """Input of field: scene, Gaussians and masks, if the literal trainer renders them."""
+        if self.stages(job).field.trainer != "literal":
+            return []
+        return [self.path(job, "scene"), self.path(job, "gaussians.ply"), self.shared("masks", "masks")(job)]
+
+    def first_field(self, job: VariantJob) -> list[str]:
+        """Input of field: LangSplat's field on the same masks and code, if it starts from that.
+
+        Raises:
+            SettingsError: no variant makes one.
+        """
+        stages, scopes = self.stages(job), self.scopes(self.row(job))
+        if stages.field.start != "langsplat":
+            return []
+        seed = self.run.seed_of(job.variant)
+        for name in self.run.every_variant():
+            other = self.stages_of(name, scopes)
+            if other.method.name != "langsplat" or self.run.seed_of(name) != seed:
+                continue
+            if all(getattr(other, part) == getattr(stages, part) for part in stages.upstream("autoencoder")):
+                return [self.path(job, name, "field.safetensors")]
+        raise SettingsError(
+            f"{job.dataset}/{job.scene}, variant {job.variant}: field.start is langsplat, but no variant has "
+            "method.name langsplat with the same masks and autoencoder",
+            fix="add such a variant, or start from another field",
+        )
+
+    def field_option(self, job: VariantJob, input: Any) -> str:
+        """Options of field for `rendered` and `first_field`."""
+        named = dict(zip(("scene", "gaussians", "masks"), input.rendered, strict=False))
+        if input.start:
+            named["start"] = input.start
+        return " ".join(f"--{name} {shlex.quote(str(path))}" for name, path in named.items())
+
+    def field_seed(self, job: VariantJob) -> int:
+        """Parameter: seed of a field in which something is random; 0 for others, which so stay the same."""
+        return self.seed(job) if self.stages(job).field.is_random else 0
 
     def clip_stage(self, job: VariantJob) -> str:
         """Return the stage that makes the CLIP vectors."""

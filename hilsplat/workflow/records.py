@@ -90,7 +90,10 @@ def expected_artifacts(plan: Plan) -> dict[str, Expected]:
                 elif stage == "field" and settings.method.name != OURS:
                     add("field.safetensors", "method", job, seed=seed, plugins=plan.baseline(job))
                 elif stage == "field":
-                    add("field.safetensors", "field", job)
+                    add("field.safetensors", "field", job, seed=seed if settings.field.is_random else None)
+                elif stage == "semantic_tree" and plan.tree_stage(job) == "feature_tree":
+                    both = {name: plan.values(name, job) for name in ("semantic_tree", "field")}
+                    add("semantic_tree", "feature_tree", job, seed=seed, settings=both)
                 else:
                     add(stage, stage, job, seed=seed if stage == "autoencoder" else None)
             add("scores.csv", "evaluate", own, plugins=readers)

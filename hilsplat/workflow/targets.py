@@ -3,6 +3,7 @@
 import shlex
 from pathlib import Path
 
+from hilsplat.datasets.registry import DATASETS
 from hilsplat.datasets.sources import published
 from hilsplat.evaluate.scores import score_summary
 from hilsplat.evaluate.tables.build import TABLES
@@ -32,7 +33,11 @@ def absent_options(plan: Plan, table: str) -> str:
         place = published(row.source)
         if place and place[0] in TABLES[table].data and reason is not None:
             by_dataset.setdefault(row.dataset, []).append((row.scene, reason))
-    sentences = []
+    sentences = [
+        f"{name}: no labelled segment is below {plan.run.data_root or 'data_root, which is not set'}."
+        for name in TABLES[table].data
+        if name in plan.run.groups and name in DATASETS and not any(data_of(row) == name for row in plan.rows)
+    ]
     for dataset, scenes in by_dataset.items():
         reasons = {reason for _, reason in scenes}
         others = "" if len(reasons) == 1 else " The others cannot be read either."

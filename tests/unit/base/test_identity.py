@@ -273,8 +273,8 @@ def edit_function(root: Path, place: str) -> None:
     ("place", "expected"),
     [
         ("segment/coverage_stage.py:run_coverage_tree", {"coverage_tree"}),
-        ("field/losses/part.py:part_loss_literal", {"field"}),
-        ("field/reference_trainer.py:run_reference", {"field_reference"}),
+        ("field/losses/part.py:part_loss_literal", {"field", "feature_tree"}),
+        ("field/literal_trainer.py:train_literally", {"field"}),
         ("embed/langsplat_files.py:read_clip", {"langsplat"}),
         ("evaluate/tables/html_page.py:as_html", {"table"}),
         ("query/field_answers.py:field_colours", {"evaluate", "figures", "comparison"}),

@@ -8,23 +8,23 @@ import scipy.sparse as sp
 import torch
 
 from hilsplat.base.artifacts import read_index, read_json, write_index
-from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.errors import MisalignedArtifactError, SettingsError
 from hilsplat.contributions.cuda_algebra import DeviceMasks, DeviceQuadratic
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.quadratic import StackedWeights
 from hilsplat.contributions.view_matrices import painted_indicator
 from hilsplat.field.autoencoder import run_autoencoder
-from hilsplat.field.contrast import Contrast, ViewRelations, distinct
+from hilsplat.field.contrast import Contrast, ViewRelations, compared, distinct
 from hilsplat.field.field import run_field
 from hilsplat.field.language_field import LanguageField
+from hilsplat.field.literal_trainer import Shares, ViewTargets, view_losses
 from hilsplat.field.losses.latent_regression import latent_regression_loss
 from hilsplat.field.minimise import lbfgs
 from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
-from hilsplat.field.reference_trainer import rendered_loss, run_reference
 from hilsplat.field.solver import keep_labelled, solve_field
 from hilsplat.methods.method import MethodInputs
 from hilsplat.semantic_tree.tree import run_semantic_tree
-from hilsplat.settings import AutoencoderSettings, FieldSettings, ReferenceSettings, SemanticTreeSettings
+from hilsplat.settings import AutoencoderSettings, FieldSettings, SemanticTreeSettings
 from tests.unit.field.clustering import clustering_loss
 from tests.unit.field.torch_losses import instance_term, part_term
 from tests.unit.round_gaussians import round_gaussians
@@ -48,6 +48,7 @@ class Toy:
         self.level = np.repeat(np.array([1, 2, 3], np.uint8), 3)
         indicator = painted_indicator(self.labels.astype(np.int32), 9, np.ones(PIXELS, bool))
         half = painted_indicator(self.labels.astype(np.int32), 9, rng.random(PIXELS) < 0.5)
+        self.painted, self.half = indicator, half
         self.pixels = np.asarray(indicator.sum(axis=1)).ravel().astype(np.float32)
         self.half_pixels = np.asarray(half.sum(axis=1)).ravel().astype(np.float32)
         self.A = (sp.diags(1 / self.pixels) @ indicator @ self.W).astype(np.float32)
@@ -240,25 +241,43 @@ def test_pruning_drops_look_alikes_that_are_unrelated():
     assert distinct(means, depth, 1.0).tolist() == [0, 1, 2, 3]
 
 
-def test_the_reference_loss_is_the_solver_s_language_loss():
+@pytest.mark.parametrize("instance", ["literal", "coverage_tree"])
+@pytest.mark.parametrize("part", ["literal", "disentangle"])
+def test_the_literal_trainer_takes_the_solver_s_objective_on_rendered_maps(instance, part):
+    weights = {"weight_language": 0.7, "weight_clustering": 0.4, "weight_instance": 0.5, "weight_part": 0.25}
+    settings = FieldSettings(instance_mode=instance, part_mode=part, tau=0.5, **weights)
+    toy = Toy((0.7, 0.4, 0.0))
+    contrast = toy.contrast(settings)
+    shares = Shares(1, toy.problem.total_pixels, *compared(contrast.relations))
+    view = ViewTargets(
+        np.arange(9), toy.level.astype(np.int64) - 1, toy.painted, toy.half, contrast.relations[0]
+    )
+    W = toy.W.astype(np.float64)
+    maps = np.einsum("pg,gld->pld", W, toy.features)
+    losses, by_maps = view_losses(maps, view, toy.latents, settings, shares)
+    expected = toy.problem.terms(toy.features) | contrast.values(toy.features)
+    assert losses == pytest.approx({name: expected[name] for name in losses}, rel=1e-4)
+    _, by_features = contrast.weighted(toy.features, (0.5, 0.25))
+    half = toy.problem.hessian_product(toy.features) - toy.problem.right_side()
+    by_features = by_features + 2 / toy.problem.total_pixels * half
+    assert np.einsum("pg,pld->gld", W, by_maps) == pytest.approx(by_features, abs=1e-5)
+
+
+def test_langsplats_l1_is_a_mean_over_all_pixels():
     toy = Toy((1.0, 0.0, 0.0))
-    features = torch.from_numpy(toy.features)
-    rendered = torch.from_numpy(toy.W) @ features.reshape(GAUSSIANS, -1)
-    alpha = torch.full((6, 10), 0.8)
-    shown = 0.8 * rendered.reshape(6, 10, -1)  # premultiplied, as the rasteriser gives it
-    labels = toy.labels.astype(np.int32)
-    squared = rendered_loss(shown, alpha, labels, toy.latents, "squared")
-    assert squared.item() == pytest.approx(toy.problem.terms(toy.features)["language"], rel=1e-5)
+    settings = FieldSettings(language="l1", trainer="literal", weight_part=0.0)
+    relations = toy.contrast(settings).relations[0]
+    view = ViewTargets(np.arange(9), toy.level.astype(np.int64) - 1, toy.painted, toy.half, relations)
+    maps = np.einsum("pg,gld->pld", toy.W.astype(np.float64), toy.features)
+    losses, gradient = view_losses(maps, view, toy.latents, settings, Shares(1, 1.0, 1, 1))
     apart = [
-        np.abs(rendered.numpy().reshape(60, 3, 2)[p, i] - toy.latents[labels[p, i]]).sum()
-        for p in range(60)
+        np.abs(maps[p, i] - toy.latents[toy.labels[p, i]]).sum()
+        for p in range(PIXELS)
         for i in range(3)
-        if labels[p, i] >= 0
+        if toy.labels[p, i] >= 0
     ]
-    l1 = rendered_loss(shown, alpha, labels, toy.latents, "l1")
-    assert l1.item() == pytest.approx(sum(apart) / (60 * 2), rel=1e-5)
-    thin = rendered_loss(shown, torch.full((6, 10), 0.4), labels, toy.latents, "l1")
-    assert thin.item() == 0  # thinly covered pixels do not count
+    assert losses["language"] == pytest.approx(sum(apart) / (PIXELS * CHANNELS))
+    assert not gradient[toy.labels < 0].any()
 
 
 @pytest.fixture
@@ -300,35 +319,76 @@ def test_the_median_start_and_pruning_are_options_of_the_stage(boxes_with_latent
     assert reports["pruned"]["contrasted_masks"] < reports["plain"]["contrasted_masks"]
 
 
-def test_the_reference_trainer_and_baselines_refuse_other_gaussians(boxes_with_latents, monkeypatch):
+LITERAL = SMALL_MASKS.model_copy(update={"trainer": "literal", "iterations": 60, "rate": 0.05})
+
+
+def literal_field(world, contributions, autoencoder, out, settings=LITERAL, ply=None, threads=1, **more):
+    rendered = world.scene, ply or world.ply, world.masks
+    parts = (contributions, world.coverage_tree, autoencoder)
+    run_field(*parts, out, settings, threads, rendered=rendered, **more)
+
+
+def test_the_literal_trainer_and_baselines_refuse_other_gaussians(boxes_with_latents, monkeypatch):
     world, contributions, autoencoder = boxes_with_latents
     other = world.folder / "other.ply"
     other.write_bytes(b"other")
-    monkeypatch.setattr("hilsplat.field.reference_trainer.load_ply", lambda path: None)
-    parts = (world.scene, other, world.masks, contributions, autoencoder)
     with pytest.raises(MisalignedArtifactError, match=r"made for another other\.ply"):
-        run_reference(*parts, world.folder / "l.safetensors", ReferenceSettings(), "cpu", 0, 1)
+        literal_field(world, contributions, autoencoder, world.folder / "l.safetensors", ply=other)
+    parts = (world.scene, other, world.masks, contributions, autoencoder)
     with pytest.raises(MisalignedArtifactError, match=r"made for another other\.ply"):
         MethodInputs(*parts).view_weights(world.views[0])
 
 
-def test_the_reference_trainer_lowers_its_loss(boxes_with_latents, monkeypatch):
-    world, contributions, autoencoder = boxes_with_latents
+@pytest.fixture
+def flat_boxes(boxes_with_latents, monkeypatch):
+    """The two boxes, with Gaussians that render them."""
     row, column = np.divmod(np.arange(96), 12)
     means = np.stack([column - 5.5, row - 3.5, np.full(96, 10.0)], axis=1)
     flat = round_gaussians(means, log_scale=-1.5, opacity_logit=5.0)
-    monkeypatch.setattr("hilsplat.field.reference_trainer.load_ply", lambda path: flat)
-    out = world.folder / "reference" / "field.safetensors"
-    arguments = (world.scene, world.ply, world.masks, contributions, autoencoder, out)
-    settings = ReferenceSettings(steps=60, rate=0.05)
-    run_reference(*arguments, settings, "cpu", 0, 1)
-    curve = read_json(world.folder / "reference" / "field.report.json")["curve"]
-    assert [point["step"] for point in curve] == list(range(2, 61, 2))
-    assert curve[-1]["loss"] < 0.7 * curve[0]["loss"]
+    monkeypatch.setattr("hilsplat.field.literal_trainer.load_ply", lambda path: flat)
+    return boxes_with_latents
+
+
+def test_the_literal_trainer_lowers_its_loss_and_is_the_same_on_any_number_of_threads(flat_boxes):
+    world, contributions, autoencoder = flat_boxes
+    out = world.folder / "literal" / "field.safetensors"
+    settings = LITERAL.model_copy(update={"start": "random"})
+    literal_field(world, contributions, autoencoder, out, settings)
+    report = read_json(world.folder / "literal" / "field.report.json")
+    assert [point["step"] for point in report["curve"]] == list(range(2, 61, 2))
+    assert report["curve"][-1]["loss"] < 0.7 * report["curve"][0]["loss"]
+    assert report["trained"]["language"] < 0.5 * report["start"]["language"]
     before = out.read_bytes()
-    run_reference(*arguments, settings, "cpu", 0, 2)
+    literal_field(world, contributions, autoencoder, out, settings, threads=2)
     assert out.read_bytes() == before
     assert LanguageField.load(out).features.shape == (96, 3, 3)
+
+
+def test_a_field_goes_on_from_another_one(flat_boxes):
+    world, contributions, autoencoder = flat_boxes
+    first, out = (world.folder / name / "field.safetensors" for name in ("first", "second"))
+    literal_field(
+        world, contributions, autoencoder, first, LITERAL.model_copy(update={"min_labelled_share": 0.0})
+    )
+    onward = SMALL_MASKS.model_copy(update={"start": "langsplat"})
+    parts = (contributions, world.coverage_tree, autoencoder)
+    run_field(*parts, out, onward, 1, start=first)
+    begun = read_json(out.with_suffix(".report.json"))["lifted"]
+    trained = read_json(first.with_suffix(".report.json"))["trained"]
+    assert begun.pop("ridge") == 0  # which pulls towards the start
+    assert begun == pytest.approx({name: trained[name] for name in begun}, rel=1e-4)
+    other = LanguageField(LanguageField.load(first).features, "other", "code")
+    other.save(first)
+    with pytest.raises(MisalignedArtifactError, match="other Gaussians, or to another code"):
+        run_field(*parts, out, onward, 1, start=first)
+
+
+@pytest.mark.parametrize("more", [{"trainer": "literal"}, {"start": "langsplat"}])
+def test_settings_that_need_another_input_say_so(boxes_with_latents, more):
+    world, contributions, autoencoder = boxes_with_latents
+    settings = SMALL_MASKS.model_copy(update=more)
+    with pytest.raises(SettingsError, match="don't fit together"):
+        run_field(contributions, world.coverage_tree, autoencoder, world.folder / "l", settings, 1)
 
 
 @pytest.mark.parametrize("stale", ["coverage_tree", "autoencoder", "contributions"])
@@ -344,12 +404,11 @@ def test_parts_of_masks_in_another_order_are_refused(boxes_with_latents, stale):
         run_field(*parts, world.folder / "l.safetensors", SMALL_MASKS, 1)
 
 
-def test_the_reference_trainer_and_baselines_refuse_masks_in_another_order(boxes_with_latents, monkeypatch):
-    world, contributions, autoencoder = boxes_with_latents
+def test_the_literal_trainer_and_baselines_refuse_masks_in_another_order(flat_boxes):
+    world, contributions, autoencoder = flat_boxes
     reverse_masks(world, "001.png")
-    monkeypatch.setattr("hilsplat.field.reference_trainer.load_ply", lambda path: None)
-    parts = (world.scene, world.ply, world.masks, contributions, autoencoder)
     with pytest.raises(MisalignedArtifactError, match=r"contains other masks \(view 001\.png\)"):
-        run_reference(*parts, world.folder / "l.safetensors", ReferenceSettings(), "cpu", 0, 1)
+        literal_field(world, contributions, autoencoder, world.folder / "l.safetensors")
+    parts = (world.scene, world.ply, world.masks, contributions, autoencoder)
     with pytest.raises(MisalignedArtifactError, match=r"contains other masks \(view 001\.png\)"):
         MethodInputs(*parts).view_labels("001.png")

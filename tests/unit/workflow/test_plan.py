@@ -59,6 +59,19 @@ def test_scenes_of_the_groups_are_run_and_missing_data_is_named(tmp_path):
     assert targets.absent_options(found, "replica") == ""
 
 
+def test_segments_of_waymo_are_run_without_a_row(tmp_path):
+    groups = ["benchmark", "waymo"]
+    none = plan(tmp_path, groups=groups, data_root=str(tmp_path))
+    assert f"waymo: no labelled segment is below {tmp_path}." in targets.absent_options(none, "waymo")
+    file = tmp_path / "waymo/validation/lidar_segmentation/one.parquet"
+    file.parent.mkdir(parents=True)
+    file.touch()
+    found = plan(tmp_path, groups=groups, data_root=str(tmp_path))
+    row = found.rows[-1]
+    assert (row.name, row.group, row.unit, row.source) == ("waymo/one", "waymo", "metre", "data:waymo/one")
+    assert "incomplete" in found.absent["waymo/one"]  # the test has no other component
+
+
 def test_a_run_without_scenes_says_what_there_is(tmp_path):
     with pytest.raises(SettingsError, match=r"no scene to run(.|\n)*rooms/room \(benchmark\)"):
         plan(tmp_path, groups=["ci"])
@@ -119,6 +132,39 @@ def test_what_variants_share_keeps_its_place_when_the_tables_change(tmp_path):
     outputs = list(expected_artifacts(found))
     assert outputs.count(code) == 1 and re.fullmatch(found.variants(), "network")
     assert "results/synthetic/one/network/scores.csv" not in outputs
+
+
+def test_levels_by_the_tree_take_the_theta_of_the_tree(tmp_path):
+    by_tree = {"masks": {"levels": "tree"}, "coverage_tree": {"theta": 0.7}}
+    found = plan(tmp_path, variants={**VARIANTS, "levels": by_tree}, main_variants=["default"])
+    masks = [
+        json.loads(found.settings("masks")(Job("synthetic", "one", name)))["theta"]
+        for name in ("default", "theta", "levels")
+    ]
+    assert masks == [None, None, 0.7]
+    assert found.shared_variant("masks", Job("synthetic", "one", "levels")) == "levels"
+
+
+def test_a_literal_trainer_reads_what_it_renders_and_a_field_may_go_on_from_langsplat(tmp_path):
+    shared = {"autoencoder": NETWORK}
+    variants = {
+        "langsplat": {**shared, "method": {"name": "langsplat"}},
+        "on": {**shared, "field": {"start": "langsplat"}},
+        "literal": {**shared, "field": {"trainer": "literal"}},
+        "alone": {"field": {"start": "langsplat"}},
+    }
+    found = plan(tmp_path, variants=variants, main_variants=["default"], seeds=2)
+    on, literal = (Job("synthetic", "one", name) for name in ("on.seed1", "literal"))
+    first = found.first_field(on)
+    assert first == ["results/synthetic/one/langsplat.seed1/field.safetensors"] and found.rendered(on) == []
+    assert found.field_option(on, SimpleNamespace(rendered=[], start=first[0])) == f"--start {first[0]}"
+    rendered = found.rendered(literal)
+    assert found.first_field(literal) == [] and rendered[2] == "results/synthetic/one/default/masks"
+    option = found.field_option(literal, SimpleNamespace(rendered=rendered, start=[]))
+    assert option.split()[::2] == ["--scene", "--gaussians", "--masks"]
+    assert (found.field_seed(on), found.field_seed(Job("synthetic", "one"))) == (1, 0)
+    with pytest.raises(SettingsError, match=r"no variant has method\.name langsplat with the same"):
+        found.first_field(Job("synthetic", "one", "alone"))
 
 
 def test_an_override_of_one_scene_changes_what_it_shares(tmp_path):

@@ -5,7 +5,7 @@ import sys
 
 from hilsplat.workflow.stages import STAGES
 
-TRAINING = {"field", "field_reference", "models"}
+TRAINING = {"models"}
 """Stages whose losses are torch's."""
 
 

@@ -1,0 +1,237 @@
+"""Train the field as the paper does: render a view, take its losses, step by Adam. Only features train.
+
+Slow on purpose: it is the reference for the sparse solver (`solver.solve_field`). Both minimise the same
+objective, term by term; here every term is taken on the rendered maps of one random view per step, and its
+expectation over the views is the solver's.
+
+Departs from minghanqin/LangSplat `train.py`, whose loop it is: one run trains the three levels on the same
+views; rendered features are divided by alpha, so that the losses see what a query sees; thinly covered pixels
+are left out; features of Gaussians are not scaled to unit length before they are blended.
+"""
+
+import logging
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from hilsplat.base.levels import LEVELS
+from hilsplat.contributions.compositing import MIN_ALPHA
+from hilsplat.contributions.rows import Contributions
+from hilsplat.contributions.view_matrices import label_maps, painted_indicator, random_half
+from hilsplat.field.adam import Adam
+from hilsplat.field.contrast import Contrast, ViewRelations, compared, instance_term, part_term
+from hilsplat.field.problem import QuadraticProblem
+from hilsplat.scene.finished import require_same
+from hilsplat.scene.scene import Scene
+from hilsplat.segment.digests import digests_in, load_masks
+from hilsplat.settings import FieldSettings
+from hilsplat.splat.ply import load_ply
+from hilsplat.splat.rasterise.api import draw
+from hilsplat.splat.rasterise.device import choose_device
+
+logger = logging.getLogger(__name__)
+
+CURVE_POINTS = 30
+"""Points of the report's curve of loss over seconds."""
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What is rendered: the scene's cameras, its frozen Gaussians, and the masks of its views."""
+
+    scene: Path
+    gaussians: Path
+    masks: Path
+
+
+@dataclass(frozen=True)
+class ViewTargets:
+    """Masks of one view on its covered pixels.
+
+    Attributes:
+        rows: rows of its masks in the contributions.
+        level: level of each mask, 0 to 2.
+        painted: a row of ones per mask, at the pixels that show it (masks x pixels).
+        half: the same, at the pixels of a random half.
+        relations: masks that L_ins and L_part compare.
+    """
+
+    rows: Int64[np.ndarray, " m"]
+    level: Int64[np.ndarray, " m"]
+    painted: sp.csr_matrix
+    half: sp.csr_matrix
+    relations: ViewRelations
+
+
+@dataclass(frozen=True)
+class Shares:
+    """What turns losses of one view into an estimate of the whole objective: see `view_losses`."""
+
+    views: int
+    pixels: float
+    instance: int
+    part: int
+
+
+def view_losses(
+    shown: Float64[np.ndarray, "P 3 D"],
+    view: ViewTargets,
+    latents: Float32[np.ndarray, "M D"],
+    settings: FieldSettings,
+    shares: Shares,
+) -> tuple[dict[str, float], Float64[np.ndarray, "P 3 D"]]:
+    """Every loss on the rendered maps of one view, and the gradient of their weighted sum.
+
+    Args:
+        shown: rendered features divided by alpha, channels of each level.
+        view: its masks.
+        latents: code of every mask of the scene.
+        settings: weights and readings.
+        shares: the losses are scaled so that their mean over all views is the solver's objective.
+
+    Returns:
+        unweighted losses by name; the gradient by the maps, 0 where nothing is painted.
+    """
+    pixels, levels, channels = shown.shape
+    flat = shown.reshape(pixels, levels * channels)
+    count = np.diff(view.painted.indptr).astype(np.float64)[:, None]
+    half_count = np.diff(view.half.indptr).astype(np.float64)[:, None]
+    of_level = np.arange(len(view.rows)), view.level
+    sums, half_sums = (
+        (matrix @ flat).reshape(-1, levels, channels)[of_level] for matrix in (view.painted, view.half)
+    )
+    own = sums / np.maximum(count, 1)
+    mask_of = np.full((pixels, levels), -1)
+    mask_of[view.painted.indices, np.repeat(view.level, np.diff(view.painted.indptr))] = np.repeat(
+        np.arange(len(view.rows)), np.diff(view.painted.indptr)
+    )
+    inside = mask_of >= 0
+    at = mask_of[inside]
+    here = shown[inside]
+    gradient = np.zeros_like(shown)
+    scale = shares.views / shares.pixels
+    to_latent, to_mean = here - latents[view.rows[at]], here - own[at]
+    losses = {"clustering": scale * float(np.square(to_mean).sum())}
+    by_pixel = 2 * scale * settings.weight_clustering * to_mean
+    if settings.language == "l1":
+        share = 1 / (pixels * channels)  # LangSplat: the mean over all pixels; unlabelled ones count 0
+        losses["language"] = share * float(np.abs(to_latent).sum())
+        by_pixel += settings.weight_language * share * np.sign(to_latent)
+    else:
+        losses["language"] = scale * float(np.square(to_latent).sum())
+        by_pixel += 2 * scale * settings.weight_language * to_latent
+    means, halves, others = (np.zeros((len(latents), channels)) for _ in range(3))
+    rest = np.maximum(count - half_count, 1)
+    means[view.rows] = own
+    halves[view.rows] = half_sums / np.maximum(half_count, 1)
+    others[view.rows] = (sums - half_sums) / rest
+    entries = compared([view.relations])
+    losses["instance"], by_means = instance_term(means, [view.relations], settings)
+    losses["part"], (own_part, by_half, by_other) = part_term(
+        means, halves, others, [view.relations], settings
+    )
+    for name, found, of_all in (("instance", entries[0], shares.instance), ("part", entries[1], shares.part)):
+        losses[name] *= shares.views * found / max(of_all, 1)
+    ins = settings.weight_instance * shares.views * entries[0] / max(shares.instance, 1)
+    part = settings.weight_part * shares.views * entries[1] / max(shares.part, 1)
+    of_mask = (ins * by_means + part * own_part)[view.rows] / np.maximum(count, 1)
+    of_other = part * by_other[view.rows] / rest
+    of_half = part * by_half[view.rows] / np.maximum(half_count, 1) - of_other
+    by_pixel += (of_mask + of_other)[at]
+    gradient[inside] = by_pixel
+    in_half = np.zeros((pixels, levels), bool)
+    in_half[view.half.indices, np.repeat(view.level, np.diff(view.half.indptr))] = True
+    gradient[in_half] += of_half[mask_of[in_half]]
+    return losses, gradient
+
+
+def train_literally(
+    problem: QuadraticProblem,
+    contrast: Contrast,
+    contributions: Contributions,
+    rendered: Rendered,
+    settings: FieldSettings,
+    seed: int,
+    threads: int,
+) -> tuple[Float32[np.ndarray, "N 3 D"], dict[str, object]]:
+    """Adam from the field's start, one random view per step, each once before any is repeated.
+
+    Returns:
+        the features, and a report: every loss of the whole objective before and after, and the curve.
+
+    Raises:
+        MisalignedArtifactError: the contributions belong to other Gaussians or other masks.
+    """
+    scene = Scene.load(rendered.scene)
+    require_same("contributions", scene.name, rendered.gaussians, contributions.gaussians_sha256)
+    gaussians, device = load_ply(rendered.gaussians), choose_device("auto")
+    features = problem.lifted.reshape(len(gaussians), -1).astype(np.float32)
+    channels = features.shape[1] // len(LEVELS)
+    shares = Shares(len(contributions.views), problem.total_pixels, *compared(contrast.relations))
+    report: dict[str, object] = {"start": problem.terms(problem.lifted) | contrast.values(problem.lifted)}
+    targets: dict[int, ViewTargets] = {}
+    order, queue = np.random.default_rng(seed), list[int]()
+    adam, curve, recent = Adam(features, settings.rate), list[dict[str, float]](), list[float]()
+    log_every, begin = max(1, settings.iterations // CURVE_POINTS), time.perf_counter()
+    weights = {
+        "language": settings.weight_language,
+        "clustering": settings.weight_clustering,
+        "instance": settings.weight_instance,
+        "part": settings.weight_part,
+    }
+    ridge = 2 * settings.ridge / problem.total_pixels * problem.mass[:, :, None]
+    for step in range(1, settings.iterations + 1):
+        queue = queue or order.permutation(len(contributions.views)).tolist()
+        number = queue.pop()
+        camera = scene.cameras[contributions.views[number]]
+        seen = draw(gaussians, camera, 0, features=features, threads=threads, device=device)
+        if number not in targets:
+            targets[number] = _targets(
+                contributions, rendered, number, seen.alpha, contrast.relations[number]
+            )
+        alpha = np.maximum(seen.alpha.reshape(-1, 1), 1e-6)
+        shown = (seen.image[..., 3:].reshape(len(alpha), -1) / alpha).astype(np.float64)
+        maps = shown.reshape(len(alpha), len(LEVELS), channels)
+        losses, by_maps = view_losses(maps, targets[number], problem.latents, settings, shares)
+        by_image = np.zeros((*seen.alpha.shape, 3 + features.shape[1]), np.float32)
+        by_image[..., 3:] = (by_maps.reshape(shown.shape) / alpha).reshape(*seen.alpha.shape, -1)
+        gradient = seen.gradients(by_image, np.zeros_like(seen.alpha)).features
+        if settings.ridge:
+            gradient = gradient + (ridge * (features.reshape(problem.lifted.shape) - problem.lifted)).reshape(
+                features.shape
+            )
+        adam.step(gradient)
+        recent.append(sum(weights[name] * value for name, value in losses.items()))
+        if step % log_every == 0 or step == settings.iterations:
+            seconds = round(time.perf_counter() - begin, 2)
+            curve.append({"step": step, "loss": float(np.mean(recent)), "seconds": seconds})
+            logger.info("literal trainer: step %d, loss %.5f", step, curve[-1]["loss"])
+            recent = []
+    found = features.reshape(problem.lifted.shape)
+    report["trained"] = problem.terms(found) | contrast.values(found)
+    return found, {**report, "curve": curve}
+
+
+def _targets(
+    contributions: Contributions,
+    rendered: Rendered,
+    number: int,
+    alpha: Float32[np.ndarray, "H W"],
+    relations: ViewRelations,
+) -> ViewTargets:
+    view = contributions.views[number]
+    masks = load_masks(rendered.masks, view, digests_in(contributions.folder))
+    labels = label_maps(masks)
+    covered: Bool[np.ndarray, " P"] = alpha.reshape(-1) >= MIN_ALPHA
+    half = random_half(view, len(labels))
+    return ViewTargets(
+        contributions.rows_of_views()[number],
+        masks.level.astype(np.int64) - 1,
+        painted_indicator(labels, len(masks), covered),
+        painted_indicator(labels, len(masks), covered & half),
+        relations,
+    )

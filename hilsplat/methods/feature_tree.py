@@ -1,0 +1,189 @@
+"""A semantic tree from clustered features: the paper's 3D hierarchical clustering, taken by the letter.
+
+1. Every Gaussian learns an identity feature for each level by L = L_h + lambda_1 L_ins + lambda_2 L_part
+   alone (paper, Sec. III-C). No language takes part.
+2. Gaussians are clustered coarse to fine: wholes by their features at level whole, parts inside each whole,
+   subparts inside each part. Two clusters stay apart if they are farther from each other than half the median
+   distance of two masks that share a view and a parent.
+3. A cluster takes the masks of its level that it fits best; their CLIP vectors become its vector, as in
+   OpenGaussian. Parents follow from containment, as for linked masks.
+
+The paper says "train and cluster point-level features" and no more; the rule of the distance is ours.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import scipy.cluster.hierarchy
+from jaxtyping import Float32, Int64
+
+from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.contributions.mask_operator import MaskOperator
+from hilsplat.contributions.rows import Contributions
+from hilsplat.field.contrast import Contrast, view_relations
+from hilsplat.field.field import read_parents
+from hilsplat.field.problem import QuadraticProblem
+from hilsplat.field.solver import solve_field
+from hilsplat.methods.common.groups import group_means
+from hilsplat.methods.common.quantise import kmeans
+from hilsplat.semantic_tree.level_nodes import MIN_FIT, LevelNodes
+from hilsplat.semantic_tree.nodes import best_fits, level_ious
+from hilsplat.semantic_tree.tree import run_semantic_tree
+from hilsplat.settings import FieldSettings, SemanticTreeSettings
+
+CENTRES = 256
+"""Most centres of k-means that are then joined."""
+
+CENTRE_OF = 4
+"""Least Gaussians for each centre."""
+
+KMEANS_ROUNDS = 10
+RIDGE = 1e-3
+"""Weight of the pull towards the random start: it only keeps unseen directions from drifting."""
+
+
+def identity_features(
+    contributions: Contributions,
+    parents: dict[str, np.ndarray],
+    settings: FieldSettings,
+    size: int,
+    steps: int,
+    seed: int,
+    threads: int,
+) -> tuple[Float32[np.ndarray, "N 3 D"], Float32[np.ndarray, "M D"]]:
+    """Train features with L alone, from a random start.
+
+    Args:
+        contributions: of the scene.
+        parents: per view, the coverage tree's parent of each mask.
+        settings: weights and readings of L_h, L_ins and L_part.
+        size: D.
+        steps: of L-BFGS.
+        seed: of the start.
+        threads: of the products; the result does not depend on it.
+
+    Returns:
+        features, nan for Gaussians that no mask of a level shows; the mean feature of each mask.
+    """
+    alone = {"weight_language": 0.0, "ridge": RIDGE, "start": "random", "cg_steps": 0, "lbfgs_steps": steps}
+    settings = settings.model_copy(update=alone)
+    masks, halves = (
+        MaskOperator.of(contributions.matrix(name), contributions.level, threads) for name in ("A", "A_half")
+    )
+    pixels = contributions.pixels.astype(np.float32)
+    no_latents = np.zeros((len(contributions), size), np.float32)
+    weights = (0.0, settings.weight_clustering, settings.ridge)
+    problem = QuadraticProblem.of(
+        masks, contributions.quadratic(threads), pixels, no_latents, weights, "random", seed
+    )
+    relations = view_relations(contributions, parents, settings)
+    half_pixels = contributions.half_pixels.astype(np.float32)
+    contrast = Contrast(masks, halves, pixels, half_pixels, relations, settings)
+    features, _ = solve_field(problem, contrast, settings)
+    means = masks.means(features)
+    return np.where((problem.mass > 0)[:, :, None], features, np.nan).astype(np.float32), means
+
+
+def farthest_alike(
+    means: Float32[np.ndarray, "M D"], contributions: Contributions, parents: dict[str, np.ndarray]
+) -> tuple[float, ...]:
+    """Half the median distance of two masks that share a view, a level and a parent, for each level.
+
+    Args:
+        means: mean feature of each mask.
+        contributions: rows of the masks.
+        parents: per view, the coverage tree's parent of each mask, -1 for none.
+    """
+    found: list[list[float]] = [[] for _ in LEVELS]
+    for view, rows in zip(contributions.views, contributions.rows_of_views(), strict=True):
+        level, parent = contributions.level[rows], parents[view]
+        usable = contributions.pixels[rows] > 0
+        alike = (level[:, None] == level) & (parent[:, None] == parent) & usable[:, None] & usable
+        for a, b in np.argwhere(np.triu(alike, 1)):
+            found[level[a] - 1].append(float(np.linalg.norm(means[rows[a]] - means[rows[b]])))
+    return tuple(0.5 * float(np.median(values)) if values else np.inf for values in found)
+
+
+def joined_clusters(
+    features: Float32[np.ndarray, "n D"], farthest: float, seed: int
+) -> Int64[np.ndarray, " n"]:
+    """Cluster of each row: centres of k-means, joined while their average distance is below `farthest`."""
+    count = int(np.clip(len(features) // CENTRE_OF, 1, CENTRES))
+    _, centre = kmeans(features, count, seed, KMEANS_ROUNDS)
+    used, centre = np.unique(centre, return_inverse=True)
+    if len(used) < 2:
+        return np.zeros(len(features), np.int64)
+    means, _ = group_means(features, centre, len(used))
+    joined = scipy.cluster.hierarchy.linkage(means, "average")
+    return (scipy.cluster.hierarchy.fcluster(joined, farthest, "distance") - 1)[centre].astype(np.int64)
+
+
+def nested_clusters(
+    features: Float32[np.ndarray, "N 3 D"], farthest: tuple[float, ...], seed: int
+) -> Int64[np.ndarray, "N 3"]:
+    """Cluster of each Gaussian at each level, -1 where its feature is nan; finer ones lie inside coarser."""
+    found = np.full(features.shape[:2], NONE, np.int64)
+    around = np.zeros(len(features), np.int64)
+    for level in LEVELS:
+        has = ~np.isnan(features[:, level.index, 0])
+        number = 0
+        for cluster in np.unique(around[has]):
+            inside = np.flatnonzero(has & (around == cluster))
+            own = joined_clusters(features[inside, level.index], farthest[level.index], seed)
+            found[inside, level.index] = number + own
+            number += int(own.max()) + 1
+        around = np.where(
+            has, found[:, level.index], -2 - around
+        )  # Gaussians without one stay with their whole
+    return found
+
+
+def run_feature_tree(
+    contributions_folder: Path,
+    masks_folder: Path,
+    coverage_folder: Path,
+    out: Path,
+    settings: SemanticTreeSettings,
+    field_settings: FieldSettings,
+    seed: int,
+    threads: int,
+) -> None:
+    """Write a semantic tree whose nodes are clusters of features that L alone trains.
+
+    Args:
+        contributions_folder: weights of each Gaussian in each mask, with G.
+        masks_folder: masks of the views.
+        coverage_folder: coverage trees of the views, for L_ins and L_part.
+        out: folder to write, as `run_semantic_tree`.
+        settings: of the tree.
+        field_settings: weights and readings of L.
+        seed: of the features' start and of k-means.
+        threads: results do not depend on it.
+
+    Raises:
+        MisalignedArtifactError: an input belongs to other masks.
+    """
+    contributions = Contributions.load(contributions_folder)
+    parents = read_parents(coverage_folder, contributions)
+    features, means = identity_features(
+        contributions, parents, field_settings, settings.feature_size, settings.feature_steps, seed, threads
+    )
+    clusters = nested_clusters(features, farthest_alike(means, contributions, parents), seed)
+    S, mass = contributions.matrix("S"), contributions.mass()
+
+    def nodes_of(level: Level, rows: Int64[np.ndarray, " m"]) -> LevelNodes:
+        own, view = clusters[:, level.index], contributions.view[rows]
+        fits, iou = best_fits(level_ious(own.astype(np.int32), S[rows], mass, view))
+        of_mask = np.where(iou > MIN_FIT, fits, NONE).astype(np.int64)
+        number = int(own.max(initial=NONE)) + 1
+        pairs = np.unique(np.stack([of_mask, view], axis=1)[of_mask != NONE], axis=0)
+        kept = np.flatnonzero(np.bincount(pairs[:, 0], minlength=number) >= settings.min_views)
+        renumber = np.full(number + 1, NONE, np.int64)
+        renumber[kept] = np.arange(len(kept))
+        quality, _ = group_means(iou[of_mask != NONE, None], of_mask[of_mask != NONE], number)
+        of_gaussian = renumber[own].astype(np.int32)
+        return LevelNodes(
+            renumber[of_mask], of_gaussian, (of_gaussian != NONE).astype(np.float32), quality[kept, 0]
+        )
+
+    run_semantic_tree(contributions_folder, masks_folder, out, settings, threads, nodes_of)
