@@ -10,7 +10,17 @@ import pandas as pd
 from tests.reference import tiny
 from tests.workflow.conftest import SCENE, Project
 
-TABLES = ("hierarchy", "lerf", "3dovs", "ablation", "theta", "omega", "frames-hi-lerf", "frames-hi-3dovs")
+TABLES = (
+    "hierarchy",
+    "lerf",
+    "3dovs",
+    "ablation",
+    "components",
+    "theta",
+    "omega",
+    "frames-hi-lerf",
+    "frames-hi-3dovs",
+)
 TABLES += ("efficiency", "pruning", "cost-seconds", "efficiency-seconds", "pruning-seconds")
 REPORTED = ("cost", "replica", "scannet", "waymo")
 """Tables in which the tiny scene has no row."""

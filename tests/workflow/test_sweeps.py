@@ -9,7 +9,8 @@ import pytest
 from tests.workflow.conftest import Project, copy_project
 from tests.workflow.test_bad_input import noise_photos
 
-NONE = ("theta_variants=[]", "omega_variants=[]", "pruning_variants=[]", "ablation_variants=[]")
+LISTS = ("theta", "omega", "pruning", "ablation", "component")
+NONE = tuple(f"{name}_variants=[]" for name in LISTS)
 MAIN = "main_variants=[default]"
 
 
@@ -60,7 +61,7 @@ def test_without_sweeps_every_stage_runs_once(base):
         ),
         ("pruning_variants=[default,pruned]", {"field": 1, "evaluate": 1, "table": 2}),
         (
-            "ablation_variants=[no-hierarchy,clustering,clustering-part,default,all-losses]",
+            "component_variants=[no-hierarchy,clustering,clustering-part,default,all-losses]",
             {"field": 4, "evaluate": 4, "table": 1},
         ),
         # d = 3 needs its own autoencoder, which both share; baselines write the field by another rule
@@ -71,6 +72,18 @@ def test_without_sweeps_every_stage_runs_once(base):
         (
             "main_variants=[default,langsplat,lifted]",
             {"autoencoder": 2, "method": 2, "evaluate": 2},
+        ),
+        # levels by the coverage tree need their own masks and what follows; the rows share all but the field
+        (
+            "ablation_variants=[langsplat,initial-2d,paper-hc,paper-instance,paper-part,paper-tree]",
+            {
+                **dict.fromkeys(("masks", "coverage_tree", "contributions", "semantic_tree", "clip"), 1),
+                "autoencoder": 2,
+                "field": 4,
+                "method": 2,
+                "evaluate": 6,
+                "table": 1,
+            },
         ),
         # only what is random is repeated: PCA and our solver are not
         ("seeds=3", {}),
