@@ -170,7 +170,7 @@ class ViewTruth:
         return ViewTruth((), categories, {})
 
     def own_part(self, path: tuple[str, ...], answer: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-        """The answer to a path's last text, without what lies in other wholes that have a part of this text.
+        """Remove from a text's answer what is inside other annotated wholes with a part of this text.
 
         "leg" answers with the legs of chair and table; those in the annotated table are not the chair's.
         """

@@ -122,7 +122,7 @@ def test_levels_by_the_tree_are_depths_whatever_head_made_a_mask():
 
 
 def test_theta_decides_levels_by_the_tree():
-    # 3 of the second mask's 4 px lie in the first
+    # 3 of the second mask's 4 px are in the first
     found = HierarchicalMasks.from_dense(
         rows("########..", ".....####."), np.array([1, 1], np.uint8), *[np.ones(2, np.float32)] * 2
     )
