@@ -413,8 +413,9 @@ class SemanticTreeSettings(Section):
         "side",
         gt=0,
     )
-    device: Literal["cpu", "cuda"] = knob(
-        "cpu", "device that compares masks; cuda: by torch, equal up to rounding"
+    device: Literal["auto", "cpu", "cuda"] = knob(
+        "cpu",
+        "device that compares masks; cuda: by torch, equal up to rounding; auto: cuda if found",
     )
 
     @property
@@ -512,8 +513,9 @@ class FieldSettings(Section):
         le=1,
         origin="paper: pruning, no number",
     )
-    device: Literal["cpu", "cuda"] = knob(
-        "cpu", "device that multiplies matrices; cuda: by torch, equal up to rounding"
+    device: Literal["auto", "cpu", "cuda"] = knob(
+        "cpu",
+        "device that multiplies matrices; cuda: by torch, equal up to rounding; auto: cuda if found",
     )
 
     @property

@@ -1,7 +1,7 @@
 """Snakemake logger plugin: the progress of a run in place of Snakemake's block of lines per job.
 
 `profiles/default` switches it on. With --verbose, --quiet, --dry-run or another --logger, Snakemake's own
-output remains.
+output remains. After a dry run comes a table of what the run would take.
 """
 
 import logging
@@ -9,7 +9,8 @@ import sys
 
 from snakemake_interface_logger_plugins.base import LogHandlerBase
 
-from hilsplat.workflow.progress import ProgressDisplay, RunProgress
+from hilsplat.workflow.estimate import RunEstimate
+from hilsplat.workflow.progress import ProgressDisplay, RunProgress, estimates
 
 
 class LogHandler(LogHandlerBase):
@@ -26,6 +27,8 @@ class LogHandler(LogHandlerBase):
         self.stream = sys.stdout if settings.stdout else sys.stderr
         unchanged = settings.dryrun or settings.verbose or settings.quiet
         self.display = None if unchanged else ProgressDisplay(self.stream, self.format, RunProgress())
+        self.is_dry = settings.dryrun and not settings.quiet
+        self.estimate: RunEstimate | None = None
 
     def emit(self, record: logging.LogRecord) -> None:
         """Show a record."""
@@ -34,11 +37,26 @@ class LogHandler(LogHandlerBase):
                 self.display.show(record)
             elif text := self.format(record):
                 print(text, file=self.stream, flush=True)
+            if self.is_dry and getattr(record, "event", None) == "job_info":
+                self._count(record)
         except Exception:
             self.handleError(record)
 
+    def _count(self, record: logging.LogRecord) -> None:
+        """Add a job to the estimate of a dry run; the Snakefile has set the plan by then."""
+        if self.estimate is None and estimates.resources is not None:
+            self.estimate = RunEstimate(estimates.resources)
+        if self.estimate is not None:
+            facts = record.__dict__
+            memory = facts["resources"].get("mem_mb", 0)
+            self.estimate.add(facts["rule_name"], dict(facts["wildcards"]), memory)
+
     def close(self) -> None:
-        """Remove the line of progress."""
+        """Remove the line of progress, or print the table of a dry run."""
+        if self.estimate is not None:
+            for line in self.estimate.lines():
+                print(line, file=self.stream, flush=True)
+            self.estimate = None
         if self.display is not None:
             self.display.close()
         super().close()

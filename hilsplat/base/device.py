@@ -12,6 +12,7 @@ from hilsplat.base.errors import DeviceError
 logger = logging.getLogger(__name__)
 
 ComputeDevice = Literal["cpu", "cuda"]
+WantedDevice = Literal["auto", "cpu", "cuda"]
 
 
 @cache
@@ -49,12 +50,12 @@ def one_torch_thread() -> Iterator[None]:
 
 
 @cache
-def compute_device(wanted: ComputeDevice) -> ComputeDevice:
+def compute_device(wanted: WantedDevice) -> ComputeDevice:
     """The device of a stage.
 
     Args:
-        wanted: the default is never `cuda`: its sums agree with the CPU's up to rounding, but not byte for
-            byte.
+        wanted: auto: cuda if torch finds a device. The default is cpu: sums of cuda agree with the CPU's up
+            to rounding, but not byte for byte.
 
     Raises:
         DeviceError: `wanted` is `cuda`, and torch finds no device. There is no fallback.
@@ -62,6 +63,8 @@ def compute_device(wanted: ComputeDevice) -> ComputeDevice:
     if wanted == "cpu":
         return "cpu"
     problem = cuda_missing()
+    if problem and wanted == "auto":
+        return "cpu"
     if problem:
         raise DeviceError(
             "device: cuda cannot be used here",

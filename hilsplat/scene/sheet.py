@@ -23,6 +23,7 @@ NOTHING = ("", "-")
 GROUPS = (
     "benchmark",
     "development",
+    "dense",
     "ci",
     "photos",
     "lerf",

@@ -24,11 +24,8 @@ from hilsplat.workflow.resources import COSTS, JobResources
 
 PACKAGE = "hilsplat"
 
-DISK_MIB_PER_MP = 35.0
-"""Results and caches of a scene per megapixel of its views (48 photographs of 0.5 megapixels: 0.8 GB)."""
-
 RULES = ("poses", "gaussians", "masks", "contributions", "semantic_tree", "clip", "field", "figures")
-"""Rules whose memory is compared with the machine's."""
+"""Rules whose memory and disk are compared with the machine's."""
 
 
 @dataclass(frozen=True)
@@ -188,11 +185,10 @@ def space() -> Iterator[Finding]:
             "configuration", "note", str(error), "choose scenes, or name them: hilsplat run photos/desk"
         )
         return
-    resources, disk_mib, memory = JobResources(plan), 0.0, (0.0, "", "")
+    resources, disk_mb, memory = JobResources(plan), 0.0, (0.0, "", "")
     for row in plan.scenes:
         job = SimpleNamespace(dataset=row.dataset, scene=row.scene, variant="default")
-        views, view_mp = resources.size(row)
-        disk_mib += DISK_MIB_PER_MP * views * view_mp
+        disk_mb += sum(resources.disk_mb(rule, job) for rule in RULES)
         needs = (
             (resources.memory_mb(rule)(job, threads=1, attempt=1), rule, row.name)
             for rule in RULES
@@ -200,7 +196,7 @@ def space() -> Iterator[Finding]:
         )
         memory = max(memory, *needs)
     folder = _existing(plan.results)
-    free, needed = shutil.disk_usage(folder).free / 2**30, disk_mib / 1024
+    free, needed = shutil.disk_usage(folder).free / 2**30, disk_mb * 1e6 / 2**30
     text = f"{free:.1f} GiB free in {folder}; results of {len(plan.scenes)} scenes take about {needed:.1f}"
     if free > needed:
         yield Finding("disk", "ok", text)

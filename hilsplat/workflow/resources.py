@@ -2,10 +2,11 @@
 
 `resources.tsv` has, for each rule, core seconds per megapixel of all views and the parts of its memory in
 megabytes: a base, per megapixel of all views (`mp`, and `capped_mp` up to `cap`), per megapixel of one view
-(`view_mp`, and `thread_mp` per thread), and per thousand Gaussians. The memory is above the peaks in
-Snakemake's `benchmark:` records (tests/unit/workflow/peak_memory.tsv; `source` and `train_models` were not
-measured). Times were measured on the benchmark scenes and can be wrong by a factor of three elsewhere. A job
-that is killed is tried again with twice as much of everything.
+(`view_mp`, and `thread_mp` per thread), and per thousand Gaussians; then megabytes on disk, caches included,
+per megapixel of all views and per thousand Gaussians (of a field: and channel of a latent). The memory is
+above the peaks in Snakemake's `benchmark:` records (tests/unit/workflow/peak_memory.tsv; `source` and
+`train_models` were not measured). Times were measured on the benchmark scenes and can be wrong by a factor of
+three elsewhere. A job that is killed is tried again with twice as much of everything.
 """
 
 import csv
@@ -21,8 +22,10 @@ from PIL import Image
 
 from hilsplat.base.device import is_installed
 from hilsplat.base.errors import ModelError
+from hilsplat.base.levels import LEVELS
 from hilsplat.models.store import model_path, read_model
 from hilsplat.scene.sheet import SceneRow
+from hilsplat.settings import MasksSettings
 from hilsplat.splat.ply import vertex_count
 from hilsplat.workflow.jobs import Job
 from hilsplat.workflow.plan import Plan
@@ -46,11 +49,33 @@ TIME_FACTOR, LEAST_MINUTES = 6, 10
 START_S = 2.0
 """Seconds that every job takes to start Python, load libraries and read."""
 
-FIT_S_PER_MP, GRAPH_S_PER_MP = 0.14, 4.0
-"""Core seconds per megapixel of a view and step of the fit, and of the graph segmenter per megapixel."""
+FIT_S_PER_MP, FIT_S_PER_GAUSSIAN, GRAPH_S_PER_MP = 0.14, 0.7e-6, 4.0
+"""Core seconds of a step of the fit, per megapixel that it sees and per Gaussian of the limit; of the graph
+segmenter per megapixel."""
 
-EMBEDDED_S, FULL_S = {"masks": 2.5, "clip": 0.2}, {"masks": 13.0, "clip": 5.0}
-"""Core seconds per view of the embedded models, and of SAM 2.1 small and CLIP B/16 (docs/benchmarks.md)."""
+TRAINED_S_PER_MP, LITERAL_S_PER_MP = 0.02, 1.0
+"""Core seconds of a step of a baseline or of the literal trainer, per level and megapixel that it takes."""
+
+NETWORK_S = 10.0
+"""Core seconds of a trained autoencoder."""
+
+EMBEDDED_S = {"masks": 2.5, "clip": 0.2}
+"""Core seconds per view of the embedded models."""
+
+SAM_S, OTHER_SAM_S = {"huge": 87.0, "large": 44.0, "base": 14.1}, 5.7
+"""Part of a SAM's name -> core seconds of a picture's encoding; of SAM 2.1 small (docs/benchmarks.md)."""
+
+PROMPT_S, PICTURE_S, CROP_S = 0.02, 1.0, 0.3
+"""Core seconds of a prompt in SAM, of a picture between logits and masks, and of a crop in CLIP B/16."""
+
+PREVIEWED, GUIDED = 0.65, 0.25
+"""Cost of a prompt that a preview may drop, and share of the grid's prompts that guided views take."""
+
+MASKS, NODES = 230, 400
+"""Masks of a photograph, and nodes of a room: those of `plush_bedroom` (docs/benchmarks.md)."""
+
+UNTRAINED = ("lifted", "occam", "dr_splat")
+"""Baselines without training."""
 
 UNKNOWN_MP = 0.5
 """Megapixels of a view if no image header can be read before the run, such as in an archive."""
@@ -74,7 +99,7 @@ class JobResources:
     """
 
     def __init__(self, plan: Plan, cores: int | None = None) -> None:
-        self.plan = plan
+        self.plan, self.cores = plan, cores
         self._per_scene = math.inf if cores is None else max(1, cores // max(1, len(plan.scenes)))
         many = cores is not None and len(plan.run.variant_names()) >= cores
         self._per_variant = 1 if many else self._per_scene
@@ -131,22 +156,47 @@ class JobResources:
 
         return needed
 
+    def disk_mb(self, rule: str, job: Job) -> float:
+        """Return the megabytes that a scene's job writes, caches included."""
+        row, cost = self.plan.row(job), COSTS.get(rule, {})
+        views, view_mp = self.size(row)
+        of_gaussians = cost.get("disk_thousand", 0.0) * self.gaussians(row) / 1000
+        if rule in ("field", "method"):
+            of_gaussians *= self.plan.stages(job).autoencoder.latent
+        return cost.get("disk_mp", 0.0) * views * view_mp + of_gaussians
+
     def core_seconds(self, rule: str, job: Job) -> float:
         """Return the estimated core seconds of a scene's job."""
         return START_S + self._seconds(rule, *self.plan.which(job), self.size(self.plan.row(job)))
 
     def _estimate(self, rule: str, variant: str, scopes: tuple[str, ...], size: Size) -> float:
         stages = self.plan.stages_of(variant, scopes)
+        views, view_mp = size
         if rule == "gaussians":
             fit = stages.gaussians
-            steps = min(fit.iterations, fit.steps_per_view * size.views)
-            return FIT_S_PER_MP * steps * size.view_mp * fit.image_scale**2
+            small, half = fit.quarter_until, max(fit.half_until - fit.quarter_until, 0.0)
+            seen_mp = view_mp * fit.image_scale**2 * (small / 16 + half / 4 + max(1 - small - half, 0.0))
+            steps = min(fit.iterations, fit.steps_per_view * views)
+            return steps * (FIT_S_PER_MP * seen_mp + FIT_S_PER_GAUSSIAN * fit.max_gaussians)
         if rule == "masks" and stages.masks.segmenter == "graph":
-            return GRAPH_S_PER_MP * size.views * size.view_mp
+            return GRAPH_S_PER_MP * views * view_mp
         if rule in EMBEDDED_S:
             model = read_model(Path(getattr(stages, rule).model))
-            return size.views * (EMBEDDED_S if model is None or model.embedded else FULL_S)[rule]
-        return COSTS.get(rule, {}).get("core_s_per_mp", 0.0) * size.views * size.view_mp
+            if model is None or model.embedded:
+                return views * EMBEDDED_S[rule]
+            if rule == "masks":
+                return views * _sam_s(stages.masks)
+            crops = NODES * stages.clip.crops_per_node
+            return CROP_S * (views * MASKS if stages.clip.crops == "masks" else crops)
+        if rule == "method" and stages.method.name in UNTRAINED:
+            return COSTS["field"]["core_s_per_mp"] * views * view_mp
+        if rule == "method":
+            return _trained_s(TRAINED_S_PER_MP, stages.method.steps, view_mp / stages.method.pixel_step**2)
+        if rule == "field" and stages.field.trainer == "literal":
+            return _trained_s(LITERAL_S_PER_MP, stages.field.iterations, view_mp)
+        if rule == "autoencoder" and stages.autoencoder.code == "network":
+            return NETWORK_S
+        return COSTS.get(rule, {}).get("core_s_per_mp", 0.0) * views * view_mp
 
     def _size(self, row: SceneRow) -> Size:
         """Return the size of a scene from its cameras, or from its settings or image headers."""
@@ -176,6 +226,19 @@ class JobResources:
             return 0
         batch = settings.batch if rule == "clip" else settings.points_per_batch
         return _model_memory_mb(model_path(settings.model), settings.variant, batch, threads)
+
+
+def _trained_s(s_per_mp: float, steps: int, mp: float) -> float:
+    return s_per_mp * len(LEVELS) * steps * mp
+
+
+def _sam_s(masks: MasksSettings) -> float:
+    """Return the core seconds of a view in a real SAM, with those of its crops."""
+    picture_s = next((cost for word, cost in SAM_S.items() if word in masks.model), OTHER_SAM_S)
+    pictures = sum(4**layer for layer in range(masks.crop_layers + 1))
+    share = 1.0 if masks.generator == "official" else PREVIEWED
+    prompts = masks.points_per_side**2 * share * (GUIDED if masks.prompts == "guided" else 1.0)
+    return masks.key_views * pictures * (picture_s + PICTURE_S + prompts * PROMPT_S)
 
 
 def _first_mp(images: Iterable[str], max_side_px: int) -> float:

@@ -62,9 +62,9 @@ def theta_table(sources: Sources) -> Table:
     """Sweep over the coverage threshold."""
     footnotes = (
         COLUMNS_NOTE,
-        "theta decides which mask of a view lies inside which other. Rows in the paper's reading take levels from "
-        "this tree (masks.levels: tree), so theta moves masks between levels. With levels by SAM's head it affects "
-        "a field only through L_ins and L_part, and the linked semantic tree not at all.",
+        "theta decides which mask of a view lies inside which other. Rows in the paper's reading take levels "
+        "from this tree (masks.levels: tree), so theta moves masks between levels. With levels by SAM's head "
+        "it affects a field only through L_ins and L_part, and the linked semantic tree not at all.",
     )
     blocks = [reported(sources, "coverage threshold"), *component_blocks(sources, ("field",))]
     return sources.finished("theta", "Influence of the coverage threshold theta", blocks, footnotes)
@@ -74,8 +74,8 @@ def omega_table(sources: Sources) -> Table:
     """Sweep over the similarity degree."""
     footnotes = (
         COLUMNS_NOTE,
-        "Omega appears in L_ins only. Rows in the paper's reading take lambda_1 = exp(-6) and lambda_2 = exp(-5): "
-        "with 1e-6 and 1e-5 all rows are equal.",
+        "Omega appears in L_ins only. Rows in the paper's reading take lambda_1 = exp(-6) and "
+        "lambda_2 = exp(-5): with 1e-6 and 1e-5 all rows are equal.",
     )
     blocks = [reported(sources, "similarity degrees"), *component_blocks(sources, ("field",))]
     return sources.finished("omega", "Influence of the similarity degree Omega", blocks, footnotes)

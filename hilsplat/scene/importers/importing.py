@@ -27,6 +27,9 @@ logger = logging.getLogger(__name__)
 ASPECT_TOLERANCE = 0.01
 """An image may be a scaled copy of what its camera describes, but not another crop of it."""
 
+TRAIN_FOLDER = "images_train"
+"""Folder beside `images` whose names are the training views of Gaussian Grouping's data (LERF-Mask)."""
+
 
 def import_poses(
     known: KnownPoses,
@@ -115,8 +118,10 @@ def import_poses(
         "views": entries,
     }
     names = [view.view for view in views]
-    if any(view.is_test for view in present):  # the source brings its own split
-        split = {name: "test" if view.is_test else "train" for name, view in zip(names, present, strict=True)}
+    trained = {path.stem for path in (known.root / TRAIN_FOLDER).glob("*")}
+    held_out = [view.is_test or (bool(trained) and Path(view.name).stem not in trained) for view in present]
+    if any(held_out):  # the source brings its own split
+        split = {name: "test" if is_test else "train" for name, is_test in zip(names, held_out, strict=True)}
     else:
         split = split_views(names, settings.test_every)
     write_scene(out, name, unit, views, points[0], points[1], split, report, turn=False)

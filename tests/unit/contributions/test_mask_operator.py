@@ -139,3 +139,4 @@ def test_cuda_is_refused_where_there_is_none():
         with pytest.raises(DeviceError, match="finds no CUDA device"):
             compute_device("cuda")
     assert compute_device("cpu") == "cpu"
+    assert compute_device("auto") == ("cpu" if cuda_missing() else "cuda")

@@ -9,6 +9,9 @@ from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
 from hilsplat.datasets.images.lerf_mask import open_scene
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, write_hierarchy
+from hilsplat.scene.poses import run_poses
+from hilsplat.scene.scene import Scene
+from hilsplat.settings import PosesSettings
 from tests.unit.datasets.writers.labelled import write_lerf_mask
 from tests.unit.datasets.writers.true_world import TrueWorld, write_sparse
 
@@ -40,6 +43,13 @@ def test_test_views_are_posed_images_that_images_train_lacks(root):
     scene = open_scene(root, "teatime")
     assert list(scene.views) == ["frame_00001.png", "frame_00002.png", "frame_00004.png"]
     assert not scene.views["frame_00004.png"][0].mask().any()
+
+
+def test_the_poses_stage_holds_the_test_views_out(root, tmp_path):
+    settings = PosesSettings(test_every=2)
+    run_poses(root / "teatime", tmp_path / "scene", "lerf_mask/teatime", "arbitrary", False, settings, 0, 1)
+    split = Scene.load(tmp_path / "scene").split
+    assert [view for view in split if split[view] == "test"] == list(open_scene(root, "teatime").views)
 
 
 def test_an_image_without_a_pose_is_not_a_test_view(true_world, root):

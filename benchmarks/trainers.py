@@ -1,0 +1,103 @@
+"""The fast solver of the field against the literal trainer on one scene: losses, scores and seconds. By hand:
+
+    python -m benchmarks.trainers FOLDER                        # dev-1, 10,000 iterations, two seeds
+    python -m benchmarks.trainers FOLDER --scene tiny --iterations 1000 --seeds 1
+
+Both minimise the paper's objective in our reading (variant `paper`): the same masks, code and weights. FOLDER
+becomes a project; its results stay. Losses are those of the whole objective, over all views.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from benchmarks.rehearsal import PROJECT
+from hilsplat.base.artifacts import read_json
+from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
+from hilsplat.evaluate.protocols.totals import level_averages_of_scenes
+from hilsplat.evaluate.scores import read_scores
+
+PAPER = {
+    "autoencoder": {"code": "network", "latent": 3, "targets": "mask"},
+    "evaluate": {"methods": ["field"], "view_consistency": False},
+}
+OBJECTIVE = {
+    "weight_clustering": 1.0,
+    "weight_instance": 1e-6,
+    "weight_part": 1e-5,
+    "instance_mode": "literal",
+    "part_mode": "literal",
+    "min_labelled_share": 0,
+}
+WEIGHTS = {"language": 1.0, "clustering": 1.0, "ridge": 0.1, "instance": 1e-6, "part": 1e-5}
+TRAINERS = ("fast", "fast-60", "literal")
+EMPTY = ("ablation", "component", "theta", "omega", "pruning")
+
+
+def configuration(scene: str, iterations: int, seeds: int) -> dict[str, Any]:
+    """A variant for each trainer: the solver's default steps, ten times as many, the literal trainer."""
+    more = ({}, {"cg_steps": 60, "lbfgs_steps": 20}, {"trainer": "literal", "iterations": iterations})
+    trainers = dict(zip(TRAINERS, more, strict=True))
+    return {
+        "groups": ["benchmark", "development", "ci"],
+        "only": [scene],
+        "seeds": seeds,
+        "variants": {name: {**PAPER, "field": {**OBJECTIVE, **own}} for name, own in trainers.items()},
+        "main_variants": ["default", *trainers],
+        **{f"{name}_variants": [] for name in EMPTY},
+    }
+
+
+def main() -> None:
+    """Run both trainers and print their losses, scores and seconds."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.trainers", description=__doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--scene", default="dev-1")
+    parser.add_argument("--iterations", type=int, default=10_000)
+    parser.add_argument("--seeds", type=int, default=2)
+    given = parser.parse_args()
+    given.folder.mkdir(parents=True, exist_ok=True)
+    config = given.folder / "trainers.yaml"
+    config.write_text(yaml.safe_dump(configuration(given.scene, given.iterations, given.seeds)))
+    for name in ("models", "config"):
+        if not (given.folder / name).exists():
+            (given.folder / name).symlink_to(PROJECT / name)
+    command = [
+        sys.executable,
+        "-m",
+        "hilsplat",
+        "run",
+        "results/tables/hierarchy.csv",
+        "--config",
+        config.name,
+    ]
+    subprocess.run(command, cwd=given.folder, check=True)
+    scene = given.folder / "results" / "synthetic" / given.scene
+    print("| trainer, seed | objective | language | clustering | mIoU, level given | s |")
+    print("|---|---:|---:|---:|---:|---:|")
+    for report in sorted(scene.glob("*/field.report.json")):
+        if report.parent.name.partition(".")[0] in TRAINERS:
+            print(row(report.parent))
+
+
+def row(variant: Path) -> str:
+    """Losses, score and seconds of one field."""
+    report = read_json(variant / "field.report.json")
+    losses = report["trained" if "trained" in report else "after_lbfgs"]
+    objective = sum(weight * losses[name] for name, weight in WEIGHTS.items())
+    scores = read_scores([variant / "scores.csv"])
+    given = scores[scores["protocol"].str.startswith(f"{LEVEL_GIVEN.name}@")]
+    score = 100 * float(level_averages_of_scenes(given, "iou").mean())
+    record = (variant / "benchmarks" / "field.jsonl").read_text(encoding="utf-8").splitlines()[-1]
+    shown = (f"{value:.5f}" for value in (objective, losses["language"], losses["clustering"]))
+    return f"| {variant.name} | {' | '.join(shown)} | {score:.1f} | {json.loads(record)['s']:.0f} |"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,148 @@
+"""Rehearse config/paper.yaml: a tiny data root in each published layout, and the whole workflow over it.
+
+    make rehearsal                                   # in a folder that is removed
+    python -m tests.published --work FOLDER          # keeps data, project and results
+
+Three small synthetic scenes (a table, a room, a street) are written as LERF-OVS, LERF-Mask, 3D-OVS, Hi-LERF,
+Hi-3DOVS, ScanNet, ScanNet200, Replica and Waymo. The run takes `config/paper.yaml` with fewer steps and the
+embedded models, and nothing else changed. Every table must have measured rows of every data set that it
+shows, and the hours that the dry run predicts must be within a factor of 1.5 of what the run took; the exit
+code is 1 otherwise.
+"""
+
+import argparse
+import re
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import yaml
+
+from hilsplat.evaluate.tables.build import TABLES
+from hilsplat.settings import WorldSettings
+from hilsplat.world.stage import run_world
+from tests.conftest import PROJECT
+from tests.unit.datasets.writers.labelled import (
+    LERF_STEMS,
+    OVS_STEMS,
+    write_3d_ovs,
+    write_hi,
+    write_lerf_mask,
+    write_lerf_ovs,
+)
+from tests.unit.datasets.writers.true_world import TrueWorld
+from tests.unit.datasets.writers.world import (
+    write_room_as_replica,
+    write_room_as_scannet,
+    write_street_as_waymo,
+)
+from tests.workflow.conftest import copy_project
+
+WORLD = WorldSettings(views=12, image_px=128, arc_deg=100, objects=3, samples=1)
+LABELLED = ("002.png", "006.png", "010.png")
+SEED = 210
+
+REDUCED = {
+    "gaussians": {"iterations": 300, "max_gaussians": 8000, "densify_every": 50, "sh_degree": 1},
+    "masks": {"model": "models/sam-tiny", "points_per_side": 16, "crop_layers": 0, "min_area_px": 8},
+    "clip": {"model": "models/clip-tiny"},
+    "semantic_tree": {"min_views": 2},
+    "autoencoder": {"epochs": 30, "min_steps": 500},
+    "evaluate": {"min_region_px": 30},
+    "variants": {"langsplat": {"method": {"steps": 200, "pixel_step": 2}}},
+    "overrides": {group: {"poses": {"max_side_px": 128}} for group in ("scannet", "replica", "waymo")},
+}
+"""Fewer steps, fewer prompts and the embedded models."""
+
+MEASURED = {
+    "lerf": ("lerf", "lerf_mask"),
+    "3dovs": ("3d_ovs",),
+    "hierarchy": ("lerf", "3d_ovs"),
+    "frames-hi-lerf": ("lerf",),
+    "frames-hi-3dovs": ("3d_ovs",),
+    "replica": ("replica",),
+    "scannet": ("scannet",),
+    "waymo": ("waymo",),
+    "ablation": ("lerf", "3d_ovs"),
+}
+"""Table -> data sets of which it must have measured rows; every other table needs some measured row."""
+
+LARGEST_FACTOR = 1.5
+
+
+def write_data(work: Path, root: Path) -> None:
+    """Write one scene of each data set.
+
+    Args:
+        work: for the synthetic scenes.
+        root: the data root.
+    """
+    for kind in ("tabletop", "room", "street"):
+        run_world(f"world:{kind}:{SEED}", WORLD, work / kind, threads=2)
+    table = TrueWorld.open(work / "tabletop")
+    write_lerf_ovs(table, root / "lerf_ovs", "figurines", LABELLED)
+    write_hi(table, root / "hi_lerf", root / "lerf_ovs", "figurines", LABELLED, LERF_STEMS)
+    write_lerf_mask(table, root / "lerf_mask", "figurines", LABELLED)
+    write_3d_ovs(table, root / "3d_ovs", "sofa", LABELLED)
+    write_hi(table, root / "hi_3dovs", root / "3d_ovs", "sofa", LABELLED, OVS_STEMS)
+    write_room_as_scannet(work / "room", root / "scannet", "scene0000_00")
+    write_room_as_replica(work / "room", root / "replica", "room_0")
+    write_street_as_waymo(work / "street", root / "waymo" / "validation", "1000_segment")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write the data, run the workflow, check tables and estimate; 1 if something is missing."""
+    parser = argparse.ArgumentParser(prog="python -m tests.published", description=__doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.add_argument("--work", type=Path, help="new folder that is kept")
+    parser.add_argument("--cores", type=int, default=2)
+    given = parser.parse_args(arguments)
+    if given.work is None:
+        with tempfile.TemporaryDirectory() as folder:
+            return rehearse(Path(folder) / "rehearsal", given.cores)
+    return rehearse(given.work.absolute(), given.cores)
+
+
+def rehearse(work: Path, cores: int) -> int:
+    """As `main`, in a folder that does not exist yet."""
+    work.mkdir(parents=True)
+    write_data(work / "worlds", work / "data")
+    project = copy_project(PROJECT, work / "project", results=False)
+    (project.root / "reduced.yaml").write_text(yaml.safe_dump({**REDUCED, "data_root": str(work / "data")}))
+    command = [sys.executable, "-m", "hilsplat", "run", "--config", "config/paper.yaml", "reduced.yaml"]
+    planned = project.run(*command, "--", "--cores", str(cores), "--dry-run").stdout
+    estimate = planned[planned.index("This run would take") :]
+    print(estimate, flush=True)
+    hours = float(re.findall(r"^all .* ([\d.]+) +[\d.]+$", estimate, re.MULTILINE)[0])
+    start = time.monotonic()
+    project.run(*command, "--", "--cores", str(cores))
+    taken = (time.monotonic() - start) / 3600
+    problems = [*unfilled(project.root / "results" / "tables")]
+    if not 1 / LARGEST_FACTOR <= taken / hours <= LARGEST_FACTOR:
+        problems.append(f"the run took {taken:.2f} hours, and the dry run said {hours:.2f}")
+    for problem in problems:
+        print(problem)
+    print(f"{taken * 60:.1f} min; the dry run said {hours * 60:.1f}; {len(problems)} problems")
+    return int(bool(problems))
+
+
+def unfilled(tables: Path) -> list[str]:
+    """Tables without a measured row, or without one of a data set that they must show."""
+    found = []
+    for name in TABLES:
+        rows = (tables / f"{name}.csv").read_text(encoding="utf-8")
+        measured = [row for row in rows.splitlines() if "measured" in row]
+        if not measured:
+            found.append(f"table {name} has no measured row")
+        found += [
+            f"table {name} has no measured row of {dataset}"
+            for dataset in MEASURED.get(name, ())
+            if not any(dataset in row for row in measured)
+        ]
+    return found
+
+
+if __name__ == "__main__":
+    sys.exit(main())
