@@ -37,7 +37,13 @@ from hilsplat.models.int8 import (
 from hilsplat.models.memory import available_mib, needs_of
 from hilsplat.models.network import Network
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks, require_same_masks
+from hilsplat.segment.digests import (
+    MASKS_SHA256,
+    digests_in,
+    load_masks,
+    pixel_digests,
+    require_same_masks,
+)
 from hilsplat.settings import ClipSettings
 
 
@@ -91,10 +97,13 @@ def run_clip(
     view_cache = ViewCache(Path(cache) / "clip")
 
     def embed(view: str) -> np.ndarray:
+        masks = load_masks(masks_folder, view, digests)
+        pixels = pixel_digests(masks)
+        order = sorted(range(len(pixels)), key=pixels.__getitem__)  # of the cache: levels don't matter
         key = sha256_of_json(
             {
                 "image": sha256_of_file(scene.image_path(view)),
-                "masks": digests[view],
+                "masks": [pixels[row] for row in order],
                 "model": model.digest,
                 "precision": model.precision,
                 "providers": model.vision.providers,
@@ -102,7 +111,6 @@ def run_clip(
                 "code": code_digest(ClipModel),
             }
         )
-        masks = load_masks(masks_folder, view, digests)
         if masks.size_hw != scene.cameras[view].size_hw:
             raise MisalignedArtifactError(
                 f"masks of view {view} of {scene.name} do not fit its camera",
@@ -112,11 +120,13 @@ def run_clip(
             )
         rows = np.arange(len(masks)) if chosen is None else chosen[view]
         found = view_cache.find(key)
-        known = found["clip"] if found is not None else np.zeros((len(masks), model.width), np.float16)
+        known = np.zeros((len(masks), model.width), np.float16)
+        if found is not None:
+            known[order] = found["clip"]
         missing = rows[~known[rows].any(axis=1)]
         if len(missing):
             known[missing] = model.embed_masks(scene.image(view), masks, settings, missing)
-            view_cache.put(key, {"clip": known})
+            view_cache.put(key, {"clip": known[order]})
         else:
             view_cache.hits += 1
         vectors = np.zeros_like(known)

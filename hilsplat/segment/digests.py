@@ -4,6 +4,7 @@ Rows of CLIP vectors, contributions, coverage trees, nodes and codes refer to ma
 together only if they were computed from the same masks in the same order.
 """
 
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -26,6 +27,12 @@ def digest_of(masks: HierarchicalMasks) -> str:
             for part in (f"{name} {array.dtype.str} {array.shape}".encode(), array.tobytes())
         )
     )
+
+
+def pixel_digests(masks: HierarchicalMasks) -> list[str]:
+    """Return the SHA-256 of each mask's pixels, whatever its level and its place among the others."""
+    ends = masks.offsets.tolist()
+    return [sha256_of_bytes(masks.runs[start:end].tobytes()) for start, end in itertools.pairwise(ends)]
 
 
 def index_entry(masks: HierarchicalMasks) -> dict[str, int | str]:

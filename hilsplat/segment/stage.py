@@ -64,8 +64,8 @@ def run_masks(
     Args:
         scene_folder: the `Scene` artifact.
         out: folder to write: `<view>.npz` (`HierarchicalMasks`) and `index.json` (`digests.index_entry`).
-        cache: folder of the view cache. With SAM it holds the decoder's candidates, so a change of
-            thresholds runs no network.
+        cache: folder of the view cache. With SAM it holds the decoder's candidates and the masks, so a change
+            of thresholds runs no network, and one of levels nothing.
         settings: which segmenter, and how.
         threads: views worked on at once, if they fit into the memory; the result does not depend on it.
         memory_mib: memory that the stage may use; None: what is free.
@@ -138,10 +138,34 @@ def sam_masks(
     settings: MasksSettings,
     points: Float[np.ndarray, "P 2"] | None = None,
 ) -> HierarchicalMasks:
-    """One view's masks by SAM; the networks run only if the view is not in the cache."""
+    """One view's masks by SAM; the networks run only if the view is not in the cache.
+
+    The cache holds the candidates and the masks: another threshold runs no network, other levels nothing.
+    """
     key = candidates_key(sha256_of_file(scene.image_path(view)), model, settings, points)
-    arrays = cache.get(key, lambda: decode_candidates(scene.image(view), model, settings, points).arrays())
-    return masks_from_candidates(Candidates(**arrays), scene.cameras[view].size_hw, model, settings)
+    size_hw = scene.cameras[view].size_hw
+
+    def from_candidates() -> dict[str, np.ndarray]:
+        arrays = cache.get(
+            key, lambda: decode_candidates(scene.image(view), model, settings, points).arrays()
+        )
+        return masks_from_candidates(Candidates(**arrays), size_hw, model, settings).arrays()
+
+    masks_key = sha256_of_json(
+        {
+            "candidates": key,
+            "size": size_hw,
+            "settings": settings.model_dump(exclude={"levels", "theta", "key_views", "prompts"}),
+            "code": code_digest(masks_from_candidates, HierarchicalMasks),
+        }
+    )
+    found = cache.find(masks_key)
+    if found is None:
+        found = from_candidates()
+        cache.put(masks_key, found)
+    else:
+        cache.hits += 1
+    return HierarchicalMasks.from_arrays(found)
 
 
 def graph_masks(scene: Scene, view: str, cache: ViewCache, settings: MasksSettings) -> HierarchicalMasks:
