@@ -79,7 +79,7 @@ def main() -> None:
     ]
     subprocess.run(command, cwd=given.folder, check=True)
     scene = given.folder / "results" / "synthetic" / given.scene
-    print("| trainer, seed | objective | language | clustering | mIoU, level given | s |")
+    print("| trainer, seed | objective | language | clustering | mIoU, level given | core s |")
     print("|---|---:|---:|---:|---:|---:|")
     for report in sorted(scene.glob("*/field.report.json")):
         if report.parent.name.partition(".")[0] in TRAINERS:
@@ -96,7 +96,7 @@ def row(variant: Path) -> str:
     score = 100 * float(level_averages_of_scenes(given, "iou").mean())
     record = (variant / "benchmarks" / "field.jsonl").read_text(encoding="utf-8").splitlines()[-1]
     shown = (f"{value:.5f}" for value in (objective, losses["language"], losses["clustering"]))
-    return f"| {variant.name} | {' | '.join(shown)} | {score:.1f} | {json.loads(record)['s']:.0f} |"
+    return f"| {variant.name} | {' | '.join(shown)} | {score:.1f} | {json.loads(record)['cpu_time']:.0f} |"
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ LOOPS = {
     "clip": "CLIP of views",
     "contributions": "contributions of views",
     "evaluate": "views scored",
-    "comparison": "queries compared",
+    "comparison": "methods compared",
 }
 """Rule -> the loop (`base.progress.track`) that takes nearly all of its time."""
 

@@ -15,6 +15,7 @@ import secrets
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from io import TextIOWrapper
@@ -80,7 +81,13 @@ def mark_run() -> None:
 
 
 def unmark_run() -> None:
-    """Remove the marker of this process's run."""
+    """Remove the marker of this process's run, and cancel the timers that Snakemake leaves running.
+
+    Its limit of jobs per timespan starts one after every scheduling; the process would wait for all of them.
+    """
+    for thread in threading.enumerate():
+        if isinstance(thread, threading.Timer):
+            thread.cancel()
     while _marks:
         stream = _marks.pop()
         Path(stream.name).unlink(missing_ok=True)

@@ -11,6 +11,7 @@ code is 1 otherwise.
 """
 
 import argparse
+import csv
 import re
 import sys
 import tempfile
@@ -57,17 +58,28 @@ REDUCED = {
 """Fewer steps, fewer prompts and the embedded models."""
 
 MEASURED = {
-    "lerf": ("lerf", "lerf_mask"),
+    "lerf": ("lerf_ovs", "lerf_mask"),
     "3dovs": ("3d_ovs",),
-    "hierarchy": ("lerf", "3d_ovs"),
-    "frames-hi-lerf": ("lerf",),
-    "frames-hi-3dovs": ("3d_ovs",),
+    "hierarchy": ("hi_lerf", "hi_3dovs"),
+    "frames-hi-lerf": ("hi_lerf",),
+    "frames-hi-3dovs": ("hi_3dovs",),
     "replica": ("replica",),
     "scannet": ("scannet",),
     "waymo": ("waymo",),
-    "ablation": ("lerf", "3d_ovs"),
+    "ablation": ("hi_lerf", "hi_3dovs"),
+    "theta": ("hi_lerf", "hi_3dovs"),
+    "omega": ("hi_lerf", "hi_3dovs"),
+    "efficiency": ("lerf", "3d_ovs"),
+    "cost": (),
 }
-"""Table -> data sets of which it must have measured rows; every other table needs some measured row."""
+"""Table -> data sets of which it must have measured rows; any other table needs some measured row."""
+
+FILLED = {
+    "ablation": ("LERF localization", "LERF mIoU", "3D-OVS mIoU", "Hi-LERF mIoU", "Hi-LERF HC"),
+    "scannet": ("19 classes mIoU", "ScanNet200 mIoU", "ScanNet200 AP"),
+    "efficiency": ("Hi-LERF mIoU", "Hi-LERF HC"),
+}
+"""Table -> columns that some measured row must fill."""
 
 LARGEST_FACTOR = 1.5
 
@@ -111,7 +123,8 @@ def rehearse(work: Path, cores: int) -> int:
     write_data(work / "worlds", work / "data")
     project = copy_project(PROJECT, work / "project", results=False)
     (project.root / "reduced.yaml").write_text(yaml.safe_dump({**REDUCED, "data_root": str(work / "data")}))
-    command = [sys.executable, "-m", "hilsplat", "run", "--config", "config/paper.yaml", "reduced.yaml"]
+    command = [sys.executable, "-m", "hilsplat", "run"]
+    command += ["--config", "config/paper.yaml", "--config", "reduced.yaml"]
     planned = project.run(*command, "--", "--cores", str(cores), "--dry-run").stdout
     estimate = planned[planned.index("This run would take") :]
     print(estimate, flush=True)
@@ -132,14 +145,16 @@ def unfilled(tables: Path) -> list[str]:
     """Tables without a measured row, or without one of a data set that they must show."""
     found = []
     for name in TABLES:
-        rows = (tables / f"{name}.csv").read_text(encoding="utf-8")
-        measured = [row for row in rows.splitlines() if "measured" in row]
-        if not measured:
+        with (tables / f"{name}.csv").open(encoding="utf-8") as stream:
+            measured = [row for row in csv.DictReader(stream) if row["kind"] == "measured"]
+        missing = {*MEASURED.get(name, ())} - {row["data"] for row in measured}
+        if not measured and name not in MEASURED:
             found.append(f"table {name} has no measured row")
+        found += [f"table {name} has no measured row of {dataset}" for dataset in sorted(missing)]
         found += [
-            f"table {name} has no measured row of {dataset}"
-            for dataset in MEASURED.get(name, ())
-            if not any(dataset in row for row in measured)
+            f"no measured row of table {name} has a value in column {column}"
+            for column in FILLED.get(name, ())
+            if not any(row.get(column) for row in measured)
         ]
     return found
 

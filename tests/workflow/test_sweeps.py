@@ -12,6 +12,8 @@ from tests.workflow.test_bad_input import noise_photos
 LISTS = ("theta", "omega", "pruning", "ablation", "component")
 NONE = tuple(f"{name}_variants=[]" for name in LISTS)
 MAIN = "main_variants=[default]"
+BY_LEVELS = ("masks", "coverage_tree", "contributions", "semantic_tree", "clip", "autoencoder")
+"""Rules that run again for masks of other levels."""
 
 
 @pytest.fixture(scope="module")
@@ -51,13 +53,14 @@ def test_without_sweeps_every_stage_runs_once(base):
 @pytest.mark.parametrize(
     ("config", "added"),
     [
+        # theta decides the levels of masks, so each value has its own; Omega's rows share all but the field
         (
-            "theta_variants=[theta-0.6,theta-0.7,theta-0.8,default]",
-            {"coverage_tree": 3, "field": 3, "evaluate": 3, "table": 1, "sweep_plot": 1},
+            "theta_variants=[theta-0.6,theta-0.7,theta-0.8,paper-tree]",
+            {**dict.fromkeys((*BY_LEVELS, "field", "evaluate"), 4), "table": 1, "sweep_plot": 1},
         ),
         (
             "omega_variants=[omega-2,omega-10,omega-100,omega-1000]",
-            {"field": 4, "evaluate": 4, "table": 1, "sweep_plot": 1},
+            {**dict.fromkeys(BY_LEVELS, 1), "field": 4, "evaluate": 4, "table": 1, "sweep_plot": 1},
         ),
         ("pruning_variants=[default,pruned]", {"field": 1, "evaluate": 1, "table": 2}),
         (
@@ -73,11 +76,11 @@ def test_without_sweeps_every_stage_runs_once(base):
             "main_variants=[default,langsplat,lifted]",
             {"autoencoder": 2, "method": 2, "evaluate": 2},
         ),
-        # levels by the coverage tree need their own masks and what follows; the rows share all but the field
+        # LangSplat has levels by head; the other rows share all but the field
         (
             "ablation_variants=[langsplat,initial-2d,paper-hc,paper-instance,paper-part,paper-tree]",
             {
-                **dict.fromkeys(("masks", "coverage_tree", "contributions", "semantic_tree", "clip"), 1),
+                **dict.fromkeys(BY_LEVELS, 1),
                 "autoencoder": 2,
                 "field": 4,
                 "method": 2,
@@ -101,8 +104,8 @@ def test_a_sweep_adds_its_own_stages_and_later_alone(plain, base, config, added)
 
 
 def test_sweeps_take_the_scenes_that_are_named_for_them(plain):
-    every = jobs(plain, "theta_variants=[theta-0.6,default]")
-    other = jobs(plain, "theta_variants=[theta-0.6,default]", "sweep_scenes=[table-2]")
+    every = jobs(plain, "pruning_variants=[pruned,default]")
+    other = jobs(plain, "pruning_variants=[pruned,default]", "sweep_scenes=[table-2]")
     assert (every["field"], other["field"]) == (2, 1)
 
 

@@ -1,6 +1,7 @@
 """Figures of the paper: queries by method, one query over four views, features at three levels."""
 
 import logging
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,13 +48,21 @@ class Answerer:
     method: str
     scene: LanguageScene
 
-    def mask(self, shown: Shown, evaluate: EvaluateSettings) -> Bool[np.ndarray, "H W"]:
-        """Answer to a query in its view, at its level if it has one."""
+    def masks(self, rows: Sequence[Shown], evaluate: EvaluateSettings) -> list[Bool[np.ndarray, "H W"]]:
+        """Answers to queries in their views, at their levels if they have one."""
         if self.method == "tree":
-            return shown.tree_mask(self.scene)
-        rule = rule_of(evaluate)
-        relevancy = np.asarray(self.scene.field_relevancy([shown.path[-1]], shown.view))[0]
-        return relevancy_mask(SmoothedRelevancy.of(relevancy, rule), shown.level, rule)[0]
+            return [shown.tree_mask(self.scene) for shown in rows]
+        rule, asked = rule_of(evaluate), defaultdict[str, list[str]](list)
+        for shown in rows:
+            asked[shown.view].append(shown.path[-1])
+        maps = {  # all texts of a view at once: a network decodes its pixels at every call
+            view: dict(zip(texts, np.asarray(self.scene.field_relevancy(texts, view)), strict=True))
+            for view, texts in asked.items()
+        }
+        return [
+            relevancy_mask(SmoothedRelevancy.of(maps[row.view][row.path[-1]], rule), row.level, rule)[0]
+            for row in rows
+        ]
 
 
 def run_comparison(
@@ -162,15 +171,16 @@ def draw_methods(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: E
     title = f"{scene.name}: queries by method"
     figure, grid = _grid(scene, *(shape[::-1] if many else shape), title, width_in)
     by_query = grid.T if many else grid
-    for axes, row in zip(by_query, track(list(rows), "queries compared"), strict=False):
+    answers = [method.masks(rows, evaluate) for method in track(list(methods), "methods compared")]
+    for number, (axes, row) in enumerate(zip(by_query, rows, strict=False)):
         image = first.image(row.view)
         title = f"truth, {row.view}" if row.truth is not None else row.view
         asked = f"“{row.text}” ({row.level.label})\n" if many and row.level else ""
         show(axes[0], paint_answer(image, None, row.truth), asked + title)
         if not many:
             label_left(axes[0], row.text, row.level)
-        for place, method in zip(axes[1:], methods, strict=True):
-            mask = method.mask(row, evaluate)
+        for place, method, masks in zip(axes[1:], methods, answers, strict=True):
+            mask = masks[number]
             score = f"IoU {iou(mask, row.truth):.2f}" if row.truth is not None else ""
             named = score if many else f"{method.title}\n{score}".rstrip()
             show(place, paint_answer(image, mask, row.truth), named)
@@ -186,11 +196,12 @@ def draw_views(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: Eva
     scene = first.scene
     asked = f"“{rows[0].text}” over {len(rows)} views" if rows else "no query"
     figure, grid = _grid(scene, len(methods) + 1, max(len(rows), 1), f"{scene.name}: {asked}")
+    answers = [method.masks(rows, evaluate) for method in methods]
     for column, row in enumerate(rows):
         image = first.image(row.view)
         show(grid[0][column], paint_answer(image, None, row.truth), row.view)
-        for place, method in enumerate(methods, start=1):
-            mask = method.mask(row, evaluate)
+        for place, masks in enumerate(answers, start=1):
+            mask = masks[column]
             score = f"IoU {iou(mask, row.truth):.2f}" if row.truth is not None else ""
             show(grid[place][column], paint_answer(image, mask, row.truth), score)
     label_left(grid[0][0], "photograph")

@@ -45,7 +45,7 @@ def children_consistency(family: Family, reading: Reading) -> list[float]:
 def hierarchical_consistency(
     transitions: Sequence[Sequence[Family]], reading: Reading = "containment", pooled: bool = False
 ) -> float:
-    """HC of one view (paper, Sec. IV-A). Averaging: children of a parent, parents of a level, levels.
+    """HC of one view (paper, Sec. IV, Eq. 7). Averaging: children of a parent, parents of a level, levels.
 
     Every parent weighs the same, however many children it has: one child inside its parent and three
     outside another give (1 + 0) / 2 = 0.5. The mean over children alone is `consistency_per_child`: 0.25.

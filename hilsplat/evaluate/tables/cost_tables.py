@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from hilsplat.datasets.images.hi import IMAGES_OF
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
 from hilsplat.evaluate.tables.ablation import component_cells
 from hilsplat.evaluate.tables.costs import Cost
@@ -114,7 +115,7 @@ def quality_blocks(
     for data, costs in by_dataset(sources.costs).items():
         rows = []
         for variant, method, of_row in by_answer(sources, costs):
-            part = given(scores, data, variant, method)
+            part = given(scores, of_row, variant, method)
             if method not in methods or part is None:
                 continue
             quality = component_cells(scores, part)
@@ -126,12 +127,16 @@ def quality_blocks(
     return blocks
 
 
-def given(scores: "pd.DataFrame", data: str, variant: str, method: str) -> "pd.DataFrame | None":
-    """Scores of one row with the level given; None if there are none."""
+def given(scores: "pd.DataFrame", costs: Sequence[Cost], variant: str, method: str) -> "pd.DataFrame | None":
+    """Return the scores of one row with the level given; None if there are none.
+
+    Labels with levels have their own data set (Hi-LERF), or are the scenes' own.
+    """
     if scores.empty:
         return None
     part = scores[
-        (scores["dataset"] == data)
+        scores["dataset"].isin([*IMAGES_OF, costs[0].dataset])
+        & scores["scene"].isin([cost.scene for cost in costs])
         & (scores["variant"] == variant)
         & (scores["seed"] == "0")
         & (scores["method"] == method)

@@ -220,17 +220,20 @@ def level_cells(part: "pd.DataFrame", metric: str = "iou") -> dict[str, Cell]:
     return {**cells, "Avg": Cell.percent(mean_over_levels(values.values()))}
 
 
-def same_row(scores: "pd.DataFrame", part: "pd.DataFrame", protocols: tuple[str, ...]) -> "pd.DataFrame":
-    """Scores of other protocols by the same variant, seed, method and masks on the same data set.
+def same_row(
+    scores: "pd.DataFrame", part: "pd.DataFrame", protocols: tuple[str, ...], dataset: str | None = None
+) -> "pd.DataFrame":
+    """Return the scores of other protocols by the same variant, seed, method and masks.
 
     Args:
         scores: scores with seeds (`with_seeds`).
         part: the scores of one row.
         protocols: prefixes of the protocols' names.
+        dataset: data set of the scores; None: that of the row.
     """
     first = part.iloc[0]
-    keys = ("dataset", "variant", "seed", "masks", "method")
-    same = scores["protocol"].str.startswith(protocols)
+    keys = ("variant", "seed", "masks", "method")
+    same = scores["protocol"].str.startswith(protocols) & (scores["dataset"] == (dataset or first["dataset"]))
     for key in keys:
         same &= scores[key] == first[key]
     return scores[same]
