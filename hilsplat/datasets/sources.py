@@ -14,6 +14,9 @@ DATA_PREFIX = "data:"
 LABELS_ON: dict[str, tuple[str, ...]] = {"lerf_ovs": ("hi_lerf",), "3d_ovs": ("hi_3dovs",)}
 """Data sets that label the images of another one, in addition to its own labels."""
 
+LEVELLED = tuple(name for names in LABELS_ON.values() for name in names)
+"""Those data sets; their labels have levels."""
+
 
 def published(source: str) -> tuple[str, str] | None:
     """Data set and scene of a source such as `data:lerf_ovs/figurines`; None for anything else."""

@@ -53,7 +53,7 @@ FIT_S_PER_MP, FIT_S_PER_GAUSSIAN, GRAPH_S_PER_MP = 0.14, 0.7e-6, 4.0
 """Core seconds of a step of the fit, per megapixel that it sees and per Gaussian of the limit; of the graph
 segmenter per megapixel."""
 
-TRAINED_S_PER_MP, LITERAL_S_PER_MP = 0.02, 1.0
+TRAINED_S_PER_MP, LITERAL_S_PER_MP = 0.08, 0.15
 """Core seconds of a step of a baseline or of the literal trainer, per level and megapixel that it takes."""
 
 NETWORK_S = 10.0

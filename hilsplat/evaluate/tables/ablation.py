@@ -5,7 +5,7 @@ import statistics
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from hilsplat.datasets.images.hi import IMAGES_OF
+from hilsplat.datasets.sources import LEVELLED
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN, PATH
 from hilsplat.evaluate.protocols.totals import level_averages_of_scenes, table_value
 from hilsplat.evaluate.tables.measured import level_cells, measured_blocks, same_row, with_seeds
@@ -115,7 +115,7 @@ def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, C
     Hi-LERF and Hi-3DOVS label images of LERF and 3D-OVS, whose own labels give the other columns.
     """
     own = part.iloc[0]["dataset"]
-    lerf, ovs3d = ("lerf_ovs", "3d_ovs") if own in IMAGES_OF else (own, own)
+    lerf, ovs3d = ("lerf_ovs", "3d_ovs") if own in LEVELLED else (own, own)
     flat, ovs = same_row(scores, part, FLAT, lerf), same_row(scores, part, OVS, ovs3d)
     levels = level_cells(part)
     return {

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from hilsplat.datasets.images.hi import IMAGES_OF
+from hilsplat.datasets.sources import LEVELLED
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
 from hilsplat.evaluate.tables.ablation import component_cells
 from hilsplat.evaluate.tables.costs import Cost
@@ -135,7 +135,7 @@ def given(scores: "pd.DataFrame", costs: Sequence[Cost], variant: str, method: s
     if scores.empty:
         return None
     part = scores[
-        scores["dataset"].isin([*IMAGES_OF, costs[0].dataset])
+        scores["dataset"].isin([*LEVELLED, costs[0].dataset])
         & scores["scene"].isin([cost.scene for cost in costs])
         & (scores["variant"] == variant)
         & (scores["seed"] == "0")

@@ -32,8 +32,7 @@ def rows(block_world):
 def test_tree_and_field_of_an_exact_world_answer_with_the_truth(block_world, rows):
     for method in ("tree", "field"):
         answerer = Answerer(method, method, block_world.answers)
-        for row in rows[1]:
-            mask = answerer.mask(row, EVALUATE)
+        for row, mask in zip(rows[1], answerer.masks(rows[1], EVALUATE), strict=True):
             assert np.count_nonzero(mask != row.truth) <= 0.05 * row.truth.size, (method, row.text)
 
 
