@@ -5,7 +5,7 @@
 # make docs    set up, then build the site of the documentation in site/; a broken link fails
 # make bench   set up, then time the fast paths and a run on photographs; tables go to results/benchmarks (docs/benchmarks.md)
 #              with BASE=<commit>: what got slower since then, by runs of both versions in turn
-# make rehearsal  set up, then run config/paper.yaml over tiny data in the published layouts (docs/workflow.md)
+# make published  set up, then run config/paper.yaml over tiny data in the published layouts (docs/workflow.md)
 # make chaos   set up, then kill, freeze and starve runs of the ci configuration, and compare tables (docs/workflow.md)
 # make report  set up, run, and write results/report.html
 # make setup   create .venv with everything that the targets above need
@@ -17,7 +17,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: run demo test lint docs bench chaos rehearsal report setup
+.PHONY: run demo test lint docs bench chaos published report setup
 
 run: $(STAMP)
 	hilsplat run -- --cores $(CORES)
@@ -57,7 +57,7 @@ else
 	python -m benchmarks.rehearsal results/benchmarks/rehearsal
 endif
 
-rehearsal: $(STAMP)
+published: $(STAMP)
 	python -m tests.published --cores $(CORES)
 
 chaos: $(STAMP)

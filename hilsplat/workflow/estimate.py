@@ -8,12 +8,12 @@ from types import SimpleNamespace
 from hilsplat.workflow.resources import START_S, JobResources
 
 GPU_GAIN = {"gaussians": 30, "masks": 27, "clip": 60, "contributions": 3, "field": 5}
-"""Rule -> seconds of a core over seconds of a GPU (24 GB, RTX 3090): 30,000 steps of 3DGS in 25 minutes, SAM
-ViT-H's generator in 4 s a picture, CLIP B/16 in 5 ms a crop; sparse products by memory bandwidth. From
-published times, not measured here. Other rules run on the CPU."""
+"""Rule -> one core's time divided by that of a 24 GB GPU (RTX 3090), from published times: 3DGS takes 25
+minutes for 30,000 steps, SAM ViT-H's generator 4 s per picture, CLIP B/16 5 ms per crop; sparse products are
+limited by memory bandwidth. Not measured here. Other rules run on the CPU."""
 
 OTHERS = "tables"
-"""Name of what belongs to no scene."""
+"""Name of the row for jobs without a scene."""
 
 
 @dataclass

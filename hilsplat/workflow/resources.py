@@ -50,23 +50,23 @@ START_S = 2.0
 """Seconds that every job takes to start Python, load libraries and read."""
 
 FIT_S_PER_MP, FIT_S_PER_GAUSSIAN, GRAPH_S_PER_MP = 0.14, 0.7e-6, 4.0
-"""Core seconds of a step of the fit, per megapixel that it sees and per Gaussian of the limit; of the graph
-segmenter per megapixel."""
+"""Core seconds per step of the fit, for each megapixel that it sees and for each Gaussian of the limit; core
+seconds of the graph segmenter per megapixel."""
 
 TRAINED_S_PER_MP, LITERAL_S_PER_MP = 0.08, 0.15
-"""Core seconds of a step of a baseline or of the literal trainer, per level and megapixel that it takes."""
+"""Core seconds per step, level and megapixel of a trained baseline, and of the literal trainer."""
 
 NETWORK_S = 10.0
-"""Core seconds of a trained autoencoder."""
+"""Core seconds to train an autoencoder."""
 
 EMBEDDED_S = {"masks": 2.5, "clip": 0.2}
 """Core seconds per view of the embedded models."""
 
 SAM_S, OTHER_SAM_S = {"huge": 87.0, "large": 44.0, "base": 14.1}, 5.7
-"""Part of a SAM's name -> core seconds of a picture's encoding; of SAM 2.1 small (docs/benchmarks.md)."""
+"""Part of a SAM's name -> core seconds to encode a picture; those of SAM 2.1 small (docs/benchmarks.md)."""
 
 PROMPT_S, PICTURE_S, CROP_S = 0.02, 1.0, 0.3
-"""Core seconds of a prompt in SAM, of a picture between logits and masks, and of a crop in CLIP B/16."""
+"""Core seconds per SAM prompt, per picture between logits and masks, and per crop in CLIP B/16."""
 
 PREVIEWED, GUIDED = 0.65, 0.25
 """Cost of a prompt that a preview may drop, and share of the grid's prompts that guided views take."""
@@ -233,7 +233,7 @@ def _trained_s(s_per_mp: float, steps: int, mp: float) -> float:
 
 
 def _sam_s(masks: MasksSettings) -> float:
-    """Return the core seconds of a view in a real SAM, with those of its crops."""
+    """Return the core seconds that a full-size SAM takes for a view and its crops."""
     picture_s = next((cost for word, cost in SAM_S.items() if word in masks.model), OTHER_SAM_S)
     pictures = sum(4**layer for layer in range(masks.crop_layers + 1))
     share = 1.0 if masks.generator == "official" else PREVIEWED

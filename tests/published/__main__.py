@@ -1,6 +1,6 @@
 """Rehearse config/paper.yaml: a tiny data root in each published layout, and the whole workflow over it.
 
-    make rehearsal                                   # in a folder that is removed
+    make published                                   # in a folder that is removed
     python -m tests.published --work FOLDER          # keeps data, project and results
 
 Three small synthetic scenes (a table, a room, a street) are written as LERF-OVS, LERF-Mask, 3D-OVS, Hi-LERF,
@@ -72,7 +72,7 @@ MEASURED = {
     "efficiency": ("lerf", "3d_ovs"),
     "cost": (),
 }
-"""Table -> data sets of which it must have measured rows; any other table needs some measured row."""
+"""Table -> data sets whose measured rows it must have; any other table needs some measured row."""
 
 FILLED = {
     "ablation": ("LERF localization", "LERF mIoU", "3D-OVS mIoU", "Hi-LERF mIoU", "Hi-LERF HC"),

@@ -89,6 +89,14 @@ def test_tables_list_what_was_not_measured(planned):
     assert len(tables) == len(TABLES)
 
 
+def test_a_dry_run_ends_with_what_the_run_would_take(planned):
+    table = planned.partition("This run would take about:\n")[2].splitlines()
+    assert table[0].split() == ["scenes", "jobs", "disk", "memory", "hours,", "2", "cores", "hours,", "GPU"]
+    assert [row.split()[0] for row in table[1:6]] == ["3d_ovs", "lerf", "scannet", "tables", "all"]
+    counted = re.search(r"^total +(\d+)$", planned, re.M)
+    assert table[5].split()[1:3] == ["3", counted[1]]
+
+
 def test_without_a_data_root_the_run_says_so_and_stops(project, tmp_path):
     copy = copy_project(project, tmp_path / "project", results=False)
     printed = run(copy, "groups=[lerf,scannet]")
