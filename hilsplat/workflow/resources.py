@@ -49,7 +49,7 @@ TIME_FACTOR, LEAST_MINUTES = 6, 10
 START_S = 2.0
 """Seconds that every job takes to start Python, load libraries and read."""
 
-FIT_S_PER_MP, FIT_S_PER_GAUSSIAN, GRAPH_S_PER_MP = 0.14, 0.7e-6, 4.0
+FIT_S_PER_MP, FIT_S_PER_GAUSSIAN, GRAPH_S_PER_MP = 0.14, 0.9e-6, 4.0
 """Core seconds per step of the fit, for each megapixel that it sees and for each Gaussian of the limit; core
 seconds of the graph segmenter per megapixel."""
 
@@ -59,7 +59,7 @@ TRAINED_S_PER_MP, LITERAL_S_PER_MP = 0.08, 0.15
 NETWORK_S = 10.0
 """Core seconds to train an autoencoder."""
 
-EMBEDDED_S = {"masks": 2.5, "clip": 0.2}
+EMBEDDED_S = {"masks": 1.5, "clip": 0.1}
 """Core seconds per view of the embedded models."""
 
 SAM_S, OTHER_SAM_S = {"huge": 87.0, "large": 44.0, "base": 14.1}, 5.7
