@@ -5,7 +5,7 @@
 
 Both minimise the paper's objective in our reading (variant `paper`): the same masks, code and weights. FOLDER
 becomes a project; its results stay. Losses are those of the whole objective, over all views. The literal
-trainer's rate is constant, as LangSplat's is; at LangSplat's 0.0025, noise keeps it 1.5 % above the minimum.
+trainer's rate is constant, as LangSplat's is; at its 0.0025, noise keeps it 1.5 % above the minimum.
 """
 
 import argparse
@@ -20,7 +20,7 @@ import yaml
 from benchmarks.rehearsal import PROJECT
 from hilsplat.base.artifacts import read_json
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
-from hilsplat.evaluate.protocols.totals import level_averages_of_scenes
+from hilsplat.evaluate.protocols.totals import level_values, mean_over_levels
 from hilsplat.evaluate.scores import read_scores
 
 PAPER = {
@@ -98,7 +98,7 @@ def row(variant: Path) -> str:
     objective = sum(weight * losses[name] for name, weight in WEIGHTS.items())
     scores = read_scores([variant / "scores.csv"])
     given = scores[scores["protocol"].str.startswith(f"{LEVEL_GIVEN.name}@")]
-    score = 100 * float(level_averages_of_scenes(given, "iou").mean())
+    score = 100 * mean_over_levels(level_values(given, "iou").values())
     record = (variant / "benchmarks" / "field.jsonl").read_text(encoding="utf-8").splitlines()[-1]
     shown = (f"{value:.5f}" for value in (objective, losses["language"], losses["clustering"]))
     return f"| {variant.name} | {' | '.join(shown)} | {score:.1f} | {json.loads(record)['cpu_time']:.0f} |"
