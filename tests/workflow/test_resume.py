@@ -18,6 +18,10 @@ def finished_entries(cache: Path) -> list[Path]:
     return [file for file in cache.rglob("*.npz") if "/." not in str(file.relative_to(cache.parent))]
 
 
+ENTRIES = {"masks": 2}
+"""Entries of a view in the cache of a stage, if there is more than one: SAM's candidates and the masks."""
+
+
 def kill_when(project: Project, command: list[str], cache: Path, entries: int) -> None:
     """Start a command and SIGKILL it once its cache holds the given number of finished entries."""
     process = subprocess.Popen(
@@ -40,7 +44,7 @@ def kill_when(project: Project, command: list[str], cache: Path, entries: int) -
 
 @pytest.mark.parametrize(
     ("name", "entries"),
-    [("default/masks", 2), ("default/clip", 2), ("default/contributions", 2), ("gaussians.ply", 1)],
+    [("default/masks", 4), ("default/clip", 2), ("default/contributions", 2), ("gaussians.ply", 1)],
 )
 def test_a_killed_stage_resumes(copy_of_finished: Project, name: str, entries: int) -> None:
     project = copy_of_finished
@@ -65,7 +69,8 @@ def test_a_killed_stage_resumes(copy_of_finished: Project, name: str, entries: i
     assert after == expected
     if path.is_dir():
         assert all(file.exists() for file in kept), "finished views were thrown away"
-        assert int(re.search(r"from_cache (\d+)", resumed.stderr)[1]) >= entries
+        views = entries // ENTRIES.get(path.name, 1)
+        assert int(re.search(r"from_cache (\d+)", resumed.stderr)[1]) >= views
 
 
 def test_one_more_view_costs_one_view(copy_of_finished: Project) -> None:
@@ -94,4 +99,4 @@ def test_one_more_view_costs_one_view(copy_of_finished: Project) -> None:
     after = run_with_training_views([*train, added])
     for stage in cache:
         assert before[stage] < after[stage]
-        assert len(after[stage] - before[stage]) == 1, stage
+        assert len(after[stage] - before[stage]) == ENTRIES.get(stage, 1), stage
