@@ -1,4 +1,4 @@
-"""The fast solver of the field against the literal trainer on one scene: losses, scores and seconds. By hand:
+"""The fast solver of the field against the literal trainer on one scene: losses, scores and time. By hand:
 
     python -m benchmarks.trainers FOLDER                        # dev-1, 6000 iterations, two seeds
     python -m benchmarks.trainers FOLDER --scene tiny --iterations 1000 --seeds 1
@@ -22,6 +22,7 @@ from hilsplat.base.artifacts import read_json
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
 from hilsplat.evaluate.protocols.totals import level_values, mean_over_levels
 from hilsplat.evaluate.scores import read_scores
+from hilsplat.settings import FieldSettings
 
 PAPER = {
     "autoencoder": {"code": "network", "latent": 3, "targets": "mask"},
@@ -35,13 +36,12 @@ OBJECTIVE = {
     "part_mode": "literal",
     "min_labelled_share": 0,
 }
-WEIGHTS = {"language": 1.0, "clustering": 1.0, "ridge": 0.1, "instance": 1e-6, "part": 1e-5}
 TRAINERS = ("fast", "fast-60", "literal")
 EMPTY = ("ablation", "component", "theta", "omega", "pruning")
 
 
 def configuration(scene: str, iterations: int, seeds: int) -> dict[str, Any]:
-    """A variant for each trainer: the solver's default steps, ten times as many, the literal trainer."""
+    """Return the configuration: a variant per trainer; `fast-60` is the solver with many more steps."""
     literal = {"trainer": "literal", "rate": 0.001}
     more = ({}, {"cg_steps": 60, "lbfgs_steps": 20}, literal)
     trainers = dict(zip(TRAINERS, more, strict=True))
@@ -59,7 +59,7 @@ def configuration(scene: str, iterations: int, seeds: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Run both trainers and print their losses, scores and seconds."""
+    """Run both trainers, and print a row for each field."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.trainers", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("folder", type=Path)
@@ -73,15 +73,8 @@ def main() -> None:
     for name in ("models", "config"):
         if not (given.folder / name).exists():
             (given.folder / name).symlink_to(PROJECT / name)
-    command = [
-        sys.executable,
-        "-m",
-        "hilsplat",
-        "run",
-        "results/tables/hierarchy.csv",
-        "--config",
-        config.name,
-    ]
+    command = [sys.executable, "-m", "hilsplat", "run", "results/tables/hierarchy.csv"]
+    command += ["--config", config.name]
     subprocess.run(command, cwd=given.folder, check=True)
     scene = given.folder / "results" / "synthetic" / given.scene
     print("| trainer, seed | objective | language | clustering | mIoU, level given | core s |")
@@ -92,10 +85,13 @@ def main() -> None:
 
 
 def row(variant: Path) -> str:
-    """Losses, score and seconds of one field."""
+    """Return a field's losses, score and processor seconds as a row in Markdown."""
     report = read_json(variant / "field.report.json")
     losses = report["trained" if "trained" in report else "after_lbfgs"]
-    objective = sum(weight * losses[name] for name, weight in WEIGHTS.items())
+    settings = FieldSettings.model_validate(OBJECTIVE).model_dump()
+    terms = ("language", "clustering", "instance", "part")
+    objective = settings["ridge"] * losses["ridge"]
+    objective += sum(settings[f"weight_{name}"] * losses[name] for name in terms)
     scores = read_scores([variant / "scores.csv"])
     given = scores[scores["protocol"].str.startswith(f"{LEVEL_GIVEN.name}@")]
     score = 100 * mean_over_levels(level_values(given, "iou").values())

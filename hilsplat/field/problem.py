@@ -8,6 +8,9 @@ With the rendered map M = W F, the mask means A F, the areas n and the mask late
 - ridge: sum of visible mass x |F - F_lifted|^2
 
 Together they are one quadratic form, solved by a few conjugate-gradient steps from the lifted average.
+
+Departs: the paper's objective has no term with CLIP, and a constant field minimises it. The language loss is
+LangSplat's regression with squared instead of absolute differences, averaged over labelled pixels only.
 """
 
 from dataclasses import dataclass

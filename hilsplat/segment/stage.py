@@ -64,8 +64,8 @@ def run_masks(
     Args:
         scene_folder: the `Scene` artifact.
         out: folder to write: `<view>.npz` (`HierarchicalMasks`) and `index.json` (`digests.index_entry`).
-        cache: folder of the view cache. With SAM it holds the decoder's candidates and the masks, so a change
-            of thresholds runs no network, and one of levels nothing.
+        cache: folder of the view cache. With SAM it holds the decoder's candidates and the masks: other
+            thresholds run no network, and other levels compute nothing.
         settings: which segmenter, and how.
         threads: views worked on at once, if they fit into the memory; the result does not depend on it.
         memory_mib: memory that the stage may use; None: what is free.
@@ -140,7 +140,7 @@ def sam_masks(
 ) -> HierarchicalMasks:
     """One view's masks by SAM; the networks run only if the view is not in the cache.
 
-    The cache holds the candidates and the masks: another threshold runs no network, other levels nothing.
+    The cache holds candidates and masks: other thresholds run no network, and other levels compute nothing.
     """
     key = candidates_key(sha256_of_file(scene.image_path(view)), model, settings, points)
     size_hw = scene.cameras[view].size_hw
@@ -159,13 +159,7 @@ def sam_masks(
             "code": code_digest(masks_from_candidates, HierarchicalMasks),
         }
     )
-    found = cache.find(masks_key)
-    if found is None:
-        found = from_candidates()
-        cache.put(masks_key, found)
-    else:
-        cache.hits += 1
-    return HierarchicalMasks.from_arrays(found)
+    return HierarchicalMasks.from_arrays(cache.get(masks_key, from_candidates))
 
 
 def graph_masks(scene: Scene, view: str, cache: ViewCache, settings: MasksSettings) -> HierarchicalMasks:

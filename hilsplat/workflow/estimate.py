@@ -1,4 +1,4 @@
-"""What a run will take: a table after a dry run, from the jobs that Snakemake would start."""
+"""Estimate what a run will take from the jobs of a dry run, as a table."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 from hilsplat.workflow.resources import START_S, JobResources
 
-GPU_GAIN = {"gaussians": 30, "masks": 27, "clip": 60, "contributions": 3, "field": 5}
+GPU_GAIN = {"gaussians": 30, "masks": 27, "clip": 60}
 """Rule -> one core's time divided by that of a 24 GB GPU (RTX 3090), from published times: 3DGS takes 25
-minutes for 30,000 steps, SAM ViT-H's generator 4 s per picture, CLIP B/16 5 ms per crop; sparse products are
-limited by memory bandwidth. Not measured here. Other rules run on the CPU."""
+minutes for 30,000 steps, SAM ViT-H's generator 4 s per picture, CLIP B/16 5 ms per crop. Not measured here.
+Other rules are counted as if they ran on the CPU."""
 
 OTHERS = "tables"
 """Name of the row for jobs without a scene."""

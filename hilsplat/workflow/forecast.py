@@ -10,16 +10,10 @@ from hilsplat.scene.finished import KEY_VIEWS
 from hilsplat.scene.sheet import PHOTOS, SceneRow
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.progress import duration
-from hilsplat.workflow.resources import JobResources
+from hilsplat.workflow.resources import GUIDED, NODES, PICTURE_S, JobResources
 
-NODES = 400
-"""Nodes of a room; those of `plush_bedroom` (docs/benchmarks.md)."""
-
-KEPT_PROMPTS, GUIDED_PROMPTS = 0.3, 0.25
-"""Share of the previewed prompts whose masks are decoded, and of the grid's prompts with guided ones."""
-
-VIEW_S = 1.0
-"""Core seconds per view outside the networks: from logits to masks."""
+KEPT_PROMPTS = 0.3
+"""Share of the previewed prompts whose masks are decoded."""
 
 
 def forecasts(plan: Plan, cores: int) -> list[str]:
@@ -59,8 +53,8 @@ def _forecast(
     every = stages.poses.test_every
     views = len(files) - (len(files) // every if every else 0)
     prompts = stages.masks.points_per_side**2
-    base_s = view_s["image"] + VIEW_S
-    full_s, guided_s = base_s + prompts * prompt_s, base_s + GUIDED_PROMPTS * prompts * prompt_s
+    base_s = view_s["image"] + PICTURE_S
+    full_s, guided_s = base_s + prompts * prompt_s, base_s + GUIDED * prompts * prompt_s
     before_s = sum(resources.core_seconds(rule, job) for rule in ("poses", "gaussians"))
     after_s = sum(resources.core_seconds(rule, job) for rule in ("contributions", "semantic_tree"))
     key = SimpleNamespace(dataset=row.dataset, scene=row.scene, variant=KEY_VIEWS)

@@ -51,7 +51,7 @@ START_S = 2.0
 
 FIT_S_PER_MP, FIT_S_PER_GAUSSIAN, GRAPH_S_PER_MP = 0.14, 0.9e-6, 4.0
 """Core seconds per step of the fit, for each megapixel that it sees and for each Gaussian of the limit; core
-seconds of the graph segmenter per megapixel."""
+seconds per megapixel in the graph segmenter."""
 
 TRAINED_S_PER_MP, LITERAL_S_PER_MP = 0.08, 0.15
 """Core seconds per step, level and megapixel of a trained baseline, and of the literal trainer."""

@@ -85,9 +85,10 @@ def unmark_run() -> None:
 
     Its limit of jobs per timespan starts one after every scheduling; the process would wait for all of them.
     """
-    for thread in threading.enumerate():
-        if isinstance(thread, threading.Timer):
-            thread.cancel()
+    timers = (thread for thread in threading.enumerate() if isinstance(thread, threading.Timer))
+    for timer in timers:
+        if str(getattr(timer.function, "__module__", "")).startswith("snakemake"):
+            timer.cancel()
     while _marks:
         stream = _marks.pop()
         Path(stream.name).unlink(missing_ok=True)

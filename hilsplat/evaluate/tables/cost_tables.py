@@ -128,7 +128,7 @@ def quality_blocks(
 
 
 def given(scores: "pd.DataFrame", costs: Sequence[Cost], variant: str, method: str) -> "pd.DataFrame | None":
-    """Return the scores of one row with the level given; None if there are none.
+    """Return a row's scores with the level given, or None if there are none.
 
     Labels with levels have their own data set (Hi-LERF), or are the scenes' own.
     """

@@ -223,7 +223,7 @@ def level_cells(part: "pd.DataFrame", metric: str = "iou") -> dict[str, Cell]:
 def same_row(
     scores: "pd.DataFrame", part: "pd.DataFrame", protocols: tuple[str, ...], dataset: str | None = None
 ) -> "pd.DataFrame":
-    """Return the scores of other protocols by the same variant, seed, method and masks.
+    """Return what the same variant, seed, method and masks scored under other protocols.
 
     Args:
         scores: scores with seeds (`with_seeds`).

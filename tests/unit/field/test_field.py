@@ -18,7 +18,6 @@ from hilsplat.field.contrast import Contrast, ViewRelations, compared, distinct
 from hilsplat.field.field import run_field
 from hilsplat.field.language_field import LanguageField
 from hilsplat.field.literal_trainer import Shares, ViewTargets, view_losses
-from hilsplat.field.losses.latent_regression import latent_regression_loss
 from hilsplat.field.minimise import lbfgs
 from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
 from hilsplat.field.solver import keep_labelled, solve_field
@@ -26,6 +25,7 @@ from hilsplat.methods.method import MethodInputs
 from hilsplat.semantic_tree.tree import run_semantic_tree
 from hilsplat.settings import AutoencoderSettings, FieldSettings, SemanticTreeSettings
 from tests.unit.field.clustering import clustering_loss
+from tests.unit.field.latent_regression import latent_regression_loss
 from tests.unit.field.torch_losses import instance_term, part_term
 from tests.unit.round_gaussians import round_gaussians
 from tests.unit.two_boxes_world import reverse_masks

@@ -13,10 +13,10 @@ from hilsplat.field.losses.instance import (
     instance_loss_literal,
     instance_loss_tree,
 )
-from hilsplat.field.losses.latent_regression import latent_regression_loss
 from hilsplat.field.losses.part import part_loss_disentangle, part_loss_literal
 from tests.unit.field import torch_losses
 from tests.unit.field.clustering import clustering_loss
+from tests.unit.field.latent_regression import latent_regression_loss
 
 LOSSES = {
     each.__name__: each

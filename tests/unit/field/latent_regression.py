@@ -1,4 +1,4 @@
-"""The language loss: it pulls rendered features to the latent of the mask around them."""
+"""The language loss pixel by pixel; the solver has a matrix product."""
 
 from jaxtyping import Float, Int
 from torch import Tensor
