@@ -28,6 +28,7 @@ from hilsplat.settings import (
     MethodSettings,
     PerturbSettings,
     PosesSettings,
+    QuerySettings,
     Section,
     SemanticTreeSettings,
     TrainingSettings,
@@ -55,6 +56,7 @@ class StageSettings(Section):
     field: FieldSettings = FieldSettings()
     method: MethodSettings = MethodSettings()
     evaluate: EvaluateSettings = EvaluateSettings()
+    query: QuerySettings = QuerySettings()
     figures: FiguresSettings = FiguresSettings()
     training: TrainingSettings = TrainingSettings()
 

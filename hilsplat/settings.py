@@ -638,6 +638,16 @@ class EvaluateSettings(Section):
     )
 
 
+class QuerySettings(Section):
+    """Names of nodes, and the doubt whether an answer is one."""
+
+    vocabulary: str = knob(
+        "auto",
+        "text file of the words that name nodes; auto: `vocabulary.txt` in the folder of the CLIP, else "
+        "1,400 common things, parts and surfaces",
+    )
+
+
 class FiguresSettings(Section):
     """Figures of each scene."""
 

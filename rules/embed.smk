@@ -28,3 +28,32 @@ rule clip:
     shell:
         "python -m hilsplat --log {log:q} clip --scene {input.scene:q} --masks {input.masks:q} {params.option} --settings {params.settings:q}"
         " --threads {threads} --memory {resources.mem_mib} --cache {params.cache:q} --out {output.clip:q}"
+
+
+# What a vocabulary calls the nodes, and how well words are answered by chance.
+rule names:
+    input:
+        scene="<results>/{dataset}/{scene}/scene",
+        semantic_tree=PLAN.shared("semantic_tree", "semantic_tree"),
+        clip=PLAN.shared("clip", "clip"),
+        vocabulary=PLAN.vocabulary,  # empty, except for a file of your own
+    output:
+        names=directory("<results>/{dataset}/{scene}/{variant}/names"),
+    log:
+        "<results>/{dataset}/{scene}/{variant}/logs/names.log",
+    benchmark:
+        "<results>/{dataset}/{scene}/{variant}/benchmarks/names.jsonl"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        mem_mb=RESOURCES.memory_mb("names"),
+        runtime=RESOURCES.minutes("names"),
+    params:
+        settings=PLAN.settings("query"),
+        evaluate=PLAN.settings("evaluate"),
+        cache=cache_folder,
+        code=PLAN.code("names"),
+    shell:
+        "python -m hilsplat --log {log:q} names --semantic-tree {input.semantic_tree:q} --clip {input.clip:q}"
+        " --settings {params.settings:q} --evaluate {params.evaluate:q} --cache {params.cache:q} --threads {threads} --out {output.names:q}"

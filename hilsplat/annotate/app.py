@@ -28,6 +28,7 @@ from hilsplat.annotate.labels import (
     version_of,
     write_labels,
 )
+from hilsplat.annotate.merging import merged
 from hilsplat.annotate.opened import OpenedScene
 from hilsplat.annotate.shapes import shaped
 from hilsplat.base.errors import SettingsError
@@ -234,13 +235,22 @@ class Annotator:
     # -- other programs ---------------------------------------------------------------------------
 
     async def take_in(self, request: Request) -> Response:
-        """What a file holds, by the number of the view; nothing is written."""
-        asked, cameras = await read(request, wire.Given), self._of(request).scene.cameras
-        found = await self._do(imported, asked.name, asked.text, cameras)
-        numbers = {view: number for number, view in enumerate(cameras.names)}
-        return answer_json(
-            {numbers[view]: [label.model_dump() for label in labels] for view, labels in found.items()}
-        )
+        """Annotations with those of files among them, by the number of the view; nothing is written."""
+        asked, scene = await read(request, wire.Given), self._of(request).scene
+        cameras = scene.cameras
+
+        def merge() -> dict[str, Any]:
+            files = [imported(file.name, file.text, cameras) for file in asked.files]
+            sizes_hw = {view: cameras[view].size_hw for view in cameras.names}
+            found = merged(self.known(scene), files, sizes_hw)
+            numbers = {view: number for number, view in enumerate(cameras.names)}
+            views = {
+                numbers[view]: [label.model_dump() for label in labels]
+                for view, labels in found.views.items()
+            }
+            return {"views": views, "added": found.added, "known": found.known}
+
+        return answer_json(await self._do(merge))
 
     async def export(self, request: Request) -> Response:
         """All annotations as files of a program."""

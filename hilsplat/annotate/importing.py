@@ -3,16 +3,15 @@
 Without our keys for level and parent a thing comes in as a whole.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
-from pydantic import ValidationError
 
 from hilsplat.annotate.labels import Label, labels_of, whole_pixels
+from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.images.isat import parse_isat
 from hilsplat.datasets.images.polygons import trace_polygons
@@ -33,9 +32,13 @@ def imported(name: str, text: str, cameras: Cameras) -> dict[str, list[Label]]:
         SceneError: the format is none of these, or the file does not fit the scene.
     """
     try:
-        content = json.loads(text)
-    except ValueError as error:
-        raise SceneError(f"{name} cannot be read: {error}", expected="a JSON file") from error
+        return _imported(name, parse_json(text), cameras)
+    except (TypeError, ValueError, KeyError, AttributeError, OverflowError) as error:
+        # the file may hold anything anywhere: a list for an id, a number that is infinite
+        raise SceneError(f"{name} cannot be read: {error}", expected="a whole JSON file") from error
+
+
+def _imported(name: str, content: Any, cameras: Cameras) -> dict[str, list[Label]]:
     found: dict[str, list[Label]] = {}
     if isinstance(content, dict) and isinstance(content.get("shapes"), list):
         image = str(content.get("imagePath") or name)
@@ -90,18 +93,15 @@ def _joined(name: str, pieces: Sequence[Piece]) -> list[Label]:
 
 def _label(name: str, number: int, pieces: Sequence[Piece], has_ids: bool) -> Label:
     text, _, _, keys = pieces[0]
-    try:
-        return Label(
-            id=number,
-            level=keys.get("level") or 1,
-            parent=keys.get("parent") if has_ids else None,
-            text=text,
-            polygons=[whole_pixels(piece[2]) for piece in pieces],
-            origin=keys.get("origin") or "drawn",
-        )
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise SceneError(f"{name}: {text!r} cannot be used: {first['loc'][0]}: {first['msg']}") from error
+    return Label.read(
+        name,
+        id=number,
+        level=keys.get("level") or 1,
+        parent=keys.get("parent") if has_ids else None,
+        text=text,
+        polygons=[whole_pixels(piece[2]) for piece in pieces],
+        origin=keys.get("origin") or "drawn",
+    )
 
 
 def _labelme_piece(where: str, shape: Any) -> Piece:

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Bool
-from pydantic import Field
+from pydantic import AfterValidator, Field, ValidationError
 
 from hilsplat.base.artifacts import output_lock, sha256_of_bytes, write_text
 from hilsplat.base.errors import ArtifactError, SceneError, SettingsError
@@ -31,6 +31,13 @@ Ring = Annotated[list[tuple[Place, Place]], Field(min_length=1, max_length=20_00
 Rings = Annotated[list[Ring], Field(max_length=2000)]
 
 
+def _plain_text(text: str) -> str:
+    plain = " ".join(text.split())
+    if not plain or not plain.isprintable():
+        raise ValueError("it needs a letter, and none that cannot be printed")
+    return plain
+
+
 class Label(Message):
     """One thing in one view.
 
@@ -47,9 +54,25 @@ class Label(Message):
     id: Annotated[int, Field(ge=1, le=1_000_000)]
     level: Annotated[int, Field(ge=1, le=3)]
     parent: int | None = None
-    text: Text
+    text: Annotated[Text, AfterValidator(_plain_text)]
     polygons: Annotated[Rings, Field(min_length=1)]
     origin: Origin = "drawn"
+
+    @staticmethod
+    def read(where: str, **values: object) -> "Label":
+        """A label of a file.
+
+        Raises:
+            SceneError: a value cannot be used; `where` names the file.
+        """
+        try:
+            return Label.model_validate(values)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            raise SceneError(
+                f"{where}: {values['text']!r} cannot be used: {first['loc'][0]}: {first['msg']}",
+                fix="correct it in the file",
+            ) from error
 
     def mask(self, size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
         """The region."""
@@ -159,7 +182,8 @@ def labels_of(found: IsatFile) -> list[Label]:
     objects = by_id(found)
     parents = parents_of(found, objects, [])
     return [
-        Label(
+        Label.read(
+            str(found.path),
             id=number,
             level=thing.keys["level"],
             parent=parents[number],

@@ -46,8 +46,14 @@ class Labels(Message):
     labels: Annotated[list[Label], Field(max_length=2000)]
 
 
-class Given(Message):
+class File(Message):
     """A file of annotations."""
 
     name: Annotated[str, Field(max_length=300)]
     text: str
+
+
+class Given(Message):
+    """Files of annotations."""
+
+    files: Annotated[list[File], Field(min_length=1, max_length=5000)]

@@ -18,6 +18,28 @@ from hilsplat.cli.stage import (
     section_of,
     stage,
 )
+from hilsplat.models.store import AUTO
+
+
+@app.command()
+def names(
+    semantic_tree: PathIn,
+    clip: PathIn,
+    out: PathOut,
+    settings: Settings = "{}",
+    evaluate: Annotated[str, typer.Option(help="settings of evaluate as JSON")] = "{}",
+    cache: Cache = DEFAULT_CACHE,
+    threads: Threads = 1,
+) -> None:
+    """Name the nodes of a semantic tree by a vocabulary."""
+    sections = {"query": section_of("query", settings), "evaluate": section_of("evaluate", evaluate)}
+    inputs = {"semantic_tree": semantic_tree, "clip": clip}
+    if (own := sections["query"].vocabulary) != AUTO:
+        inputs["vocabulary"] = Path(own)
+    with stage("names", out, settings=sections, threads=threads, inputs=inputs):
+        from hilsplat.query.node_names import run_names
+
+        run_names(semantic_tree, clip, out, cache, sections["query"], sections["evaluate"], threads)
 
 
 @app.command()

@@ -217,6 +217,13 @@ class ClipModel:
                 self._known_texts[text] = self._embed_text(text)
         return np.stack([self._known_texts[text] for text in texts])
 
+    def unknown_words(self, text: str) -> list[str]:
+        """Words of a text that the model was never taught; a tokenizer of word pieces knows all."""
+        unknown = self.tokenizer.token_to_id(getattr(self.tokenizer.model, "unk_token", None) or "")
+        encoding = self.tokenizer.encode(text)
+        places = zip(encoding.ids, encoding.offsets, strict=True)
+        return [text[start:end] for number, (start, end) in places if number == unknown and end > start]
+
     def _embed_text(self, text: str) -> Float32[np.ndarray, " C"]:
         """The unit vector of one text."""
         if not text.strip() or not sum(self.tokenizer.encode(text).attention_mask):

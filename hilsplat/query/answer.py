@@ -87,23 +87,25 @@ def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]
 def report(scene: LanguageScene, text: str, found: NodeHits, view: str | None = None) -> str:
     """The answers as text, with doubts; `view` is the one that the query was restricted to."""
     place = scene.scene.name if view is None else f"what {view} shows of {scene.scene.name}"
-    hits, doubts = hits_of(scene, found, LISTED), doubts_of(scene, found)
+    hits, doubts = hits_of(scene, found, LISTED), doubts_of(found)
     if not hits:
         levels = ", ".join(f"--level {each.label}" for each in LEVELS if each is not found.level)
         other = "" if view is None else ", or leave out --view"
         return f"nothing in {place} answers to {text!r} at level {found.level.label}; try {levels}{other}"
     lengths = "metres" if scene.scene.unit == "metre" else "scene units"
+    width = max(len(hit.name or "?") for hit in hits)
     lines = [
         f"{counted(len(hits), 'answer')} to {text!r} in {place}; lengths in {lengths}",
-        f"{'node':>5}  {'level':<8} {'score':>5}  {'position':<24} {'box size':<20} best views",
+        f"{'node':>5}  {'level':<8} {'score':>5}  {'position':<24} {'box size':<20} "
+        f"{'name':<{width}}  best views",
     ]
     for hit in hits:
         position = ", ".join(f"{value:.2f}" for value in hit.centroid)
         size = " x ".join(f"{side:.2f}" for side in hit.oriented_box.size)
         views = ", ".join(hit.best_views)
         lines.append(
-            f"{hit.node:>5}  {hit.level.label:<8} {hit.score:>5.2f}  {position:<24} {size:<20} {views}"
-            + (f"  named {hit.name!r}" if hit.name else "")
+            f"{hit.node:>5}  {hit.level.label:<8} {hit.score:>5.2f}  {position:<24} {size:<20} "
+            f"{hit.name or '?':<{width}}  {views}"
         )
     if more := len(found.ids) - len(hits):
         lines.append(f"and {counted(more, 'weaker answer')}, which the pictures show too")

@@ -16,27 +16,37 @@ if TYPE_CHECKING:
 BEST_VIEWS = 3
 
 
+LIKELY_CHANCE = 0.05
+"""An answer is doubtful if this share of words for what is absent is answered as well."""
+
+
 @dataclass(frozen=True)
 class Doubt:
-    """A text of a query that nothing in the scene answers better than a generic word.
+    """A text of a query that may be for nothing in the scene.
 
     Attributes:
         text: the text.
         level: the level that was searched, if nodes of another level do answer the text; else None.
-        score: of the best node at that level, or at any; at most 0.5, and 0 if there is none.
+        chance: share of words for what is absent that are answered as well; None: unknown, and nothing
+            answers the text better than a generic word.
+        unknown: words of the text that the model was never taught.
     """
 
     text: str
     level: Level | None
-    score: float
+    chance: float | None
+    unknown: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         """The doubt in a sentence."""
         who = "nothing" if self.level is None else f"no {self.level.label}"
-        return (
-            f"{who} here answers to {self.text!r} better than to a generic word "
-            f"(the best score is {self.score:.2f})"
-        )
+        if self.unknown:
+            words = ", ".join(map(repr, self.unknown))
+            return f"{self.text!r} may not be here: the model was never taught {words}"
+        if self.chance is None:
+            return f"{who} here answers to {self.text!r} better than to a generic word"
+        share = f"{max(self.chance, 0.01):.0%} of the words for what is certainly not here"
+        return f"{self.text!r} may not be here: {share} are answered as well"
 
 
 @dataclass(frozen=True)
@@ -46,15 +56,16 @@ class Hit:
     Attributes:
         node: row of the semantic tree.
         level: its level.
-        score: relevancy in (0, 1), where 0.5 is no better than a generic word; of what looks like a node or a
-            picture (route "like"), the cosine.
+        score: relevancy in (0, 1) of the node and, to a lesser share, of what it is part of; answers are
+            ordered by it, and 0.5 is no better than a generic word. Of what looks like a node or a picture
+            (route "like"), the cosine.
         centroid: scene units.
         box: axis-aligned, lower and upper corner, scene units.
         oriented_box: the box along the node's own axes.
         best_views: up to three train views that show it largest.
         route: as in `NodeHits`, or "like".
         doubts: texts of the query that nothing answers; a path is no better than its first text.
-        name: that a person gave the node, or empty.
+        name: that a person gave the node, else what the vocabulary calls it; empty if nothing fits.
     """
 
     node: int
@@ -85,9 +96,9 @@ class Hit:
 
 def hits_of(scene: "LanguageScene", found: NodeHits, limit: int) -> list[Hit]:
     """Describe the best nodes that answered, at most `limit`."""
-    doubts = doubts_of(scene, found)
-    best = zip(found.ids[:limit].tolist(), found.margins[:limit], strict=True)
-    return [hit_of(scene, node, scene.score(margin), found.route, doubts) for node, margin in best]
+    doubts = doubts_of(found)
+    best = zip(found.ids[:limit].tolist(), found.values[:limit], strict=True)
+    return [hit_of(scene, node, scene.score(value), found.route, doubts) for node, value in best]
 
 
 def hit_of(scene: "LanguageScene", node: int, score: float, route: str, doubts: tuple[Doubt, ...]) -> Hit:
@@ -106,19 +117,19 @@ def hit_of(scene: "LanguageScene", node: int, score: float, route: str, doubts: 
         tuple(tree.view_names[row] for row in order if area[row] > 0),
         route,
         doubts,
-        scene.names.of_node.get(node, ""),
+        scene.name_of(node),
         scene,
     )
 
 
-def doubts_of(scene: "LanguageScene", found: NodeHits) -> tuple[Doubt, ...]:
-    """Texts of a query that nothing answers better than a generic word."""
+def doubts_of(found: NodeHits) -> tuple[Doubt, ...]:
+    """Texts of a query that may be for nothing in the scene."""
     doubts = []
     for each in found.texts:
-        if each.anywhere <= 0:
-            doubts.append(Doubt(each.text, None, scene.score(each.anywhere)))
-        elif each.is_doubtful:
-            doubts.append(Doubt(each.text, each.level, scene.score(each.margin)))
+        likely = each.chance is not None and each.chance > LIKELY_CHANCE
+        if each.unknown or each.is_doubtful or likely:
+            level = each.level if each.anywhere > 0 else None
+            doubts.append(Doubt(each.text, level, each.chance if likely else None, each.unknown))
     return tuple(doubts)
 
 

@@ -7,7 +7,7 @@ Gaussians.
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, cast, get_args
@@ -18,13 +18,14 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 
 from hilsplat.base.device import ComputeDevice, compute_device
 from hilsplat.base.errors import ArtifactError, ModelError, SettingsError
-from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.field.code import Code
 from hilsplat.field.language_field import LanguageField
 from hilsplat.query.field_answers import FieldAnswers
 from hilsplat.query.hits import Hit, hit_of, hits_of
 from hilsplat.query.names import PATH_SEPARATOR, NodeNames, read_names
-from hilsplat.query.node_search import NodeHits, search
+from hilsplat.query.node_names import NodeNaming
+from hilsplat.query.node_search import NodeHits, TextAnswer, search
 from hilsplat.query.opening import Opened, OpenedParts
 from hilsplat.query.relevancy import margins, relevancy_of_margins
 from hilsplat.query.scene_views import SceneViews, members_of
@@ -62,6 +63,8 @@ class LanguageScene:
         device: "cpu" or "cuda", for look-ups of the field.
         caution: why no answer of CLIP means anything here, in a sentence; empty: no such reason.
         names: names that a person gave to nodes, which answer texts first.
+        naming: what a vocabulary calls the nodes, and words for what is absent; None: the stage has not run.
+        unknown_words: words of a text that the model of texts was never taught.
         encode_picture: unit CLIP vector of an RGB image; None: pictures cannot be looked for.
     """
 
@@ -77,9 +80,12 @@ class LanguageScene:
     device: ComputeDevice = "cpu"
     caution: str = ""
     names: NodeNames = field(default_factory=NodeNames)
+    naming: NodeNaming | None = field(default=None, repr=False)
+    unknown_words: Callable[[str], list[str]] = field(default=lambda text: [], repr=False)
     encode_picture: PictureEncoder | None = field(default=None, repr=False)
     _views: ViewStore = field(default_factory=ViewStore, repr=False)
     _texts: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
+    _by_chance: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
 
     @staticmethod
     def open(
@@ -119,6 +125,7 @@ class LanguageScene:
             device=device,
             opened=opened,
             names=read_names(found.folder, found.parts.semantic_tree),
+            naming=NodeNaming.load(found.naming, found.parts.semantic_tree, found.parts.clip),
         )
 
     @staticmethod
@@ -130,6 +137,7 @@ class LanguageScene:
         device: str = "cpu",
         opened: Opened | None = None,
         names: NodeNames | None = None,
+        naming: NodeNaming | None = None,
     ) -> "LanguageScene":
         """Read a scene's artifacts, each once, and check that they belong together.
 
@@ -140,6 +148,7 @@ class LanguageScene:
             device: as in `open`.
             opened: artifacts that other variants of the scene opened before.
             names: names of nodes; None: none, as in evaluation, which scores the models alone.
+            naming: what a vocabulary calls the nodes; None: no doubts about chance, as in evaluation.
 
         Raises:
             MisalignedArtifactError: the tree or field was made for other Gaussians, or the field for
@@ -168,6 +177,8 @@ class LanguageScene:
             compute_device(cast(ComputeDevice, device)),
             found.caution,
             names=names or NodeNames(),
+            naming=naming,
+            unknown_words=found.clip.unknown_words,
             encode_picture=found.clip.embed_picture,
         )
 
@@ -292,7 +303,8 @@ class LanguageScene:
         Raises:
             SettingsError: the view is unknown, or the path is empty or has more texts than levels.
         """
-        return search(
+        shown = None if view is None else self.nodes_shown(view)
+        found = search(
             self.tree,
             self.node_margins(path, answerer),
             self.node_vectors(answerer),
@@ -300,8 +312,49 @@ class LanguageScene:
             threshold=self.settings.node_select if threshold is None else threshold,
             ancestors=self.settings.ancestors,
             level=level,
-            shown=None if view is None else self.nodes_shown(view),
+            shown=shown,
         )
+        if self.naming is None:
+            return found
+        by_chance = self.margins_by_chance(answerer)
+        return replace(found, texts=tuple(self._doubted(each, by_chance, shown) for each in found.texts))
+
+    def _doubted(
+        self, answer: TextAnswer, by_chance: Float32[np.ndarray, "W n"], shown: Bool[np.ndarray, " n"] | None
+    ) -> TextAnswer:
+        """How well a text was answered, with the chance that a word for nothing is answered as well."""
+        if self.names.nodes_of(answer.text):
+            return answer
+        rivals = np.ones(len(self.tree), np.bool_) if shown is None else shown.copy()
+        if answer.margin < answer.anywhere:  # the best node of another level was not asked for
+            rivals &= self.tree.level == int(answer.level)
+        best = by_chance[:, rivals].max(axis=1, initial=-np.inf)
+        chance = (1 + int((best >= answer.margin).sum())) / (1 + len(best))
+        return replace(answer, chance=chance, unknown=tuple(self.unknown_words(answer.text)))
+
+    def margins_by_chance(self, answerer: Answerer = "tree") -> Float32[np.ndarray, "W n"]:
+        """Cosine margin of every node for words that mean nothing here; see `NodeNaming.rivals`."""
+        if answerer not in self._by_chance:
+            assert self.naming is not None
+            canonical = self.text_vectors(self.settings.canonical)
+            self._by_chance[answerer] = margins(self.node_vectors(answerer), self.naming.rivals, canonical)
+        return self._by_chance[answerer]
+
+    def name_of(self, node: int, *, alone: bool = False) -> str:
+        """The name that a person gave a node, else what the vocabulary calls it; empty if nothing fits.
+
+        A part is called as part of its whole, "wheel of car", unless its name says that or it stands `alone`.
+        """
+        if given := self.names.of_node.get(node, ""):
+            return given
+        own = self.naming.of_node[node] if self.naming is not None else ""
+        parent = int(self.tree.parent[node])
+        if not own or alone or parent == NONE:
+            return own
+        while int(self.tree.parent[parent]) != NONE:
+            parent = int(self.tree.parent[parent])
+        whole = self.name_of(parent)
+        return own if not whole or whole in own else f"{own} of {whole}"
 
     def nodes_shown(self, view: str) -> Bool[np.ndarray, " n"]:
         """Which nodes have a mask of at least `MIN_SHOWN_SHARE` of a view."""

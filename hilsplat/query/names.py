@@ -8,13 +8,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Literal
 
-from hilsplat.base.artifacts import output_lock, read_json, sha256_of_bytes, sha256_of_file, write_json
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
+
+from hilsplat.base.artifacts import (
+    output_lock,
+    read_json,
+    read_npz,
+    sha256_of_bytes,
+    sha256_of_file,
+    write_json,
+)
 from hilsplat.base.errors import ArtifactError, SettingsError
 
 FILE = "names.json"
-FORMAT = "hilsplat-names-1"
 PATH_SEPARATOR = ">"
 LONGEST = 80
 """Most characters of a name."""
@@ -54,11 +62,19 @@ def read_names(folder: Path, semantic_tree: Path) -> NodeNames:
         semantic_tree: the artifact whose nodes are named.
 
     Raises:
-        ArtifactError: the file is damaged or of another version.
+        ArtifactError: the file is damaged or of another version, or names nodes that do not exist.
     """
     path = Path(folder) / FILE
-    kept = _kept(path)["trees"].get(tree_digest(semantic_tree), {})
-    return NodeNames(MappingProxyType({int(node): name for node, name in kept.items()}), _version(path))
+    kept = _kept(path).trees.get(tree_digest(semantic_tree), {})
+    num_nodes = len(read_npz(Path(semantic_tree) / "tree.npz")["level"]) if kept else 0
+    if beyond := [node for node in kept if node >= num_nodes]:
+        raise ArtifactError(
+            f"{path} names nodes that the tree does not have",
+            expected=f"rows 0 to {num_nodes - 1}",
+            found=", ".join(map(str, beyond[:5])),
+            fix="correct it, or move it away to start without names",
+        )
+    return NodeNames(MappingProxyType(kept), _version(path))
 
 
 def write_names(
@@ -93,11 +109,18 @@ def write_names(
                 f"the names in {path} have changed meanwhile", fix="read them again, then change them"
             )
         found = _kept(path)
-        found["trees"][tree_digest(semantic_tree)] = {
-            str(node): name for node, name in sorted(given.items()) if name
-        }
-        write_json(path, found)
+        found.trees[tree_digest(semantic_tree)] = {node: name for node, name in sorted(given.items()) if name}
+        write_json(path, found.model_dump(mode="json"))
     return read_names(folder, semantic_tree)
+
+
+class NamesFile(BaseModel):
+    """What `names.json` holds: by the digest of a tree, names by row."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    format: Literal["hilsplat-names-1"]
+    trees: dict[str, dict[NonNegativeInt, Annotated[str, Field(max_length=LONGEST)]]]
 
 
 class StaleNamesError(ArtifactError):
@@ -112,12 +135,15 @@ def _version(path: Path) -> str:
     return sha256_of_bytes(path.read_bytes())[:16] if path.is_file() else NO_FILE
 
 
-def _kept(path: Path) -> dict[str, Any]:
+def _kept(path: Path) -> NamesFile:
     if not path.is_file():
-        return {"format": FORMAT, "trees": {}}
-    found = read_json(path)
-    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        return NamesFile(format="hilsplat-names-1", trees={})
+    try:
+        return NamesFile.model_validate(read_json(path))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
         raise ArtifactError(
-            f"{path} is of another version", expected=FORMAT, fix="move it away to start anew"
-        )
-    return found
+            f"{path} is damaged or of another version: {'.'.join(map(str, first['loc']))}: {first['msg']}",
+            expected='{"format": "hilsplat-names-1", "trees": {<digest of a tree>: {"<row>": "<name>"}}}',
+            fix="correct it, or move it away to start without names",
+        ) from error

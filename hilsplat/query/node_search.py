@@ -38,12 +38,16 @@ class TextAnswer:
         level: the level at which it was searched.
         margin: cosine margin of the best node that competed there; -inf if none did.
         anywhere: the same for the best node of any level.
+        chance: share of words for what is absent that are answered at least as well; None: unknown.
+        unknown: words of the text that the model was never taught.
     """
 
     text: str
     level: Level
     margin: float
     anywhere: float
+    chance: float | None = None
+    unknown: tuple[str, ...] = ()
 
     @property
     def is_doubtful(self) -> bool:
@@ -57,7 +61,8 @@ class NodeHits:
 
     Attributes:
         ids: rows of the semantic tree, best first.
-        margins: their cosine margins for the last text.
+        values: what they are ordered by: the cosine margin for the last text, plus what their ancestors add
+            (one text) or take away (a path).
         route: how the best was reached: "flat", or on a path "child" (it has an ancestor at the level of
             every earlier text, the last of which is its parent), "descendant" (at some, or the last is not
             its parent) or "fallback" (at none, or no node is part of what answers the first text).
@@ -65,7 +70,7 @@ class NodeHits:
     """
 
     ids: Int64[np.ndarray, " n"]
-    margins: Float64[np.ndarray, " n"]
+    values: Float64[np.ndarray, " n"]
     route: str
     texts: tuple[TextAnswer, ...]
 
@@ -109,10 +114,10 @@ def search(
     (own,) = margin
     level = automatic_level(tree, own, shown) if level is None else level
     nodes = tree.nodes_of(level)
-    added = ancestors * ancestor_margins(tree, own)
-    chosen = best_nodes(own + added, vectors, nodes, threshold, shown)
+    value = own + ancestors * ancestor_margins(tree, own)
+    chosen = best_nodes(value, vectors, nodes, threshold, shown)
     best = own[nodes if shown is None else nodes[shown[nodes]]].max(initial=-np.inf)
-    return NodeHits(chosen, own[chosen], "flat", (TextAnswer(path[0], level, float(best), *anywhere),))
+    return NodeHits(chosen, value[chosen], "flat", (TextAnswer(path[0], level, float(best), *anywhere),))
 
 
 def best_nodes(
@@ -236,7 +241,7 @@ def _search_path(
     found = [_search_way(tree, margin, ancestors, vectors, way, threshold, shown) for way in ways]
     best = max(found, key=lambda way: (way.complete, way.total))
     texts = tuple(map(TextAnswer, path, best.levels, best.margins, anywhere))
-    return NodeHits(best.ids, margin[-1][best.ids], best.route, texts)
+    return NodeHits(best.ids, best.values, best.route, texts)
 
 
 @dataclass(frozen=True)
@@ -245,6 +250,7 @@ class _Way:
 
     Attributes:
         ids: answers to the last text, best first.
+        values: as in `NodeHits`.
         levels: level of each text.
         margins: margin of the best node that competed for each text.
         route: as in `NodeHits`.
@@ -254,6 +260,7 @@ class _Way:
     """
 
     ids: Int64[np.ndarray, " h"]
+    values: Float64[np.ndarray, " h"]
     levels: tuple[Level, ...]
     margins: tuple[float, ...]
     route: str
@@ -291,7 +298,7 @@ def _search_way(
             likely = below <= PLAUSIBLE * spread
     margins.append(float(last[may].max(initial=-np.inf)))
     if not len(may):
-        return _Way(may, levels, tuple(margins), "fallback", -np.inf, False)
+        return _Way(may, value[may], levels, tuple(margins), "fallback", -np.inf, False)
     inside = bool(likely[may].any())
     reach = (1 - threshold) * np.ptp(last[nodes])
     chosen = _near_best(value, may[likely[may]] if inside else may, vectors, reach)
@@ -299,7 +306,7 @@ def _search_way(
     holders = ancestors[best_one, [level.index for level in levels[:-1]]]
     complete = inside and bool((holders != NONE).all())
     route = _route(holders, int(tree.parent[best_one]), inside)
-    return _Way(chosen, levels, tuple(margins), route, float(total[best_one]), complete)
+    return _Way(chosen, value[chosen], levels, tuple(margins), route, float(total[best_one]), complete)
 
 
 def _route(holders: Int32[np.ndarray, " a"], parent: int, inside: bool) -> str:

@@ -49,7 +49,7 @@ def query_panel(
     last = path_of(text)[-1]
     found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
     title = f"“{text}” in {scene.scene.name}: {found}{note}"
-    doubts = [*wrap(scene.caution_about(text), TITLE_LETTERS), *map(str, doubts_of(scene, hits))]
+    doubts = [*wrap(scene.caution_about(text), TITLE_LETTERS), *map(str, doubts_of(hits))]
     height, width = scene.scene.cameras[views[0]].size_hw
     row_px = TITLE_PX + round(CELL_PX * height / width) + GAP_PX
     upper_px = HEADING_PX * (1 + len(doubts)) + GAP_PX + len(views) * row_px

@@ -44,7 +44,8 @@ def export_tree(folder: Path, variant: str, out: Path, threads: int) -> str:
     """
     found = FinishedScene.locate(folder, variant)
     scene = LanguageScene.of(found, threads=threads)
-    write_json(out / "tree.json", {"scene": scene.scene.name, "nodes": readable_nodes(scene.tree)})
+    nodes = [{**node, "name": scene.name_of(row)} for row, node in enumerate(readable_nodes(scene.tree))]
+    write_json(out / "tree.json", {"scene": scene.scene.name, "nodes": nodes})
     write_tree_ply(found.parts.gaussians, scene.tree, out / "tree.ply")
     write_png(out / "tree.png", tree_picture(scene))
     counts = ", ".join(f"{len(scene.tree.nodes_of(level))} {level.label}" for level in LEVELS)

@@ -114,6 +114,11 @@ class FinishedScene:
                 raise _unfinished(folder, path)
         return FinishedScene(folder, variant, parts)
 
+    @property
+    def naming(self) -> Path:
+        """Where the names of the nodes are, beside the vectors that gave them; they may not exist."""
+        return self.parts.clip.parent / "names"
+
     def evaluate_settings(self) -> EvaluateSettings:
         """Canonical phrases, template, scale and selection of the run that made the scene.
 

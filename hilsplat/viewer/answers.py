@@ -33,7 +33,7 @@ def answer(
         "hits": [described_hit(scene, hit) for hit in hits],
         "total": len(found.ids),
         "relevancy": np.round(relevancy, 4).tolist(),
-        "doubts": [str(doubt) for doubt in doubts_of(scene, found)],
+        "doubts": [str(doubt) for doubt in doubts_of(found)],
         "caution": scene.caution_about(text),
         "route": found.route,
         "ms": round(1e3 * (time.perf_counter() - begin), 2),
@@ -81,7 +81,7 @@ def boxes(scene: LanguageScene, nodes: Sequence[int]) -> dict[str, Any]:
         "boxes": [
             {
                 "node": node,
-                "name": scene.names.of_node.get(node, ""),
+                "name": scene.name_of(node),
                 "level": int(tree.level[node]),
                 "parent": int(tree.parent[node]),
                 "centre": tree.oriented_box[node][0].tolist(),

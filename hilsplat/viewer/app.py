@@ -142,7 +142,7 @@ class Viewer:
             scene = shown.answering(asked.variant)
             if asked.node is not None:
                 hits = scene.like_node(asked.node, limit=answers.LISTED)
-                what = scene.names.of_node.get(asked.node) or f"node {asked.node}"
+                what = scene.name_of(asked.node) or f"node {asked.node}"
                 return answers.alike(scene, hits, f"like {what}", [asked.node])
             hits = scene.like_picture(_picture(asked.picture), limit=answers.LISTED)
             return answers.alike(scene, hits, "like the picture")

@@ -30,8 +30,8 @@ CROP_PX = 160
 CROP_MARGIN = 0.15
 LEAST_ALPHA = 0.1
 """A pixel that Gaussians cover by less belongs to no node; small things are enlarged, so gaps open."""
-DIMMED = 0.3
-"""Brightness of a crop outside the node."""
+DIMMED, GROUND = 0.2, 110.0
+"""Outside the node, a crop keeps this share of the photograph, on this grey."""
 
 Steps = Generator[tuple[int, int], None, bytes]
 """A file that is made step by step: how many of how many are done, first 0, and at the end the file.
@@ -58,9 +58,7 @@ def masks_zip(scene: LanguageScene, nodes: Sequence[int]) -> Steps:
     coco: dict[str, Any] = {
         "info": {"description": f"{scene.scene.name}: masks of nodes, by hilsplat"},
         "images": [],
-        "categories": [
-            {"id": node, "name": scene.names.of_node.get(node) or f"node {node}"} for node in nodes
-        ],
+        "categories": [{"id": node, "name": scene.name_of(node) or f"node {node}"} for node in nodes],
         "annotations": [],
     }
     with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -110,7 +108,7 @@ def _png(mask: Bool[np.ndarray, "H W"]) -> bytes:
 
 
 def crop(scene: LanguageScene, node: int, threads: int = 1) -> UInt8[np.ndarray, "S S 3"]:
-    """A square of the photograph that shows a node largest, with the rest of it dimmed.
+    """A square of the photograph that shows a node largest, with the rest of it fading into grey.
 
     Only the square is drawn: a camera whose picture is the square sees which of its pixels are the node's.
     """
@@ -128,7 +126,8 @@ def crop(scene: LanguageScene, node: int, threads: int = 1) -> UInt8[np.ndarray,
     shares, alpha = blend_forward(drawn, member, threads)
     is_node = shares[..., 0] > 0.5 * np.maximum(alpha, LEAST_ALPHA)
     pixels = resampled(photograph, x, y, side)
-    return np.where(is_node[..., None], pixels, (pixels * DIMMED).astype(np.uint8))
+    around = pixels * DIMMED + (1 - DIMMED) * GROUND
+    return np.where(is_node[..., None], pixels, around.astype(np.uint8))
 
 
 def resampled(image: UInt8[np.ndarray, "H W 3"], x: float, y: float, side: float) -> np.ndarray:

@@ -49,15 +49,14 @@ class Paint:
             style: as the page sends it.
             node_of_gaussian: of the tree; None: the scene has none yet.
             num_nodes: of the tree.
-            relevancy: of every Gaussian in steps of 1/255, for a style with a ramp.
+            relevancy: of every Gaussian in steps of 1/255; needed if the style has a ramp.
             count: number of Gaussians, for a scene without a tree.
 
         Raises:
-            ValueError: the table has another number of rows, or the ramp nothing to paint.
+            ValueError: the table has another number of rows.
         """
         if style.ramp:
-            if relevancy is None:
-                raise ValueError("no field relevancy was asked for")
+            assert relevancy is not None
             share = np.full(len(relevancy), 0.8, np.float32)
             return Paint(style.colours()[relevancy].astype(np.float32) / 255, share, "plain")
         if node_of_gaussian is None:

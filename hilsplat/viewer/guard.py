@@ -16,6 +16,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
 MAX_BODY_BYTES = 1 << 20
+MAX_PATH = 500
+"""Most characters of a path: Python refuses to read numbers of thousands of digits."""
 HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
     "img-src 'self' blob: data:; connect-src 'self'; worker-src 'self'; base-uri 'none'; form-action 'none'; "
@@ -42,7 +44,7 @@ class Guard:
         self.cookie = f"hilsplat-{secrets.token_hex(4)}"  # ports share cookies: a name for each server
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer 403 or 413, or pass the request on and add the headers to the answer."""
+        """Answer 403, 413 or 414, or pass the request on and add the headers to the answer."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
@@ -51,6 +53,9 @@ class Guard:
         is_opening = scope["path"] == "/" and hmac.compare_digest(given.encode(), self.token.encode())
         if refused := self._refusal(scope["method"], scope["path"], headers, is_opening):
             await PlainTextResponse(refused, 403, HEADERS)(scope, receive, send)
+            return
+        if len(scope["path"]) > MAX_PATH:
+            await PlainTextResponse("the address is too long", 414, HEADERS)(scope, receive, send)
             return
         if int(headers.get("content-length") or 0) > self.max_body or "transfer-encoding" in headers:
             await PlainTextResponse("too much was sent", 413, HEADERS)(scope, receive, send)

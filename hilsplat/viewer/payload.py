@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.query.names import NodeNames
+from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.boxes import OrientedBox
@@ -104,8 +104,9 @@ def crossing(cameras: Cameras) -> Float64[np.ndarray, " 3"]:
     return found if (found - centres[0]) @ ahead[0] > 0 else guess
 
 
-def described_nodes(tree: SemanticTree, names: NodeNames) -> dict[str, Any]:
+def described_nodes(scene: LanguageScene) -> dict[str, Any]:
     """The outline: one entry per node, in row order."""
+    tree, names, naming = scene.tree, scene.names, scene.naming
     members = [np.bincount(column[column >= 0], minlength=len(tree)) for column in tree.node_of_gaussian.T]
     return {
         "version": names.version,
@@ -115,6 +116,8 @@ def described_nodes(tree: SemanticTree, names: NodeNames) -> dict[str, Any]:
                 "level": int(tree.level[node]) - 1,
                 "parent": int(tree.parent[node]),
                 "name": names.of_node.get(node, ""),
+                "called": "" if naming is None else naming.of_node[node] or "?",
+                "surface": naming is not None and naming.surfaces[node],
                 "gaussians": int(members[Level(int(tree.level[node])).index][node]),
                 "views": int(tree.views[node]),
                 "quality": round(float(tree.quality[node]), 3),

@@ -107,7 +107,11 @@ class SavedFiles:
             yield _line(made=0, of=of)
             while (number := await made.get()) is not None:
                 yield _line(made=number, of=of)
-            data = await making
+            try:
+                data = await making
+            except (HilsplatError, OSError) as error:  # such as a full disk
+                yield _line(error=f"the film could not be made: {error}")
+                return
             yield _line(bytes=len(data))
             yield data
         finally:  # also if the page was left, or its film cancelled
@@ -132,7 +136,7 @@ class SavedFiles:
             yield _line(made=found[0], of=found[1])
             try:
                 found = await self.thread.run(partial(_step, steps))
-            except HilsplatError as error:
+            except (HilsplatError, OSError) as error:
                 yield _line(error=str(error))
                 return
         yield _line(bytes=len(found))

@@ -30,6 +30,9 @@ from hilsplat.viewer.witness import Witness
 VIEWS_MIB = 256.0
 """Memory for what is kept of views, such as their compositing weights."""
 
+KEPT_RELEVANCIES = 8
+"""Field relevancies that are kept, of as many texts, levels and variants; a byte per Gaussian each."""
+
 MAX_GAUSSIANS = 4_000_000
 """More do not fit textures of 2048 x 8192 texels, nor a server of a few GiB."""
 
@@ -78,7 +81,7 @@ class ShownScene:
         self._variants: dict[str, LanguageScene] = {}
         self._trees: dict[str, str] = {}
         self._found: dict[str, FinishedScene] = {}
-        self._relevancy: dict[str, np.ndarray] = {}
+        self._relevancy: dict[tuple[str, str, str], np.ndarray] = {}
         self._painted: tuple[Any, Paint] | None = None
 
     # -- what is written meanwhile ----------------------------------------------------------------
@@ -174,7 +177,7 @@ class ShownScene:
         return {
             "variant": variant,
             "tree": self._trees[variant],
-            **payload.described_nodes(scene.tree, scene.names),
+            **payload.described_nodes(scene),
             "clip": clip,
             "masks": masks,
             "caution": scene.caution,
@@ -193,11 +196,13 @@ class ShownScene:
 
         Gaussians without a latent get 0.
         """
-        scene = self.answering(variant)
-        found = scene.gaussian_relevancy(text, level)
-        self._relevancy = {variant: payload.as_steps(found)}
-        self._painted = None
-        return self._relevancy[variant]
+        key = (variant, text, level)
+        if key not in self._relevancy:
+            found = payload.as_steps(self.answering(variant).gaussian_relevancy(text, level))
+            for oldest in list(self._relevancy)[: 1 - KEPT_RELEVANCIES]:
+                del self._relevancy[oldest]
+            self._relevancy[key] = found
+        return self._relevancy[key]
 
     def paint(self, variant: str, style: Style) -> Paint | None:
         """A style, Gaussian by Gaussian; the last one is kept. None: the scene's own colours.
@@ -209,11 +214,10 @@ class ShownScene:
             return None
         key = (variant, style)
         if self._painted is None or self._painted[0] != key:
+            scene = self.answering(variant)
+            relevancy = self.field_relevancy(variant, style.text, style.level) if style.ramp else None
             try:
-                scene = self.answering(variant)
-                paint = Paint.of(
-                    style, scene.tree.node_of_gaussian, len(scene.tree), self._relevancy.get(variant)
-                )
+                paint = Paint.of(style, scene.tree.node_of_gaussian, len(scene.tree), relevancy)
             except ValueError as error:
                 raise SettingsError(f"the style cannot be painted: {error}", fix="reload the page") from error
             self._painted = (key, paint)

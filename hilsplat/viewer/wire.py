@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import UInt8
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from hilsplat.scene.cameras import Camera
 
@@ -15,6 +15,7 @@ MAX_TEXT = 200
 Row3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]
 Text = Annotated[str, Field(min_length=1, max_length=MAX_TEXT)]
+LevelName = Literal["auto", "whole", "part", "subpart"]
 Nodes = Annotated[list[Annotated[int, Field(ge=0)]], Field(max_length=65_534)]
 
 
@@ -58,13 +59,22 @@ class Style(Message):
         table: base64 of RGBA bytes, row 0 for Gaussians without a node, row n + 1 for node n.
         use: which levels are looked up; the finest with an alpha above 0 decides.
         mode: what becomes of Gaussians whose alpha is 0.
-        ramp: base64 of 256 RGB bytes; if given, Gaussians are painted by the field's relevancy instead.
+        ramp: base64 of 256 RGB bytes; if given, Gaussians are painted by the field's relevancy to `text` at
+            `level` instead.
     """
 
     table: Annotated[str, Field(max_length=400_000)] = ""
     use: tuple[bool, bool, bool] = (True, True, True)
     mode: Literal["plain", "tint", "ghost", "isolate"] = "plain"
     ramp: Annotated[str, Field(max_length=1024)] = ""
+    text: Annotated[str, Field(max_length=MAX_TEXT)] = ""
+    level: LevelName = "auto"
+
+    @model_validator(mode="after")
+    def _ramp_has_text(self) -> "Style":
+        if self.ramp and not self.text:
+            raise ValueError("a ramp shows the relevancy to a text, and there is none")
+        return self
 
     def rgba(self, num_nodes: int) -> UInt8[np.ndarray, "T1 4"]:
         """The table, (nodes + 1, 4); an empty one leaves every Gaussian as it is.
@@ -101,7 +111,7 @@ class Query(Asked):
     """A text or a path."""
 
     text: Text
-    level: Literal["auto", "whole", "part", "subpart"] = "auto"
+    level: LevelName = "auto"
     answerer: Literal["tree", "field"] = "tree"
     view: Annotated[int, Field(ge=0)] | None = None
     threshold: Annotated[float, Field(ge=0, le=1)] | None = None
@@ -118,7 +128,7 @@ class FieldRelevancy(Asked):
     """The field's relevancy of every Gaussian to a text."""
 
     text: Text
-    level: Literal["auto", "whole", "part", "subpart"] = "auto"
+    level: LevelName = "auto"
 
 
 class Pick(Asked):

@@ -19,7 +19,7 @@ from hilsplat.configuration import SECTIONS, RunSettings, StageSettings, parse_r
 from hilsplat.datasets.sources import unlisted
 from hilsplat.methods.registry import METHODS, OURS, require_method
 from hilsplat.models.digests import model_digest
-from hilsplat.models.store import model_path, read_model
+from hilsplat.models.store import AUTO, model_path, read_model
 from hilsplat.scene.finished import KEY_VIEWS
 from hilsplat.scene.sheet import (
     DEFAULT_SHEET,
@@ -167,6 +167,11 @@ class Plan:
     ) -> Callable[[Any], str]:
         """Parameter: digest of a stage's code, with the readers or the baseline that a job uses."""
         return lambda job: stage_code(stage(job) if callable(stage) else stage, plugins(job))
+
+    def vocabulary(self, job: Job) -> list[str]:
+        """Input of names: the user's own vocabulary."""
+        named = self.stages(job).query.vocabulary
+        return [] if named == AUTO else [named]
 
     def model(self, section: str) -> Callable[[Job], str]:
         """Parameter: digest of the model folder that a stage reads, or "none"."""

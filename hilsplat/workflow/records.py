@@ -97,6 +97,8 @@ def expected_artifacts(plan: Plan) -> dict[str, Expected]:
                 else:
                     add(stage, stage, job, seed=seed if stage == "autoencoder" else None)
             add("scores.csv", "evaluate", own, plugins=readers)
+        words = {name: plan.values(name, scene) for name in ("query", "evaluate")}
+        found[plan.path(scene, "default/names")] = Expected("names", words)
         drawn = {name: plan.values(name, scene) for name in ("figures", "evaluate")}
         figures = f"{plan.run.results}/figures/{row.name}"
         found[f"{figures}/panel.png"] = Expected("figures", drawn, None, readers)

@@ -15,6 +15,7 @@ STAGES: dict[str, str] = {
     "coverage_tree": "hilsplat.segment.coverage_stage:run_coverage_tree",
     "clip": "hilsplat.embed.stage:run_clip",
     "langsplat": "hilsplat.embed.langsplat_files",
+    "names": "hilsplat.query.node_names:run_names",
     "contributions": "hilsplat.contributions.stage:run_contributions",
     "semantic_tree": "hilsplat.semantic_tree.tree:run_semantic_tree",
     "feature_tree": "hilsplat.methods.feature_tree:run_feature_tree",

@@ -116,11 +116,12 @@ def summary(plan: Plan) -> list[str]:
 
 
 def figures(plan: Plan) -> list[str]:
-    """The panel of every scene, masks against the truth if it is known, and a comparison of methods for
-    the scenes of the sweeps."""
+    """The panel of every scene and the names of its nodes, masks against the truth if it is known, and a
+    comparison of methods for the scenes of the sweeps."""
     found = []
     for row in plan.scenes:
         compared = not plan.run.sweep_scenes or row.scene in plan.run.sweep_scenes
         pictures = ["panel", *(["masks"] if row.world else []), *(["comparison"] if compared else [])]
         found += [f"{plan.run.results}/figures/{row.name}/{picture}.png" for picture in pictures]
+        found.append(plan.path(row, "default/names"))
     return found

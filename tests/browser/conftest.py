@@ -118,7 +118,7 @@ def opened(browser) -> Iterator[Callable]:
 
     def open_page(address: str, painter: str = "gl", fragment: str = "", **more):
         viewport = {"width": WIDTH, "height": HEIGHT}
-        context = browser.new_context(viewport=viewport, reduced_motion="reduce", **more)
+        context = browser.new_context(**{"viewport": viewport, "reduced_motion": "reduce", **more})
         contexts.append(context)
         page = context.new_page()
         page.set_default_timeout(60_000)

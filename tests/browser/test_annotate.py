@@ -239,9 +239,59 @@ def test_files_are_exported_and_imported_again(page, root, tmp_path):
     saved(page)
     assert kept(root) == []
     page.get_by_label("Files to import").set_input_files(file)
-    page.get_by_text("Imported into 1 photograph.").wait_for()
+    page.get_by_text("1 label imported into 1 photograph.").wait_for()
     saved(page)
     np.testing.assert_array_equal(kept(root)[0].mask(SIZE), before)
+    page.get_by_label("Files to import").set_input_files(file)
+    page.get_by_text("0 labels imported into 0 photographs; here already: 1.").wait_for()
+    assert items(page).count() == 1
+
+
+def test_a_refused_change_goes_and_takes_only_what_came_after_it_along(page, opened, root):
+    opened.expected.append("422")
+    draw_mug(page)
+    first = kept(root)
+    held, free = [], []
+    page.route("**/api/labels/**", lambda route: route.continue_() if free else held.append(route))
+    outside = {"id": 9, "level": 2, "parent": 1, "text": "lid", "polygons": [[[30, 2], [36, 2], [36, 9]]]}
+    later = {"id": 10, "level": 1, "parent": None, "text": "book", "polygons": [[[22, 2], [36, 2], [36, 20]]]}
+    for label in (outside, later):  # two quick changes
+        page.evaluate("(label) => hilsplat.store.change([[0, [...hilsplat.store.labels(0), label]]])", label)
+    page.wait_for_timeout(300)
+    free.append(True)
+    for route in held:
+        route.continue_()
+    page.get_by_text("lies wholly outside").wait_for()
+    saved(page)
+    assert kept(root) == first
+    assert [item.get_attribute("aria-label") for item in items(page).all()] == ["mug, whole"]
+    page.locator("#view").press("Control+z")  # the mug, as before
+    saved(page)
+    assert kept(root) == [] and items(page).count() == 0
+
+
+def test_what_can_be_undone_outlives_a_reload(page, root):
+    draw_mug(page)
+    page.reload()
+    page.locator("body[data-ready=yes]").wait_for()
+    assert items(page).count() == 1
+    page.locator("#view").press("Control+z")
+    saved(page)
+    assert kept(root) == []
+    page.locator("#view").press("Control+y")
+    saved(page)
+    assert [label.text for label in kept(root)] == ["mug"]
+
+
+def test_a_subpart_proposed_under_a_whole_says_that_it_is_part_of_nothing(page, root):
+    draw_mug(page)
+    page.locator("#view").press("x")
+    page.mouse.click(*place(page, 6, 6))
+    offers = page.get_by_role("region", name="Proposals at this pixel").get_by_role("button")
+    offers.get_by_text("subpart").first.click()
+    page.get_by_text("as part of nothing: a subpart needs a part above it, and mug is a whole").wait_for()
+    saved(page)
+    assert [label.parent for label in kept(root)] == [None, None]
 
 
 def test_a_telephone_has_everything_within_its_width(page):

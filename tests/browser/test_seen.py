@@ -83,7 +83,7 @@ def test_a_caution_about_words_is_not_told_of_names_and_likeness(opened, desk_ad
 
 
 def test_the_present_photograph_is_marked_also_where_it_shows_the_answer(opened, desk_address, scene):
-    page = opened(desk_address, "server")
+    page = opened(desk_address, "server", color_scheme="dark")
     page.locator("#view").focus()
     ask(page, "mug > handle")
     answers(page).first.wait_for()

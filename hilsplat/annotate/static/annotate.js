@@ -1,7 +1,7 @@
 // The annotation page: which photograph, tool and thing; the server computes every region.
 
 import { ask, exportUrl, scene as described, watch } from "./api.js";
-import { $, make } from "./elements.js";
+import { $, counted, LEVELS, make } from "./elements.js";
 import { attachHands } from "./hands.js";
 import { Sheet } from "./sheet.js";
 import { Store } from "./store.js";
@@ -134,7 +134,8 @@ function take(each) {
   const above = own(), parent = above?.level === each.level - 1 ? above.id : null;
   drop();
   add({ text: each.text || next.text || UNNAMED, level: each.level, parent, polygons: each.polygons, origin: "proposed" });
-  tell("Proposed: accept (A), correct or delete it.");
+  const orphan = above && above.level < each.level && !parent;
+  tell(orphan ? `Proposed, as part of nothing: a ${LEVEL(each)} needs a ${LEVELS[each.level - 2]} above it, and ${above.text} is a ${LEVEL(above)}.` : "Proposed: accept (A), correct or delete it.");
 }
 
 async function carry() {
@@ -192,16 +193,12 @@ function fresh(child = false) {
 }
 
 async function take_in(files) {
-  const after = new Map();
-  for (const file of files) {
-    for (const [key, found] of Object.entries(await ask("/api/import", { name: file.name, text: await file.text() }))) {
-      const view = Number(key), shown = after.get(view) ?? store.labels(view), taken = new Set(shown.map((label) => label.id));
-      const free = Math.max(0, ...store.things.keys(), ...taken, ...found.map((label) => label.id)), clash = found.some((label) => taken.has(label.id)) ? free : 0;
-      after.set(view, [...shown, ...found.map((label) => ({ ...label, id: label.id + clash, parent: label.parent && label.parent + clash }))]);
-    }
-  }
-  store.change([...after]);
-  tell(`Imported into ${after.size} photograph${after.size === 1 ? "" : "s"}.`);
+  await store.saving;   // the server compares with what it has
+  const given = await Promise.all(files.map(async (file) => ({ name: file.name, text: await file.text() })));
+  const { views, added, known } = await ask("/api/import", { files: given });
+  const after = Object.entries(views).map(([number, labels]) => [Number(number), labels]);
+  if (after.length) store.change(after);
+  tell(`${counted(added, "label")} imported into ${counted(after.length, "photograph")}${known ? `; here already: ${known}` : ""}.`);
 }
 
 // -- hands -----------------------------------------------------------------------------------------
@@ -247,7 +244,7 @@ document.addEventListener("keydown", (event) => {
   const typing = event.target.closest("input:not([type=radio]):not([type=range]), select");
   if (typing) { if (event.key === "Enter" && event.target.id === "text") { event.target.blur(); $("view").focus(); event.preventDefault(); } return; }
   const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-  if ((event.ctrlKey || event.metaKey) && key === "z") { step(event.shiftKey ? "redo" : "undo"); event.preventDefault(); return; }
+  if ((event.ctrlKey || event.metaKey) && (key === "z" || key === "y")) { step(key === "y" || event.shiftKey ? "redo" : "undo"); event.preventDefault(); return; }
   if (event.ctrlKey || event.metaKey || event.altKey) return;
   const arrow = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[key], onView = event.target === $("view") || event.target === document.body;
   const by = event.shiftKey ? 10 : 1;
@@ -280,6 +277,7 @@ for (const [id, work] of Object.entries({ new: () => fresh(), child: () => fresh
   carry: () => soon(carry), reload: () => location.reload(), import: () => $("file").click(), "help-button": () => $("help").showModal() })) $(id).addEventListener("click", work);
 $("file").addEventListener("change", () => { const files = [...$("file").files]; $("file").value = ""; $("save").open = false; soon(() => take_in(files)); });
 $("radius").addEventListener("input", draw);
+window.addEventListener("pagehide", () => { if (store.views) store.remember(scene.folder); });
 window.addEventListener("beforeunload", (event) => { if (store.unsaved) event.preventDefault(); });
 
 async function begin() {
@@ -291,6 +289,7 @@ async function begin() {
   $("about").textContent = `${scene.name}${scene.proposes ? `. Proposals: ${scene.proposes}` : ""}${scene.carries ? ", and what other photographs have" : ""}.`;
   makeStrip(scene.views, stand);
   await store.load();
+  store.recall(scene.folder);
   const first = store.views.findIndex((view) => view.labels.length);
   stand(Number(start.get("view") ?? Math.max(0, first)) || 0);
   setTool("choose");

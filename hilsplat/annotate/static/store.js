@@ -18,6 +18,28 @@ export class Store {
     this.handlers.changed();
   }
 
+  // What can be undone outlives a reload, as long as nobody else has changed the annotations since.
+  get versions() { return this.views.map((view) => view.version).join(); }
+
+  remember(key) {
+    const steps = (entries) => entries.map(({ before }) => before);
+    for (let kept = this.past; ; kept = kept.slice(Math.ceil(kept.length / 2))) {
+      try {
+        sessionStorage.setItem(key, JSON.stringify({ versions: this.versions, past: steps(kept), future: steps(this.future) }));
+        return;
+      } catch { if (!kept.length) { sessionStorage.removeItem(key); return; } }   // too much to keep: the latest half
+    }
+  }
+
+  recall(key) {
+    const kept = JSON.parse(sessionStorage.getItem(key) ?? "null");
+    if (kept?.versions !== this.versions) return;
+    const entries = (steps) => steps.map((before) => ({ before, unsaved: new Set() }));
+    this.past = entries(kept.past);
+    this.future = entries(kept.future);
+    this.handlers.changed();
+  }
+
   labels(number) { return this.views[number].labels; }
   has(number, id) { return this.labels(number).some((label) => label.id === id); }
 
@@ -36,13 +58,14 @@ export class Store {
 
   undo() { this.step(this.past, this.future); }
   redo() { this.step(this.future, this.past); }
-  step(from, to) { if (from.length) to.push(this.swap(from.pop())); }
+  step(from, to) { if (from.length) to.push(this.swap(from.pop().before)); }
 
+  // An entry of the history: what was there before, and photographs whose change the server has not accepted yet.
   swap(after) {
     const before = after.map(([number]) => [number, this.labels(number)]);
     for (const [number, labels] of after) { this.views[number].labels = labels; this.save(number); }
     this.handlers.changed();
-    return before;
+    return { before, unsaved: new Set(after.map(([number]) => number)) };
   }
 
   save(number) {
@@ -51,16 +74,28 @@ export class Store {
   }
 
   async put(number) {
-    const view = this.views[number], sent = view.labels;
+    await null;   // until the change that this saves is in the history
+    const view = this.views[number], sent = view.labels, entries = [...this.past, ...this.future];
     try {
       const kept = await api.save(number, sent, view.version);
       view.version = kept.version;
       if (view.labels === sent) view.labels = kept.labels;   // cut to their parents
+      for (const entry of entries) entry.unsaved.delete(number);
     } catch (error) {
       this.handlers.told(error.message, true);
-      if (error.status === 422 && view.labels === sent && this.past.length) {   // it makes no sense: take it back
-        for (const [other, labels] of this.past.pop()) { this.views[other].labels = labels; if (other !== number) this.save(other); }
-      } else if (error.status === 412) await this.load();
+      if (error.status === 422) this.takeBack(number);
+      else if (error.status === 412) await this.load();
     }
+  }
+
+  // The server refused a change: it goes, with what was changed after it.
+  takeBack(number) {
+    const first = this.past.findIndex((entry) => entry.unsaved.has(number));
+    if (first < 0) return;
+    const refused = this.past.splice(first), touched = new Set();
+    this.future = [];
+    for (const { before } of refused.reverse()) for (const [other, labels] of before) { this.views[other].labels = labels; touched.add(other); }
+    touched.delete(number);   // the server has what it had
+    for (const other of touched) this.save(other);
   }
 }

@@ -2,6 +2,7 @@
 
 import * as api from "./api.js";
 import { $, counted, make, nameOf } from "./elements.js";
+import { picture } from "./pictures.js";
 import { shownHits } from "./styles.js";
 
 export function showAnswers(outline, answer, { choose, hover }) {
@@ -12,8 +13,8 @@ export function showAnswers(outline, answer, { choose, hover }) {
   $("caution").textContent = caution;
   list.replaceChildren(...(answer?.hits ?? []).map((hit, rank) => make("li", { "data-node": hit.node },
     make("button", { type: "button", onclick: () => choose(hit.node), onpointerenter: () => hover(hit.node), onpointerleave: () => hover(-1), onfocus: () => hover(hit.node), onblur: () => hover(-1) },
-      make("img", { src: api.cropUrl(outline.variant, hit.node), alt: "", width: 44, height: 44 }),
-      make("span", { class: "name" }, nameOf(outline, hit.node), make("small", {}, `${rank + 1}. ${hit.level}`)),
+      picture(api.cropUrl(outline.variant, hit.node), { width: 48, height: 48 }),
+      make("span", { class: "name" }, hit.name || nameOf(outline, hit.node), make("small", {}, `${rank + 1}. ${hit.level}`)),
       bar(hit.score)))));
 }
 

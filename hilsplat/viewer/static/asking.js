@@ -21,12 +21,18 @@ async function askAll(what, work) {
       if (!outlines.has(variantOf(pane))) continue;
       const answer = await work(pane, signal);
       if (signal.aborted) return;
-      Object.assign(pane, { answer, field: false });
+      Object.assign(pane, { answer, field: null });
       if (!k) answered(what, answer);
     }
-    await fillField(signal);
-    restyle();
-  } catch (error) { failed(error); }
+  } catch (error) { refused(error); return; }
+  await fillField(signal);
+}
+
+// What was listed and painted before would be taken for the answer.
+function refused(error) {
+  if (error.name === "AbortError") return;
+  showNothing();
+  failed(error);
 }
 
 function answered(what, answer) {
@@ -39,12 +45,15 @@ function answered(what, answer) {
 }
 
 export async function fillField(signal) {
-  if ($("colour").value !== "field" || !page.asked?.text) return;
-  for (const pane of panes) {
-    if (pane.field || !pane.answer) continue;
-    const bytes = new Uint8Array(await api.field({ variant: variantOf(pane), text: page.asked.text.split(">").at(-1).trim(), level: level() }, signal));
-    page.painter.loadValues(variantOf(pane), bytes);
-    pane.field = true;
+  if ($("colour").value === "field" && page.asked?.text) {
+    const field = { text: page.asked.text.split(">").at(-1).trim(), level: level() };
+    try {
+      for (const pane of panes) {
+        if (pane.field || !pane.answer) continue;
+        await page.painter.loadField(variantOf(pane), field, signal);
+        pane.field = field;
+      }
+    } catch (error) { failed(error); }
   }
   restyle();
 }
@@ -58,7 +67,7 @@ export async function ask(keepChoice = false) {
     return;
   }
   const view = $("here").checked ? page.camera.view : -1;
-  if ($("here").checked && view < 0) { tell("Stand at a photograph first: choose one below.", true); return; }
+  if ($("here").checked && view < 0) { refused(new Error("Stand at a photograph first: choose one below.")); return; }
   if (!keepChoice && page.chosen >= 0) choose(-1);   // nothing to take back: nothing to draw before the answer
   await askAll({ text }, (pane, signal) => api.query({ variant: variantOf(pane), text, level: level(), answerer: answererOf(pane), ...(view >= 0 ? { view } : {}) }, signal));
 }
@@ -107,10 +116,14 @@ export async function framed(from, to, done) {
 
 export function clearAnswer() {
   aborting.abort();
-  page.asked = null;
-  for (const pane of panes) Object.assign(pane, { answer: null, field: false });
   $("text").value = "";
   tell("");
+  showNothing();
+}
+
+function showNothing() {
+  page.asked = null;
+  for (const pane of panes) Object.assign(pane, { answer: null, field: null });
   showAnswers(main(), null, {});
   page.outline.answered([]);
   restyle();

@@ -12,14 +12,16 @@ export function turned(v, k, angle) {
   return [v[0] * c + x[0] * s + k[0] * d, v[1] * c + x[1] * s + k[1] * d, v[2] * c + x[2] * s + k[2] * d];
 }
 
+const FARTHEST = 20;   // times the mean distance of the photographs: what is seen is a few pixels then
+
 export class Camera {
   constructor(scene) {
     this.up = scene.up;
     this.reach = scene.reach;
     this.focus = scene.focus;
     this.view = 0;        // number of the photograph that it stands at, or -1
-    const first = Math.max(0, scene.views.findIndex((view) => view.split === "train"));
-    this.standAt(scene.views[first], first);
+    this.first = Math.max(0, scene.views.findIndex((view) => view.split === "train"));
+    this.standAt(scene.views[this.first], this.first);
   }
 
   // Stand where a photograph was taken, with its lens.
@@ -54,7 +56,7 @@ export class Camera {
 
   zoom(factor) {
     const away = add(this.c, this.target, -1), far = norm(away) * factor;
-    this.c = add(this.target, unit(away), Math.max(far, 1e-3 * this.reach));
+    this.c = add(this.target, unit(away), Math.min(Math.max(far, 1e-3 * this.reach), FARTHEST * this.reach));
     this.view = -1;
   }
 

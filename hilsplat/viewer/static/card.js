@@ -1,7 +1,8 @@
 // The chosen node: its picture, name, what it is part of and made of, and what can be done with it.
 
 import * as api from "./api.js";
-import { $, counted, LEVELS, make, nameOf } from "./elements.js";
+import { $, counted, inOrder, LEVELS, make, nameOf } from "./elements.js";
+import { picture } from "./pictures.js";
 
 export function parents(outline, node) {
   const above = [];
@@ -9,8 +10,7 @@ export function parents(outline, node) {
   return above;
 }
 
-export const children = (outline, node) => outline.nodes.map((_, row) => row).filter((row) => outline.nodes[row].parent === node)
-  .sort((a, b) => outline.nodes[b].gaussians - outline.nodes[a].gaussians);
+export const children = (outline, node) => outline.nodes.map((_, row) => row).filter((row) => outline.nodes[row].parent === node).sort(inOrder(outline));
 
 export function showCard(outline, node, unit, { choose, fly, like, name, hover }) {
   const card = $("card");
@@ -24,14 +24,14 @@ export function showCard(outline, node, unit, { choose, fly, like, name, hover }
   const fact = (term, text) => make("div", {}, make("dt", {}, term), make("dd", {}, text));
   card.replaceChildren(
     make("div", { class: "top" },
-      make("img", { src: api.cropUrl(outline.variant, node), alt: `${nameOf(outline, node)} in a photograph`, width: 96, height: 96 }),
+      picture(api.cropUrl(outline.variant, node), { alt: `${nameOf(outline, node)} in a photograph`, width: 96, height: 96 }),
       make("div", {},
         above.length ? make("nav", { "aria-label": "Part of" }, ...above.flatMap((row) => [go(row), " › "])) : null,
         input,
         make("dl", {}, fact(LEVELS[own.level], `· node ${node}`), fact("seen in", counted(own.views, "photograph")),
           fact("Gaussians", own.gaussians.toLocaleString("en")), fact("size", `${own.size.map((v) => v.toPrecision(2)).join(" × ")}${unit}`)))),
     below.length ? make("div", { class: "kids", role: "group", "aria-label": "Made of" }, ...below.map((row) => make("button", { type: "button", title: nameOf(outline, row), onclick: () => choose(row), onpointerenter: () => hover(row), onpointerleave: () => hover(-1) },
-      make("img", { src: api.cropUrl(outline.variant, row), alt: "", loading: "lazy" }), make("span", {}, outline.nodes[row].name || `${row}`)))) : "",
+      picture(api.cropUrl(outline.variant, row), { width: 56, height: 56 }), make("span", {}, nameOf(outline, row))))) : "",
     make("div", { class: "actions" },
       api.offline ? null : make("button", { type: "button", onclick: () => like(node) }, "More like this"),
       make("button", { type: "button", onclick: () => fly() }, "Fly there"),

@@ -77,6 +77,7 @@ async function rename(node, name) {
       each.version = kept.version;
       each.nodes.forEach((entry, row) => { entry.name = kept.names[row] ?? ""; });
     }
+    for (const pane of panes) for (const hit of pane.answer?.hits ?? []) if (hit.node === node) hit.name = name;
     page.outline.renamed(node);
     tell(name ? `Named “${name}”. Ask for it, here or with hilsplat query.` : "The name is taken away.");
     choose(node);   // after the words, which take room from the outline

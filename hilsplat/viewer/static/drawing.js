@@ -16,7 +16,7 @@ export function currentStyles() {
   if (!styles.length) {
     styles = panes.map((pane, k) => {
       const own = !k || variantOf(pane) === variantOf(panes[0]);
-      return styleOf({ outline: outlines.get(variantOf(pane)), answer: pane.answer, colour: $("colour").value, mode: $("mode").value, hasField: pane.field,
+      return styleOf({ outline: outlines.get(variantOf(pane)), answer: pane.answer, colour: $("colour").value, mode: $("mode").value, field: pane.field,
         level: levelIndex(pane.answer), chosen: own ? page.chosen : -1, hover: own ? page.hover : -1 });
     });
   }
@@ -48,7 +48,7 @@ function boxes(pane, k) {
   const own = outlines.get(variantOf(pane));
   if (!own || $("colour").value === "none") return [];
   const found = shownHits(pane.answer)
-    .map((hit) => ({ node: hit.node, kind: "answer", label: `${own.nodes[hit.node].name || ""} ${hit.score.toFixed(2)}`.trim() }));
+    .map((hit) => ({ node: hit.node, kind: "answer", label: `${hit.name} ${hit.score.toFixed(2)}`.trim() }));
   if (!k || variantOf(pane) === variantOf(panes[0])) {
     if (page.chosen >= 0) found.push({ node: page.chosen, kind: "chosen", label: nameOf(own, page.chosen) });
     if (page.hover >= 0 && page.hover !== page.chosen) found.push({ node: page.hover, kind: "hover", label: nameOf(own, page.hover) });
@@ -68,15 +68,19 @@ export function drawn() {
   remember();
 }
 
-let remembering = 0;
+// A new query is a step of the browser's history, so Back goes to the one before.
+let remembering = 0, remembered = null;
+export const rememberedAs = (text) => { remembered = text; };
 function remember() {
   clearTimeout(remembering);
   remembering = setTimeout(() => {
+    const text = page.asked?.text ?? "", isNew = remembered !== null && text && text !== remembered;
+    remembered = text || remembered || "";
     const link = new URLSearchParams({ c: page.camera.toText() });
     const put = (key, value, usual) => { if (value && value !== usual) link.set(key, value); };
     put("q", page.asked?.text); put("level", level(), "auto"); put("by", panes[0].by, `${page.scene.variants[0]}|tree`); put("beside", panes[1]?.by);
     put("node", page.chosen >= 0 ? `${page.chosen}.${main().tree}` : ""); put("colour", $("colour").value, "answers"); put("mode", $("mode").value, "tint");
-    history.replaceState(null, "", `${location.pathname}${api.offline ? location.search : keptSearch()}#${link}`);
+    history[isNew ? "pushState" : "replaceState"](null, "", `${location.pathname}${api.offline ? location.search : keptSearch()}#${link}`);
   }, 400);
 }
 const keptSearch = () => options.get("painter") ? `?painter=${options.get("painter")}` : "";

@@ -15,4 +15,11 @@ export function make(tag, attributes = {}, ...children) {
 
 export const counted = (count, noun) => `${count.toLocaleString("en")} ${noun}${count === 1 ? "" : "s"}`;
 export const LEVELS = ["whole", "part", "subpart"];
-export const nameOf = (outline, node) => outline.nodes[node].name || `${LEVELS[outline.nodes[node].level]} ${node}`;
+// The name that a person gave, else what the vocabulary calls it; "?" where nothing of it fits.
+export function nameOf(outline, node) {
+  const { name, called, level } = outline.nodes[node], numbered = `${LEVELS[level]} ${node}`;
+  return name || (called === "?" ? `? (${numbered})` : called || numbered);
+}
+
+// Things before surfaces, large before small.
+export const inOrder = (outline) => (a, b) => outline.nodes[a].surface - outline.nodes[b].surface || outline.nodes[b].gaussians - outline.nodes[a].gaussians;

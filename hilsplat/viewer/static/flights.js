@@ -1,6 +1,6 @@
 // Where the camera goes: to a photograph, to a node, in a short flight where the painter keeps up.
 
-import { redraw } from "./drawing.js";
+import { redraw, restyle } from "./drawing.js";
 import { main, page } from "./state.js";
 
 const calm = matchMedia("(prefers-reduced-motion: reduce)");
@@ -39,6 +39,8 @@ export function stand(number) {
 export const flyTo = (node) => {
   if (node < 0 || !main()) return;
   const { corners, size } = main().nodes[node], middle = [0, 1, 2].map((axis) => corners.reduce((sum, corner) => sum + corner[axis], 0) / corners.length);
+  page.hover = -1;   // the pointer is over something else when it arrives
+  restyle();
   goTo(page.camera.lookingAt(middle, Math.hypot(...size)));
 };
 

@@ -5,7 +5,7 @@ import { ask, askPicture, clear, clearAnswer, fillField, framed, like } from "./
 import { children } from "./card.js";
 import { choose, pointed, tapped } from "./choosing.js";
 import { attach } from "./controls.js";
-import { currentStyles, painted, redraw, restyle } from "./drawing.js";
+import { currentStyles, painted, redraw, rememberedAs, restyle } from "./drawing.js";
 import { $, counted, nameOf } from "./elements.js";
 import { flyTo, nearestView, setMoving, stand, step, touched } from "./flights.js";
 import { attachKeys } from "./keyboard.js";
@@ -24,7 +24,7 @@ export function attachHands() {
 
   attachKeys({
     ask: () => { $("text").focus(); $("text").select(); },
-    clear, step, help: () => $("help").showModal(),
+    clear, step, home: () => stand(page.camera.first), help: () => $("help").showModal(),
     zoom: (factor) => nudge(() => page.camera.zoom(factor)), orbit: (x, y) => nudge(() => page.camera.orbit(0.1 * x, 0.1 * y)),
     move: (x, y, z) => nudge(() => page.camera.move(0.06 * x, 0.06 * y, 0.06 * z)),
     photo: () => $("blend").click(), fly: () => flyTo(page.chosen), like: () => like(page.chosen), level: setLevel,
@@ -39,7 +39,7 @@ export function attachHands() {
   for (const radio of document.querySelectorAll("[name=level]")) radio.addEventListener("change", levelChanged);
   for (const id of ["left", "right"]) $(id).addEventListener("change", choosePanes);
   $("mode").addEventListener("change", restyle);
-  $("colour").addEventListener("change", async () => { try { await fillField(); } catch (error) { failed(error); } restyle(); });
+  $("colour").addEventListener("change", () => fillField());
   $("blend").addEventListener("click", () => { if (page.camera.view < 0) stand(nearestView()); page.photos.cycle(); redraw(); });
   $("reload").addEventListener("click", () => location.reload());
   $("help-button").addEventListener("click", () => $("help").showModal());
@@ -49,6 +49,14 @@ export function attachHands() {
   host.addEventListener("dragover", (event) => event.preventDefault());
   host.addEventListener("drop", (event) => { event.preventDefault(); const file = event.dataTransfer.files[0]; if (file?.type.startsWith("image/")) askPicture(file); });
   new ResizeObserver(redraw).observe(host);
+  window.addEventListener("popstate", () => {   // Back and Forward: the query of that time
+    const kept = new URLSearchParams(location.hash.slice(1)), text = kept.get("q") ?? "";
+    clearAnswer();
+    rememberedAs(text);
+    document.querySelector(`[name=level][value=${CSS.escape(kept.get("level") ?? "auto")}]`)?.click();
+    $("text").value = text;
+    if (text) ask();
+  });
 
   const selected = () => page.chosen >= 0 ? [page.chosen] : (panes[0].answer?.hits ?? []).map((hit) => hit.node);
   $("save").addEventListener("toggle", () => {

@@ -1,24 +1,66 @@
 // Keys. None acts while somebody types, and none takes a key that the browser or a control needs.
 
+const STEPS_PER_MS = 0.012, EASE_MS = 70;
+const ORBITS = { ArrowLeft: [-1, 0, 0], ArrowRight: [1, 0, 0], ArrowUp: [0, 1, 0], ArrowDown: [0, -1, 0] };
+const MOVES = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, 1, 0], e: [0, -1, 0] };
+const calm = matchMedia("(prefers-reduced-motion: reduce)");
+
+// A key that is held down moves evenly: it adds steps as time goes by, and each frame takes a share of what is left.
+class Glide {
+  held = new Map();
+  left = { move: [0, 0, 0], orbit: [0, 0, 0] };
+  running = false;
+
+  constructor(act) { this.act = act; }
+
+  press(key, kind, step) {
+    this.held.set(key, [kind, step]);
+    this.add(kind, step, 1);
+    if (this.running) return;
+    this.running = true;
+    this.last = performance.now();
+    requestAnimationFrame((now) => this.frame(now));
+  }
+
+  add(kind, step, by) { this.left[kind] = this.left[kind].map((value, axis) => value + by * step[axis]); }
+
+  frame(now) {
+    const passed = Math.min(Math.max(now - this.last, 0), 100), share = calm.matches ? 1 : 1 - Math.exp(-passed / EASE_MS);
+    this.last = now;
+    for (const [kind, step] of this.held.values()) this.add(kind, step, passed * STEPS_PER_MS);
+    let still = !this.held.size;
+    for (const kind of ["move", "orbit"]) {
+      if (Math.hypot(...this.left[kind]) < 1e-3) continue;
+      still = false;
+      this.act[kind](...this.left[kind].map((value) => share * value));
+      this.left[kind] = this.left[kind].map((value) => (1 - share) * value);
+    }
+    this.running = !still;
+    if (!still) requestAnimationFrame((next) => this.frame(next));
+  }
+}
+
 export function attachKeys(act) {
+  const glide = new Glide(act);
+  document.addEventListener("keyup", (event) => glide.held.delete(event.key.toLowerCase()));
+  window.addEventListener("blur", () => glide.held.clear());
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
     const typing = event.target.closest("input:not([type=radio]):not([type=checkbox]), textarea, [contenteditable]");
     if (event.key === "Escape") { act.clear(); return; }
     if (typing) return;
-    const on = (selector) => event.target.closest(selector);
-    const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
-    const moves = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, 1, 0], e: [0, -1, 0] }[event.key.toLowerCase()];
+    const on = (selector) => event.target.closest(selector), letter = event.key.toLowerCase();
     const keys = {
       "/": act.ask, "?": act.help, "[": () => act.step(-1), "]": () => act.step(1), "+": () => act.zoom(0.9), "=": () => act.zoom(0.9), "-": () => act.zoom(1 / 0.9),
       o: act.photo, f: act.fly, m: act.like, n: act.name, g: act.mode, u: act.parent, j: act.child,
       0: () => act.level("auto"), 1: () => act.level("whole"), 2: () => act.level("part"), 3: () => act.level("subpart"),
     };
     if (on("select")) return;
-    if (arrows && !on("#view") && event.target !== document.body) return;   // lists and radios have their own arrows
-    if (arrows) act.orbit(...arrows);
-    else if (moves) act.move(...moves);
-    else if (keys[event.key] ?? keys[event.key.toLowerCase()]) (keys[event.key] ?? keys[event.key.toLowerCase()])();
+    const free = on("#view") || event.target === document.body;   // lists and radios have their own arrows, and Home
+    if ((ORBITS[event.key] || event.key === "Home") && !free) return;
+    if (event.key === "Home") act.home();
+    else if (ORBITS[event.key] || MOVES[letter]) { if (!event.repeat) glide.press(letter, ORBITS[event.key] ? "orbit" : "move", ORBITS[event.key] ?? MOVES[letter]); }
+    else if (keys[event.key] ?? keys[letter]) (keys[event.key] ?? keys[letter])();
     else return;
     event.preventDefault();
   });

@@ -1,7 +1,8 @@
 // The semantic tree as a tree of the page: keys as in the ARIA practices, names and crops, folded when large.
 
 import * as api from "./api.js";
-import { $, counted, LEVELS, make, nameOf } from "./elements.js";
+import { $, counted, inOrder, LEVELS, make, nameOf } from "./elements.js";
+import { picture } from "./pictures.js";
 
 const FOLD_FROM = 200;   // nodes: a larger tree is folded below its wholes
 
@@ -26,7 +27,7 @@ export class Outline {
     this.items.clear();
     const children = new Map();
     outline.nodes.forEach((node, row) => children.set(node.parent, [...(children.get(node.parent) ?? []), row]));
-    for (const rows of children.values()) rows.sort((a, b) => outline.nodes[b].gaussians - outline.nodes[a].gaussians);
+    for (const rows of children.values()) rows.sort(inOrder(outline));
     const folded = outline.nodes.length >= FOLD_FROM;
     const item = (row) => {
       const node = outline.nodes[row], kids = children.get(row) ?? [];
@@ -34,7 +35,7 @@ export class Outline {
         "aria-expanded": kids.length ? String(!folded) : null, "aria-label": `${nameOf(outline, row)}, ${LEVELS[node.level]}` },
       make("div", { class: "row" },
         make("span", { class: "fold", "aria-hidden": "true" }, kids.length ? "▶" : ""),
-        make("img", { src: api.cropUrl(outline.variant, row), alt: "", loading: "lazy", width: 30, height: 30 }),
+        picture(api.cropUrl(outline.variant, row), { width: 48, height: 48 }),
         make("span", { class: "label" }, nameOf(outline, row)),
         make("small", {}, counted(node.views, "view"))));
       if (kids.length) element.append(make("ul", { role: "group" }, ...kids.map(item)));

@@ -2,6 +2,7 @@
 
 import * as api from "./api.js";
 import { $, make } from "./elements.js";
+import { picture } from "./pictures.js";
 
 export class Photos {
   constructor(views, stand) {
@@ -9,7 +10,7 @@ export class Photos {
     this.views = views;
     $("views").replaceChildren(...views.map((view, number) => make("button", { type: "button", role: "option", "aria-selected": "false", tabindex: number ? "-1" : "0",
       "aria-label": `${view.name}${view.split === "test" ? ", held out" : ""}`, title: view.name, class: view.split, onclick: () => stand(number) },
-    make("img", { src: api.thumbUrl(number), alt: "", loading: "lazy" }))));
+    picture(api.thumbUrl(number), {}))));
     $("views").addEventListener("keydown", (event) => {
       const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
       if (!step) return;

@@ -49,18 +49,21 @@ export class Renderer {
     this.arrays();
   }
 
-  loadNodes(variant, buffer) {
-    const gl = this.gl, values = new Uint16Array(buffer);
+  async loadNodes(variant) { this.putNodes(variant, new Uint16Array(await api.nodes(variant))); }
+
+  putNodes(variant, values) {
+    const gl = this.gl;
     this.nodeTextures.set(variant, this.texture(gl.RGBA16UI, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT, values, this.count, 4));
     (this.nodeValues ??= new Map()).set(variant, values);
   }
 
-  // Relevancy of each Gaussian, in the spare channel.
-  loadValues(variant, bytes) {
+  // The field's relevancy of each Gaussian, in the spare channel.
+  async loadField(variant, { text, level }, signal) {
+    const bytes = new Uint8Array(await api.field({ variant, text, level }, signal));
     const values = this.nodeValues.get(variant);
     for (let i = 0; i < bytes.length; i++) values[4 * i + 3] = bytes[i];
     this.gl.deleteTexture(this.nodeTextures.get(variant));
-    this.loadNodes(variant, values.buffer);
+    this.putNodes(variant, values);
   }
 
   link(vertexText, fragmentText) {

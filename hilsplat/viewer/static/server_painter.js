@@ -4,6 +4,10 @@ import * as api from "./api.js";
 import { latest } from "./latest.js";
 import { wireStyle } from "./styles.js";
 
+const asked = (camera, pane, [width, height], quality, image) =>
+  ({ variant: pane.variant || "default", camera: camera.wire(width, height), style: wireStyle(pane.style), quality, image });
+const fetched = async (frame) => createImageBitmap(await api.frame(frame));
+
 export class ServerPainter {
   kind = "server";
   lastMs = 0;
@@ -13,15 +17,15 @@ export class ServerPainter {
     host.prepend(this.canvas);
     this.context = this.canvas.getContext("2d");
     this.moving = false;
-    this.drawn = 0; this.asked = 0;
+    this.drawn = 0; this.asked = 0; this.last = "";
     this.request = latest(async (...args) => {
-      try { await this.fetch(...args); onDrawn(); } catch (error) { onError(error); }
+      try { await this.fetch(...args); onDrawn(); } catch (error) { this.last = ""; onError(error); }
     });
   }
 
   async load() {}
-  loadNodes() {}
-  loadValues() {}
+  async loadNodes() {}
+  async loadField() {}   // a frame names the text; the server looks it up
   get settled() { return this.drawn === this.asked; }
 
   resize(width, height) {
@@ -33,27 +37,26 @@ export class ServerPainter {
 
   draw(camera, panes, width, height) {
     this.resize(width, height);
-    this.request(camera.copy(), panes, width, height, this.moving, ++this.asked);
+    const each = Math.floor(width / panes.length), scale = Math.min(this.moving ? 0.5 : 1, 4096 / Math.max(each, height));
+    const size = [Math.max(1, Math.round(each * scale)), Math.max(1, Math.round(height * scale))];
+    const frames = panes.map((pane) => asked(camera, pane, size, this.moving ? 60 : 85, "jpeg"));
+    const key = JSON.stringify([width, height, frames]);
+    if (key === this.last) return;
+    this.last = key;
+    this.request(frames, each, height, ++this.asked);
   }
 
-  async fetch(camera, panes, width, height, moving, number) {
-    const begin = performance.now(), each = Math.floor(width / panes.length);
-    const scale = Math.min(moving ? 0.5 : 1, 4096 / Math.max(each, height));
-    const size = [Math.max(1, Math.round(each * scale)), Math.max(1, Math.round(height * scale))];
-    const pictures = await Promise.all(panes.map((pane) => this.picture(camera, pane, size, moving ? 60 : 85, "jpeg")));
+  async fetch(frames, each, height, number) {
+    const begin = performance.now();
+    const pictures = await Promise.all(frames.map(fetched));
     pictures.forEach((picture, k) => { this.context.drawImage(picture, k * each, 0, each, height); picture.close(); });
     this.lastMs = performance.now() - begin;
     this.drawn = number;
   }
 
-  async picture(camera, pane, [width, height], quality, image) {
-    const blob = await api.frame({ variant: pane.variant || "default", camera: camera.wire(width, height), style: wireStyle(pane.style), quality, image });
-    return createImageBitmap(blob);
-  }
-
   async capture(camera, panes, width, height) {
     const canvas = new OffscreenCanvas(width, height), context = canvas.getContext("2d"), each = Math.floor(width / panes.length);
-    for (const [k, pane] of panes.entries()) context.drawImage(await this.picture(camera, pane, [each, height], 95, "png"), k * each, 0);
+    for (const [k, pane] of panes.entries()) context.drawImage(await fetched(asked(camera, pane, [each, height], 95, "png")), k * each, 0);
     return canvas.convertToBlob({ type: "image/png" });
   }
 }

@@ -8,7 +8,7 @@ export const start = new URLSearchParams(location.hash.slice(1));
 
 export const page = { scene: null, camera: null, painter: null, photos: null, outline: null, chosen: -1, hover: -1, asked: null, waiting: false, moving: false, slow: false };
 export const outlines = new Map();                             // by variant
-export const panes = [{ by: "", answer: null, field: false }]; // one, or two side by side
+export const panes = [{ by: "", answer: null, field: null }]; // one, or two side by side
 
 export const variantOf = (pane) => pane.by.split("|")[0];
 export const answererOf = (pane) => pane.by.split("|")[1] || "tree";
@@ -30,7 +30,6 @@ export function sceneChanged(parts = []) {
 
 export async function loadVariant(name, again = false) {
   if (outlines.has(name) && !again) return;
-  const [described, nodes] = await Promise.all([api.variant(name), again ? null : api.nodes(name)]);
-  if (nodes) page.painter.loadNodes(name, nodes);
+  const [described] = await Promise.all([api.variant(name), again ? null : page.painter.loadNodes(name)]);
   outlines.set(name, described);
 }

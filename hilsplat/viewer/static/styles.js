@@ -27,13 +27,14 @@ export const shownHits = (answer) => answer?.route === "like" ? answer.hits.slic
 
 /*
  * outline: the nodes of a variant; answer: what was found, or null; colour, mode: the choices of the page;
- * level: 0, 1, 2 for what is painted by level; chosen, hover: nodes, or -1.
+ * level: 0, 1, 2 for what is painted by level; chosen, hover: nodes, or -1; field: the {text, level} whose field
+ * relevancy was asked for, or null.
  */
-export function styleOf({ outline, answer, colour, mode, level, chosen, hover, hasField }) {
+export function styleOf({ outline, answer, colour, mode, level, chosen, hover, field }) {
   const nodes = outline?.nodes ?? [], table = new Uint8Array(4 * (nodes.length + 1));
   const set = (node, rgb, a) => { if (node >= 0 && node < nodes.length) table.set([...rgb, Math.round(255 * a)], 4 * (node + 1)); };
   let use = [true, true, true];
-  if (colour === "field" && answer && hasField) return { table, use, mode: "plain", ramp: RAMP };
+  if (colour === "field" && answer && field) return { table, use, mode: "plain", ramp: RAMP, field };
   if (colour === "nodes" || (colour === "relevancy" && answer)) {
     use = [0, 1, 2].map((each) => each === level);
     const own = nodes.map((_, node) => node).filter((node) => nodes[node].level === level);
@@ -67,7 +68,7 @@ const sent = new WeakMap();
 export function wireStyle(style) {
   if (!sent.has(style)) {
     const plain = !style.ramp && style.mode === "plain" && style.table.every((v, k) => k % 4 !== 3 || v === 0);
-    sent.set(style, plain ? {} : { table: base64(style.table), use: style.use, mode: style.mode, ramp: style.ramp ? base64(style.ramp) : "" });
+    sent.set(style, plain ? {} : style.ramp ? { ramp: base64(style.ramp), ...style.field } : { table: base64(style.table), use: style.use, mode: style.mode });
   }
   return sent.get(style);
 }

@@ -25,7 +25,7 @@ export async function useVariants() {
   const known = (by) => page.scene.variants.includes(by?.split("|")[0]) ? by : null;
   panes[0].by = known(start.get("by")) ?? `${page.scene.variants[0]}|tree`;
   const beside = known(start.get("beside"));
-  if (beside && !api.offline) panes[1] = { by: beside, answer: null, field: false };
+  if (beside && !api.offline) panes[1] = { by: beside, answer: null, field: null };
   for (const pane of panes) await loadVariant(variantOf(pane));
   fillVariants();
   showOutline();
@@ -46,9 +46,9 @@ function showOutline() {
 export async function choosePanes() {
   try {
     const left = $("left").value, right = $("right").value, changed = left.split("|")[0] !== variantOf(panes[0]);
-    panes[0] = left === panes[0].by ? panes[0] : { by: left, answer: null, field: false };
+    panes[0] = left === panes[0].by ? panes[0] : { by: left, answer: null, field: null };
     if (!right) panes.length = 1;
-    else if (panes[1]?.by !== right) panes[1] = { by: right, answer: null, field: false };
+    else if (panes[1]?.by !== right) panes[1] = { by: right, answer: null, field: null };
     for (const pane of panes) await loadVariant(variantOf(pane));
     if (changed) { choose(-1); showOutline(); }
     if (page.asked?.text) await ask(true); else restyle();

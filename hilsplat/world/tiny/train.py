@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from hilsplat.base.artifacts import atomic_folder, sha256_of_json
+from hilsplat.base.artifacts import atomic_folder, sha256_of_json, write_text
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.progress import stage_log
 from hilsplat.segment.sam import SamModel
@@ -28,6 +28,7 @@ from hilsplat.world.tiny.render import generator_digest, kind_of_seed, render_tr
 from hilsplat.world.tiny.steps import Budget, Curve
 from hilsplat.world.tiny.train_clip import train_clip
 from hilsplat.world.tiny.train_sam import train_sam
+from hilsplat.world.tiny.vocabulary import world_vocabulary
 
 logger = logging.getLogger(__name__)
 
@@ -206,6 +207,7 @@ def _make_clip(
             "texts_competing": len({phrases[0] for phrases in others.phrase_sets}),
         }
         with atomic_folder(out / "clip-tiny") as temporary:
+            write_text(temporary / "vocabulary.txt", world_vocabulary())
             export_clip(vision, text, tokenizer, temporary)
             write_clip_card(temporary, recipe, curve, metrics)
 

@@ -11,6 +11,7 @@ from pycocotools import mask as coco_masks
 from hilsplat.annotate.exporting import exported
 from hilsplat.annotate.importing import imported, unpacked_counts
 from hilsplat.annotate.labels import Label
+from hilsplat.annotate.merging import merged
 from hilsplat.base.errors import SceneError
 from hilsplat.scene.cameras import Cameras
 
@@ -122,9 +123,84 @@ def test_labelme_rectangles_and_groups(cameras):
             "circle",
         ),
         ('{"shapes": [{"label": "", "points": [[1, 1], [5, 5]]}], "imagePath": "DSC_1"}', "text: "),
+        ('{"shapes": [{"label": "  ", "points": [[1, 1], [5, 5]]}], "imagePath": "DSC_1"}', "text: "),
+        ('{"shapes": [{"label": "a\\u0007", "points": [[1, 1], [5, 5]]}], "imagePath": "DSC_1"}', "text: "),
+        (200_000 * "[" + 200_000 * "]", "nested too deeply"),
+        ('{"shapes": [{"label": "a", "points": [[1, 1e999], [5, 5]]}], "imagePath": "DSC_1"}', "read"),
+        ('{"shapes": [{"label": "a", "points": [[1, NaN], [5, 5]]}], "imagePath": "DSC_1"}', "read"),
+        ('{"shapes": [{"label": "a", "points": [[1, 1]], "group_id": [1]}], "imagePath": "DSC_1"}', "read"),
+        ('{"shapes": [7], "imagePath": "DSC_1"}', "read"),
+        ('{"shapes": [], "imagePath": "DSC_1", "imageHeight": [1], "imageWidth": NaN}', "does not fit"),
+        ('{"annotations": [7], "images": [], "categories": []}', "COCO"),
+        ('{"annotations": [], "images": [], "categories": [{"id": [1], "name": "a"}]}', "COCO"),
+        ('{"objects": [7], "info": {"name": "DSC_1", "width": 40, "height": 30}}', ""),
+        ('{"objects": [], "info": 7}', ""),
         ('{"annotations": [{}], "images": []}', "'categories'"),
     ],
 )
 def test_a_file_that_does_not_fit_says_why(content, message, cameras):
     with pytest.raises(SceneError, match=message):
         imported("file.json", content, cameras)
+
+
+# -- beside what is there -------------------------------------------------------------------------
+
+SIZES = {"DSC_1.png": SIZE, "DSC_2.png": SIZE}
+
+
+def square(left: int, top: int, side: int = 8) -> list[list[tuple[int, int]]]:
+    right, bottom = left + side, top + side
+    return [[(left, top), (right, top), (right, bottom), (left, bottom)]]
+
+
+def labelme(view: str, *things: tuple[str, int, int]) -> str:
+    shapes = [{"label": text, "points": square(x, y)[0]} for text, x, y in things]
+    return json.dumps({"shapes": shapes, "imagePath": view, "imageHeight": SIZE[0], "imageWidth": SIZE[1]})
+
+
+def ids(found, view: str) -> dict[str, int]:
+    return {label.text: label.id for label in found.views[view]}
+
+
+def test_shapes_without_ids_are_one_thing_only_if_their_texts_say_so(cameras):
+    files = [
+        imported("DSC_1.json", labelme("DSC_1.png", ("mug", 2, 2), ("cup", 20, 2)), cameras),
+        imported("DSC_2.json", labelme("DSC_2.png", ("lamp", 2, 2), ("mug", 20, 2)), cameras),
+    ]
+    turtle = Label(id=1, level=1, text="turtle", polygons=square(2, 15))
+    found = merged({"DSC_1.png": [turtle]}, files, SIZES)
+    first, second = ids(found, "DSC_1.png"), ids(found, "DSC_2.png")
+    assert first["turtle"] == 1 and found.added == 4 and found.known == 0
+    assert first["mug"] == second["mug"]
+    assert len({first["turtle"], first["mug"], first["cup"], second["lamp"]}) == 4
+
+
+def test_two_of_a_kind_stay_two(cameras):
+    text = labelme("DSC_1.png", ("mug", 2, 2), ("mug", 20, 2))
+    other = labelme("DSC_2.png", ("mug", 2, 2), ("mug", 20, 2))
+    found = merged({}, [imported("a", text, cameras), imported("b", other, cameras)], SIZES)
+    assert [[label.id for label in found.views[view]] for view in SIZES] == [[1, 2], [1, 2]]
+
+
+@pytest.mark.parametrize("kind", ["hilsplat", "isat", "labelme", "coco"])
+def test_our_own_export_changes_nothing_when_it_comes_in_again(kind, known, cameras):
+    files = [imported(name, text, cameras) for name, text in files_of(exported(kind, known, cameras)).items()]
+    found = merged(known, files, SIZES)
+    assert (found.views, found.added, found.known) == ({}, 0, 4)
+
+
+def test_a_region_that_was_corrected_elsewhere_replaces_the_one_of_the_same_thing(known, cameras):
+    polygons = [[(4, 4), (35, 4), (35, 11), (4, 11)], RING[1]]
+    corrected = known["DSC_1.png"][0].model_copy(update={"polygons": polygons, "id": 77})
+    found = merged(known, [{"DSC_1.png": [corrected]}], SIZES)
+    mug = next(label for label in found.views["DSC_1.png"] if label.id == 3)
+    assert (len(found.views["DSC_1.png"]), found.added, mug.polygons) == (3, 1, corrected.polygons)
+
+
+def test_parts_follow_their_whole_to_its_new_number():
+    lamp = Label(id=1, level=1, text="lamp", polygons=square(2, 2, 20))
+    mug = Label(id=1, level=1, text="mug", polygons=square(2, 2, 20))
+    handle = Label(id=2, level=2, parent=1, text="handle", polygons=square(4, 4))
+    found = merged({"DSC_1.png": [lamp]}, [{"DSC_1.png": [mug, handle]}], SIZES)
+    _, new_mug, new_handle = found.views["DSC_1.png"]
+    assert new_mug.id != 1 and new_handle.parent == new_mug.id

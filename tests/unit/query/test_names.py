@@ -1,5 +1,6 @@
 """Names that a person gave to nodes: kept with the scene, answering texts and paths before CLIP."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -7,10 +8,9 @@ import numpy as np
 import pytest
 
 import hilsplat
-from hilsplat.base.artifacts import read_json, write_json
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.query.answer import answer
-from hilsplat.query.names import FILE, NO_FILE, StaleNamesError, read_names, write_names
+from hilsplat.query.names import FILE, NO_FILE, StaleNamesError, read_names, tree_digest, write_names
 from tests.unit.finished_desk import SCENE, build_finished_desk
 
 
@@ -82,7 +82,7 @@ def test_the_command_answers_by_names_too(desk, tmp_path):
     book = nodes_by_text(hilsplat.open(desk))["book"]
     name_nodes(desk, {book: "atlas"})
     first = next(answer(desk, "atlas", out=tmp_path))
-    assert "1 answer to 'atlas'" in first and "named 'atlas'" in first and "doubtful" not in first
+    assert "1 answer to 'atlas'" in first and "  atlas  " in first and "doubtful" not in first
 
 
 def test_a_change_must_know_the_version_that_it_changes(desk):
@@ -120,11 +120,31 @@ def test_a_node_that_does_not_exist_cannot_be_named(desk):
         name_nodes(desk, {99: "mug"})
 
 
-def test_a_file_of_another_version_is_refused_and_kept(desk):
-    write_json(desk / FILE, {"format": "hilsplat-names-9"})
-    with pytest.raises(ArtifactError, match="another version"):
+FORMAT = "hilsplat-names-1"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"format": "hilsplat-names-9", "trees": {}},
+        {"trees": {}},
+        {"format": FORMAT},
+        {"format": FORMAT, "trees": []},
+        {"format": FORMAT, "trees": {"DIGEST": ["mug"]}},
+        {"format": FORMAT, "trees": {"DIGEST": {"first": "mug"}}},
+        {"format": FORMAT, "trees": {"DIGEST": {"-1": "mug"}}},
+        {"format": FORMAT, "trees": {"DIGEST": {"99999": "mug"}}},
+        {"format": FORMAT, "trees": {"DIGEST": {"0": 7}}},
+        ["mug"],
+        None,
+    ],
+)
+def test_a_damaged_file_is_refused_and_kept(desk, content):
+    text = json.dumps(content).replace("DIGEST", tree_digest(desk / "default/semantic_tree"))
+    (desk / FILE).write_text(text)
+    with pytest.raises(ArtifactError, match=r"names\.json"):
         hilsplat.open(desk)
-    assert read_json(desk / FILE) == {"format": "hilsplat-names-9"}
+    assert (desk / FILE).read_text() == text
     (desk / FILE).unlink()
 
 

@@ -73,7 +73,7 @@ def test_every_region_is_found_at_its_level(scene, name):
     level = Level(int(scene.tree.level[NODE[name]]))
     hits = scene.select((name,), level=level, threshold=0.85)
     assert hits.ids.tolist() == [NODE[name]]
-    assert scene.score(hits.margins[0]) > 0.9
+    assert scene.query(name, level.label)[0].score > 0.9
     assert scene.query(name, level.label)[0].node == NODE[name]
 
 
@@ -141,7 +141,7 @@ def test_what_is_part_of_a_likely_thing_is_ahead(scene):
 
     assert found(0.0).ids[0] == NODE["B corner"]
     assert found(0.2).ids.tolist() == [NODE["A top left"]]
-    assert found(0.2).margins.tolist() == [1.0]  # its own, with nothing added
+    assert found(0.2).values == pytest.approx([1.4])  # its own, and a fifth of its ancestors' mean
     orphans = replace(scene.tree, parent=np.full(7, -1, np.int32))
     assert (ancestor_margins(orphans, margin)[scene.tree.level > 1] == -1.0).all()
 

@@ -141,16 +141,13 @@ def test_margins_are_cosines_and_relevancies_their_logistic():
 
 def test_a_text_that_nothing_answers_is_doubtful(three_mugs):
     (doubt,) = three_mugs.query("unicorn", "whole")[0].doubts
-    # cosine 0 with the text and 0.1 with the nearest phrase, at scale 100: 1 / (1 + exp(10))
+    # cosine 0 with the text and 0.1 with the nearest phrase
     assert (doubt.text, doubt.level) == ("unicorn", None)
-    assert doubt.score == pytest.approx(4.54e-5, rel=1e-2)
-    assert str(doubt) == (
-        "nothing here answers to 'unicorn' better than to a generic word (the best score is 0.00)"
-    )
+    assert str(doubt) == "nothing here answers to 'unicorn' better than to a generic word"
     assert three_mugs.query("mug")[0].doubts == ()
 
 
-def test_the_first_text_of_a_path_is_doubted_though_the_last_is_answered_well(three_mugs):
+def test_the_first_text_of_a_path_is_doubted_though_the_last_is_answered_well():
     tree = tree_of([1, 1, 2], [-1, -1, 0])
     hits = searched(tree, [[-0.1, -0.2, 0.3], [-0.5, -0.5, 0.3]], "unicorn", "head")
     assert (hits.ids.tolist(), hits.route) == ([2], "child")
@@ -159,7 +156,7 @@ def test_the_first_text_of_a_path_is_doubted_though_the_last_is_answered_well(th
         ("head", Level.PART, False),
     ]
     # a part does answer to "unicorn", but it was searched among wholes
-    (doubt,) = doubts_of(three_mugs, hits)
+    (doubt,) = doubts_of(hits)
     assert (doubt.text, doubt.level) == ("unicorn", Level.WHOLE)
     assert str(doubt).startswith("no whole here answers to 'unicorn' better than to a generic word")
 

@@ -84,6 +84,12 @@ def test_no_path_reaches_a_file(client, path):
     assert client.get(path).status_code == 404
 
 
+@pytest.mark.parametrize("start", ["/api/photo/", "/api/thumb/", "/api/crop/default/"])
+def test_a_number_of_thousands_of_digits_is_refused(client, start):
+    assert client.get(start + 5000 * "9").status_code == 414
+    assert client.get(start + 400 * "9").status_code == 422
+
+
 @pytest.mark.parametrize("variant", ["..", "../default", "scene", "%2e%2e", "nothing"])
 def test_a_variant_is_a_name_that_the_folder_lists(client, variant):
     assert client.get(f"/api/nodes/{variant}").status_code in (404, 422)

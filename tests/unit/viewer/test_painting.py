@@ -158,3 +158,26 @@ def test_numbers_that_are_not_finite_are_refused(client, camera):
         headers={"content-type": "application/json"},
     )
     assert sent.status_code == 400
+
+
+def test_a_frame_shows_the_relevancy_to_its_own_text_whatever_another_page_asks(shown, client, camera):
+    ramp = base64.b64encode(np.repeat(np.arange(256, dtype=np.uint8), 3).tobytes()).decode()
+
+    def frame(text: str) -> bytes:
+        style = {"ramp": ramp, "text": text, "level": "whole"}
+        body = {"camera": wire_camera(camera), "image": "png", "style": style}
+        return client.post("/api/frame", json=body).content
+
+    mug, book = frame("mug"), frame("book")
+    assert mug != book
+    client.post("/api/field", json={"text": "book", "level": "whole"})  # another page, of which WebGL paints
+    assert frame("mug") == mug
+    for number in range(12):  # more than are kept
+        client.post("/api/field", json={"text": f"text {number}", "level": "whole"})
+    assert frame("mug") == mug
+
+
+def test_a_ramp_without_a_text_is_refused(client, camera):
+    style = {"ramp": base64.b64encode(bytes(768)).decode()}
+    sent = client.post("/api/frame", json={"camera": wire_camera(camera), "style": style})
+    assert sent.status_code == 400 and "ramp" in sent.json()["error"]

@@ -1,0 +1,275 @@
+"""The stage `names`: what a vocabulary calls each node, and how well words are answered by chance."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from hilsplat.base.artifacts import (
+    INDEX,
+    ViewCache,
+    atomic_folder,
+    read_full_index,
+    read_json,
+    read_npy,
+    remake,
+    sha256_of_file,
+    sha256_of_json,
+    write_index,
+    write_json,
+    write_npy,
+)
+from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.base.progress import stage_log, track
+from hilsplat.embed.clip import ClipModel, open_clip_of
+from hilsplat.query.names import tree_digest
+from hilsplat.query.relevancy import margins
+from hilsplat.semantic_tree.tree import SemanticTree
+from hilsplat.settings import EvaluateSettings, QuerySettings
+
+CANDIDATES = 5
+"""Texts that are kept for each node, best first."""
+
+STANDS_OUT = 3.0
+"""A name's cosine is at least this many standard deviations above the mean cosine of the vocabulary."""
+
+FEWEST_ABSENT = 100
+"""With fewer words for what is absent that the model knows, the whole vocabulary takes their place."""
+
+
+THINGS, PARTS, SURFACES = range(3)
+
+VOCABULARY = "vocabulary.txt"
+"""In a model's folder: what that model knows. In this package: for all others."""
+
+COMMON = Path(str(files("hilsplat.query") / VOCABULARY))
+AUTO = "auto"
+SECTIONS = ("things", "parts", "surfaces", "absent")
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """Texts, each once.
+
+    Attributes:
+        things: names of objects.
+        parts: names of parts; a text such as "car wheel" names the whole too.
+        surfaces: floors, walls and the like, which are listed after the things.
+        absent: words for what is in hardly any scene; empty: none are listed.
+    """
+
+    things: tuple[str, ...]
+    parts: tuple[str, ...] = ()
+    surfaces: tuple[str, ...] = ()
+    absent: tuple[str, ...] = ()
+
+    @staticmethod
+    def read(path: Path) -> "Vocabulary":
+        """Read a text file: texts on lines or between commas, below [things] (the default), [parts], ...
+
+        Raises:
+            SettingsError: it cannot be read, has an unknown section or names nothing.
+        """
+        try:
+            lines = Path(path).read_text(encoding="utf-8").splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            raise SettingsError(
+                f"the vocabulary {path} cannot be read: {error}", expected="a text file in UTF-8"
+            ) from error
+        found: dict[str, dict[str, None]] = {section: {} for section in SECTIONS}
+        section = SECTIONS[0]
+        for number, line in enumerate(lines, 1):
+            text = line.partition("#")[0].strip()
+            if text.startswith("["):
+                section = text.strip("[]").strip().lower()
+                if section not in found:
+                    raise SettingsError(
+                        f"line {number} of the vocabulary {path} has an unknown section",
+                        expected=", ".join(f"[{each}]" for each in SECTIONS),
+                        found=text,
+                    )
+            else:
+                found[section] |= dict.fromkeys(
+                    " ".join(each.split()) for each in text.split(",") if each.strip()
+                )
+        if not (found["things"] or found["parts"] or found["surfaces"]):
+            raise SettingsError(f"the vocabulary {path} names nothing", expected="a text per line")
+        return Vocabulary(**{section: tuple(texts) for section, texts in found.items()})
+
+
+def vocabulary_file(setting: str, model: Path) -> Path:
+    """The file of a setting; `auto` is that of the model if it has one, else the package's."""
+    if setting != AUTO:
+        return Path(setting)
+    own = Path(model) / VOCABULARY
+    return own if own.is_file() else COMMON
+
+
+@dataclass(frozen=True)
+class NodeNaming:
+    """What a vocabulary calls the nodes of a tree.
+
+    Attributes:
+        of_node: name of each node; "": nothing fits.
+        candidates: the texts nearest to each node, best first, with their cosine margins.
+        surfaces: whether each node is called a surface.
+        rivals: unit vectors of words, whose best margins are what an answer reaches by chance.
+    """
+
+    of_node: tuple[str, ...]
+    candidates: tuple[tuple[tuple[str, float], ...], ...]
+    surfaces: tuple[bool, ...]
+    rivals: Float32[np.ndarray, "W C"]
+
+    @staticmethod
+    def load(folder: Path, semantic_tree: Path, clip_folder: Path) -> "NodeNaming | None":
+        """Read the artifact; None if there is none for this tree and these vectors.
+
+        Raises:
+            ArtifactError: it is damaged.
+        """
+        folder = Path(folder)
+        if not folder.is_dir():
+            return None
+        index = read_full_index(folder, "tree_sha256", "clip_sha256")
+        made_for = index["tree_sha256"], index["clip_sha256"]
+        if made_for != (tree_digest(semantic_tree), _clip_digest(clip_folder)):
+            return None
+        rows = read_json(folder / "names.json")
+        try:
+            return NodeNaming(
+                tuple(str(row["name"]) for row in rows),
+                tuple(tuple((text, float(value)) for text, value in row["candidates"]) for row in rows),
+                tuple(bool(row["surface"]) for row in rows),
+                read_npy(folder / "rivals.npy").astype(np.float32),
+            )
+        except (TypeError, KeyError, ValueError) as error:
+            raise ArtifactError(
+                f"{folder / 'names.json'} is damaged: {error!r}", fix=remake(folder)
+            ) from error
+
+
+def run_names(
+    semantic_tree: Path,
+    clip_folder: Path,
+    out: Path,
+    cache: Path,
+    settings: QuerySettings,
+    evaluate: EvaluateSettings,
+    threads: int,
+) -> None:
+    """Name the nodes of a tree.
+
+    Args:
+        semantic_tree: the nodes.
+        clip_folder: CLIP vectors of their masks.
+        out: folder to write: `names.json`, `rivals.npy` and an index.
+        cache: folder of the cache of text vectors; all scenes of a model share them.
+        settings: the vocabulary.
+        evaluate: template and canonical phrases.
+        threads: for CLIP.
+
+    Raises:
+        SettingsError: the vocabulary cannot be read.
+        ModelError: the CLIP that embedded the masks is not found.
+    """
+    tree = SemanticTree.load(semantic_tree, clip_folder)
+    model = open_clip_of(clip_folder, threads, evaluate.template)
+    path = vocabulary_file(settings.vocabulary, model.model.folder)
+    vocabulary = Vocabulary.read(path)
+    absent = vocabulary.absent or Vocabulary.read(COMMON).absent
+    with stage_log("names", Path(out).parent.parent.name) as counts, atomic_folder(out) as folder:
+        known = [text for text in absent if not model.unknown_words(text)]
+        rivals = known if len(known) >= FEWEST_ABSENT else [*vocabulary.things, *vocabulary.parts]
+        texts = [*vocabulary.things, *vocabulary.parts, *vocabulary.surfaces]
+        every = list(dict.fromkeys([*texts, *rivals, *evaluate.canonical]))
+        vectors = dict(zip(every, text_vectors(model, every, cache), strict=True))
+
+        def of(words: Sequence[str]) -> np.ndarray:
+            return np.stack([vectors[word] for word in words])
+
+        naming = named(tree, vocabulary, of(texts), of(evaluate.canonical), of(rivals))
+        rows = zip(naming.of_node, naming.surfaces, naming.candidates, strict=True)
+        described = [
+            {
+                "name": name,
+                "surface": surface,
+                "candidates": [[text, round(value, 4)] for text, value in best],
+            }
+            for name, surface, best in rows
+        ]
+        write_json(folder / "names.json", described)
+        write_npy(folder / "rivals.npy", naming.rivals.astype(np.float16))
+        write_index(
+            folder,
+            {},
+            tree_sha256=tree_digest(semantic_tree),
+            clip_sha256=_clip_digest(clip_folder),
+            vocabulary=path.name,
+            vocabulary_sha256=sha256_of_file(path),
+            texts=len(texts),
+            rivals=len(rivals),
+        )
+        counts["nodes"], counts["named"] = len(tree), sum(bool(name) for name in naming.of_node)
+        counts["texts"] = len(texts)
+
+
+def text_vectors(model: ClipModel, texts: Sequence[str], cache: Path) -> Float32[np.ndarray, "T C"]:
+    """Unit vectors of texts; a real CLIP takes half a minute for a vocabulary, so they are kept."""
+    key = sha256_of_json({"model": model.digest, "template": model.template, "texts": list(texts)})
+
+    def embed() -> dict[str, np.ndarray]:
+        vectors = [model.embed_texts([text]) for text in track(texts, "texts", len(texts))]
+        return {"vectors": np.concatenate(vectors)}
+
+    return ViewCache(Path(cache) / "texts").get(key, embed)["vectors"]
+
+
+def named(
+    tree: SemanticTree,
+    vocabulary: Vocabulary,
+    texts: Float32[np.ndarray, "T C"],
+    canonical: Float32[np.ndarray, "K C"],
+    rivals: Float32[np.ndarray, "W C"],
+) -> NodeNaming:
+    """Give every node the text that its vector is nearest to, if that text stands out from the others.
+
+    A whole is a thing or a surface. A part or subpart is a part, or a thing: a plate is part of a laid table.
+
+    Args:
+        tree: the nodes, with their vectors.
+        vocabulary: gives the texts.
+        texts: unit vectors of its things, parts and surfaces, in this order.
+        canonical: unit vectors of the generic phrases.
+        rivals: see `NodeNaming`.
+    """
+    groups = (vocabulary.things, vocabulary.parts, vocabulary.surfaces)
+    words = [word for group in groups for word in group]
+    kinds = np.repeat([THINGS, PARTS, SURFACES], [len(group) for group in groups])
+    margin = margins(tree.clip, texts, canonical).T
+    names: list[str] = []
+    candidates: list[tuple[tuple[str, float], ...]] = []
+    surfaces: list[bool] = []
+    for node, level in enumerate(tree.level.tolist()):
+        may = np.flatnonzero(kinds != (PARTS if level == Level.WHOLE else SURFACES))
+        own = margin[node, may]
+        order = np.argsort(-own, kind="stable")[:CANDIDATES]
+        best = own.max(initial=0.0)
+        fits = best > 0 and best - own.mean() >= STANDS_OUT * own.std()
+        names.append(words[may[order[0]]] if fits else "")
+        surfaces.append(bool(fits and kinds[may[order[0]]] == SURFACES))
+        candidates.append(tuple((words[may[row]], float(own[row])) for row in order))
+    for level in LEVELS[1:]:  # a part is not called what its whole is called
+        for node in tree.nodes_of(level).tolist():
+            parent = int(tree.parent[node])
+            if parent != NONE and names[node] == names[parent]:
+                names[node] = ""
+    return NodeNaming(tuple(names), tuple(candidates), tuple(surfaces), rivals)
+
+
+def _clip_digest(clip_folder: Path) -> str:
+    return sha256_of_file(Path(clip_folder) / INDEX)

@@ -1,0 +1,77 @@
+"""Both pages for everybody: axe-core's rules, the reader's own colours, large type."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.browser.conftest import serving
+from tests.browser.test_ask import answers, ask
+
+SERIOUS = ("serious", "critical")
+
+
+def violations(page) -> list[str]:
+    """What axe-core calls serious or worse, with the first elements."""
+    axe = pytest.importorskip("axe_playwright_python", reason="axe-playwright-python is not installed")
+    page.evaluate((Path(axe.__file__).parent / "axe.min.js").read_text(encoding="utf-8"))
+    found = page.evaluate("axe.run(document, { resultTypes: ['violations'] })")["violations"]
+    return [
+        f"{each['id']}: {each['help']}: {[node['html'][:120] for node in each['nodes'][:4]]}"
+        for each in found
+        if each["impact"] in SERIOUS
+    ]
+
+
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+def test_the_viewer_has_no_serious_violation(opened, desk_address, scheme):
+    page = opened(desk_address, color_scheme=scheme)
+    assert violations(page) == []
+    ask(page, "mug > handle")
+    answers(page).first.click()
+    page.locator("#save summary").click()
+    assert violations(page) == []
+    page.locator("#view").press("?")
+    assert violations(page) == []
+
+
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+def test_the_annotator_has_no_serious_violation(opened, desk, tmp_path, scheme):
+    label = {"id": 1, "level": 1, "parent": None, "text": "mug", "origin": "proposed"}
+    label["polygons"] = [[[1, 1], [15, 1], [15, 20], [1, 20]]]
+    with serving(desk, "annotate", "--data-root", str(tmp_path)) as address:
+        page = opened(address, color_scheme=scheme)
+        page.evaluate("(label) => hilsplat.store.change([[0, [label]]])", label)
+        page.locator("#save summary").click()
+        assert violations(page) == []
+        page.close()
+
+
+def test_the_scheme_of_the_reader_is_followed(opened, desk_address):
+    def brightness(scheme: str) -> int:
+        page = opened(desk_address, color_scheme=scheme)
+        colour = page.evaluate("getComputedStyle(document.getElementById('panel')).backgroundColor")
+        return sum(int(value) for value in colour[4:-1].split(","))
+
+    assert brightness("dark") < 150 < 600 < brightness("light")
+
+
+def test_the_chosen_level_shows_in_forced_colours(opened, desk_address):
+    page = opened(desk_address, forced_colors="active")
+    outlines = """[...document.querySelectorAll('#levels label')].map((label) => [
+        label.querySelector('input').checked, getComputedStyle(label.querySelector('span')).outlineStyle])"""
+    assert all((style == "solid") == checked for checked, style in page.evaluate(outlines))
+
+
+def test_at_twice_the_size_the_picture_is_still_large(opened, desk_address):
+    page = opened(desk_address, viewport={"width": 640, "height": 360})
+    box = page.locator("#view").bounding_box()
+    assert box["height"] > 250 and box["width"] > 300
+    assert page.evaluate("document.documentElement.scrollWidth") <= 640
+
+
+def test_controls_are_large_enough_to_hit(opened, desk_address):
+    page = opened(desk_address)
+    low = """[...document.querySelectorAll('#tools select, #tools summary, #tools button, #views button')]
+        .filter((each) => each.getBoundingClientRect().height > 0 && each.getBoundingClientRect().height < 24)
+        .map((each) => each.id || each.textContent)"""
+    assert page.evaluate(low) == []

@@ -1,0 +1,121 @@
+"""Camera, history, pictures under way and refusals: what the page does with hands, keys and a slow server."""
+
+import numpy as np
+import pytest
+
+from tests.browser.conftest import wire_camera
+from tests.browser.test_ask import answers, ask
+
+
+def distance(page) -> float:
+    """From the camera to what it orbits about."""
+    return page.evaluate("Math.hypot(...hilsplat.camera.c.map((v, k) => v - hilsplat.camera.target[k]))")
+
+
+def test_a_refused_query_takes_the_answers_of_the_one_before_away(opened, desk_address):
+    opened.expected.append("422")
+    page = opened(desk_address)
+    ask(page, "mug > handle")
+    answers(page).first.wait_for()
+    page.locator("#text").fill("mug > ")
+    page.keyboard.press("Enter")
+    page.locator("#status.error").wait_for()
+    assert not answers(page).count() and not page.locator("#overlay path.answer").count()
+    assert page.evaluate("hilsplat.painted()[0].style.table.every((value) => value === 0)")
+
+
+def test_the_server_paints_the_first_picture_once_and_sends_no_nodes(opened, desk_address):
+    asked = []
+    page = opened(desk_address, "server")
+    page.on("request", lambda request: asked.append(request.url))
+    page.reload()
+    page.locator("body[data-ready=yes]").wait_for()
+    page.evaluate("hilsplat.begun")
+    page.wait_for_timeout(1000)
+    assert len([url for url in asked if "/api/frame" in url]) == 1
+    assert not [url for url in asked if "/api/nodes/" in url or "/api/splats" in url]
+
+
+def test_two_small_pictures_are_under_way_at_most(opened, desk_address):
+    page = opened(desk_address, "server")
+    held = []
+    for pattern in ("**/api/crop/**", "**/api/thumb/**"):
+        page.route(pattern, lambda route: held.append(route))
+    page.reload()
+    page.locator("body[data-ready=yes]").wait_for()
+    page.evaluate("hilsplat.begun")
+    page.wait_for_timeout(1000)
+    assert len(held) == 2
+    held[0].continue_()
+    page.wait_for_timeout(500)
+    assert len(held) == 3
+    page.unroute_all(behavior="ignoreErrors")
+
+
+def test_zooming_out_ends_and_home_goes_back(opened, desk_address):
+    page = opened(desk_address)
+    begun = wire_camera(page)
+    page.locator("#view").focus()
+    for _ in range(120):
+        page.keyboard.press("-")
+    far = distance(page)
+    assert far <= 20.01 * page.evaluate("hilsplat.camera.reach")
+    page.keyboard.press("-")
+    assert distance(page) == pytest.approx(far)
+    page.keyboard.press("Home")
+    page.wait_for_timeout(300)
+    np.testing.assert_allclose(wire_camera(page)["cam_from_world"], begun["cam_from_world"])
+
+
+def test_a_held_key_moves_evenly(opened, desk_address):
+    page = opened(desk_address, reduced_motion="no-preference")
+    page.locator("#view").focus()
+    page.evaluate("""() => {
+        window.places = [];
+        const look = () => { window.places.push(hilsplat.camera.c.slice()); requestAnimationFrame(look); };
+        look();
+    }""")
+    page.keyboard.down("d")
+    page.wait_for_timeout(900)
+    page.keyboard.up("d")
+    places = np.array(page.evaluate("window.places"))
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    moved = np.flatnonzero(steps > 0)
+    assert len(moved) > 5 and steps.max() < 0.4 * steps.sum()  # the keyboard repeats no key here
+    page.wait_for_timeout(800)
+    before = page.evaluate("hilsplat.camera.c")
+    page.wait_for_timeout(300)
+    assert page.evaluate("hilsplat.camera.c") == before
+
+
+def test_nothing_stays_framed_as_hovered_after_a_flight(opened, desk_address):
+    page = opened(desk_address)
+    row = page.locator("[role=treeitem] > .row").first
+    row.locator(".label").click()
+    page.locator("#overlay path.chosen").first.wait_for(state="attached")
+    page.locator("[role=treeitem] > .row .label").nth(1).hover()
+    page.locator("#overlay path.hover").first.wait_for(state="attached")
+    page.locator("#view").press("f")
+    page.locator("#overlay path.hover").first.wait_for(state="detached")
+
+
+def test_back_goes_to_the_query_before(opened, desk_address):
+    page = opened(desk_address)
+    page.wait_for_timeout(800)
+    for text in ("mug > handle", "book"):
+        page.locator("#text").fill(text)
+        page.keyboard.press("Enter")
+        answers(page).first.wait_for()
+        page.wait_for_timeout(1200)  # the address follows
+    page.go_back()
+    page.wait_for_function("document.getElementById('text').value === 'mug > handle'")
+    answers(page).first.wait_for()
+    page.wait_for_timeout(1000)
+    page.go_forward()
+    page.wait_for_function("document.getElementById('text').value === 'book'")
+    page.wait_for_timeout(1000)
+    page.go_back()
+    page.wait_for_timeout(1000)
+    page.go_back()
+    page.wait_for_function("document.getElementById('text').value === ''")
+    assert not answers(page).count()
