@@ -314,30 +314,28 @@ class LanguageScene:
             level=level,
             shown=shown,
         )
-        if self.naming is None:
-            return found
-        by_chance = self.margins_by_chance(answerer)
-        return replace(found, texts=tuple(self._doubted(each, by_chance, shown) for each in found.texts))
+        return replace(found, texts=tuple(self._doubted(each, answerer, shown) for each in found.texts))
 
     def _doubted(
-        self, answer: TextAnswer, by_chance: Float32[np.ndarray, "W n"], shown: Bool[np.ndarray, " n"] | None
+        self, answer: TextAnswer, answerer: Answerer, shown: Bool[np.ndarray, " n"] | None
     ) -> TextAnswer:
         """How well a text was answered, with the chance that a word for nothing is answered as well."""
         if self.names.nodes_of(answer.text):
             return answer
-        rivals = np.ones(len(self.tree), np.bool_) if shown is None else shown.copy()
-        if answer.margin < answer.anywhere:  # the best node of another level was not asked for
-            rivals &= self.tree.level == int(answer.level)
-        best = by_chance[:, rivals].max(axis=1, initial=-np.inf)
-        chance = (1 + int((best >= answer.margin).sum())) / (1 + len(best))
+        chance = None
+        if self.naming is not None and len(self.naming.rivals):
+            rivals = np.ones(len(self.tree), np.bool_) if shown is None else shown.copy()
+            if answer.margin < answer.anywhere:  # the best node of another level was not asked for
+                rivals &= self.tree.level == int(answer.level)
+            best = self._margins_by_chance(answerer, self.naming)[:, rivals].max(axis=1, initial=-np.inf)
+            chance = (1 + int((best >= answer.margin).sum())) / (1 + len(best))
         return replace(answer, chance=chance, unknown=tuple(self.unknown_words(answer.text)))
 
-    def margins_by_chance(self, answerer: Answerer = "tree") -> Float32[np.ndarray, "W n"]:
+    def _margins_by_chance(self, answerer: Answerer, naming: NodeNaming) -> Float32[np.ndarray, "W n"]:
         """Cosine margin of every node for words that mean nothing here; see `NodeNaming.rivals`."""
         if answerer not in self._by_chance:
-            assert self.naming is not None
             canonical = self.text_vectors(self.settings.canonical)
-            self._by_chance[answerer] = margins(self.node_vectors(answerer), self.naming.rivals, canonical)
+            self._by_chance[answerer] = margins(self.node_vectors(answerer), naming.rivals, canonical)
         return self._by_chance[answerer]
 
     def name_of(self, node: int, *, alone: bool = False) -> str:

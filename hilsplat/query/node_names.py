@@ -38,7 +38,8 @@ STANDS_OUT = 3.0
 """A name's cosine is at least this many standard deviations above the mean cosine of the vocabulary."""
 
 FEWEST_ABSENT = 100
-"""With fewer words for what is absent that the model knows, the whole vocabulary takes their place."""
+"""With fewer words for what is absent that the model knows, the whole vocabulary takes their place; a smaller
+one says nothing about chance."""
 
 
 THINGS, PARTS, SURFACES = range(3)
@@ -117,7 +118,7 @@ class NodeNaming:
         of_node: name of each node; "": nothing fits.
         candidates: the texts nearest to each node, best first, with their cosine margins.
         surfaces: whether each node is called a surface.
-        rivals: unit vectors of words, whose best margins are what an answer reaches by chance.
+        rivals: unit vectors of words, whose best margins are what an answer reaches by chance; may be empty.
     """
 
     of_node: tuple[str, ...]
@@ -184,13 +185,13 @@ def run_names(
     absent = vocabulary.absent or Vocabulary.read(COMMON).absent
     with stage_log("names", Path(out).parent.parent.name) as counts, atomic_folder(out) as folder:
         known = [text for text in absent if not model.unknown_words(text)]
-        rivals = known if len(known) >= FEWEST_ABSENT else [*vocabulary.things, *vocabulary.parts]
         texts = [*vocabulary.things, *vocabulary.parts, *vocabulary.surfaces]
+        rivals = known if len(known) >= FEWEST_ABSENT else texts if len(texts) >= FEWEST_ABSENT else []
         every = list(dict.fromkeys([*texts, *rivals, *evaluate.canonical]))
         vectors = dict(zip(every, text_vectors(model, every, cache), strict=True))
 
         def of(words: Sequence[str]) -> np.ndarray:
-            return np.stack([vectors[word] for word in words])
+            return np.array([vectors[word] for word in words], np.float32).reshape(-1, tree.clip.shape[1])
 
         naming = named(tree, vocabulary, of(texts), of(evaluate.canonical), of(rivals))
         rows = zip(naming.of_node, naming.surfaces, naming.candidates, strict=True)

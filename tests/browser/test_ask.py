@@ -71,8 +71,7 @@ def test_doubts_are_told(opened, desk_address, painter):
     page.keyboard.press("Enter")
     answers(page).first.wait_for()
     told = page.get_by_role("status").inner_text()
-    line = "Perhaps nothing of the kind: nothing here answers to 'unicorn' better than to a generic word"
-    assert line in told and told.count("unicorn") == 1
+    assert "'unicorn' may not be here: the model was never taught 'unicorn'." in told
 
 
 @both

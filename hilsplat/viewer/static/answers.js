@@ -32,7 +32,7 @@ export function summary(answer) {
     : `${counted(answer.total, "answer")}, best ${best.score.toFixed(2)}, ${answer.level}`];
   if (answer.route === "fallback") lines.push("No answer is part of anything that answers to the first text.");
   const doubts = answer.doubts.map((doubt) => `${doubt}.`);
-  if (!alike && (best.score < 0.5 || doubts.length)) doubts[0] = `Perhaps nothing of the kind: ${doubts[0] ?? "the best is below 0.5."}`;
+  if (!alike && best.score < 0.5 && !doubts.length) doubts.push("Perhaps nothing of the kind: the best is below 0.5.");
   return [...lines, ...doubts].map((line) => line[0].toUpperCase() + line.slice(1)).join("\n");
 }
 

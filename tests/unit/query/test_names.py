@@ -82,7 +82,7 @@ def test_the_command_answers_by_names_too(desk, tmp_path):
     book = nodes_by_text(hilsplat.open(desk))["book"]
     name_nodes(desk, {book: "atlas"})
     first = next(answer(desk, "atlas", out=tmp_path))
-    assert "1 answer to 'atlas'" in first and "  atlas  " in first and "doubtful" not in first
+    assert "1 answer to 'atlas'" in first and " atlas  0" in first and "doubtful" not in first
 
 
 def test_a_change_must_know_the_version_that_it_changes(desk):

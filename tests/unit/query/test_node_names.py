@@ -1,0 +1,142 @@
+"""Names of nodes from a vocabulary, and the doubt whether a word is for anything in the scene."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hilsplat
+from hilsplat.base.artifacts import read_json
+from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.embed.clip import open_clip_of
+from hilsplat.query.answer import answer
+from hilsplat.query.names import write_names
+from hilsplat.query.node_names import COMMON, NodeNaming, Vocabulary, named, run_names, vocabulary_file
+from hilsplat.settings import EvaluateSettings, QuerySettings
+from tests.unit.finished_desk import SCENE, build_finished_desk
+from tests.unit.query.test_search_scales import tree_of
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory) -> Path:
+    """The finished desk, its nodes named by the words of its CLIP and 120 more that are the book's blue."""
+    project = build_finished_desk(tmp_path_factory.mktemp("project"))
+    words = "[things]\nmug, book\n[parts]\nhandle, rim\n"
+    (project / "models/colours/vocabulary.txt").write_text(words)
+    name_desk(project / SCENE)
+    return project / SCENE
+
+
+def name_desk(desk: Path, vocabulary: str = "auto") -> None:
+    run_names(
+        desk / "default/semantic_tree",
+        desk / "default/clip",
+        desk / "default/names",
+        desk / "cache",
+        QuerySettings(vocabulary=vocabulary),
+        EvaluateSettings(),
+        1,
+    )
+
+
+def test_sections_comments_and_repeated_texts_of_a_file(tmp_path):
+    path = tmp_path / "words.txt"
+    path.write_text(
+        "mug, red  mug # two\n\n[Parts]\nhandle\nhandle, lid\n[surfaces]\nfloor\n[absent]\nmoon\n"
+    )
+    assert Vocabulary.read(path) == Vocabulary(("mug", "red mug"), ("handle", "lid"), ("floor",), ("moon",))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [(b"[colours]\nred", "line 1 .* unknown section"), (b"# nothing", "names nothing"), (b"\xff", "read")],
+)
+def test_a_file_that_is_no_vocabulary_is_refused(tmp_path, content, message):
+    (tmp_path / "words.txt").write_bytes(content)
+    with pytest.raises(SettingsError, match=message):
+        Vocabulary.read(tmp_path / "words.txt")
+
+
+def test_the_common_vocabulary_is_large_and_its_absent_words_name_nothing_common():
+    common = Vocabulary.read(COMMON)
+    assert len(common.things) > 1000 and len(common.parts) > 300 and len(common.absent) >= 300
+    assert not {*common.absent} & {*common.things, *common.parts, *common.surfaces} - {"tank"}
+    assert vocabulary_file("auto", Path("nowhere")) == COMMON
+
+
+def test_what_stands_out_is_a_name_and_a_part_is_not_called_what_its_whole_is():
+    texts = np.eye(24, dtype=np.float32)
+    vocabulary = Vocabulary(
+        tuple(f"thing {n}" for n in range(11)), tuple(f"part {n}" for n in range(11)), ("floor", "wall")
+    )
+    tree = tree_of([1, 1, 1, 2, 2, 2], [-1, -1, -1, 0, 0, 1])
+    vague = np.full(24, 0.2, np.float32)
+    tree = replace(tree, clip=np.stack([texts[2], texts[22], vague, texts[11], texts[2], texts[12]]))
+    generic = np.full((1, 24), 0.01, np.float32)
+    naming = named(tree, vocabulary, texts, generic, texts[:3])
+    assert naming.of_node == ("thing 2", "floor", "", "part 0", "", "part 1")
+    assert naming.surfaces == (False, True, False, False, False, False)
+    assert naming.candidates[0][0] == ("thing 2", pytest.approx(0.99)) and len(naming.candidates[0]) == 5
+
+
+def test_parts_are_named_inside_their_whole_and_given_names_win(desk):
+    scene = hilsplat.open(desk)
+    naming = NodeNaming(
+        ("mug", "book", "handle", "", "rim"), ((),) * 5, (False,) * 5, np.eye(3, dtype=np.float32)
+    )
+    scene = replace(scene, naming=naming)
+    order = [scene.query(text)[0].node for text in ("mug", "book", "mug > handle", "mug > handle > rim")]
+    assert order[:2] == [0, 1] and scene.name_of(order[2]) == "handle of mug"
+    assert scene.name_of(order[3]) == "rim of mug" and scene.name_of(order[3], alone=True) == "rim"
+    tree = desk / "default/semantic_tree"
+    write_names(desk, tree, {0: "pot"}, len(scene.tree), "none")
+    renamed = replace(scene, names=hilsplat.open(desk).names)
+    assert renamed.name_of(0) == "pot" and renamed.name_of(order[2]) == "handle of pot"
+    (desk / "names.json").unlink()
+
+
+def test_the_stage_writes_names_that_answers_show(desk, tmp_path):
+    rows = read_json(desk / "default/names/names.json")
+    scene = hilsplat.open(desk)
+    assert len(rows) == len(scene.tree) and scene.naming is not None
+    (mug,) = scene.query("mug")
+    assert rows[mug.node]["candidates"][0][0] == "mug"
+    assert mug.name == scene.name_of(mug.node)
+    assert "name " in next(answer(desk, "mug", out=tmp_path))
+
+
+def test_names_of_another_tree_are_not_shown_and_damaged_ones_are_refused(desk, tmp_path):
+    tree, clip = desk / "default/semantic_tree", desk / "default/clip"
+    assert NodeNaming.load(desk / "default/nothing", tree, clip) is None
+    index = read_json(desk / "default/names/index.json")
+    other = tmp_path / "names"
+    other.mkdir()
+    (other / "index.json").write_text(json.dumps({**index, "tree_sha256": "another"}))
+    assert NodeNaming.load(other, tree, clip) is None
+    (other / "index.json").write_text(json.dumps(index))
+    (other / "names.json").write_text('[{"name": "mug"}]')
+    with pytest.raises(ArtifactError, match=r"names\.json is damaged"):
+        NodeNaming.load(other, tree, clip)
+
+
+def test_a_word_that_the_model_was_never_taught_is_doubted(desk):
+    scene = hilsplat.open(desk)
+    assert open_clip_of(desk / "default/clip").unknown_words("mug zebra, book") == ["zebra", ","]
+    (doubt,) = scene.query("zebra")[0].doubts
+    assert str(doubt) == "'zebra' may not be here: the model was never taught 'zebra'"
+    assert scene.query("mug > handle")[0].doubts == ()
+
+
+def test_a_text_that_words_for_nothing_reach_is_doubted_with_the_chance(desk):
+    scene = hilsplat.open(desk)
+    blue, white = np.array([[0, 0, 1.0]], np.float32), np.full((1, 3), 3**-0.5, np.float32)
+    rivals = np.concatenate([np.repeat(blue, 30, axis=0), np.repeat(white, 70, axis=0)])
+    scene = replace(scene, naming=replace(scene.naming, rivals=rivals), _by_chance={})
+    (doubt,) = scene.query("book", "whole")[0].doubts  # a third of the words finds the book as well
+    assert doubt.chance == pytest.approx(31 / 101)
+    assert (
+        str(doubt)
+        == "'book' may not be here: 31% of the words for what is certainly not here are answered as well"
+    )
