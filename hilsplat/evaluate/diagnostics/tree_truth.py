@@ -47,6 +47,7 @@ class TreeMeasure:
         parent_accuracy: share of matched nodes whose parent's main true node is the true parent, among
             those with a true parent; nan at level whole.
         view_consistency: mean pooled IoU of the nodes' masks across views.
+        pairs: each matched node with its true node.
     """
 
     nodes: int
@@ -57,6 +58,7 @@ class TreeMeasure:
     purity: float
     parent_accuracy: float
     view_consistency: float
+    pairs: tuple[tuple[int, int], ...] = ()
 
 
 def measure_tree(
@@ -118,6 +120,7 @@ def measure_tree(
             purity=float(overlap[nodes][:, :-1].max(axis=1).sum() / max(size, 1e-12)) if len(nodes) else 0.0,
             parent_accuracy=float(right.mean()) if len(right) else float("nan"),
             view_consistency=float(tree.quality[nodes].mean()) if len(nodes) else 0.0,
+            pairs=tuple(zip(matched.tolist(), partner.tolist(), strict=True)),
         )
     return found
 

@@ -1,0 +1,102 @@
+"""How often the vocabulary names nodes rightly, and how often doubts are right, on finished synthetic scenes.
+
+    python -m benchmarks.naming results/synthetic/dev-1 results/synthetic-rooms/dev-room
+
+A node counts if it has an IoU above 0.5 with a true node; its name is right if it is the true text or a
+synonym. Texts that are present are those of the matched nodes. Texts that are absent are those of the
+vocabulary that name nothing in the scene; words that the model was never taught are always doubted
+and not counted.
+"""
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import hilsplat
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.tables import markdown_table
+from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
+from hilsplat.evaluate.diagnostics.tree_truth import measure_tree, true_votes
+from hilsplat.query.node_names import Vocabulary, vocabulary_file
+
+ABSENT = 200
+"""Texts for absent things that are asked, at most, spread over the vocabulary."""
+
+
+@dataclass
+class Counts:
+    """Right and all of something."""
+
+    right: int = 0
+    all: int = 0
+
+    def add(self, right: bool) -> None:
+        """Count one."""
+        self.right, self.all = self.right + right, self.all + 1
+
+    def __str__(self) -> str:
+        return f"{self.right / self.all:.0%} of {self.all}" if self.all else "-"
+
+
+@dataclass
+class Naming:
+    """Counts of a level over scenes.
+
+    Attributes:
+        top1: the nearest text is right.
+        top5: one of the nearest five is.
+        named: the node got a name.
+        right: the name that it got is right.
+        doubted: a text that is present was doubted when it was asked.
+    """
+
+    top1: Counts = field(default_factory=Counts)
+    top5: Counts = field(default_factory=Counts)
+    named: Counts = field(default_factory=Counts)
+    right: Counts = field(default_factory=Counts)
+    doubted: Counts = field(default_factory=Counts)
+
+
+def measure(folder: Path, levels: dict[Level, Naming], missed: Counts) -> None:
+    """Add a scene; `missed` counts absent texts that were answered without a doubt."""
+    scene = hilsplat.open(folder)
+    assert scene.naming is not None, f"{folder} has no names: hilsplat run {folder}/default/names"
+    truth = HierarchyAnnotations.load(folder / "world/truth")
+    ply = folder / "gaussians.ply"
+    views = scene.scene.views("train")
+    votes = true_votes(scene.scene, ply, truth, views, scene.tree.min_weight, threads=2)
+    for level, measured in measure_tree(scene.tree, votes, truth).items():
+        counts = levels[level]
+        for node, partner in measured.pairs:
+            texts = {truth.nodes[partner].text, *truth.nodes[partner].synonyms}
+            nearest = [text for text, _ in scene.naming.candidates[node]]
+            name = scene.naming.of_node[node]
+            counts.top1.add(nearest[0] in texts)
+            counts.top5.add(bool(texts & {*nearest}))
+            counts.named.add(bool(name))
+            if name:
+                counts.right.add(name in texts)
+            counts.doubted.add(bool(scene.query(truth.nodes[partner].text)[0].doubts))
+    known = Vocabulary.read(vocabulary_file("auto", Path("models/clip-tiny")))
+    here = {text for node in truth.nodes for text in (node.text, *node.synonyms)}
+    absent = [text for text in (*known.things, *known.parts) if text not in here]
+    for text in absent[:: -(-len(absent) // ABSENT)]:
+        missed.add(not scene.query(text)[0].doubts)
+
+
+def main() -> None:
+    """Measure the scenes that the command line names."""
+    levels, missed = {level: Naming() for level in LEVELS}, Counts()
+    for name in sys.argv[1:]:
+        measure(Path(name), levels, missed)
+    rows = [
+        (level.label, *map(str, (own.top1, own.top5, own.named, own.right, own.doubted)))
+        for level, own in levels.items()
+    ]
+    head = ("level", "top-1", "top-5", "named", "of the named, right", "present, doubted")
+    print(markdown_table(head, rows, 1))
+    print(f"absent texts answered without a doubt: {missed}")
+
+
+if __name__ == "__main__":
+    main()
