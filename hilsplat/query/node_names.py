@@ -34,12 +34,13 @@ from hilsplat.settings import EvaluateSettings, QuerySettings
 CANDIDATES = 5
 """Texts that are kept for each node, best first."""
 
-STANDS_OUT = 3.0
-"""A name's cosine is at least this many standard deviations above the mean cosine of the vocabulary."""
+STANDS_OUT = 0.5
+"""A name's margin is at least this many standard deviations of the vocabulary's margins above that of the
+fifth nearest text; synonyms are among the nearest. Chosen on development scenes (docs/experiments.md)."""
 
 FEWEST_ABSENT = 100
-"""With fewer words for what is absent that the model knows, the whole vocabulary takes their place; a smaller
-one says nothing about chance."""
+"""With fewer words for what is absent that the model knows, words of the vocabulary that no node is nearest to
+take their place; fewer of those say nothing about chance."""
 
 
 THINGS, PARTS, SURFACES = range(3)
@@ -186,14 +187,17 @@ def run_names(
     with stage_log("names", Path(out).parent.parent.name) as counts, atomic_folder(out) as folder:
         known = [text for text in absent if not model.unknown_words(text)]
         texts = [*vocabulary.things, *vocabulary.parts, *vocabulary.surfaces]
-        rivals = known if len(known) >= FEWEST_ABSENT else texts if len(texts) >= FEWEST_ABSENT else []
-        every = list(dict.fromkeys([*texts, *rivals, *evaluate.canonical]))
+        every = list(dict.fromkeys([*texts, *known, *evaluate.canonical]))
         vectors = dict(zip(every, text_vectors(model, every, cache), strict=True))
 
         def of(words: Sequence[str]) -> np.ndarray:
             return np.array([vectors[word] for word in words], np.float32).reshape(-1, tree.clip.shape[1])
 
-        naming = named(tree, vocabulary, of(texts), of(evaluate.canonical), of(rivals))
+        margin = margins(tree.clip, of(texts), of(evaluate.canonical)).T
+        if len(known) < FEWEST_ABSENT:
+            known = [text for row, text in enumerate(texts) if row not in {*margin.argmax(axis=1).tolist()}]
+        rivals = known if len(known) >= FEWEST_ABSENT else []
+        naming = named(tree, vocabulary, margin, of(rivals))
         rows = zip(naming.of_node, naming.surfaces, naming.candidates, strict=True)
         described = [
             {
@@ -233,8 +237,7 @@ def text_vectors(model: ClipModel, texts: Sequence[str], cache: Path) -> Float32
 def named(
     tree: SemanticTree,
     vocabulary: Vocabulary,
-    texts: Float32[np.ndarray, "T C"],
-    canonical: Float32[np.ndarray, "K C"],
+    margin: Float32[np.ndarray, "n T"],
     rivals: Float32[np.ndarray, "W C"],
 ) -> NodeNaming:
     """Give every node the text that its vector is nearest to, if that text stands out from the others.
@@ -244,14 +247,12 @@ def named(
     Args:
         tree: the nodes, with their vectors.
         vocabulary: gives the texts.
-        texts: unit vectors of its things, parts and surfaces, in this order.
-        canonical: unit vectors of the generic phrases.
+        margin: cosine margins of the nodes for its things, parts and surfaces, in this order.
         rivals: see `NodeNaming`.
     """
     groups = (vocabulary.things, vocabulary.parts, vocabulary.surfaces)
     words = [word for group in groups for word in group]
     kinds = np.repeat([THINGS, PARTS, SURFACES], [len(group) for group in groups])
-    margin = margins(tree.clip, texts, canonical).T
     names: list[str] = []
     candidates: list[tuple[tuple[str, float], ...]] = []
     surfaces: list[bool] = []
@@ -260,7 +261,7 @@ def named(
         own = margin[node, may]
         order = np.argsort(-own, kind="stable")[:CANDIDATES]
         best = own.max(initial=0.0)
-        fits = best > 0 and best - own.mean() >= STANDS_OUT * own.std()
+        fits = best > 0 and best - own[order[-1]] >= STANDS_OUT * own.std()
         names.append(words[may[order[0]]] if fits else "")
         surfaces.append(bool(fits and kinds[may[order[0]]] == SURFACES))
         candidates.append(tuple((words[may[row]], float(own[row])) for row in order))

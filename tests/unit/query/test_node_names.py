@@ -14,6 +14,7 @@ from hilsplat.embed.clip import open_clip_of
 from hilsplat.query.answer import answer
 from hilsplat.query.names import write_names
 from hilsplat.query.node_names import COMMON, NodeNaming, Vocabulary, named, run_names, vocabulary_file
+from hilsplat.query.relevancy import margins
 from hilsplat.settings import EvaluateSettings, QuerySettings
 from tests.unit.finished_desk import SCENE, build_finished_desk
 from tests.unit.query.test_search_scales import tree_of
@@ -75,7 +76,7 @@ def test_what_stands_out_is_a_name_and_a_part_is_not_called_what_its_whole_is():
     vague = np.full(24, 0.2, np.float32)
     tree = replace(tree, clip=np.stack([texts[2], texts[22], vague, texts[11], texts[2], texts[12]]))
     generic = np.full((1, 24), 0.01, np.float32)
-    naming = named(tree, vocabulary, texts, generic, texts[:3])
+    naming = named(tree, vocabulary, margins(tree.clip, texts, generic).T, texts[:3])
     assert naming.of_node == ("thing 2", "floor", "", "part 0", "", "part 1")
     assert naming.surfaces == (False, True, False, False, False, False)
     assert naming.candidates[0][0] == ("thing 2", pytest.approx(0.99)) and len(naming.candidates[0]) == 5
