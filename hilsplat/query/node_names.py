@@ -39,8 +39,8 @@ STANDS_OUT = 0.5
 fifth nearest text; synonyms are among the nearest. Chosen on development scenes (docs/experiments.md)."""
 
 FEWEST_ABSENT = 100
-"""With fewer words for what is absent that the model knows, words that no node is nearest to take their place;
-fewer of those say nothing about chance."""
+"""With fewer words for absent things that the model knows, words that no node is nearest to take their place.
+Fewer of those say nothing about chance."""
 
 
 THINGS, PARTS, SURFACES = range(3)
