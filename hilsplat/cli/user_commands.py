@@ -42,6 +42,10 @@ def query(
         str, typer.Option(help="tree: nodes of the semantic tree answer; field: the paper's language field")
     ] = "tree",
     view: Annotated[str | None, typer.Option(help="find only what this view shows, such as 000.png")] = None,
+    threshold: Annotated[
+        float | None,
+        typer.Option(help="least score of an answer, between 0 and 1; default: the answers near the best"),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -69,6 +73,7 @@ def query(
             views=views,
             answerer=answerer,
             view=view,
+            threshold=threshold,
             out=out,
             device=device,
             threads=threads,

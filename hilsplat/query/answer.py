@@ -30,6 +30,7 @@ def answer(
     views: int = 3,
     answerer: str = "tree",
     view: str | None = None,
+    threshold: float | None = None,
     out: Path | None = None,
     device: str = "cpu",
     threads: int = 1,
@@ -47,18 +48,19 @@ def answer(
         answerer: "tree" or "field", see `LanguageScene.query`.
         view: restricts the answers to what this view shows, and puts it first in the panel; None: the
             whole scene.
+        threshold: least score of an answer; None: those near the best.
         out: folder of both files; by default `queries/<text>` in the scene's folder.
         device: "cpu" or "cuda" for look-ups of the field.
         threads: number of threads for rendering.
 
     Raises:
         ArtifactError: the scene is not finished.
-        SettingsError: the level, answerer, view or device is unknown.
+        SettingsError: the level, answerer, view or device is unknown, or the threshold not between 0 and 1.
         DeviceError: cuda was asked for and torch finds no device.
     """
     found = FinishedScene.locate(Path(folder), variant)
     scene = LanguageScene.of(found, threads=threads, device=device)
-    nodes = scene.find(text, level, answerer=answerer, view=view)
+    nodes = scene.find(text, level, answerer=answerer, view=view, threshold=threshold)
     hits = hits_of(scene, nodes, LISTED)
     label = masks_label(found.parts.masks)
     note = f"; a diagnostic, masks made from the true labels: {label}" if made_from_truth(label) else ""

@@ -27,7 +27,7 @@ from hilsplat.query.names import PATH_SEPARATOR, NodeNames, read_names
 from hilsplat.query.node_names import NodeNaming
 from hilsplat.query.node_search import NodeHits, TextAnswer, search
 from hilsplat.query.opening import Opened, OpenedParts
-from hilsplat.query.relevancy import margins, relevancy_of_margins
+from hilsplat.query.relevancy import margin_of_relevancy, margins, relevancy_of_margins
 from hilsplat.query.scene_views import SceneViews, members_of
 from hilsplat.query.view_store import ViewStore
 from hilsplat.scene.finished import FinishedScene, SceneParts
@@ -215,14 +215,14 @@ class LanguageScene:
             answerer: "tree": nodes answer with their averaged CLIP vectors; "field": with the decoded
                 mean of the paper's field over their Gaussians.
             view: name of a view, to find only what it shows; None: the whole scene.
-            threshold: a hit's margin is at most (1 - threshold) times the range of the level's margins
-                below the best one (that the view shows), or three times that if it looks like the best;
-                None: the scene's `node_select`.
+            threshold: least score of an answer, in (0, 1); None: those near the best, whose margin is at most
+                (1 - `node_select`) times the range of the level's margins below it, or three times that if
+                they look like it.
             limit: most answers to return.
 
         Raises:
-            SettingsError: the text is empty, the level, answerer or view is unknown, or a path has more
-                texts than levels.
+            SettingsError: the text is empty, the level, answerer or view is unknown, a path has more texts
+                than levels, or the threshold is not between 0 and 1.
         """
         found = self.find(text, level, answerer=answerer, view=view, threshold=threshold)
         return hits_of(self, found, limit)
@@ -309,11 +309,14 @@ class LanguageScene:
             self.node_margins(path, answerer),
             self.node_vectors(answerer),
             tuple(path),
-            threshold=self.settings.node_select if threshold is None else threshold,
+            threshold=self.settings.node_select if threshold is None else 0.0,  # 0: the whole level
             ancestors=self.settings.ancestors,
             level=level,
             shown=shown,
         )
+        if threshold is not None:
+            kept = found.values >= margin_of_relevancy(threshold, self.settings.relevancy_scale)
+            found = replace(found, ids=found.ids[kept], values=found.values[kept])
         return replace(found, texts=tuple(self._doubted(each, answerer, shown) for each in found.texts))
 
     def _doubted(

@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Float, Float32
 
+from hilsplat.base.errors import SettingsError
+
 CHUNK_ROWS = 65_536
 """Embeddings to compare at once, so that products with many texts stay small."""
 
@@ -36,6 +38,17 @@ def margins(
 def relevancy_of_margins(margin: Float[np.ndarray, "*n"], scale: float) -> Float[np.ndarray, "*n"]:
     """The score for people and protocols: 1 / (1 + exp(-scale * margin)), 0.5 at margin 0."""
     return 1 / (1 + np.exp(-scale * margin))
+
+
+def margin_of_relevancy(score: float, scale: float) -> float:
+    """The margin that has a score: the inverse of `relevancy_of_margins`.
+
+    Raises:
+        SettingsError: the score is not between 0 and 1.
+    """
+    if not 0 < score < 1:
+        raise SettingsError(f"no answer has a score of {score:g} or more", expected="between 0 and 1")
+    return float(np.log(score / (1 - score)) / scale)
 
 
 def relevancy(

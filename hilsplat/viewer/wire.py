@@ -114,7 +114,7 @@ class Query(Asked):
     level: LevelName = "auto"
     answerer: Literal["tree", "field"] = "tree"
     view: Annotated[int, Field(ge=0)] | None = None
-    threshold: Annotated[float, Field(ge=0, le=1)] | None = None
+    threshold: Annotated[float, Field(gt=0, lt=1)] | None = None
 
 
 class Like(Asked):

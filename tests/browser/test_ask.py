@@ -193,6 +193,8 @@ def test_two_answerers_stand_side_by_side(opened, desk_address):
     ask_box.press("Enter")
     answers(page).first.wait_for()
     drawn(page, lambda: page.get_by_label("Beside").select_option("default|field"))
+    right = page.get_by_role("list", name="On the right, by default, field: 1 of 1 are on the left too")
+    assert right.get_by_role("button").count() == 1
     page.locator("#overlay .split").wait_for(state="attached")
     page.wait_for_timeout(1500)
     picture = pixels(page)

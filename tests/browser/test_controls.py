@@ -119,3 +119,25 @@ def test_back_goes_to_the_query_before(opened, desk_address):
     page.go_back()
     page.wait_for_function("document.getElementById('text').value === ''")
     assert not answers(page).count()
+
+
+@pytest.mark.parametrize("painter", ["gl", "server"])
+@pytest.mark.parametrize("colour", ["relevancy", "field"])
+def test_a_threshold_cuts_the_colours_and_counts_what_reaches_it(opened, desk_address, painter, colour):
+    page = opened(desk_address, painter)
+    ask(page, "mug")
+    answers(page).first.wait_for()
+    page.get_by_label("Colours", exact=True).select_option(colour)
+    scale = page.get_by_role("group", name="Colours of relevancy")
+    scale.wait_for()
+    assert scale.inner_text().split() == page.evaluate(
+        "[hilsplat.painted()[0].style.low, hilsplat.painted()[0].style.high].map((value) => value.toFixed(2))"
+    )
+    counts = []
+    page.get_by_label("scores from").check()
+    for least in ("0.3", "0.95"):
+        page.get_by_role("slider", name="Least score").fill(least)
+        page.wait_for_timeout(800)
+        counts.append(int(scale.inner_text().split()[2].replace(",", "")))
+    assert 0 < counts[1] < counts[0] <= page.evaluate("24 * 36")
+    assert "least=0.95" in page.url

@@ -5,17 +5,29 @@ import { $, counted, make, nameOf } from "./elements.js";
 import { picture } from "./pictures.js";
 import { shownHits } from "./styles.js";
 
-export function showAnswers(outline, answer, { choose, hover }) {
-  const list = $("answers");
-  $("answers-section").hidden = !answer?.hits.length;
+// beside: {outline, answer, by} of the other side, or undefined.
+export function showAnswers(outline, answer, acts, beside) {
+  const theirs = beside?.answer?.hits ?? [], own = answer?.hits ?? [], sameTree = beside?.outline?.tree === outline?.tree;
+  $("answers-section").hidden = !own.length && !theirs.length;
   const caution = (answer ?? outline)?.caution ?? "";   // an answer by name or by likeness has none
   $("caution").hidden = !caution;
   $("caution").textContent = caution;
-  list.replaceChildren(...(answer?.hits ?? []).map((hit, rank) => make("li", { "data-node": hit.node },
-    make("button", { type: "button", onclick: () => choose(hit.node), onpointerenter: () => hover(hit.node), onpointerleave: () => hover(-1), onfocus: () => hover(hit.node), onblur: () => hover(-1) },
-      picture(api.cropUrl(outline.variant, hit.node), { width: 48, height: 48 }),
-      make("span", { class: "name" }, hit.name || nameOf(outline, hit.node), make("small", {}, `${rank + 1}. ${hit.level}`)),
-      bar(hit.score)))));
+  const only = (hit, others) => sameTree && !others.some((other) => other.node === hit.node);
+  $("answers").replaceChildren(...own.map((hit, rank) => item(outline, hit, rank, acts, beside && only(hit, theirs) ? ", only on the left" : "")));
+  $("beside").hidden = !beside?.answer;
+  if (!beside?.answer) { $("answers-beside").replaceChildren(); return; }
+  const both = theirs.filter((hit) => !only(hit, own)).length;
+  $("beside-title").textContent = `On the right, by ${beside.by}${sameTree ? `: ${both} of ${theirs.length} are on the left too` : ", another tree"}`;
+  $("answers-beside").replaceChildren(...theirs.map((hit, rank) => item(beside.outline, hit, rank, sameTree ? acts : null, only(hit, own) ? ", only on the right" : "")));
+}
+
+// Nodes of another tree than the left one's cannot be chosen.
+function item(outline, hit, rank, acts, note) {
+  const look = acts && { onclick: () => acts.choose(hit.node), onpointerenter: () => acts.hover(hit.node), onpointerleave: () => acts.hover(-1), onfocus: () => acts.hover(hit.node), onblur: () => acts.hover(-1) };
+  return make("li", { "data-node": hit.node }, make("button", { type: "button", disabled: !acts, ...look },
+    picture(api.cropUrl(outline.variant, hit.node), { width: 48, height: 48 }),
+    make("span", { class: "name" }, hit.name || nameOf(outline, hit.node), make("small", {}, `${rank + 1}. ${hit.level}${note}`)),
+    bar(hit.score)));
 }
 
 function bar(score) {

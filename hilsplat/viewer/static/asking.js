@@ -5,7 +5,7 @@ import * as api from "./api.js";
 import { acts, choose } from "./choosing.js";
 import { overlay, redraw, restyle } from "./drawing.js";
 import { $, nameOf } from "./elements.js";
-import { answererOf, failed, host, level, main, outlines, page, panes, tell, variantOf } from "./state.js";
+import { answererOf, failed, host, level, main, outlines, page, panes, tell, threshold, variantOf } from "./state.js";
 import { styleOf } from "./styles.js";
 
 const PICTURE_PX = 512;
@@ -23,6 +23,7 @@ async function askAll(what, work) {
       if (signal.aborted) return;
       Object.assign(pane, { answer, field: null });
       if (!k) answered(what, answer);
+      else listAnswers();
     }
   } catch (error) { refused(error); return; }
   await fillField(signal);
@@ -38,10 +39,15 @@ function refused(error) {
 function answered(what, answer) {
   page.asked = { ...what, shows: answer.hits[0]?.best_views ?? [] };
   tell(summary(answer));
-  showAnswers(main(), answer, acts);
+  listAnswers();
   page.outline.answered(answer.hits.map((hit) => hit.node));
   markChosen(page.chosen);
   restyle();
+}
+
+export function listAnswers() {
+  const right = panes[1];
+  showAnswers(main(), panes[0].answer, acts, right && { outline: outlines.get(variantOf(right)), answer: right.answer, by: right.by.replace("|", ", ") });
 }
 
 export async function fillField(signal) {
@@ -50,7 +56,8 @@ export async function fillField(signal) {
     try {
       for (const pane of panes) {
         if (pane.field || !pane.answer) continue;
-        await page.painter.loadField(variantOf(pane), field, signal);
+        pane.values = new Uint8Array(await api.field({ variant: variantOf(pane), ...field }, signal));
+        page.painter.loadField(variantOf(pane), pane.values);
         pane.field = field;
       }
     } catch (error) { failed(error); }
@@ -69,7 +76,8 @@ export async function ask(keepChoice = false) {
   const view = $("here").checked ? page.camera.view : -1;
   if ($("here").checked && view < 0) { refused(new Error("Stand at a photograph first: choose one below.")); return; }
   if (!keepChoice && page.chosen >= 0) choose(-1);   // nothing to take back: nothing to draw before the answer
-  await askAll({ text }, (pane, signal) => api.query({ variant: variantOf(pane), text, level: level(), answerer: answererOf(pane), ...(view >= 0 ? { view } : {}) }, signal));
+  await askAll({ text }, (pane, signal) => api.query({ variant: variantOf(pane), text, level: level(), answerer: answererOf(pane),
+    ...(view >= 0 ? { view } : {}), ...(threshold() === null ? {} : { threshold: threshold() }) }, signal));
 }
 
 export async function like(node) {
@@ -135,3 +143,4 @@ export function clear() {
 }
 
 acts.like = like;
+acts.list = listAnswers;

@@ -1,7 +1,7 @@
 // The chosen node and the one under the pointer, and the names that a person gives.
 
 import * as api from "./api.js";
-import { markChosen, showAnswers } from "./answers.js";
+import { markChosen } from "./answers.js";
 import { showCard } from "./card.js";
 import { painted, restyle } from "./drawing.js";
 import { LEVELS } from "./elements.js";
@@ -81,7 +81,7 @@ async function rename(node, name) {
     page.outline.renamed(node);
     tell(name ? `Named “${name}”. Ask for it, here or with hilsplat query.` : "The name is taken away.");
     choose(node);   // after the words, which take room from the outline
-    if (panes[0].answer) showAnswers(own, panes[0].answer, acts);
+    acts.list();
   } catch (error) {
     if (error.status === 412) { await loadVariant(own.variant, true); page.outline.show(main()); choose(node); tell("Somebody else changed the names meanwhile; they are here now. Name it again.", true); } else failed(error);
   }

@@ -3,7 +3,8 @@
 import * as api from "./api.js";
 import { $, nameOf } from "./elements.js";
 import { drawOverlay } from "./overlay.js";
-import { host, level, levelIndex, main, options, outlines, page, panes, variantOf } from "./state.js";
+import { showScale } from "./scale.js";
+import { host, level, levelIndex, main, options, outlines, page, panes, threshold, variantOf } from "./state.js";
 import { shownHits, styleOf } from "./styles.js";
 
 const SLOW_MS = 60;
@@ -16,7 +17,7 @@ export function currentStyles() {
   if (!styles.length) {
     styles = panes.map((pane, k) => {
       const own = !k || variantOf(pane) === variantOf(panes[0]);
-      return styleOf({ outline: outlines.get(variantOf(pane)), answer: pane.answer, colour: $("colour").value, mode: $("mode").value, field: pane.field,
+      return styleOf({ outline: outlines.get(variantOf(pane)), answer: pane.answer, colour: $("colour").value, mode: $("mode").value, field: pane.field, threshold: threshold(),
         level: levelIndex(pane.answer), chosen: own ? page.chosen : -1, hover: own ? page.hover : -1 });
     });
   }
@@ -40,6 +41,7 @@ function paint(now) {
 export function overlay() {
   const width = host.clientWidth, height = host.clientHeight;
   drawOverlay($("overlay"), page.camera, panes.map((pane, k) => ({ boxes: boxes(pane, k), label: panes.length > 1 ? pane.by.replace("|", ", ") : "" })), width, height, $("tools").offsetTop + $("tools").offsetHeight);
+  showScale(currentStyles()[0]);
   page.photos.place(page.camera, width, height, panes.length);
   page.photos.mark(page.camera.view, page.asked?.shows ?? []);
 }
@@ -79,7 +81,7 @@ function remember() {
     const link = new URLSearchParams({ c: page.camera.toText() });
     const put = (key, value, usual) => { if (value && value !== usual) link.set(key, value); };
     put("q", page.asked?.text); put("level", level(), "auto"); put("by", panes[0].by, `${page.scene.variants[0]}|tree`); put("beside", panes[1]?.by);
-    put("node", page.chosen >= 0 ? `${page.chosen}.${main().tree}` : ""); put("colour", $("colour").value, "answers"); put("mode", $("mode").value, "tint");
+    put("node", page.chosen >= 0 ? `${page.chosen}.${main().tree}` : ""); put("colour", $("colour").value, "answers"); put("mode", $("mode").value, "tint"); put("least", threshold() === null ? "" : String(threshold()));
     history[isNew ? "pushState" : "replaceState"](null, "", `${location.pathname}${api.offline ? location.search : keptSearch()}#${link}`);
   }, 400);
 }

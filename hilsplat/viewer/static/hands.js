@@ -10,7 +10,7 @@ import { $, counted, nameOf } from "./elements.js";
 import { flyTo, nearestView, setMoving, stand, step, touched } from "./flights.js";
 import { attachKeys } from "./keyboard.js";
 import { save } from "./saves.js";
-import { failed, host, main, page, panes, tell, variantOf } from "./state.js";
+import { failed, host, main, page, panes, start, tell, variantOf } from "./state.js";
 import { choosePanes } from "./variants.js";
 
 const MODES = ["tint", "ghost", "isolate", "plain"];
@@ -39,6 +39,16 @@ export function attachHands() {
   for (const radio of document.querySelectorAll("[name=level]")) radio.addEventListener("change", levelChanged);
   for (const id of ["left", "right"]) $(id).addEventListener("change", choosePanes);
   $("mode").addEventListener("change", restyle);
+  const thresholdChanged = () => {
+    $("threshold-at").disabled = !$("threshold-on").checked;
+    $("threshold-told").textContent = Number($("threshold-at").value).toFixed(2);
+    restyle();
+  };
+  const askAgain = () => { if (page.asked?.text && !api.offline) ask(true); };
+  $("threshold-on").addEventListener("change", () => { thresholdChanged(); askAgain(); });
+  $("threshold-at").addEventListener("input", thresholdChanged);
+  $("threshold-at").addEventListener("change", askAgain);
+  if (start.get("least")) { $("threshold-on").checked = true; $("threshold-at").value = start.get("least"); thresholdChanged(); }
   $("colour").addEventListener("change", () => fillField());
   $("blend").addEventListener("click", () => { if (page.camera.view < 0) stand(nearestView()); page.photos.cycle(); redraw(); });
   $("reload").addEventListener("click", () => location.reload());

@@ -68,7 +68,7 @@ function onlyWhatIsHere() {
   $("gif-side").hidden = true;
   $("save").querySelector("hr").hidden = true;
   $("colour").querySelector("[value=field]").remove();
-  $("levels").hidden = true;
+  $("levels").hidden = $("threshold").hidden = true;
   $("text").setAttribute("list", "texts");
   document.body.append(make("datalist", { id: "texts" }, ...api.texts.map((text) => make("option", { value: text }))));
   $("text").placeholder = api.texts[0] ?? "";

@@ -58,8 +58,7 @@ export class Renderer {
   }
 
   // The field's relevancy of each Gaussian, in the spare channel.
-  async loadField(variant, { text, level }, signal) {
-    const bytes = new Uint8Array(await api.field({ variant, text, level }, signal));
+  loadField(variant, bytes) {
     const values = this.nodeValues.get(variant);
     for (let i = 0; i < bytes.length; i++) values[4 * i + 3] = bytes[i];
     this.gl.deleteTexture(this.nodeTextures.get(variant));

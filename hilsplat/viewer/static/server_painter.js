@@ -25,7 +25,7 @@ export class ServerPainter {
 
   async load() {}
   async loadNodes() {}
-  async loadField() {}   // a frame names the text; the server looks it up
+  loadField() {}   // a frame names the text; the server looks it up
   get settled() { return this.drawn === this.asked; }
 
   resize(width, height) {

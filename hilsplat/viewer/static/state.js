@@ -13,6 +13,8 @@ export const panes = [{ by: "", answer: null, field: null }]; // one, or two sid
 export const variantOf = (pane) => pane.by.split("|")[0];
 export const answererOf = (pane) => pane.by.split("|")[1] || "tree";
 export const level = () => document.querySelector("[name=level]:checked").value;
+// Least score of an answer, or null for those near the best.
+export const threshold = () => $("threshold-on").checked ? Number($("threshold-at").value) : null;
 export const levelIndex = (answer) => Math.max(0, LEVELS.indexOf(level() === "auto" ? answer?.level ?? "whole" : level()));
 export const main = () => outlines.get(variantOf(panes[0]));
 

@@ -12,6 +12,14 @@ export const RAMP = (() => {
   return ramp;
 })();
 
+// The ramp with what is below a threshold in dark grey.
+const cut = new Map();
+function rampFrom(threshold) {
+  if (threshold === null) return RAMP;
+  if (!cut.has(threshold)) cut.set(threshold, RAMP.map((value, k) => Math.floor(k / 3) < 255 * threshold ? 28 : value));
+  return cut.get(threshold);
+}
+
 // A colour that neighbours in the table do not share.
 export function colourOf(node) {
   const hue = (node * 0.61803398875) % 1, value = (n) => {
@@ -28,22 +36,25 @@ export const shownHits = (answer) => answer?.route === "like" ? answer.hits.slic
 /*
  * outline: the nodes of a variant; answer: what was found, or null; colour, mode: the choices of the page;
  * level: 0, 1, 2 for what is painted by level; chosen, hover: nodes, or -1; field: the {text, level} whose field
- * relevancy was asked for, or null.
+ * relevancy was asked for, or null; threshold: the least relevancy that is painted, or null.
  */
-export function styleOf({ outline, answer, colour, mode, level, chosen, hover, field }) {
+export function styleOf({ outline, answer, colour, mode, level, chosen, hover, field, threshold = null }) {
   const nodes = outline?.nodes ?? [], table = new Uint8Array(4 * (nodes.length + 1));
   const set = (node, rgb, a) => { if (node >= 0 && node < nodes.length) table.set([...rgb, Math.round(255 * a)], 4 * (node + 1)); };
   let use = [true, true, true];
-  if (colour === "field" && answer && field) return { table, use, mode: "plain", ramp: RAMP, field };
+  const range = {};   // of the colours
+  if (colour === "field" && answer && field) return { table, use, mode: "plain", ramp: rampFrom(threshold), field, low: 0, high: 1 };
   if (colour === "nodes" || (colour === "relevancy" && answer)) {
     use = [0, 1, 2].map((each) => each === level);
     const own = nodes.map((_, node) => node).filter((node) => nodes[node].level === level);
     const values = own.map((node) => answer?.relevancy[node] ?? 0), low = Math.min(...values), high = Math.max(...values);
+    Object.assign(range, { low, high });
     own.forEach((node, k) => {
+      if (colour === "relevancy" && threshold !== null && values[k] < threshold) return;
       const step = high > low ? Math.round(255 * (values[k] - low) / (high - low)) : 128;
       set(node, colour === "nodes" ? colourOf(node) : RAMP.subarray(3 * step, 3 * step + 3), colour === "nodes" ? 0.6 : 0.8);
     });
-    mode = "plain";
+    if (colour === "nodes" || threshold === null) mode = "plain";
   } else if (colour === "answers" && answer) {
     const hits = shownHits(answer);
     hits.forEach((hit, rank) => set(hit.node, ANSWER, 0.72 - 0.42 * rank / Math.max(hits.length, 4)));
@@ -54,7 +65,7 @@ export function styleOf({ outline, answer, colour, mode, level, chosen, hover, f
     set(chosen, CHOSEN, 0.62);
   }
   if (hover >= 0 && hover !== chosen && colour !== "none") set(hover, HOVER, 0.45);
-  return { table, use, mode, ramp: null };
+  return { table, use, mode, ramp: null, ...(colour === "relevancy" ? range : {}) };
 }
 
 const base64 = (bytes) => {

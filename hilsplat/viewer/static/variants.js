@@ -1,8 +1,7 @@
 // Who answers: variants of the scene, one or two of them side by side, as they come to exist and change.
 
-import { showAnswers } from "./answers.js";
 import * as api from "./api.js";
-import { ask } from "./asking.js";
+import { ask, listAnswers } from "./asking.js";
 import { acts, choose } from "./choosing.js";
 import { redraw, restyle } from "./drawing.js";
 import { $, counted, make } from "./elements.js";
@@ -38,7 +37,7 @@ export async function useVariants() {
 
 function showOutline() {
   page.outline.show(main());
-  showAnswers(main(), panes[0].answer, acts);
+  listAnswers();
   $("about").textContent = `${page.scene.name}: ${counted(page.scene.gaussians, "Gaussian")}. Masks by ${main().masks}, words and pictures by ${main().clip}.`;
   restyle();
 }
@@ -51,8 +50,8 @@ export async function choosePanes() {
     else if (panes[1]?.by !== right) panes[1] = { by: right, answer: null, field: null };
     for (const pane of panes) await loadVariant(variantOf(pane));
     if (changed) { choose(-1); showOutline(); }
-    if (page.asked?.text) await ask(true); else restyle();
-    redraw();
+    if (page.asked?.text) await ask(true); else listAnswers();
+    restyle();
   } catch (error) { failed(error); }
 }
 

@@ -82,6 +82,18 @@ def test_automatic_level_is_the_region_s_own(scene, name):
     assert scene.select((name,), threshold=0.85).ids.tolist() == [NODE[name]]
 
 
+def test_a_threshold_keeps_the_answers_with_at_least_that_score(scene):
+    every = scene.query("A top", "part", threshold=1e-6, limit=99)
+    scores = [hit.score for hit in every]
+    assert len(every) == len(scene.tree.nodes_of(Level.PART)) and scores == sorted(scores, reverse=True)
+    least = (scores[0] + scores[1]) / 2
+    assert [hit.node for hit in scene.query("A top", "part", threshold=least)] == [every[0].node]
+    assert scene.query("A top", "part", threshold=1 - 1e-9) == []
+    for wrong in (0.0, 1.0, -2.0, float("nan")):
+        with pytest.raises(SettingsError, match="between 0 and 1"):
+            scene.query("A top", threshold=wrong)
+
+
 def test_automatic_level_is_that_of_the_best_node_and_of_equals_the_coarsest(scene):
     margin = np.full(7, -0.1)
     margin[[NODE["A top left"], NODE["A top"], NODE["A"]]] = 0.3, 0.2, 0.1
