@@ -3,7 +3,7 @@
 import * as api from "./api.js";
 import { ask, listAnswers } from "./asking.js";
 import { acts, choose } from "./choosing.js";
-import { redraw, restyle } from "./drawing.js";
+import { restyle } from "./drawing.js";
 import { $, counted, make } from "./elements.js";
 import { failed, loadVariant, main, page, panes, sceneChanged, start, tell, variantOf } from "./state.js";
 
