@@ -13,6 +13,7 @@ VARIANT_STAGES = {
     "clip",
     "contributions",
     "semantic_tree",
+    "names",
     "autoencoder",
     "method",
 } | AFTER_FIELD

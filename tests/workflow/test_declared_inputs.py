@@ -19,6 +19,7 @@ OUTPUTS = {
     "clip": "results/synthetic/tiny/default/clip",
     "contributions": "results/synthetic/tiny/default/contributions",
     "semantic_tree": "results/synthetic/tiny/default/semantic_tree",
+    "names": "results/synthetic/tiny/default/names",
     "autoencoder": "results/synthetic/tiny/default/autoencoder",
     "field": FIELD,
     "method": "results/synthetic/tiny/lifted/field.safetensors",
