@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from typing_extensions import TypedDict  # pydantic describes no other before Python 3.12
 
 from hilsplat.query.hits import Hit, doubts_of, hits_of
 from hilsplat.query.language_scene import LanguageScene, path_of
@@ -14,6 +15,34 @@ LISTED = 24
 """Most answers to list."""
 
 
+class FoundNode(TypedDict):
+    """One answer: row of the semantic tree, level, score, name, numbers of the views that show it largest."""
+
+    node: int
+    level: str
+    score: float
+    name: str
+    best_views: list[int]
+
+
+class Answer(TypedDict):
+    """The answers to a text, or what looks like a node or a picture.
+
+    `relevancy` has a number for every node, `total` counts all answers of which `hits` lists the best, and
+    `route` is as in `hilsplat.Hit`.
+    """
+
+    text: str
+    level: str
+    hits: list[FoundNode]
+    total: int
+    relevancy: list[float]
+    doubts: list[str]
+    caution: str
+    route: str
+    ms: float
+
+
 def answer(
     scene: LanguageScene,
     text: str,
@@ -21,7 +50,7 @@ def answer(
     answerer: str = "tree",
     view: str | None = None,
     threshold: float | None = None,
-) -> dict[str, Any]:
+) -> Answer:
     """Ask a scene for a text: hits, relevancy of every node to the last text, doubts."""
     begin = time.perf_counter()
     found = scene.find(text, level, answerer=answerer, view=view, threshold=threshold)
@@ -40,7 +69,7 @@ def answer(
     }
 
 
-def alike(scene: LanguageScene, hits: Sequence[Hit], what: str, also: Sequence[int] = ()) -> dict[str, Any]:
+def alike(scene: LanguageScene, hits: Sequence[Hit], what: str, also: Sequence[int] = ()) -> Answer:
     """What looks like a node or a picture; `also` are nodes that belong to the answer anyway."""
     relevancy = np.zeros(len(scene.tree))
     relevancy[[hit.node for hit in hits]] = [max(hit.score, 0.0) for hit in hits]
@@ -58,7 +87,7 @@ def alike(scene: LanguageScene, hits: Sequence[Hit], what: str, also: Sequence[i
     }
 
 
-def described_hit(scene: LanguageScene, hit: Hit) -> dict[str, Any]:
+def described_hit(scene: LanguageScene, hit: Hit) -> FoundNode:
     """One answer."""
     return {
         "node": hit.node,

@@ -15,6 +15,7 @@ from hilsplat.query.names import StaleNamesError, write_names
 from hilsplat.scene.scene import Scene
 from hilsplat.viewer import answers, exports, wire
 from hilsplat.viewer.guard import Guard
+from hilsplat.viewer.openapi import description
 from hilsplat.viewer.payload import packed_gaussians, packed_nodes
 from hilsplat.viewer.picking import pick
 from hilsplat.viewer.saved_files import SavedFiles, node_of
@@ -48,6 +49,7 @@ class Viewer:
         """The application, guarded."""
         routes = [
             *self.pages.routes(),
+            Route("/openapi.json", self.described),
             Route("/api/scene", self.scene),
             Route("/api/changes", self.changes),
             Route("/api/variant/{variant}", self.variant),
@@ -65,6 +67,10 @@ class Viewer:
             *SavedFiles(self.thread, self.pages.static).routes(),
         ]
         return guarded(routes, token, {StaleNamesError: 412, StaleSceneError: 409})
+
+    async def described(self, request: Request) -> Response:
+        """What a script may ask."""
+        return answer_json(description())
 
     # -- the scene --------------------------------------------------------------------------------
 
@@ -127,7 +133,7 @@ class Viewer:
         """A text or a path."""
         asked = await read(request, wire.Query)
 
-        def answer(shown: ShownScene) -> dict[str, Any]:
+        def answer(shown: ShownScene) -> answers.Answer:
             view = None if asked.view is None else view_name(shown.scene, asked.view)
             scene = shown.answering(asked.variant)
             return answers.answer(scene, asked.text, asked.level, asked.answerer, view, asked.threshold)
@@ -138,7 +144,7 @@ class Viewer:
         """What looks like a node or a picture."""
         asked = await read(request, wire.Like)
 
-        def answer(shown: ShownScene) -> dict[str, Any]:
+        def answer(shown: ShownScene) -> answers.Answer:
             scene = shown.answering(asked.variant)
             if asked.node is not None:
                 hits = scene.like_node(asked.node, limit=answers.LISTED)

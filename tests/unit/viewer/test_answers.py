@@ -15,6 +15,7 @@ from pathlib import Path
 
 import av
 import cv2
+import jsonschema
 import numpy as np
 import pytest
 from PIL import Image
@@ -61,6 +62,32 @@ def test_the_page_gets_the_answers_of_the_scene(client, scene, text, answerer):
     assert found["doubts"] == [str(doubt) for doubt in hits[0].doubts] and found["route"] == hits[0].route
     last = text.split(">")[-1].strip()
     np.testing.assert_allclose(found["relevancy"], scene.node_relevancy([last], answerer)[0], atol=1e-4)
+
+
+def test_what_a_script_may_ask_is_described_as_it_is(client):
+    described = client.get("/openapi.json").json()
+    bodies = {
+        "/api/query": {"text": "mug > handle"},
+        "/api/like": {"node": 0},
+        "/api/export/boxes": {"nodes": [0]},
+        "/api/field": {"text": "mug"},
+    }
+    for path, methods in described["paths"].items():
+        for method, of in methods.items():
+            asked = path.format(variant="default", number=0, node=0)
+            body = bodies.get(path) if method == "post" else None
+            if method == "get" or body is not None:
+                given = client.request(method, asked, json=body)
+                (kind,) = of["responses"]["200"]["content"]
+                found = given.headers["content-type"].replace("png", "jpeg")  # as the photograph is
+                assert (given.status_code, found) == (200, kind)
+            if body is not None:
+                sent = of["requestBody"]["content"]["application/json"]["schema"]
+                jsonschema.validate(body, {**sent, "components": described["components"]})
+    schema = {"$ref": "#/components/schemas/Answer", "components": described["components"]}
+    answer = client.post("/api/query", json={"text": "mug > handle"}).json()
+    jsonschema.validate(answer, schema)
+    assert {*answer} == {*described["components"]["schemas"]["Answer"]["properties"]}
 
 
 def test_a_photograph_and_a_level_restrict_the_answers(client, scene):

@@ -1,0 +1,87 @@
+"""What a script may ask the page's server, as an OpenAPI description; docs/viewer.md has an example."""
+
+from functools import cache
+from typing import Any
+
+from pydantic import BaseModel, TypeAdapter
+
+from hilsplat.viewer import wire
+from hilsplat.viewer.answers import Answer
+
+IMAGE = "image/jpeg"
+JSON = "application/json"
+BYTES = "application/octet-stream"
+
+SENT: tuple[tuple[str, str, str, type[BaseModel] | None, str], ...] = (
+    ("get", "/api/scene", "Views with their cameras, number of Gaussians, variants that answer", None, JSON),
+    ("get", "/api/variant/{variant}", "The nodes of a variant's semantic tree, in row order", None, JSON),
+    ("get", "/api/photo/{number}", "An undistorted photograph", None, IMAGE),
+    (
+        "get",
+        "/api/crop/{variant}/{node}",
+        "A node in the photograph that shows it largest",
+        None,
+        IMAGE,
+    ),
+    ("post", "/api/query", "Answers to a text or a path", wire.Query, JSON),
+    ("post", "/api/like", "What looks like a node or a picture", wire.Like, JSON),
+    ("post", "/api/pick", "The nodes that a pixel of a camera shows, with their shares", wire.Pick, JSON),
+    ("post", "/api/frame", "A picture of the scene", wire.Frame, IMAGE),
+    ("post", "/api/field", "The field's relevancy of every Gaussian in 1/255", wire.FieldRelevancy, BYTES),
+    ("post", "/api/export/ply", "The Gaussians of nodes as a 3DGS PLY", wire.Selection, BYTES),
+    ("post", "/api/export/boxes", "Boxes of nodes", wire.Selection, JSON),
+)
+"""Method, path, what it gives, what must be sent, and the type of the answer."""
+
+ANSWERS = ("/api/query", "/api/like")
+
+
+@cache
+def description() -> dict[str, Any]:
+    """The description, as OpenAPI 3.1."""
+    schemas: dict[str, Any] = {}
+
+    def schema_of(kind: Any) -> dict[str, Any]:
+        made = TypeAdapter(kind).json_schema(ref_template="#/components/schemas/{model}")
+        schemas.update(made.pop("$defs", {}))
+        schemas[kind.__name__] = made
+        return {"$ref": f"#/components/schemas/{kind.__name__}"}
+
+    paths: dict[str, Any] = {}
+    for method, path, summary, sent, given in SENT:
+        names = [part.strip("{}") for part in path.split("/") if part.startswith("{")]
+        content = {"schema": schema_of(Answer)} if path in ANSWERS else {}
+        paths.setdefault(path, {})[method] = {
+            "summary": summary,
+            "parameters": [
+                {
+                    "name": name,
+                    "in": "path",
+                    "required": True,
+                    "schema": {"type": "string" if name == "variant" else "integer"},
+                }
+                for name in names
+            ],
+            **({"requestBody": _body(schema_of(sent))} if sent else {}),
+            "responses": {
+                "200": {"description": summary, "content": {given: content}},
+                "400": {"description": "what was sent is malformed: {error}"},
+                "403": {"description": "the cookie, the host or the origin is missing or another"},
+                "422": {"description": "it cannot be answered: {error}"},
+            },
+        }
+    return {
+        "openapi": "3.1.0",
+        "info": {
+            "title": "hilsplat view",
+            "version": "1",
+            "description": "Open the printed address first: it sets the cookie that every request needs. A "
+            "POST also needs the header Origin: http:// and the host of the address.",
+        },
+        "paths": paths,
+        "components": {"schemas": schemas},
+    }
+
+
+def _body(schema: dict[str, Any]) -> dict[str, Any]:
+    return {"required": True, "content": {JSON: {"schema": schema}}}
