@@ -4,7 +4,7 @@
 
 A node counts if it has an IoU above 0.5 with a true node; its name is right if it is the true text or a
 synonym. Texts that are present are those of the matched nodes. Texts that are absent are those of the
-vocabulary that name nothing in the scene; words that the model was never taught are always doubted
+vocabulary that name nothing in the scene; words that the model does not know are always doubted
 and not counted.
 """
 

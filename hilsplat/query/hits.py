@@ -17,7 +17,7 @@ BEST_VIEWS = 3
 
 
 LIKELY_CHANCE = 0.05
-"""An answer is doubtful if this share of words for what is absent is answered as well."""
+"""An answer is doubtful if more than this share of words for absent things score as high."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class Doubt:
     Attributes:
         text: the text.
         level: the level that was searched, if nodes of another level do answer the text; else None.
-        chance: share of words for what is absent that are answered as well; None: unknown, and nothing
-            answers the text better than a generic word.
-        unknown: words of the text that the model was never taught.
+        chance: share of words for absent things whose best score is as high; None: unknown, and no node
+            matches the text better than a generic word.
+        unknown: words of the text that the model does not know.
     """
 
     text: str
@@ -42,11 +42,11 @@ class Doubt:
         who = "nothing" if self.level is None else f"no {self.level.label}"
         if self.unknown:
             words = ", ".join(map(repr, self.unknown))
-            return f"{self.text!r} may not be here: the model was never taught {words}"
+            return f"{self.text!r} may not be in the scene: the model does not know {words}"
         if self.chance is None:
             return f"{who} here answers to {self.text!r} better than to a generic word"
-        share = f"{max(self.chance, 0.01):.0%} of the words for what is certainly not here"
-        return f"{self.text!r} may not be here: {share} are answered as well"
+        share = f"{max(self.chance, 0.01):.0%} of words for absent things"
+        return f"{self.text!r} may not be in the scene: {share} score as high"
 
 
 @dataclass(frozen=True)

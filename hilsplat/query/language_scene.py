@@ -64,7 +64,7 @@ class LanguageScene:
         caution: why no answer of CLIP means anything here, in a sentence; empty: no such reason.
         names: names that a person gave to nodes, which answer texts first.
         naming: what a vocabulary calls the nodes, and words for what is absent; None: the stage has not run.
-        unknown_words: words of a text that the model of texts was never taught.
+        unknown_words: words of a text that the model of texts does not know.
         encode_picture: unit CLIP vector of an RGB image; None: pictures cannot be looked for.
     """
 
@@ -322,20 +322,20 @@ class LanguageScene:
     def _doubted(
         self, answer: TextAnswer, answerer: Answerer, shown: Bool[np.ndarray, " n"] | None
     ) -> TextAnswer:
-        """How well a text was answered, with the chance that a word for nothing is answered as well."""
+        """A text's answer with the share of words for absent things that score as high."""
         if self.names.nodes_of(answer.text):
             return answer
         chance = None
         if self.naming is not None and len(self.naming.rivals):
             rivals = np.ones(len(self.tree), np.bool_) if shown is None else shown.copy()
-            if answer.margin < answer.anywhere:  # the best node of another level was not asked for
+            if answer.margin < answer.anywhere:  # only one level was searched
                 rivals &= self.tree.level == int(answer.level)
             best = self._margins_by_chance(answerer, self.naming)[:, rivals].max(axis=1, initial=-np.inf)
             chance = (1 + int((best >= answer.margin).sum())) / (1 + len(best))
         return replace(answer, chance=chance, unknown=tuple(self.unknown_words(answer.text)))
 
     def _margins_by_chance(self, answerer: Answerer, naming: NodeNaming) -> Float32[np.ndarray, "W n"]:
-        """Cosine margin of every node for words that mean nothing here; see `NodeNaming.rivals`."""
+        """Cosine margin of every node for words for absent things; see `NodeNaming.rivals`."""
         if answerer not in self._by_chance:
             canonical = self.text_vectors(self.settings.canonical)
             self._by_chance[answerer] = margins(self.node_vectors(answerer), naming.rivals, canonical)

@@ -1,4 +1,4 @@
-"""The stage `names`: what a vocabulary calls each node, and how well words are answered by chance."""
+"""The stage `names`: the best word of a vocabulary for each node, and words for absent things."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -61,7 +61,7 @@ class Vocabulary:
         things: names of objects.
         parts: names of parts; a text such as "car wheel" names the whole too.
         surfaces: floors, walls and the like, which are listed after the things.
-        absent: words for what is in hardly any scene; empty: none are listed.
+        absent: words for things that few scenes have; empty: the file has none.
     """
 
     things: tuple[str, ...]
@@ -119,7 +119,8 @@ class NodeNaming:
         of_node: name of each node; "": nothing fits.
         candidates: the texts nearest to each node, best first, with their cosine margins.
         surfaces: whether each node is called a surface.
-        rivals: unit vectors of words, whose best margins are what an answer reaches by chance; may be empty.
+        rivals: unit vectors of words for absent things; their best margins are what chance reaches. May be
+            empty.
     """
 
     of_node: tuple[str, ...]

@@ -38,8 +38,8 @@ class TextAnswer:
         level: the level at which it was searched.
         margin: cosine margin of the best node that competed there; -inf if none did.
         anywhere: the same for the best node of any level.
-        chance: share of words for what is absent that are answered at least as well; None: unknown.
-        unknown: words of the text that the model was never taught.
+        chance: share of words for absent things whose best margin is as high; None: unknown.
+        unknown: words of the text that the model does not know.
     """
 
     text: str

@@ -28,8 +28,8 @@ class FoundNode(TypedDict):
 class Answer(TypedDict):
     """The answers to a text, or what looks like a node or a picture.
 
-    `relevancy` has a number for every node, `total` counts all answers of which `hits` lists the best, and
-    `route` is as in `hilsplat.Hit`.
+    `relevancy` has a number for every node, `total` counts all answers, `hits` lists the best, and `route` is
+    as in `hilsplat.Hit`.
     """
 
     text: str

@@ -69,7 +69,7 @@ class Viewer:
         return guarded(routes, token, {StaleNamesError: 412, StaleSceneError: 409})
 
     async def described(self, request: Request) -> Response:
-        """What a script may ask."""
+        """The OpenAPI description."""
         return answer_json(description())
 
     # -- the scene --------------------------------------------------------------------------------

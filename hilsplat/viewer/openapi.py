@@ -1,4 +1,4 @@
-"""What a script may ask the page's server, as an OpenAPI description; docs/viewer.md has an example."""
+"""The OpenAPI description of the requests that a script may send; docs/viewer.md has an example."""
 
 from functools import cache
 from typing import Any

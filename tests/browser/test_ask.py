@@ -71,7 +71,7 @@ def test_doubts_are_told(opened, desk_address, painter):
     page.keyboard.press("Enter")
     answers(page).first.wait_for()
     told = page.get_by_role("status").inner_text()
-    assert "'unicorn' may not be here: the model was never taught 'unicorn'." in told
+    assert "'unicorn' may not be in the scene: the model does not know 'unicorn'." in told
 
 
 @both

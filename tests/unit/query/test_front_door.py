@@ -206,7 +206,7 @@ def test_the_example_of_the_docs_runs(desk, project, monkeypatch, capsys):
     assert names["mask"].shape == names["photograph"].shape[:2]
     assert names["best"].keys() == {"desk"}
     printed = capsys.readouterr().out
-    assert "'unicorn' may not be here: the model was never taught 'unicorn'" in printed
+    assert "'unicorn' may not be in the scene: the model does not know 'unicorn'" in printed
     assert "has no view 'no such view'" in printed
 
 
@@ -229,7 +229,7 @@ def test_query_takes_data_set_and_scene_with_the_results_folder(desk, elsewhere,
     shutil.copytree(desk, elsewhere / "copy")
     asked = run_command(project, "query", "photos/desk", "unicorn > handle", "--results", "copy/results")
     assert asked.returncode == 0, asked.stderr
-    assert "doubtful: 'unicorn' may not be here" in asked.stdout
+    assert "doubtful: 'unicorn' may not be in the scene" in asked.stdout
     assert (elsewhere / "copy" / SCENE / "queries/unicorn--handle/panel.png").is_file()
 
 

@@ -126,7 +126,7 @@ def test_a_word_that_the_model_was_never_taught_is_doubted(desk):
     scene = hilsplat.open(desk)
     assert open_clip_of(desk / "default/clip").unknown_words("mug zebra, book") == ["zebra", ","]
     (doubt,) = scene.query("zebra")[0].doubts
-    assert str(doubt) == "'zebra' may not be here: the model was never taught 'zebra'"
+    assert str(doubt) == "'zebra' may not be in the scene: the model does not know 'zebra'"
     assert scene.query("mug > handle")[0].doubts == ()
 
 
@@ -137,7 +137,4 @@ def test_a_text_that_words_for_nothing_reach_is_doubted_with_the_chance(desk):
     scene = replace(scene, naming=replace(scene.naming, rivals=rivals), _by_chance={})
     (doubt,) = scene.query("book", "whole")[0].doubts  # a third of the words finds the book as well
     assert doubt.chance == pytest.approx(31 / 101)
-    assert (
-        str(doubt)
-        == "'book' may not be here: 31% of the words for what is certainly not here are answered as well"
-    )
+    assert str(doubt) == "'book' may not be here: 31% of words for absent things are answered as well"
