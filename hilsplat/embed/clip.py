@@ -218,7 +218,7 @@ class ClipModel:
         return np.stack([self._known_texts[text] for text in texts])
 
     def unknown_words(self, text: str) -> list[str]:
-        """Words of a text that are not in the model's vocabulary; a tokenizer of word pieces knows every word."""
+        """Words of a text outside the model's vocabulary; a tokenizer of word pieces knows every word."""
         unknown = self.tokenizer.token_to_id(getattr(self.tokenizer.model, "unk_token", None) or "")
         encoding = self.tokenizer.encode(text)
         places = zip(encoding.ids, encoding.offsets, strict=True)
