@@ -79,7 +79,7 @@ class RunEstimate:
         ]
         rows += [
             (name, *_cells(found, cores))
-            for name, found in sorted(self._totals.items(), key=lambda each: each[0] == OTHERS)
+            for name, found in sorted(self._totals.items(), key=lambda each: (each[0] == OTHERS, each[0]))
         ]
         rows.append(("all", *_cells(total, cores)))
         return ["This run would take about:", *_aligned(rows), *NOTES]

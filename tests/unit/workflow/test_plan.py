@@ -296,6 +296,7 @@ def test_a_run_of_photographs_leaves_tables_alone(tmp_path):
     assert targets.default(plan(tmp_path, groups=["photos"])) == [
         "results/figures/photos/desk/panel.png",
         "results/figures/photos/desk/comparison.png",
+        "results/photos/desk/default/names",
     ]
     wanted = targets.default(plan(tmp_path, sweep_scenes=["one"], theta_variants=["theta"]))
     assert "results/figures/synthetic/one/comparison.png" in wanted

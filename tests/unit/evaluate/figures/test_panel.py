@@ -98,7 +98,7 @@ def test_a_query_is_reported_and_drawn(block_world, tmp_path):
 
 
 def test_no_answer_is_said(block_world):
-    empty = replace(block_world.answers.find("bear"), ids=np.zeros(0, np.int64), margins=np.zeros(0))
+    empty = replace(block_world.answers.find("bear"), ids=np.zeros(0, np.int64), values=np.zeros(0))
     words = report(block_world.answers, "unicorn", empty)
     assert words.startswith(
         "nothing in synthetic/blocks answers to 'unicorn' at level whole; try --level part"
