@@ -137,4 +137,4 @@ def test_a_text_that_words_for_nothing_reach_is_doubted_with_the_chance(desk):
     scene = replace(scene, naming=replace(scene.naming, rivals=rivals), _by_chance={})
     (doubt,) = scene.query("book", "whole")[0].doubts  # a third of the words finds the book as well
     assert doubt.chance == pytest.approx(31 / 101)
-    assert str(doubt) == "'book' may not be here: 31% of words for absent things are answered as well"
+    assert str(doubt) == "'book' may not be in the scene: 31% of words for absent things score as high"

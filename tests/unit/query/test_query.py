@@ -68,10 +68,15 @@ def scene(tmp_path_factory) -> LanguageScene:
     )
 
 
+def near(scene, node_select: float = 0.85) -> LanguageScene:
+    """The scene with another share of the range within which answers lie."""
+    return replace(scene, settings=scene.settings.model_copy(update={"node_select": node_select}))
+
+
 @pytest.mark.parametrize("name", NODE)
 def test_every_region_is_found_at_its_level(scene, name):
     level = Level(int(scene.tree.level[NODE[name]]))
-    hits = scene.select((name,), level=level, threshold=0.85)
+    hits = near(scene).select((name,), level=level)
     assert hits.ids.tolist() == [NODE[name]]
     assert scene.query(name, level.label)[0].score > 0.9
     assert scene.query(name, level.label)[0].node == NODE[name]
@@ -79,7 +84,7 @@ def test_every_region_is_found_at_its_level(scene, name):
 
 @pytest.mark.parametrize("name", NODE)
 def test_automatic_level_is_the_region_s_own(scene, name):
-    assert scene.select((name,), threshold=0.85).ids.tolist() == [NODE[name]]
+    assert near(scene).select((name,)).ids.tolist() == [NODE[name]]
 
 
 def test_a_threshold_keeps_the_answers_with_at_least_that_score(scene):
@@ -321,7 +326,7 @@ def test_hits_tell_gaussians_and_an_oriented_box(scene):
 
 
 def test_path_goes_from_child_to_child(scene):
-    hits = scene.select(("A", "A top", "A top left"), threshold=0.85)
+    hits = near(scene).select(("A", "A top", "A top left"))
     assert hits.ids.tolist() == [NODE["A top left"]]
     assert hits.route == "child"
     assert hits.level == Level.SUBPART
@@ -329,7 +334,7 @@ def test_path_goes_from_child_to_child(scene):
 
 def test_path_restricts_a_part_to_its_object(scene):
     # "A top" asked inside B can only be a part of B
-    assert scene.select(("B", "A top"), threshold=0.85).ids.tolist() == [NODE["B top"]]
+    assert near(scene).select(("B", "A top")).ids.tolist() == [NODE["B top"]]
 
 
 @pytest.mark.parametrize(
@@ -344,7 +349,7 @@ def test_path_restricts_a_part_to_its_object(scene):
     ],
 )
 def test_a_short_path_finds_its_levels_unless_one_is_given(scene, path, level, found):
-    hits = scene.select(path, level=level, threshold=0.85)
+    hits = near(scene).select(path, level=level)
     assert hits.ids.tolist() == [NODE[found]]
     assert hits.level == Level(int(scene.tree.level[NODE[found]]))
 
@@ -390,7 +395,7 @@ def test_a_view_shows_what_has_a_mask_there(scene, monkeypatch):
 
 def test_path_falls_back_to_any_descendant_of_the_object(scene):
     # "B top" has no subpart; "B corner" hangs directly under B
-    hits = scene.select(("B", "B top", "B corner"), threshold=0.85)
+    hits = near(scene).select(("B", "B top", "B corner"))
     assert hits.ids.tolist() == [NODE["B corner"]]
     assert hits.route == "descendant"
 
@@ -398,7 +403,7 @@ def test_path_falls_back_to_any_descendant_of_the_object(scene):
 def test_path_falls_back_to_the_whole_level(scene):
     parent = np.where(scene.tree.level == Level.SUBPART, -1, scene.tree.parent).astype(np.int32)
     orphaned = replace(scene, tree=replace(scene.tree, parent=parent))
-    hits = orphaned.select(("A", "A top", "B corner"), threshold=0.85)
+    hits = near(orphaned).select(("A", "A top", "B corner"))
     assert hits.ids.tolist() == [NODE["B corner"]]
     assert hits.route == "fallback"
 

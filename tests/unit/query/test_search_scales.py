@@ -18,6 +18,7 @@ from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings
+from tests.unit.query.test_query import near
 from tests.unit.round_gaussians import round_gaussians
 
 
@@ -120,16 +121,16 @@ def three_mugs() -> LanguageScene:
 def test_a_large_scale_saturates_scores_but_not_the_ranking(three_mugs):
     scores = three_mugs.node_relevancy(["mug"])[0]
     assert scores.tolist() == [1.0, 1.0, 1.0]  # 1 / (1 + exp(-18)) in float32
-    assert three_mugs.select(["mug"], threshold=0.0).ids.tolist() == [1, 0, 2]
+    assert near(three_mugs, 0.0).select(["mug"]).ids.tolist() == [1, 0, 2]
     assert three_mugs.select(["mug"]).ids.tolist() == [1]
     assert three_mugs.query("mug")[0].score == pytest.approx(1.0)
 
 
 def test_the_scale_of_relevancies_changes_no_answer(three_mugs):
     small = replace(three_mugs, settings=EvaluateSettings(relevancy_scale=0.1))
-    for threshold in (0.0, 0.3, 0.95):
-        found = three_mugs.select(["mug"], threshold=threshold)
-        assert small.select(["mug"], threshold=threshold).ids.tolist() == found.ids.tolist()
+    for share in (0.0, 0.3, 0.95):
+        found = near(three_mugs, share).select(["mug"])
+        assert near(small, share).select(["mug"]).ids.tolist() == found.ids.tolist()
 
 
 def test_margins_are_cosines_and_relevancies_their_logistic():
