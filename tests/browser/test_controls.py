@@ -38,6 +38,7 @@ def test_the_server_paints_the_first_picture_once_and_sends_no_nodes(opened, des
 
 def test_two_small_pictures_are_under_way_at_most(opened, desk_address):
     page = opened(desk_address, "server")
+    page.wait_for_timeout(2000)  # until its own are all there
     held = []
     for pattern in ("**/api/crop/**", "**/api/thumb/**"):
         page.route(pattern, lambda route: held.append(route))
@@ -127,7 +128,7 @@ def test_a_threshold_cuts_the_colours_and_counts_what_reaches_it(opened, desk_ad
     page = opened(desk_address, painter)
     ask(page, "mug")
     answers(page).first.wait_for()
-    page.get_by_label("Colours", exact=True).select_option(colour)
+    page.locator("#colour").select_option(colour)
     scale = page.get_by_role("group", name="Colours of relevancy")
     scale.wait_for()
     assert scale.inner_text().split() == page.evaluate(
