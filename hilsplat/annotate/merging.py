@@ -35,7 +35,7 @@ def merged(
     """Add the labels of files to those of a scene.
 
     Ids of a file count only together with text and level: programs without ids number the shapes of every
-    photograph from 1. A label is the thing of the scene that it lies on, else the one with its id, else one
+    photograph from 1. A label is the thing of the scene that it overlaps, else the one with its id, else one
     with its text that the photograph does not show yet, else a new one; it must have the thing's text and
     level.
 
@@ -88,7 +88,7 @@ def _row_of(
 
 
 def _number(label: Label, here: Sequence[Label], things: Mapping[int, tuple[str, int]]) -> int:
-    """Id of a label that lies on nothing of the photograph."""
+    """Id of a label that overlaps no label of its kind in the photograph."""
     taken = {other.id for other in here}
     alike = [number for number, kind in things.items() if kind == _kind(label) and number not in taken]
     if label.id in alike or label.id not in things:

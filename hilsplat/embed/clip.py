@@ -222,7 +222,8 @@ class ClipModel:
         unknown = self.tokenizer.token_to_id(getattr(self.tokenizer.model, "unk_token", None) or "")
         encoding = self.tokenizer.encode(text)
         places = zip(encoding.ids, encoding.offsets, strict=True)
-        return [text[start:end] for number, (start, end) in places if number == unknown and end > start]
+        words = [text[start:end] for number, (start, end) in places if number == unknown]
+        return [word for word in words if any(letter.isalnum() for letter in word)]
 
     def _embed_text(self, text: str) -> Float32[np.ndarray, " C"]:
         """The unit vector of one text."""

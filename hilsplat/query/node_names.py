@@ -23,6 +23,7 @@ from hilsplat.base.artifacts import (
     write_npy,
 )
 from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.base.identity import code_digest
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, open_clip_of
@@ -138,22 +139,27 @@ class NodeNaming:
         folder = Path(folder)
         if not folder.is_dir():
             return None
-        index = read_full_index(folder, "tree_sha256", "clip_sha256")
+        index = read_full_index(folder, "tree_sha256", "clip_sha256", "nodes")
         made_for = index["tree_sha256"], index["clip_sha256"]
         if made_for != (tree_digest(semantic_tree), _clip_digest(clip_folder)):
             return None
         rows = read_json(folder / "names.json")
         try:
-            return NodeNaming(
+            found = NodeNaming(
                 tuple(str(row["name"]) for row in rows),
                 tuple(tuple((text, float(value)) for text, value in row["candidates"]) for row in rows),
                 tuple(bool(row["surface"]) for row in rows),
                 read_npy(folder / "rivals.npy").astype(np.float32),
             )
+            if len(rows) != index["nodes"] or found.rivals.ndim != 2:
+                raise ValueError(f"{len(rows)} names, rivals of shape {found.rivals.shape}")
         except (TypeError, KeyError, ValueError) as error:
             raise ArtifactError(
-                f"{folder / 'names.json'} is damaged: {error!r}", fix=remake(folder)
+                f"{folder / 'names.json'} or rivals.npy is damaged: {error!r}",
+                expected=f"{index['nodes']} names with candidates, and vectors (W, C)",
+                fix=remake(folder),
             ) from error
+        return found
 
 
 def run_names(
@@ -196,7 +202,8 @@ def run_names(
 
         margin = margins(tree.clip, of(texts), of(evaluate.canonical)).T
         if len(known) < FEWEST_ABSENT:
-            known = [text for row, text in enumerate(texts) if row not in {*margin.argmax(axis=1).tolist()}]
+            nearest = set(margin.argmax(axis=1).tolist())
+            known = [text for row, text in enumerate(texts) if row not in nearest]
         rivals = known if len(known) >= FEWEST_ABSENT else []
         naming = named(tree, vocabulary, margin, of(rivals))
         rows = zip(naming.of_node, naming.surfaces, naming.candidates, strict=True)
@@ -217,6 +224,7 @@ def run_names(
             clip_sha256=_clip_digest(clip_folder),
             vocabulary=path.name,
             vocabulary_sha256=sha256_of_file(path),
+            nodes=len(tree),
             texts=len(texts),
             rivals=len(rivals),
         )
@@ -226,7 +234,14 @@ def run_names(
 
 def text_vectors(model: ClipModel, texts: Sequence[str], cache: Path) -> Float32[np.ndarray, "T C"]:
     """Unit vectors of texts; a real CLIP takes half a minute for a vocabulary, so they are kept."""
-    key = sha256_of_json({"model": model.digest, "template": model.template, "texts": list(texts)})
+    key = sha256_of_json(
+        {
+            "model": model.digest,
+            "template": model.template,
+            "texts": list(texts),
+            "code": code_digest(ClipModel),
+        }
+    )
 
     def embed() -> dict[str, np.ndarray]:
         vectors = [model.embed_texts([text]) for text in track(texts, "texts", len(texts))]

@@ -12,7 +12,8 @@ SERIOUS = ("serious", "critical")
 
 def violations(page) -> list[str]:
     """What axe-core calls serious or worse, with the first elements."""
-    axe = pytest.importorskip("axe_playwright_python", reason="axe-playwright-python is not installed")
+    import axe_playwright_python as axe  # of the extra that brings playwright: without it nothing gets here
+
     page.evaluate((Path(axe.__file__).parent / "axe.min.js").read_text(encoding="utf-8"))
     found = page.evaluate("axe.run(document, { resultTypes: ['violations'] })")["violations"]
     return [

@@ -133,8 +133,8 @@ def test_labelme_rectangles_and_groups(cameras):
         ('{"shapes": [], "imagePath": "DSC_1", "imageHeight": [1], "imageWidth": NaN}', "does not fit"),
         ('{"annotations": [7], "images": [], "categories": []}', "COCO"),
         ('{"annotations": [], "images": [], "categories": [{"id": [1], "name": "a"}]}', "COCO"),
-        ('{"objects": [7], "info": {"name": "DSC_1", "width": 40, "height": 30}}', ""),
-        ('{"objects": [], "info": 7}', ""),
+        ('{"objects": [7], "info": {"name": "DSC_1", "width": 40, "height": 30}}', "file.json, object 0"),
+        ('{"objects": [], "info": 7}', "size of its image"),
         ('{"annotations": [{}], "images": []}', "'categories'"),
     ],
 )

@@ -1,6 +1,7 @@
 """Names of nodes from a vocabulary, and the doubt whether a word is for anything in the scene."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from tests.unit.query.test_search_scales import tree_of
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory) -> Path:
-    """The finished desk, its nodes named by the words of its CLIP and 120 more that are the book's blue."""
+    """The finished desk, its nodes named by the words that its CLIP knows."""
     project = build_finished_desk(tmp_path_factory.mktemp("project"))
     words = "[things]\nmug, book\n[parts]\nhandle, rim\n"
     (project / "models/colours/vocabulary.txt").write_text(words)
@@ -117,14 +118,17 @@ def test_names_of_another_tree_are_not_shown_and_damaged_ones_are_refused(desk, 
     (other / "index.json").write_text(json.dumps({**index, "tree_sha256": "another"}))
     assert NodeNaming.load(other, tree, clip) is None
     (other / "index.json").write_text(json.dumps(index))
-    (other / "names.json").write_text('[{"name": "mug"}]')
-    with pytest.raises(ArtifactError, match=r"names\.json is damaged"):
-        NodeNaming.load(other, tree, clip)
+    shutil.copy(desk / "default/names/rivals.npy", other)
+    whole = read_json(desk / "default/names/names.json")
+    for damaged in ([{"name": "mug"}], whole[:-1], [*whole[:-1], 7], {}):
+        (other / "names.json").write_text(json.dumps(damaged))
+        with pytest.raises(ArtifactError, match=r"names\.json or rivals\.npy is damaged"):
+            NodeNaming.load(other, tree, clip)
 
 
 def test_a_word_that_the_model_was_never_taught_is_doubted(desk):
     scene = hilsplat.open(desk)
-    assert open_clip_of(desk / "default/clip").unknown_words("mug zebra, book") == ["zebra", ","]
+    assert open_clip_of(desk / "default/clip").unknown_words("mug zebra, book") == ["zebra"]
     (doubt,) = scene.query("zebra")[0].doubts
     assert str(doubt) == "'zebra' may not be in the scene: the model does not know 'zebra'"
     assert scene.query("mug > handle")[0].doubts == ()

@@ -170,7 +170,7 @@ def test_a_frame_shows_the_relevancy_to_its_own_text_whatever_another_page_asks(
 
     mug, book = frame("mug"), frame("book")
     assert mug != book
-    client.post("/api/field", json={"text": "book", "level": "whole"})  # another page, of which WebGL paints
+    client.post("/api/field", json={"text": "book", "level": "whole"})  # another page, painted by WebGL
     assert frame("mug") == mug
     for number in range(12):  # more than are kept
         client.post("/api/field", json={"text": f"text {number}", "level": "whole"})
