@@ -341,16 +341,16 @@ class LanguageScene:
             self._by_chance[answerer] = margins(self.node_vectors(answerer), naming.rivals, canonical)
         return self._by_chance[answerer]
 
-    def name_of(self, node: int, *, alone: bool = False) -> str:
+    def name_of(self, node: int) -> str:
         """The name that a person gave a node, else what the vocabulary calls it; empty if nothing fits.
 
-        A part is called as part of its whole, "wheel of car", unless its name says that or it stands `alone`.
+        A part is called as part of its whole, "wheel of car", unless its name says that.
         """
         if given := self.names.of_node.get(node, ""):
             return given
         own = self.naming.of_node[node] if self.naming is not None else ""
         parent = int(self.tree.parent[node])
-        if not own or alone or parent == NONE:
+        if not own or parent == NONE:
             return own
         while int(self.tree.parent[parent]) != NONE:
             parent = int(self.tree.parent[parent])
