@@ -16,7 +16,7 @@ from hilsplat.scene.scene import Scene
 from hilsplat.viewer import answers, exports, wire
 from hilsplat.viewer.guard import Guard
 from hilsplat.viewer.openapi import description
-from hilsplat.viewer.payload import packed_gaussians, packed_nodes
+from hilsplat.viewer.payload import packed_nodes
 from hilsplat.viewer.picking import pick
 from hilsplat.viewer.saved_files import SavedFiles, node_of
 from hilsplat.viewer.scene_thread import SceneThread
@@ -53,7 +53,7 @@ class Viewer:
             Route("/api/scene", self.scene),
             Route("/api/changes", self.changes),
             Route("/api/variant/{variant}", self.variant),
-            Route("/api/splats", self.splats),
+            Route("/api/splats/{chunk:int}", self.splats),
             Route("/api/nodes/{variant}", self.nodes),
             Route("/api/photo/{number:int}", self.photo),
             Route("/api/thumb/{number:int}", self.thumb),
@@ -88,17 +88,20 @@ class Viewer:
         return answer_json(await self.thread.do(request, lambda shown: shown.described_variant(variant)))
 
     async def splats(self, request: Request) -> Response:
-        """The Gaussians, packed."""
+        """A part of the Gaussians as SPZ."""
+        chunk = request.path_params["chunk"]
         tag = f'"{await self.thread.do(request, lambda shown: shown.splats_tag)}"'
         if request.headers.get("if-none-match") == tag:
             return Response(status_code=304, headers={"etag": tag})
-        data = await self.thread.do(request, lambda shown: packed_gaussians(shown.gaussians))
+        data = await self.thread.do(request, lambda shown: shown.chunk(chunk))
         return Response(data, headers={"etag": tag, "cache-control": "no-cache"})
 
     async def nodes(self, request: Request) -> Response:
         """Nodes of the Gaussians, packed."""
         variant = request.path_params["variant"]
-        data = await self.thread.do(request, lambda shown: packed_nodes(shown.answering(variant).tree))
+        data = await self.thread.do(
+            request, lambda shown: packed_nodes(shown.answering(variant).tree, shown.order)
+        )
         return plain(data, BYTES)
 
     async def photo(self, request: Request) -> Response:
@@ -160,7 +163,8 @@ class Viewer:
         asked = await read(request, wire.FieldRelevancy)
 
         def answer(shown: ShownScene) -> bytes:
-            return shown.field_relevancy(asked.variant, asked.text, asked.level).tobytes()
+            found = shown.field_relevancy(asked.variant, asked.text, asked.level)
+            return (found[shown.order] if asked.order == "page" else found).tobytes()
 
         return plain(await self.thread.do(request, answer), BYTES)
 

@@ -6,12 +6,11 @@ The file is the page itself: its scripts as data addresses in an import map, `of
 
 import base64
 import re
-import zlib
 from typing import TYPE_CHECKING, Any
 
 from hilsplat.base.images import resize_to_fit
 from hilsplat.viewer import answers, exports
-from hilsplat.viewer.payload import packed_gaussians, packed_nodes
+from hilsplat.viewer.payload import packed_nodes
 from hilsplat.viewer.server import as_json, encoded
 
 if TYPE_CHECKING:
@@ -44,7 +43,7 @@ def html_page(shown: "ShownScene", asked: "Page", static: dict[str, bytes]) -> e
     with shown.unchanged():
         photos = [encoded(resize_to_fit(scene.image(view), PHOTO_PX), quality=75) for view in scene.views]
     described: dict[str, Any] = {
-        "scene": {**shown.described(), "variants": [asked.variant]},
+        "scene": {**shown.described(), "variants": [asked.variant], "chunk": len(shown.gaussians)},
         "variant": shown.described_variant(asked.variant),
         "answers": [answers.answer(scene, text) for text in asked.texts],
         "photos": [_text(photo) for photo in photos],
@@ -70,8 +69,8 @@ def html_page(shown: "ShownScene", asked: "Page", static: dict[str, bytes]) -> e
     parts = {
         "data": as_json(described).decode(),
         "sorter": sorter,
-        "splats": _text(zlib.compress(packed_gaussians(shown.gaussians), 6)),
-        "nodes": _text(zlib.compress(packed_nodes(scene.tree), 6)),
+        "splats": _text(shown.spz(shown.order)),
+        "nodes": _text(packed_nodes(scene.tree, shown.order)),
     }
     held = "\n".join(
         f'<script type="text/plain" id="{name}">{_inert(text)}</script>' for name, text in parts.items()

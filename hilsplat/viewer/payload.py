@@ -1,10 +1,10 @@
-"""What the page gets once: the scene as JSON, Gaussians and their nodes as bytes for the GPU."""
+"""What the page gets once: the scene as JSON, Gaussians in chunks and their nodes."""
 
-import struct
+import gzip
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64, Int64, UInt8
 
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.query.language_scene import LanguageScene
@@ -13,44 +13,32 @@ from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.boxes import OrientedBox
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.order import morton_order
 
-MAGIC = b"hilsplat"
-HEADER = struct.Struct("<8sIII12x")
-"""Magic, number of Gaussians, number of spherical harmonics, texels of harmonics a Gaussian; 32 bytes."""
+CHUNK = 65_536
+"""Gaussians that a browser gets at once: 32 rows of its textures."""
 
-HALVES_PER_TEXEL = 8
 MAX_NODES = 65_534
 """Nodes are numbered from 1 in 16 bits; 0 is none."""
 
-LARGEST_LOG_SCALE = 20.0
-"""As the rasteriser cuts scales."""
 
+def arrival_order(gaussians: Gaussians) -> Int64[np.ndarray, " N"]:
+    """The order in which a browser gets Gaussians: chunks that show less and less, each along a curve.
 
-def packed_gaussians(gaussians: Gaussians) -> bytes:
-    """Header, two texels of geometry per Gaussian, then its harmonics; texels are RGBA32UI.
-
-    Geometry: mean (3 floats) and opacity (float); log scales, a spare and the unit quaternion (8 halves).
-    Halves hold the logarithm of a scale: a relative error of 0.4 % at most for scales from 1e-4 to 1e4.
+    A first picture of the first chunk shows a scene in outline.
     """
-    n, bases = len(gaussians), gaussians.sh.shape[1]
-    texels = -(-3 * bases // HALVES_PER_TEXEL)
-    geometry = np.zeros((n, 8), np.float32)
-    geometry[:, :3], geometry[:, 3] = gaussians.means, gaussians.opacities
-    halves = np.zeros((n, 8), np.float16)
-    halves[:, :3] = np.minimum(gaussians.log_scales, LARGEST_LOG_SCALE)
-    halves[:, 4:] = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
-    geometry[:, 4:] = halves.view(np.float32)
-    harmonics = np.zeros((n, texels * HALVES_PER_TEXEL), np.float16)
-    harmonics[:, : 3 * bases] = gaussians.sh.reshape(n, -1)
-    return b"".join((HEADER.pack(MAGIC, n, bases, texels), geometry.tobytes(), harmonics.tobytes()))
+    scales = np.sort(gaussians.log_scales, axis=1)
+    shows = np.argsort(-(scales[:, 1] + scales[:, 2] + np.log(gaussians.opacities + 1e-12)), kind="stable")
+    chunks = [shows[first : first + CHUNK] for first in range(0, len(shows), CHUNK)]
+    return np.concatenate([chunk[morton_order(gaussians.means[chunk])] for chunk in chunks])
 
 
-def packed_nodes(tree: SemanticTree) -> bytes:
+def packed_nodes(tree: SemanticTree, order: Int64[np.ndarray, " N"]) -> bytes:
     """RGBA16UI texel per Gaussian: its node at each level, from 1; 0 is none. The fourth channel is spare."""
     assert len(tree) <= MAX_NODES, f"{len(tree)} nodes"
-    texels = np.zeros((len(tree.node_of_gaussian), 4), np.uint16)
-    texels[:, :3] = tree.node_of_gaussian + 1
-    return texels.tobytes()
+    texels = np.zeros((len(order), 4), np.uint16)
+    texels[:, :3] = tree.node_of_gaussian[order] + 1
+    return gzip.compress(texels.tobytes(), 1, mtime=0)
 
 
 def described_scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
@@ -62,6 +50,7 @@ def described_scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
         "name": scene.name,
         "unit": "metre" if scene.unit == "metre" else "scene unit",
         "gaussians": len(gaussians),
+        "chunk": CHUNK,
         "sh_degree": gaussians.sh_degree,
         "up": up.tolist(),
         "focus": focus.tolist(),

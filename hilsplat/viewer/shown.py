@@ -22,6 +22,7 @@ from hilsplat.scene.scene import Scene
 from hilsplat.segment.origin import masks_label
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply
+from hilsplat.splat.spz import fractional_bits, spz_bytes
 from hilsplat.viewer import payload
 from hilsplat.viewer.frames import Paint
 from hilsplat.viewer.wire import Style
@@ -182,6 +183,35 @@ class ShownScene:
             "masks": masks,
             "caution": scene.caution,
         }
+
+    @cached_property
+    def order(self) -> np.ndarray:
+        """Rows of the Gaussians in the order in which the browser has them."""
+        return payload.arrival_order(self.gaussians)
+
+    @cached_property
+    def _bits(self) -> int:
+        return fractional_bits(self.gaussians)
+
+    @property
+    def num_chunks(self) -> int:
+        """In how many parts the browser gets the Gaussians."""
+        return -(-len(self.gaussians) // payload.CHUNK)
+
+    def chunk(self, number: int) -> bytes:
+        """A part of the Gaussians as SPZ.
+
+        Raises:
+            SettingsError: there is none of this number.
+        """
+        if number >= self.num_chunks:
+            raise SettingsError(f"chunk {number} does not exist", expected=f"0 to {self.num_chunks - 1}")
+        rows = self.order[number * payload.CHUNK : (number + 1) * payload.CHUNK]
+        return self.spz(rows)
+
+    def spz(self, rows: np.ndarray) -> bytes:
+        """Some Gaussians as SPZ."""
+        return spz_bytes(self.gaussians, rows, self._bits)
 
     @cached_property
     def splats_tag(self) -> str:

@@ -125,10 +125,11 @@ class Like(Asked):
 
 
 class FieldRelevancy(Asked):
-    """The field's relevancy of every Gaussian to a text."""
+    """The field's relevancy of every Gaussian to a text, in the order of the PLY or of the page's chunks."""
 
     text: Text
     level: LevelName = "auto"
+    order: Literal["file", "page"] = "file"
 
 
 class Pick(Asked):

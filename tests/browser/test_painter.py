@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 
 from hilsplat.base.images import to_uint8
+from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import render
+from hilsplat.splat.spz import fractional_bits, spz_bytes
 from hilsplat.viewer.wire import WireCamera
 from tests.browser.conftest import drawn, pixels, wire_camera
+from tests.unit.splat.spz_reader import decoded
 
 
 def psnr(found: np.ndarray, expected: np.ndarray) -> float:
@@ -15,9 +18,9 @@ def psnr(found: np.ndarray, expected: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / max(error, 1e-9)))
 
 
-def rendered(folder, page) -> np.ndarray:
+def rendered(gaussians: Gaussians, page) -> np.ndarray:
     camera = WireCamera.model_validate(wire_camera(page)).camera()
-    return to_uint8(render(load_ply(folder / "gaussians.ply"), camera).color)
+    return to_uint8(render(gaussians, camera).color)
 
 
 def test_webgl_is_the_one_that_these_tests_are_for(opened, cloud_address):
@@ -26,14 +29,16 @@ def test_webgl_is_the_one_that_these_tests_are_for(opened, cloud_address):
     assert page.locator("#view").get_attribute("data-painter") == "gl"
 
 
-def test_webgl_draws_what_the_pipeline_renders(opened, cloud, cloud_address):
+def test_webgl_draws_what_the_pipeline_renders_of_the_same_bytes(opened, cloud, cloud_address):
     page = opened(cloud_address)
+    gaussians = load_ply(cloud / "gaussians.ply")
+    sent = decoded(spz_bytes(gaussians, np.arange(len(gaussians)), fractional_bits(gaussians)))
     for keys in ((), ("ArrowLeft", "ArrowLeft", "ArrowUp"), ("+",) * 9, ("w",) * 9):
         for key in keys:
             page.locator("#view").focus()
             drawn(page, lambda key=key: page.keyboard.press(key))
         page.wait_for_timeout(400)
-        found, expected = pixels(page), rendered(cloud, page)
+        found, expected = pixels(page), rendered(sent, page)
         assert expected.std() > 20
         assert psnr(found, expected) > 40, keys
 
@@ -45,7 +50,7 @@ def test_the_server_draws_what_the_pipeline_renders(opened, cloud, cloud_address
         return [c.width, c.height, ...c.getContext('2d').getImageData(0, 0, c.width, c.height).data]; })()"""
     width, height, *values = page.evaluate(read)
     found = np.array(values, np.uint8).reshape(height, width, 4)[..., :3]
-    assert psnr(found, rendered(cloud, page)) > 30
+    assert psnr(found, rendered(load_ply(cloud / "gaussians.ply"), page)) > 30
 
 
 def test_software_webgl_leaves_the_painting_to_the_server(opened, cloud_address):

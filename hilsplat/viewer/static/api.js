@@ -16,7 +16,7 @@ export async function scene() {
 }
 export const changes = async () => (await get("/api/changes")).json();
 export const variant = async (name) => (await get(at(`/api/variant/${encodeURIComponent(name)}`))).json();
-export const splats = async () => (await get(at("/api/splats"))).arrayBuffer();
+export const splats = async (chunk) => (await get(at(`/api/splats/${chunk}`))).arrayBuffer();
 export const nodes = async (name) => (await get(at(`/api/nodes/${encodeURIComponent(name)}`))).arrayBuffer();
 export const photoUrl = (number) => at(`/api/photo/${number}`);
 export const thumbUrl = (number) => at(`/api/thumb/${number}`);
@@ -25,7 +25,7 @@ export const sorter = () => new Worker("/static/sorter.js");
 
 export const query = async (asked, signal) => (await send(at("/api/query"), asked, { signal })).json();
 export const like = async (asked, signal) => (await send(at("/api/like"), asked, { signal })).json();
-export const field = async (asked, signal) => (await send(at("/api/field"), asked, { signal })).arrayBuffer();
+export const field = async (asked, signal) => (await send(at("/api/field"), { ...asked, order: "page" }, { signal })).arrayBuffer();
 export const pick = async (asked, signal) => (await send(at("/api/pick"), asked, { signal })).json();
 export const frame = async (asked, signal) => (await send(at("/api/frame"), asked, { signal })).blob();
 export const names = async (asked, version) =>

@@ -41,10 +41,10 @@ async function begin() {
   if (radio) radio.checked = true;
   let made = choosePainter(describe());
   if (made.kind === "gl") {
-    try { await made.load(await api.splats()); } catch (error) {
+    try { await made.load(page.scene, api.splats, arriving); } catch (error) {
       if (api.offline) throw error;
       made.canvas.remove();
-      tell(`${error.message}: the server draws instead.`);
+      console.warn(error); tell(`${error.message}: the server draws instead.`);
       made = serverPainter();
     }
   }
@@ -59,7 +59,10 @@ async function begin() {
     tell("The run goes on: you can look around; questions will be answered when the semantic tree is there.");
   }
   if (!api.offline) watch();
+  await page.painter.loaded;
 }
+
+function arriving(here, chunks) { Object.assign($("arriving"), { value: here, max: chunks, hidden: here === chunks }); }
 
 // An exported page has no server: it answers the texts that it was made with.
 function onlyWhatIsHere() {

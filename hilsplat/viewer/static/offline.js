@@ -8,18 +8,15 @@ const held = (id) => document.getElementById(id).textContent.trim();
 const data = JSON.parse(held("data"));
 export const texts = data.answers.map((answer) => answer.text), opening = data.opening;
 
-async function unpacked(id) {
-  const bytes = Uint8Array.from(atob(held(id)), (c) => c.charCodeAt(0));
-  return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer();
-}
+const unpacked = (id) => Uint8Array.from(atob(held(id)), (c) => c.charCodeAt(0)).buffer;
 
 const image = (text) => text ? `data:image/jpeg;base64,${text}` : "data:,";
 const none = async () => { throw new Refused("This page has no server."); };
 
 export const scene = async () => data.scene;
 export const variant = async () => data.variant;
-export const splats = () => unpacked("splats");
-export const nodes = () => unpacked("nodes");
+export const splats = async () => unpacked("splats");
+export const nodes = async () => unpacked("nodes");
 export const photoUrl = (number) => image(data.photos[number]);
 export const thumbUrl = photoUrl;
 export const cropUrl = (variant, node) => image(data.crops[node]);

@@ -2,6 +2,7 @@
 
 import * as api from "./api.js";
 import { fragment, vertex } from "./shaders.js";
+import { readChunk, unzipped } from "./spz.js";
 
 const WIDTH = 2048;
 
@@ -30,30 +31,50 @@ export class Renderer {
     this.worker.onmessage = ({ data }) => this.ordered(data);
   }
 
-  async load(buffer) {
-    const gl = this.gl, head = new DataView(buffer);
-    const n = head.getUint32(8, true), bases = head.getUint32(12, true), texels = head.getUint32(16, true);
-    const most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
-    if (Math.ceil(n * texels / WIDTH) > most) throw new Error(`${n} Gaussians do not fit the textures of this browser`);
-    this.count = n;
-    const geometry = new Uint32Array(buffer, 32, 8 * n), harmonics = new Uint32Array(buffer, 32 + 32 * n, 4 * texels * n);
+  // Gaussians come in chunks of whole rows of texels: what is here is drawn while the rest arrives.
+  async load({ gaussians, chunk }, chunkOf, told) {
+    const gl = this.gl, first = await readChunk(await chunkOf(0)), { bases, texels } = first;
+    if (Math.ceil(gaussians * texels / WIDTH) > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error(`${gaussians} Gaussians do not fit the textures of this browser`);
+    this.count = gaussians;
+    this.here = 0;
     this.program = this.link(vertex(bases, texels), fragment);
-    this.geometry = this.texture(gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT, geometry, 2 * n, 4);
-    this.harmonics = this.texture(gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT, harmonics, texels * n, 4);
-    this.nodeTextures.set("", this.texture(gl.RGBA16UI, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT, new Uint16Array(4 * n), n, 4));
+    this.geometry = this.texture(gl.RGBA32UI, gaussians);
+    this.rest = this.texture(gl.RGBA32UI, texels * gaussians);
+    this.nodeTextures.set("", this.texture(gl.RGBA16UI, gaussians));
     this.style = gl.createTexture(); this.ramp = gl.createTexture();
     this.styleBytes = null;
-    const means = new Float32Array(3 * n), floats = new Float32Array(buffer, 32, 8 * n);
-    for (let i = 0; i < n; i++) { means[3 * i] = floats[8 * i]; means[3 * i + 1] = floats[8 * i + 1]; means[3 * i + 2] = floats[8 * i + 2]; }
-    this.worker.postMessage({ means }, [means.buffer]);
     this.arrays();
+    this.worker.postMessage({ count: gaussians });
+    this.arrived(first);
+    this.loaded = this.loadRest(Math.ceil(gaussians / chunk), chunkOf, told);
   }
 
-  async loadNodes(variant) { this.putNodes(variant, new Uint16Array(await api.nodes(variant))); }
+  async loadRest(chunks, chunkOf, told) {
+    for (let number = 1; number < chunks; number++) {
+      told(number, chunks);
+      this.arrived(await readChunk(await chunkOf(number)));
+      this.onOrdered();
+    }
+    told(chunks, chunks);
+  }
+
+  arrived({ count, texels, geometry, rest, places }) {
+    const gl = this.gl;
+    this.fill(this.geometry, geometry, this.here, gl.RGBA_INTEGER, gl.UNSIGNED_INT);
+    this.fill(this.rest, rest, texels * this.here, gl.RGBA_INTEGER, gl.UNSIGNED_INT);
+    const means = new Float32Array(3 * count);
+    for (let i = 0; i < count; i++) for (let axis = 0; axis < 3; axis++) means[3 * i + axis] = places[4 * i + axis];
+    this.worker.postMessage({ means, first: this.here }, [means.buffer]);
+    this.here += count;
+    this.sorted.row = null;
+  }
+
+  async loadNodes(variant) { this.putNodes(variant, new Uint16Array(await unzipped(await api.nodes(variant)))); }
 
   putNodes(variant, values) {
-    const gl = this.gl;
-    this.nodeTextures.set(variant, this.texture(gl.RGBA16UI, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT, values, this.count, 4));
+    const gl = this.gl, texture = this.texture(gl.RGBA16UI, this.count);
+    this.fill(texture, values, 0, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT);
+    this.nodeTextures.set(variant, texture);
     (this.nodeValues ??= new Map()).set(variant, values);
   }
 
@@ -82,15 +103,20 @@ export class Renderer {
     return program;
   }
 
-  texture(internal, format, type, data, texels, channels) {
-    const gl = this.gl, texture = gl.createTexture(), rows = Math.max(1, Math.ceil(texels / WIDTH));
+  texture(internal, texels) {
+    const gl = this.gl, texture = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, internal, WIDTH, rows);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, internal, WIDTH, Math.max(1, Math.ceil(texels / WIDTH)));
     this.nearest();
-    const full = Math.floor(texels / WIDTH), rest = texels - full * WIDTH;   // the last row is not full
-    if (full) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, full, format, type, data, 0);
-    if (rest) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, full, rest, 1, format, type, data, full * WIDTH * channels);
     return texture;
+  }
+
+  // Texels from `first`, which begins a row; the last row may not be full.
+  fill(texture, data, first, format, type) {
+    const gl = this.gl, texels = data.length / 4, full = Math.floor(texels / WIDTH), rest = texels - full * WIDTH, row = first / WIDTH;
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    if (full) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, WIDTH, full, format, type, data, 0);
+    if (rest) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row + full, rest, 1, format, type, data, full * WIDTH * 4);
   }
 
   nearest() {
@@ -116,7 +142,7 @@ export class Renderer {
 
   // Ask for the order of this camera; `ordered` draws again when it is there.
   order(camera) {
-    const row = [...camera.R[2], camera.translation[2]], s = this.sorted;
+    const [x, y, z] = camera.R[2], row = [x, -y, -z, camera.translation[2]], s = this.sorted;   // in the axes of SPZ
     s.wanted = row;
     if (s.pending || (s.row && row.every((v, k) => v === s.row[k]))) return;
     s.pending = true; s.row = row;
@@ -162,7 +188,7 @@ export class Renderer {
     gl.scissor(left, 0, width, height);
     gl.useProgram(this.program);
     this.uploadStyle(pane.style);
-    const textures = [["geometry", this.geometry], ["harmonics", this.harmonics],
+    const textures = [["geometry", this.geometry], ["rest", this.rest],
       ["nodes", this.nodeTextures.get(pane.variant) ?? this.nodeTextures.get("")], ["style", this.style], ["ramp", this.ramp]];
     textures.forEach(([name, texture], number) => {
       gl.activeTexture(gl.TEXTURE0 + number);
@@ -170,9 +196,9 @@ export class Renderer {
       gl.uniform1i(at[name], number);
     });
     const R = camera.R, margin = [0.15 * width / k.fx, 0.15 * height / k.fy];
-    gl.uniformMatrix3fv(at.rotation, true, R.flat());
+    gl.uniformMatrix3fv(at.rotation, true, R.flatMap(([x, y, z]) => [x, -y, -z]));   // from the axes of SPZ
     gl.uniform3fv(at.translation, camera.translation);
-    gl.uniform3fv(at.centre, camera.c);
+    gl.uniform3f(at.centre, camera.c[0], -camera.c[1], -camera.c[2]);
     gl.uniform4f(at.lens, k.fx, k.fy, k.cx, k.cy);
     gl.uniform4f(at.limits, -k.cx / k.fx - margin[0], (width - k.cx) / k.fx + margin[0], -k.cy / k.fy - margin[1], (height - k.cy) / k.fy + margin[1]);
     gl.uniform2f(at.size, width, height);

@@ -5,7 +5,7 @@ export const vertex = (bases, texels) => `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D;
 #define BASES ${bases}
 #define TEXELS ${texels}
-uniform usampler2D geometry, harmonics, nodes;
+uniform usampler2D geometry, rest, nodes;
 uniform sampler2D style, ramp;
 uniform mat3 rotation;
 uniform vec3 translation, centre;
@@ -21,16 +21,14 @@ flat out uint number;
 
 ivec2 at(uint texel) { return ivec2(int(texel & 2047u), int(texel >> 11)); }
 
-vec3 harmonic(uint gaussian, vec3 d) {
-  float h[8 * TEXELS];
-  for (int t = 0; t < TEXELS; t++) {
-    uvec4 w = texelFetch(harmonics, at(gaussian * uint(TEXELS) + uint(t)), 0);
-    vec2 a = unpackHalf2x16(w.x), b = unpackHalf2x16(w.y), c = unpackHalf2x16(w.z), e = unpackHalf2x16(w.w);
-    h[8*t] = a.x; h[8*t+1] = a.y; h[8*t+2] = b.x; h[8*t+3] = b.y;
-    h[8*t+4] = c.x; h[8*t+5] = c.y; h[8*t+6] = e.x; h[8*t+7] = e.y;
-  }
-  #define SH(k) vec3(h[3*k], h[3*k+1], h[3*k+2])
-  vec3 rgb = 0.5 + 0.28209479177387814 * SH(0);
+// Positions, rotations and harmonics are in the axes of SPZ: y up, z backwards.
+uint words[4 * TEXELS];
+float byte_at(int k) { return float((words[k >> 2] >> uint(8 * (k & 3))) & 255u); }
+vec3 bytes_at(int k) { return vec3(byte_at(k), byte_at(k + 1), byte_at(k + 2)); }
+
+vec3 harmonic(vec3 d) {
+  #define SH(k) ((bytes_at(3 * k + 3) - 128.0) / 128.0)
+  vec3 rgb = 0.5 + 0.28209479177387814 * (bytes_at(0) / 255.0 - 0.5) / 0.15;
   float x = d.x, y = d.y, z = d.z;
   #if BASES > 1
   rgb += 0.4886025119029199 * (-y * SH(1) + z * SH(2) - x * SH(3));
@@ -51,8 +49,8 @@ vec3 harmonic(uint gaussian, vec3 d) {
 void main() {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);   // outside, until proven visible
   place = vec2(0.0); paint = vec4(0.0); number = index + 1u;
-  uvec4 first = texelFetch(geometry, at(2u * index), 0);
-  float opacity = uintBitsToFloat(first.w);
+  uvec4 first = texelFetch(geometry, at(index), 0);
+  float opacity = float(first.w & 255u) / 255.0;
   uvec4 own = texelFetch(nodes, at(index), 0);
 
   vec4 chosen = vec4(0.0);
@@ -68,11 +66,13 @@ void main() {
 
   vec3 mean = uintBitsToFloat(first.xyz), p = rotation * mean + translation;
   if (p.z <= 0.01) return;
-  uvec4 second = texelFetch(geometry, at(2u * index + 1u), 0);
-  vec2 s01 = unpackHalf2x16(second.x);
-  vec3 scale = exp(vec3(s01, unpackHalf2x16(second.y).x));
-  vec2 wx = unpackHalf2x16(second.z), yz = unpackHalf2x16(second.w);
-  vec4 q = normalize(vec4(wx, yz));
+  vec3 scale = exp(vec3((first.www >> uvec3(8u, 16u, 24u)) & 255u) / 16.0 - 10.0);
+  for (int t = 0; t < TEXELS; t++) {
+    uvec4 found = texelFetch(rest, at(index * uint(TEXELS) + uint(t)), 0);
+    for (int k = 0; k < 4; k++) words[4 * t + k] = found[k];
+  }
+  vec3 turning = bytes_at(3) / 127.5 - 1.0;
+  vec4 q = normalize(vec4(sqrt(max(0.0, 1.0 - dot(turning, turning))), turning));
   float w = q.x, i = q.y, j = q.z, k = q.w;
   mat3 turn = mat3(1.0 - 2.0*(j*j + k*k), 2.0*(i*j + w*k), 2.0*(i*k - w*j),
                    2.0*(i*j - w*k), 1.0 - 2.0*(i*i + k*k), 2.0*(j*k + w*i),
@@ -98,7 +98,7 @@ void main() {
   vec2 px = middle + place.x * sqrt(wide) * along + place.y * sqrt(narrow) * vec2(-along.y, along.x);
   gl_Position = vec4(2.0 * px.x / size.x - 1.0, 1.0 - 2.0 * px.y / size.y, 0.0, 1.0);
 
-  vec3 rgb = harmonic(index, normalize(mean - centre));
+  vec3 rgb = harmonic(normalize(mean - centre));
   if (other && mode == 1) rgb = vec3(0.35 * dot(rgb, vec3(0.299, 0.587, 0.114)));
   paint = vec4(mix(rgb, chosen.rgb, chosen.a), opacity);
 }`;

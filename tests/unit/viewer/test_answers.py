@@ -8,7 +8,6 @@ import re
 import shutil
 import threading
 import zipfile
-import zlib
 from collections.abc import Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -30,11 +29,11 @@ from hilsplat.splat.ply import load_ply
 from hilsplat.viewer import exports
 from hilsplat.viewer.app import Viewer
 from hilsplat.viewer.exports import coco_counts, write_gif
-from hilsplat.viewer.payload import packed_gaussians
 from hilsplat.viewer.saved_files import SavedFiles
 from hilsplat.viewer.scene_thread import SceneThread
 from hilsplat.viewer.shown import ShownScene
 from tests.unit.finished_desk import SCENE
+from tests.unit.splat.spz_reader import decoded
 from tests.unit.viewer.conftest import ADDRESS, TOKEN
 
 
@@ -125,13 +124,15 @@ def test_what_is_like_a_node_or_a_picture(client, scene):
         assert client.post("/api/like", json={"picture": bad}).status_code == 422
 
 
-def test_the_field_s_relevancy_of_every_gaussian(client, scene):
+def test_the_field_s_relevancy_of_every_gaussian(client, scene, shown):
     values = np.frombuffer(
         client.post("/api/field", json={"text": "mug", "level": "whole"}).content, np.uint8
     )
     nodes = scene.tree.node_of_gaussian[:, 0]
     (mug,) = scene.query("mug", "whole")
     assert len(values) == len(nodes)
+    on_page = client.post("/api/field", json={"text": "mug", "level": "whole", "order": "page"}).content
+    np.testing.assert_array_equal(np.frombuffer(on_page, np.uint8), values[shown.order])
     assert values[nodes == mug.node].mean() > values[nodes != mug.node].mean() + 50
 
 
@@ -325,9 +326,10 @@ def test_photographs_are_given_by_number(client, scene):
 
 
 def test_gaussians_are_sent_once(client, shown):
-    first = client.get("/api/splats")
-    assert first.content == packed_gaussians(shown.gaussians)
-    again = client.get("/api/splats", headers={"if-none-match": first.headers["etag"]})
+    first = client.get("/api/splats/0")
+    assert len(decoded(first.content)) == len(shown.gaussians)
+    assert client.get("/api/splats/1").status_code == 422
+    again = client.get("/api/splats/0", headers={"if-none-match": first.headers["etag"]})
     assert again.status_code == 304 and not again.content
 
 
@@ -340,7 +342,7 @@ def test_an_exported_page_holds_all_that_it_needs(client, shown):
     assert not re.search(r"""(src|href)=["'](?!data:)""", page) and "http://127" not in page
     held = dict(re.findall(r'<script type="text/plain" id="(\w+)">(.*?)</script>', page, re.S))
     assert set(held) == {"data", "sorter", "splats", "nodes"}
-    assert zlib.decompress(base64.b64decode(held["splats"])) == packed_gaussians(shown.gaussians)
+    assert len(decoded(base64.b64decode(held["splats"]))) == len(shown.gaussians)
     data = json.loads(held["data"])
     assert [answer["text"] for answer in data["answers"]] == ["mug > handle", evil]
     assert len(data["photos"]) == len(data["scene"]["views"]) and data["opening"] == "v3"

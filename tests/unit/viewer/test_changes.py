@@ -128,7 +128,7 @@ def test_a_page_of_before_gets_nothing_of_after(page, desk):
     for path, sent in (("query", {"text": "mug"}), ("frame", {"camera": camera}), ("export/film", {})):
         answer = page.post(f"/api/{path}", json=sent, params={"of": page.state})
         assert answer.status_code == 409 and "reload" in answer.json()["error"]
-    for path in ("splats", "nodes/default", "variant/default", "thumb/0"):
+    for path in ("splats/0", "nodes/default", "variant/default", "thumb/0"):
         assert page.get(f"/api/{path}", params={"of": page.state}).status_code == 409
         assert page.get(f"/api/{path}", params={"of": again}).status_code == 200
 
