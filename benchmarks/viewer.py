@@ -2,8 +2,8 @@
 
     python -m benchmarks.viewer results/synthetic/table-1 1 5 17      # the scene, and 5 and 17 times as large
 
-A larger scene is the given one with each Gaussian split into as many smaller ones around it, with their nodes.
-Chromium paints with WebGL in software (Mesa's llvmpipe), and then the server paints.
+In a larger scene each Gaussian is split into as many smaller ones around it, of the same nodes. Chromium
+paints with WebGL in software (Mesa's llvmpipe), and then the server paints.
 """
 
 import argparse
@@ -13,7 +13,6 @@ import statistics
 import sys
 import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,16 @@ from tests.browser.conftest import ARGUMENTS, serving
 
 ROUNDS = 3
 TEXT = "car"
-COLUMNS = ("Gaussians", "painter", "MB sent", "bytes each", "first picture, s", "all here, s", "drag, s", "answer, s")
+COLUMNS = (
+    "Gaussians",
+    "painter",
+    "MB sent",
+    "bytes each",
+    "first picture, s",
+    "all here, s",
+    "drag, s",
+    "answer, s",
+)
 COLUMNS += ("heap, MB", "server, MiB")
 
 
@@ -64,7 +72,9 @@ def enlarged(folder: Path, times: int, out: Path) -> Path:
 def opened(browser: Any, folder: Path, painter: str) -> dict[str, float]:
     """Open the page of a scene once, drag and ask."""
     with serving(folder) as address:
-        server = next(child for child in psutil.Process().children() if "hilsplat" in " ".join(child.cmdline()))
+        server = next(
+            child for child in psutil.Process().children() if "hilsplat" in " ".join(child.cmdline())
+        )
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.set_default_timeout(300_000)
         counter = page.context.new_cdp_session(page)

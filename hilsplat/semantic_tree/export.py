@@ -1,10 +1,11 @@
 """Export of the semantic tree: JSON, and a PLY with the nodes of each Gaussian."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Int32, Int64
 
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.levels import LEVELS, Level
@@ -56,15 +57,37 @@ def write_tree_ply(gaussians_ply: Path, tree: "SemanticTree", out: Path) -> None
     _write(table, out)
 
 
-def write_selection_ply(gaussians_ply: Path, rows: Int64[np.ndarray, " g"], out: Path) -> None:
-    """Copy some Gaussians of a 3DGS PLY, such as those that answer a query."""
+def write_selection_ply(
+    gaussians_ply: Path,
+    rows: Int64[np.ndarray, " g"],
+    out: Path,
+    labels: Int32[np.ndarray, " g"] | None = None,
+    names: Sequence[str] = (),
+) -> None:
+    """Copy some Gaussians of a 3DGS PLY, such as those that answer a query.
+
+    Args:
+        labels: of each, from 1; written as the property `label`.
+        names: of the labels; each has a comment `label 1: mug` in the header.
+    """
     from plyfile import PlyData
 
-    _write(PlyData.read(str(gaussians_ply))["vertex"].data[rows], out)
+    table = PlyData.read(str(gaussians_ply))["vertex"].data[rows]
+    if labels is None:
+        _write(table, out)
+        return
+    labelled = np.empty(len(table), [*table.dtype.descr, ("label", "<i4")])
+    for name in table.dtype.names:
+        labelled[name] = table[name]
+    labelled["label"] = labels
+    # a header is ASCII, a comment one line
+    plain = [" ".join(name.split()).encode("ascii", "backslashreplace").decode() for name in names]
+    _write(labelled, out, [f"label {number + 1}: {name}" for number, name in enumerate(plain)])
 
 
-def _write(table: np.ndarray, out: Path) -> None:
+def _write(table: np.ndarray, out: Path, comments: Sequence[str] = ()) -> None:
     from plyfile import PlyData, PlyElement
 
     with atomic_path(out) as temporary:
-        PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(str(temporary))
+        element = PlyElement.describe(table, "vertex")
+        PlyData([element], byte_order="<", comments=list(comments)).write(str(temporary))

@@ -1,12 +1,14 @@
-"""A smooth closed camera path around what the cameras saw, as a film and a contact sheet."""
+"""Smooth camera paths, around what the cameras saw or through given ones; a film and a contact sheet."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64, UInt8
+from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation, Slerp
 
 from hilsplat.base.images import write_png
 from hilsplat.base.parallel import in_order
@@ -50,6 +52,33 @@ def closed_path(cameras: list[Camera], frames: int) -> list[Camera]:
     walked = np.stack([np.interp(where, at, column) for column in ring.T], axis=1)
     smooth = gaussian_filter1d(walked, SMOOTHING * fine, axis=0, mode="wrap")[::8]
     return [_camera(row, cameras[0]) for row in smooth]
+
+
+def open_path(cameras: list[Camera], frames: int) -> list[Camera]:
+    """Cameras along a smooth curve through the given ones, in their order, from the first to the last.
+
+    Position and lens follow a monotone cubic, so that the path does not overshoot; the direction turns
+    evenly between neighbours. Image size is that of the first camera.
+
+    Args:
+        cameras: at least two.
+        frames: number of cameras to return.
+    """
+    centres = np.stack([camera.centre for camera in cameras])
+    turns = Rotation.from_matrix([camera.cam_from_world[:3, :3] for camera in cameras])
+    spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()) or 1.0
+    moved = np.linalg.norm(np.diff(centres, axis=0), axis=1) / spread
+    turned = (turns[1:] * turns[:-1].inv()).magnitude()
+    at = np.concatenate([[0], np.cumsum(moved + turned + 1e-6)])
+    where = np.linspace(0, at[-1], frames)
+    lenses = np.stack([camera.scaled(cameras[0].size_hw).K.ravel() for camera in cameras])
+    walked = PchipInterpolator(at, np.concatenate([centres, lenses], axis=1))(where)
+    path = []
+    for row, turn in zip(walked, Slerp(at, turns)(where).as_matrix(), strict=True):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn, -turn @ row[:3]
+        path.append(Camera("path", pose, row[3:].reshape(3, 3), cameras[0].size_hw))
+    return path
 
 
 def _camera(row: Float64[np.ndarray, " 9"], like: Camera) -> Camera:

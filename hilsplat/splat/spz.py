@@ -1,9 +1,9 @@
 """Gaussians as SPZ, the compressed format of Niantic Labs (version 2), which many viewers read.
 
-A gzip stream of 16 bytes of header and six columns: positions in 24-bit fixed point, then opacity, colour, log
-scales, rotation and harmonics of a byte each, in axes x right, y up, z backwards. The format sets the steps of
-all but positions and harmonics. Against `render`, a synthetic scene of degree 2 keeps 43 dB in 17 bytes a
-Gaussian.
+A gzip stream of 16 bytes of header and six columns: positions in 24-bit fixed point, then opacity, colour,
+log scales, rotation and harmonics of a byte each, in axes x right, y up, z backwards. The format sets the
+steps of all but positions and harmonics. Against `render`, a synthetic scene of degree 2 keeps 43 dB in 17
+bytes a Gaussian.
 """
 
 import gzip

@@ -10,6 +10,8 @@ from typing_extensions import TypedDict  # pydantic describes no other before Py
 from hilsplat.query.hits import Hit, doubts_of, hits_of
 from hilsplat.query.language_scene import LanguageScene, path_of
 from hilsplat.viewer.payload import box_corners
+from hilsplat.viewer.server import view_name
+from hilsplat.viewer.wire import Group, Question
 
 LISTED = 24
 """Most answers to list."""
@@ -43,27 +45,25 @@ class Answer(TypedDict):
     ms: float
 
 
-def answer(
-    scene: LanguageScene,
-    text: str,
-    level: str = "auto",
-    answerer: str = "tree",
-    view: str | None = None,
-    threshold: float | None = None,
-) -> Answer:
-    """Ask a scene for a text: hits, relevancy of every node to the last text, doubts."""
+def answer(scene: LanguageScene, asked: Question, answerer: str = "tree") -> Answer:
+    """Ask a scene: hits, relevancy of every node to the last text, doubts.
+
+    Raises:
+        SettingsError: the text is empty, or the view does not exist.
+    """
     begin = time.perf_counter()
-    found = scene.find(text, level, answerer=answerer, view=view, threshold=threshold)
-    hits, path = hits_of(scene, found, LISTED), path_of(text)
+    view = None if asked.view is None else view_name(scene.scene, asked.view)
+    found = scene.find(asked.text, asked.level, answerer=answerer, view=view, threshold=asked.threshold)
+    hits, path = hits_of(scene, found, LISTED), path_of(asked.text)
     relevancy = scene.node_relevancy([path[-1]], "field" if answerer == "field" else "tree")[0]
     return {
-        "text": text,
+        "text": asked.text,
         "level": found.level.label,
         "hits": [described_hit(scene, hit) for hit in hits],
         "total": len(found.ids),
         "relevancy": np.round(relevancy, 4).tolist(),
         "doubts": [str(doubt) for doubt in doubts_of(found)],
-        "caution": scene.caution_about(text),
+        "caution": scene.caution_about(asked.text),
         "route": found.route,
         "ms": round(1e3 * (time.perf_counter() - begin), 2),
     }
@@ -98,8 +98,8 @@ def described_hit(scene: LanguageScene, hit: Hit) -> FoundNode:
     }
 
 
-def boxes(scene: LanguageScene, nodes: Sequence[int]) -> dict[str, Any]:
-    """Boxes of nodes, for other programs."""
+def boxes(scene: LanguageScene, groups: Sequence[Group]) -> dict[str, Any]:
+    """Boxes of nodes, for other programs; a node of several groups has one in each."""
     tree = scene.tree
     return {
         "format": "hilsplat-boxes-1",
@@ -109,6 +109,7 @@ def boxes(scene: LanguageScene, nodes: Sequence[int]) -> dict[str, Any]:
         "scene_from_source": scene.scene.scene_from_source.tolist(),
         "boxes": [
             {
+                "group": group.name,
                 "node": node,
                 "name": scene.name_of(node),
                 "level": int(tree.level[node]),
@@ -121,6 +122,7 @@ def boxes(scene: LanguageScene, nodes: Sequence[int]) -> dict[str, Any]:
                 "upper": tree.box[node][1].tolist(),
                 "centroid": tree.centroid[node].tolist(),
             }
-            for node in nodes
+            for group in groups
+            for node in group.nodes
         ],
     }

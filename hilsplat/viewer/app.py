@@ -32,7 +32,6 @@ from hilsplat.viewer.server import (
     serve,
     static_files,
     thumbnail,
-    view_name,
 )
 from hilsplat.viewer.shown import ShownScene
 from hilsplat.viewer.witness import StaleSceneError
@@ -137,9 +136,7 @@ class Viewer:
         asked = await read(request, wire.Query)
 
         def answer(shown: ShownScene) -> answers.Answer:
-            view = None if asked.view is None else view_name(shown.scene, asked.view)
-            scene = shown.answering(asked.variant)
-            return answers.answer(scene, asked.text, asked.level, asked.answerer, view, asked.threshold)
+            return answers.answer(shown.answering(asked.variant), asked, asked.answerer)
 
         return answer_json(await self.thread.do(request, answer))
 

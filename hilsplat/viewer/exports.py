@@ -15,13 +15,12 @@ from PIL import Image
 
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Camera
-from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.export import write_selection_ply
 from hilsplat.splat.film import write_film
-from hilsplat.splat.flyaround import closed_path
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.rasterise.cpu import blend_forward, project_gaussians
 from hilsplat.viewer.frames import Paint, painted
+from hilsplat.viewer.wire import Group
 
 FRAMES_PER_S = 24
 STEP = {"mp4": 1, "gif": 2}
@@ -40,25 +39,48 @@ Between two steps the thread of the scene draws what a person waits for.
 """
 
 
-def selection_ply(gaussians_ply: Path, rows: np.ndarray) -> bytes:
-    """Some Gaussians as a 3DGS PLY."""
+class Groups:
+    """The Gaussians of groups of nodes.
+
+    Attributes:
+        rows: of the Gaussians of any group, ascending.
+        labels: of each of them, its group from 1; of several, the one with the fewest Gaussians.
+        names: of the groups.
+    """
+
+    def __init__(self, scene: LanguageScene, groups: Sequence[Group]) -> None:
+        members = [scene.gaussians_of(group.nodes) for group in groups]
+        label = np.zeros(len(scene.gaussians), np.int32)
+        for number in sorted(range(len(groups)), key=lambda number: -len(members[number])):
+            label[members[number]] = number + 1
+        self.rows = np.flatnonzero(label)
+        self.labels = label[self.rows]
+        self.names = [group.name for group in groups]
+
+
+def selection_ply(gaussians_ply: Path, groups: Groups) -> bytes:
+    """The Gaussians of groups as a 3DGS PLY, with their labels."""
     with TemporaryDirectory() as folder:
         out = Path(folder) / "selection.ply"
-        write_selection_ply(gaussians_ply, rows, out)
+        write_selection_ply(gaussians_ply, groups.rows, out, groups.labels, groups.names)
         return out.read_bytes()
 
 
 # -- masks ----------------------------------------------------------------------------------------
 
 
-def masks_zip(scene: LanguageScene, nodes: Sequence[int]) -> Steps:
-    """Masks of nodes in all views: a PNG per node and view that shows it, and one COCO file."""
+def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
+    """Masks of nodes in all views: a PNG per node and view that shows it, and one COCO file.
+
+    Groups are the categories of COCO; a node of several groups has an annotation in each.
+    """
+    nodes = sorted({node for group in groups for node in group.nodes})
     yield 0, len(scene.views)
     held = io.BytesIO()
     coco: dict[str, Any] = {
         "info": {"description": f"{scene.scene.name}: masks of nodes, by hilsplat"},
         "images": [],
-        "categories": [{"id": node, "name": scene.name_of(node) or f"node {node}"} for node in nodes],
+        "categories": [{"id": number + 1, "name": group.name} for number, group in enumerate(groups)],
         "annotations": [],
     }
     with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -74,17 +96,18 @@ def masks_zip(scene: LanguageScene, nodes: Sequence[int]) -> Steps:
                 )
                 rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
                 box = (columns[0], rows[0], np.ptp(columns) + 1, np.ptp(rows) + 1)
-                coco["annotations"].append(
-                    {
-                        "id": len(coco["annotations"]) + 1,
-                        "image_id": number,
-                        "category_id": node,
-                        "iscrowd": 0,
-                        "area": int(mask.sum()),
-                        "bbox": [int(side) for side in box],
-                        "segmentation": {"size": [height, width], "counts": coco_counts(mask)},
-                    }
-                )
+                described = {
+                    "image_id": number,
+                    "node": node,
+                    "iscrowd": 0,
+                    "area": int(mask.sum()),
+                    "bbox": [int(side) for side in box],
+                    "segmentation": {"size": [height, width], "counts": coco_counts(mask)},
+                }
+                for category, group in enumerate(groups):
+                    if node in group.nodes:
+                        found = {"id": len(coco["annotations"]) + 1, "category_id": category + 1}
+                        coco["annotations"].append({**found, **described})
             yield number + 1, len(scene.views)
         archive.writestr("coco.json", json.dumps(coco, ensure_ascii=False))
     return held.getvalue()
@@ -163,35 +186,26 @@ def _square_around(points: np.ndarray, camera: Camera) -> tuple[float, float, fl
 
 def film(
     gaussians: Gaussians,
-    scene: Scene,
+    cameras: Sequence[Camera],
     paint: Paint | None,
     *,
     kind: str = "mp4",
-    frames: int = 120,
-    side_px: int = 640,
     threads: int = 1,
     told: Callable[[int], None] = lambda drawn: None,
 ) -> bytes:
-    """A closed flight around what the training cameras saw, in the colours of a style.
+    """A flight in the colours of a style.
 
     Args:
         gaussians: what is flown around.
-        scene: cameras.
+        cameras: one for each picture, of even sizes.
         paint: the style; None: the scene's own colours.
-        kind: "mp4" or "gif".
-        frames: of the flight; a GIF has every other one.
-        side_px: the longer side.
+        kind: "mp4" or "gif", which has every other picture.
         threads: for drawing.
         told: gets the number of pictures drawn, after each; what it raises ends the film.
     """
-    cameras = [scene.cameras[view] for view in scene.views("train") or scene.views()]
-    height, width = cameras[0].size_hw
-    scale = side_px / max(height, width)
-    size_hw = (max(2, round(height * scale / 2) * 2), max(2, round(width * scale / 2) * 2))
-    path = [camera.scaled(size_hw) for camera in closed_path(cameras, frames)[:: STEP[kind]]]
 
     def pictures() -> Iterator[np.ndarray]:
-        for number, camera in enumerate(path):
+        for number, camera in enumerate(cameras[:: STEP[kind]]):
             yield painted(gaussians, camera, paint, threads)
             told(number + 1)
 

@@ -32,7 +32,7 @@ def html_page(shown: "ShownScene", asked: "Page", static: dict[str, bytes]) -> e
 
     Args:
         shown: the scene.
-        asked: variant, the texts whose answers the page holds, and where its camera begins.
+        asked: variant, the queries whose answers the page holds, and where its camera begins.
         static: files of the page by name.
 
     Raises:
@@ -40,12 +40,15 @@ def html_page(shown: "ShownScene", asked: "Page", static: dict[str, bytes]) -> e
         StaleSceneError: a part of the scene was written anew before or meanwhile.
     """
     scene = shown.answering(asked.variant)
+    questions = [*asked.kept, *([asked.last] if asked.last else [])]
     with shown.unchanged():
         photos = [encoded(resize_to_fit(scene.image(view), PHOTO_PX), quality=75) for view in scene.views]
     described: dict[str, Any] = {
         "scene": {**shown.described(), "variants": [asked.variant], "chunk": len(shown.gaussians)},
         "variant": shown.described_variant(asked.variant),
-        "answers": [answers.answer(scene, text) for text in asked.texts],
+        "asked": [question.model_dump(exclude_none=True) for question in questions],
+        "answers": [answers.answer(scene, question) for question in questions],
+        "kept": len(asked.kept),
         "photos": [_text(photo) for photo in photos],
         "opening": asked.start,
         "crops": {},

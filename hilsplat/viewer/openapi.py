@@ -28,7 +28,8 @@ SENT: tuple[tuple[str, str, str, type[BaseModel] | None, str], ...] = (
     ("post", "/api/pick", "The nodes that a pixel of a camera shows, with their shares", wire.Pick, JSON),
     ("post", "/api/frame", "A picture of the scene", wire.Frame, IMAGE),
     ("post", "/api/field", "The field's relevancy of every Gaussian in 1/255", wire.FieldRelevancy, BYTES),
-    ("post", "/api/export/ply", "The Gaussians of nodes as a 3DGS PLY", wire.Selection, BYTES),
+    ("post", "/api/export/ply", "The Gaussians of nodes as a 3DGS PLY, with labels", wire.Selection, BYTES),
+    ("post", "/api/export/spz", "The Gaussians of nodes as SPZ", wire.Selection, BYTES),
     ("post", "/api/export/boxes", "Boxes of nodes", wire.Selection, JSON),
 )
 """Method, path, what it gives, what must be sent, and the type of the answer."""

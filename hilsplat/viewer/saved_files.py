@@ -18,6 +18,7 @@ from starlette.routing import Route
 
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.query.language_scene import LanguageScene
+from hilsplat.splat.order import morton_order
 from hilsplat.viewer import answers, exports, wire
 from hilsplat.viewer.html_page import html_page
 from hilsplat.viewer.scene_thread import SceneThread
@@ -36,6 +37,7 @@ class SavedFiles:
         """Where they are."""
         return [
             Route("/api/export/ply", self.ply, methods=["POST"]),
+            Route("/api/export/spz", self.spz, methods=["POST"]),
             Route("/api/export/boxes", self.boxes, methods=["POST"]),
             Route("/api/export/masks", self.masks, methods=["POST"]),
             Route("/api/export/film", self.film, methods=["POST"]),
@@ -48,9 +50,20 @@ class SavedFiles:
 
         def make(shown: ShownScene) -> bytes:
             scene = shown.answering(asked.variant)
-            rows = scene.gaussians_of(nodes_of(scene, asked.nodes))
+            groups = exports.Groups(scene, checked(scene, asked.groups))
             with shown.unchanged():
-                return exports.selection_ply(shown.folder / "gaussians.ply", rows)
+                return exports.selection_ply(shown.folder / "gaussians.ply", groups)
+
+        return plain(await self.thread.do(request, make), BYTES)
+
+    async def spz(self, request: Request) -> Response:
+        """Gaussians of nodes, compressed."""
+        asked = await read(request, wire.Selection)
+
+        def make(shown: ShownScene) -> bytes:
+            scene = shown.answering(asked.variant)
+            rows = exports.Groups(scene, checked(scene, asked.groups)).rows
+            return shown.spz(rows[morton_order(shown.gaussians.means[rows])])
 
         return plain(await self.thread.do(request, make), BYTES)
 
@@ -60,7 +73,7 @@ class SavedFiles:
 
         def make(shown: ShownScene) -> dict[str, Any]:
             scene = shown.answering(asked.variant)
-            return answers.boxes(scene, nodes_of(scene, asked.nodes))
+            return answers.boxes(scene, checked(scene, asked.groups))
 
         return answer_json(await self.thread.do(request, make))
 
@@ -70,23 +83,21 @@ class SavedFiles:
 
         def begin(shown: ShownScene) -> exports.Steps:
             scene = shown.answering(asked.variant)
-            return exports.masks_zip(scene, nodes_of(scene, asked.nodes))
+            return exports.masks_zip(scene, checked(scene, asked.groups))
 
         return await self._in_steps(request, begin)
 
     async def film(self, request: Request) -> Response:
-        """A fly-around in the colours of the page."""
+        """A flight in the colours of the page."""
         asked = await read(request, wire.Film)
 
         def prepared(shown: ShownScene) -> Callable[..., bytes]:
             return partial(
                 exports.film,
                 shown.gaussians,
-                shown.scene,
+                asked.cameras(shown.scene),
                 shown.paint(asked.variant, asked.style),
                 kind=asked.format,
-                frames=asked.frames,
-                side_px=asked.side_px,
                 threads=shown.threads,
             )
 
@@ -171,6 +182,9 @@ def node_of(scene: LanguageScene, node: int) -> int:
     return node
 
 
-def nodes_of(scene: LanguageScene, nodes: list[int]) -> list[int]:
-    """Nodes that the page named."""
-    return [node_of(scene, node) for node in nodes]
+def checked(scene: LanguageScene, groups: list[wire.Group]) -> list[wire.Group]:
+    """Groups of nodes that exist."""
+    for group in groups:
+        for node in group.nodes:
+            node_of(scene, node)
+    return groups

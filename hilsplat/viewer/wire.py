@@ -9,6 +9,8 @@ from jaxtyping import UInt8
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from hilsplat.scene.cameras import Camera
+from hilsplat.scene.scene import Scene
+from hilsplat.splat.flyaround import closed_path, open_path
 
 MAX_SIDE_PX = 4096
 MAX_TEXT = 200
@@ -107,14 +109,19 @@ class Asked(Message):
     variant: Annotated[str, Field(max_length=100)] = "default"
 
 
-class Query(Asked):
-    """A text or a path."""
+class Question(Message):
+    """A text or a path; only answers from a threshold up, or that a photograph shows."""
 
     text: Text
     level: LevelName = "auto"
-    answerer: Literal["tree", "field"] = "tree"
-    view: Annotated[int, Field(ge=0)] | None = None
     threshold: Annotated[float, Field(gt=0, lt=1)] | None = None
+    view: Annotated[int, Field(ge=0)] | None = None
+
+
+class Query(Asked, Question):
+    """A question to a variant's tree or field."""
+
+    answerer: Literal["tree", "field"] = "tree"
 
 
 class Like(Asked):
@@ -150,18 +157,40 @@ class Frame(Asked):
 
 
 class Film(Asked):
-    """A fly-around around what the cameras saw."""
+    """A flight: around what the cameras saw, or along a path of cameras."""
 
     style: Style = Style()
     format: Literal["mp4", "gif"] = "mp4"
     side_px: Annotated[int, Field(ge=64, le=1920)] = 640
     frames: Annotated[int, Field(ge=2, le=480)] = 120
+    path: Annotated[list[WireCamera], Field(max_length=40)] = []
+
+    def cameras(self, scene: Scene) -> list[Camera]:
+        """The cameras of the flight."""
+        if len(self.path) > 1:
+            around, path = open_path, [camera.camera() for camera in self.path]
+        else:
+            around, path = (
+                closed_path,
+                [scene.cameras[view] for view in scene.views("train") or scene.views()],
+            )
+        height, width = path[0].size_hw
+        scale = self.side_px / max(height, width)
+        size_hw = (max(2, round(height * scale / 2) * 2), max(2, round(width * scale / 2) * 2))
+        return [camera.scaled(size_hw) for camera in around(path, self.frames)]
+
+
+class Group(Message):
+    """Nodes that belong together: the answers to a query, or what was chosen."""
+
+    name: Annotated[str, Field(max_length=MAX_TEXT)]
+    nodes: Nodes
 
 
 class Selection(Asked):
-    """Some nodes."""
+    """Some nodes, in groups that may overlap."""
 
-    nodes: Nodes
+    groups: Annotated[list[Group], Field(min_length=1, max_length=40)]
 
 
 class Names(Asked):
@@ -171,8 +200,9 @@ class Names(Asked):
 
 
 class Page(Asked):
-    """A scene as one HTML file with the answers to some texts."""
+    """A scene as one HTML file with the answers to kept queries, each in its colour, and to the last."""
 
-    texts: Annotated[list[Text], Field(max_length=40)]
+    kept: Annotated[list[Question], Field(max_length=40)] = []
+    last: Question | None = None
     start: Annotated[str, Field(max_length=400, pattern=r"^(v\d+|[-+.,e\d]*)$")] = ""
     """The camera that the page begins with, as in its address; empty: that of the first photograph."""

@@ -3,7 +3,7 @@
 import { get, send, streamed } from "./http.js";
 
 export const offline = false;
-export const texts = [], opening = "";   // what an exported page can answer, and where its camera begins
+export const texts = [], kept = [], first = "", opening = "";   // what an exported page can answer, and where its camera begins
 
 // Every question names the state of the scene that this page was loaded with; another state's answers are refused.
 let state = "";

@@ -5,6 +5,7 @@ import * as api from "./api.js";
 import { acts, choose } from "./choosing.js";
 import { overlay, redraw, restyle } from "./drawing.js";
 import { $, nameOf } from "./elements.js";
+import { asking, keep, showKept, whenReopened } from "./kept.js";
 import { answererOf, failed, host, level, main, outlines, page, panes, tell, threshold, variantOf } from "./state.js";
 import { styleOf } from "./styles.js";
 
@@ -42,7 +43,7 @@ function answered(what, answer) {
   listAnswers();
   page.outline.answered(answer.hits.map((hit) => hit.node));
   markChosen(page.chosen);
-  restyle();
+  showKept();
 }
 
 export function listAnswers() {
@@ -76,9 +77,30 @@ export async function ask(keepChoice = false) {
   const view = $("here").checked ? page.camera.view : -1;
   if ($("here").checked && view < 0) { refused(new Error("Stand at a photograph first: choose one below.")); return; }
   if (!keepChoice && page.chosen >= 0) choose(-1);   // nothing to take back: nothing to draw before the answer
-  await askAll({ text }, (pane, signal) => api.query({ variant: variantOf(pane), text, level: level(), answerer: answererOf(pane),
-    ...(view >= 0 ? { view } : {}), ...(threshold() === null ? {} : { threshold: threshold() }) }, signal));
+  const asked = asking(text);
+  await askAll({ text, query: asked }, (pane, signal) => api.query({ variant: variantOf(pane), answerer: answererOf(pane), ...asked }, signal));
 }
+
+// The present answer stays in a colour of its own, and the text box is free for another.
+export async function keepAnswer() {
+  const asked = page.asked?.query;
+  if (!asked || !panes[0].answer?.hits.length) { tell("Ask something to keep its answer."); return; }
+  try {
+    if (!await keep(asked)) return;
+    clearAnswer();
+    tell(`Kept “${asked.text}”. Ask for something else.`);
+    $("text").focus();
+  } catch (error) { failed(error); }
+}
+
+whenReopened(({ text, level: at, threshold: least }) => {
+  document.querySelector(`[name=level][value=${at}]`).checked = true;
+  $("threshold-on").checked = least !== undefined;
+  if (least !== undefined) $("threshold-at").value = least;
+  $("threshold-on").dispatchEvent(new Event("change"));
+  $("text").value = text;
+  ask();
+});
 
 export async function like(node) {
   if (node < 0 || api.offline) return;
@@ -134,7 +156,7 @@ function showNothing() {
   for (const pane of panes) Object.assign(pane, { answer: null, field: null });
   showAnswers(main(), null, {});
   page.outline.answered([]);
-  restyle();
+  showKept();
 }
 
 export function clear() {

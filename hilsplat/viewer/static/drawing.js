@@ -4,7 +4,7 @@ import * as api from "./api.js";
 import { $, nameOf } from "./elements.js";
 import { drawOverlay } from "./overlay.js";
 import { showScale } from "./scale.js";
-import { host, level, levelIndex, main, options, outlines, page, panes, threshold, variantOf } from "./state.js";
+import { host, keptIn, level, levelIndex, main, options, outlines, page, panes, threshold, variantOf } from "./state.js";
 import { shownHits, styleOf } from "./styles.js";
 
 const SLOW_MS = 60;
@@ -17,7 +17,7 @@ export function currentStyles() {
   if (!styles.length) {
     styles = panes.map((pane, k) => {
       const own = !k || variantOf(pane) === variantOf(panes[0]);
-      return styleOf({ outline: outlines.get(variantOf(pane)), answer: pane.answer, colour: $("colour").value, mode: $("mode").value, field: pane.field, threshold: threshold(),
+      return styleOf({ outline: outlines.get(variantOf(pane)), answer: pane.answer, colour: $("colour").value, mode: $("mode").value, field: pane.field, threshold: threshold(), kept: keptIn(k),
         level: levelIndex(pane.answer), chosen: own ? page.chosen : -1, hover: own ? page.hover : -1 });
     });
   }
@@ -49,13 +49,17 @@ export function overlay() {
 function boxes(pane, k) {
   const own = outlines.get(variantOf(pane));
   if (!own || $("colour").value === "none") return [];
-  const found = shownHits(pane.answer)
-    .map((hit) => ({ node: hit.node, kind: "answer", label: `${hit.name} ${hit.score.toFixed(2)}`.trim() }));
+  const found = $("colour").value === "answers" ? keptIn(k).flatMap(({ answer, rgb, text }) => shownHits(answer).map((hit) => ({ node: hit.node, kind: "kept", stroke: `rgb(${rgb.join(" ")})`, label: text }))) : [];
+  for (const hit of shownHits(pane.answer)) found.push({ node: hit.node, kind: "answer", label: `${hit.name} ${hit.score.toFixed(2)}`.trim() });
   if (!k || variantOf(pane) === variantOf(panes[0])) {
     if (page.chosen >= 0) found.push({ node: page.chosen, kind: "chosen", label: nameOf(own, page.chosen) });
     if (page.hover >= 0 && page.hover !== page.chosen) found.push({ node: page.hover, kind: "hover", label: nameOf(own, page.hover) });
   }
-  const last = new Map(found.map((box) => [box.node, box]));
+  const last = new Map();
+  for (const box of found) {
+    const before = last.get(box.node), both = before && ["kept", "answer"].includes(box.kind);
+    last.set(box.node, both && before.label !== box.label ? { ...box, label: `${before.label} + ${box.label}` } : box);
+  }
   return [...last.values()].map((box) => ({ ...box, corners: own.nodes[box.node].corners }));
 }
 
@@ -80,6 +84,7 @@ function remember() {
     remembered = text || remembered || "";
     const link = new URLSearchParams({ c: page.camera.toText() });
     const put = (key, value, usual) => { if (value && value !== usual) link.set(key, value); };
+    for (const query of page.kept) link.append("keep", JSON.stringify(query.asked));
     put("q", page.asked?.text); put("level", level(), "auto"); put("by", panes[0].by, `${page.scene.variants[0]}|tree`); put("beside", panes[1]?.by);
     put("node", page.chosen >= 0 ? `${page.chosen}.${main().tree}` : ""); put("colour", $("colour").value, "answers"); put("mode", $("mode").value, "tint"); put("least", threshold() === null ? "" : String(threshold()));
     history[isNew ? "pushState" : "replaceState"](null, "", `${location.pathname}${api.offline ? location.search : keptSearch()}#${link}`);

@@ -1,17 +1,33 @@
 // What hands do: mouse and touch on the view, keys, and every control of the page.
 
 import * as api from "./api.js";
-import { ask, askPicture, clear, clearAnswer, fillField, framed, like } from "./asking.js";
+import { ask, askPicture, clear, clearAnswer, fillField, framed, keepAnswer, like } from "./asking.js";
 import { children } from "./card.js";
 import { choose, pointed, tapped } from "./choosing.js";
 import { attach } from "./controls.js";
 import { currentStyles, painted, redraw, rememberedAs, restyle } from "./drawing.js";
 import { $, counted, nameOf } from "./elements.js";
 import { flyTo, nearestView, setMoving, stand, step, touched } from "./flights.js";
+import { groups } from "./kept.js";
 import { attachKeys } from "./keyboard.js";
 import { save } from "./saves.js";
 import { failed, host, main, page, panes, start, tell, variantOf } from "./state.js";
 import { choosePanes } from "./variants.js";
+
+// The path of a film: views in the order in which they were added.
+function showPath() {
+  const count = page.path.length, flies = $("path").querySelector("[value=path]");
+  flies.disabled = count < 2;
+  flies.textContent = `along your path (${counted(count, "view")})`;
+  $("path").value = count < 2 ? "around" : "path";
+  $("path-clear").hidden = !count;
+}
+
+function addToPath() {
+  page.path.push(page.camera.copy());
+  showPath();
+  tell(page.path.length < 2 ? "The path begins here. Add another view, and films fly along it." : `${counted(page.path.length, "view")} in the path. Save a film to fly along it.`);
+}
 
 const MODES = ["tint", "ghost", "isolate", "plain"];
 
@@ -27,7 +43,7 @@ export function attachHands() {
     clear, step, home: () => stand(page.camera.first), help: () => $("help").showModal(),
     zoom: (factor) => nudge(() => page.camera.zoom(factor)), orbit: (x, y) => nudge(() => page.camera.orbit(0.1 * x, 0.1 * y)),
     move: (x, y, z) => nudge(() => page.camera.move(0.06 * x, 0.06 * y, 0.06 * z)),
-    photo: () => $("blend").click(), fly: () => flyTo(page.chosen), like: () => like(page.chosen), level: setLevel,
+    photo: () => $("blend").click(), fly: () => flyTo(page.chosen), like: () => like(page.chosen), level: setLevel, keep: keepAnswer, path: addToPath,
     name: () => $("card").querySelector(".name")?.focus(),
     mode: () => { $("mode").value = MODES[(MODES.indexOf($("mode").value) + 1) % MODES.length]; restyle(); },
     parent: () => { if (page.chosen >= 0 && main().nodes[page.chosen].parent >= 0) choose(main().nodes[page.chosen].parent); },
@@ -38,6 +54,9 @@ export function attachHands() {
   $("text").addEventListener("search", () => { if (!$("text").value && page.asked?.text) clearAnswer(); });
   for (const radio of document.querySelectorAll("[name=level]")) radio.addEventListener("change", levelChanged);
   for (const id of ["left", "right"]) $(id).addEventListener("change", choosePanes);
+  $("keep").addEventListener("click", keepAnswer);
+  $("path-add").addEventListener("click", addToPath);
+  $("path-clear").addEventListener("click", () => { page.path = []; showPath(); });
   $("mode").addEventListener("change", restyle);
   const thresholdChanged = () => {
     $("threshold-at").disabled = !$("threshold-on").checked;
@@ -68,11 +87,12 @@ export function attachHands() {
     if (text) ask();
   });
 
-  const selected = () => page.chosen >= 0 ? [page.chosen] : (panes[0].answer?.hits ?? []).map((hit) => hit.node);
+  const selected = () => page.chosen >= 0 ? [{ name: nameOf(main(), page.chosen), nodes: [page.chosen] }] : groups();
   $("save").addEventListener("toggle", () => {
-    const nodes = selected();
-    $("save-what").textContent = page.chosen >= 0 ? `Of ${nameOf(main(), page.chosen)}` : nodes.length ? `Of ${counted(nodes.length, "answer")}` : "Ask or choose something to save its Gaussians, boxes and masks.";
-    for (const button of $("save").querySelectorAll("[data-nodes]")) button.disabled = !nodes.length || ("long" in button.dataset && !$("saving").hidden);
+    const chosen = selected(), count = chosen.reduce((sum, group) => sum + group.nodes.length, 0);
+    $("save-what").textContent = page.chosen >= 0 ? `Of ${chosen[0].name}` : chosen.length ? `Of ${counted(count, "answer")} to ${chosen.map((group) => group.name).join(", ")}` : "Ask or choose something to save its Gaussians, boxes and masks.";
+    for (const button of $("save").querySelectorAll("[data-nodes]")) button.disabled = !count || ("long" in button.dataset && !$("saving").hidden);
+    showPath();
   });
   $("save").addEventListener("click", async (event) => {
     const kind = event.target.closest("[data-save]")?.dataset.save;
@@ -80,9 +100,10 @@ export function attachHands() {
     $("save").open = false;
     try {
       if (kind === "link") { await navigator.clipboard.writeText(location.href); tell("The link is copied. It opens this view while this viewer runs."); return; }
-      const scale = devicePixelRatio, size = [Math.round(host.clientWidth * scale), Math.round(host.clientHeight * scale)];
-      await save(kind, { variant: variantOf(panes[0]), nodes: selected(), style: currentStyles()[0], capture: () => page.painter.capture(page.camera, painted(), ...size),
-        texts: page.asked?.text ? [page.asked.text] : [], camera: page.camera.toText(), name: page.scene.name.split("/").at(-1), told: tell });
+      const side = Number($("still-side").value), scale = side ? side / Math.max(host.clientWidth, host.clientHeight) : devicePixelRatio, size = [host.clientWidth, host.clientHeight].map((px) => Math.round(px * scale));
+      const flown = $("path").value === "path" ? { path: page.path.map((camera) => camera.wire(host.clientWidth, host.clientHeight)) } : {};
+      await save(kind, { variant: variantOf(panes[0]), groups: selected(), style: currentStyles()[0], capture: () => page.painter.capture(page.camera, painted(), ...size), flown,
+        kept: page.kept.map((query) => query.asked), last: page.asked?.query, camera: page.camera.toText(), name: page.scene.name.split("/").at(-1), told: tell });
       redraw();
     } catch (error) { failed(error); }
   });

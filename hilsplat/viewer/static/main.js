@@ -68,8 +68,8 @@ function arriving(here, chunks) { Object.assign($("arriving"), { value: here, ma
 function onlyWhatIsHere() {
   for (const element of [$("picture-button"), $("here").parentElement, $("left").parentElement, $("right").parentElement]) element.hidden = true;
   for (const button of $("save").querySelectorAll("[data-save]:not([data-save=still])")) button.hidden = true;
-  $("gif-side").hidden = true;
-  $("save").querySelector("hr").hidden = true;
+  for (const row of $("save").querySelectorAll(".sized:not(:has([data-save=still]))")) row.hidden = true;
+  for (const line of $("save").querySelectorAll("hr")) line.hidden = true;
   $("colour").querySelector("[value=field]").remove();
   $("levels").hidden = $("threshold").hidden = true;
   $("text").setAttribute("list", "texts");

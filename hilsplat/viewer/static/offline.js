@@ -6,7 +6,8 @@ export class Refused extends Error {}
 
 const held = (id) => document.getElementById(id).textContent.trim();
 const data = JSON.parse(held("data"));
-export const texts = data.answers.map((answer) => answer.text), opening = data.opening;
+const plain = (words) => words.trim().toLowerCase().replace(/\s*>\s*/g, " > ");
+export const texts = data.asked.map((query) => query.text), opening = data.opening, kept = data.asked.slice(0, data.kept), first = data.asked[data.kept]?.text;
 
 const unpacked = (id) => Uint8Array.from(atob(held(id)), (c) => c.charCodeAt(0)).buffer;
 
@@ -22,9 +23,9 @@ export const thumbUrl = photoUrl;
 export const cropUrl = (variant, node) => image(data.crops[node]);
 export const sorter = () => new Worker(URL.createObjectURL(new Blob([held("sorter")], { type: "text/javascript" })));
 
-export async function query({ text }) {
-  const plain = (words) => words.trim().toLowerCase().replace(/\s*>\s*/g, " > ");
-  const found = data.answers.find((answer) => plain(answer.text) === plain(text));
+export async function query({ text, level, threshold }) {
+  const same = data.asked.map((asked, k) => plain(asked.text) === plain(text) ? k : -1).filter((k) => k >= 0);
+  const found = data.answers[same.find((k) => data.asked[k].level === level && data.asked[k].threshold === threshold) ?? same[0]];
   if (!found) throw new Refused(`This page was made with the answers to: ${texts.join(", ") || "nothing"}.`);
   return found;
 }

@@ -2,11 +2,12 @@
 
 import * as api from "./api.js";
 import { $, LEVELS } from "./elements.js";
+import { KEPT } from "./styles.js";
 
 export const host = $("view"), options = new URLSearchParams(location.search);
 export const start = new URLSearchParams(location.hash.slice(1));
 
-export const page = { scene: null, camera: null, painter: null, photos: null, outline: null, chosen: -1, hover: -1, asked: null, waiting: false, moving: false, slow: false };
+export const page = { scene: null, camera: null, painter: null, photos: null, outline: null, chosen: -1, hover: -1, asked: null, kept: [], path: [], waiting: false, moving: false, slow: false };
 export const outlines = new Map();                             // by variant
 export const panes = [{ by: "", answer: null, field: null }]; // one, or two side by side
 
@@ -16,6 +17,8 @@ export const level = () => document.querySelector("[name=level]:checked").value;
 // Least score of an answer, or null for those near the best.
 export const threshold = () => $("threshold-on").checked ? Number($("threshold-at").value) : null;
 export const levelIndex = (answer) => Math.max(0, LEVELS.indexOf(level() === "auto" ? answer?.level ?? "whole" : level()));
+// Kept queries in a pane: what is painted, and in which colour.
+export const keptIn = (pane) => page.kept.filter((query) => query.shown && query.answers[pane]).map((query) => ({ answer: query.answers[pane], rgb: KEPT[query.colour], text: query.asked.text }));
 export const main = () => outlines.get(variantOf(panes[0]));
 
 export function tell(text, error = false) { $("status").textContent = text; $("status").classList.toggle("error", error); }

@@ -1,6 +1,8 @@
 // One function decides how every node is painted, for both painters.
 
-export const ANSWER = [255, 122, 0], CHOSEN = [58, 150, 255], HOVER = [255, 225, 70];
+export const ANSWER = [255, 122, 0], CHOSEN = [58, 150, 255], HOVER = [255, 225, 70], SHARED = [255, 255, 255];
+// Of kept queries; style.css has the same for their chips.
+export const KEPT = [[0, 200, 140], [235, 120, 200], [70, 215, 235], [180, 215, 50], [160, 120, 255], [235, 80, 80]];
 const STOPS = [[0, 0, 4], [31, 12, 72], [85, 15, 109], [136, 34, 106], [186, 54, 85], [227, 89, 51], [249, 140, 10], [249, 201, 50], [252, 255, 164]];
 
 export const RAMP = (() => {
@@ -34,11 +36,12 @@ const PAINTED_ALIKE = 5;
 export const shownHits = (answer) => answer?.route === "like" ? answer.hits.slice(0, PAINTED_ALIKE) : answer?.hits ?? [];
 
 /*
+ * kept: [{answer, rgb}] of queries that are painted too;
  * outline: the nodes of a variant; answer: what was found, or null; colour, mode: the choices of the page;
  * level: 0, 1, 2 for what is painted by level; chosen, hover: nodes, or -1; field: the {text, level} whose field
  * relevancy was asked for, or null; threshold: the least relevancy that is painted, or null.
  */
-export function styleOf({ outline, answer, colour, mode, level, chosen, hover, field, threshold = null }) {
+export function styleOf({ outline, answer, colour, mode, level, chosen, hover, field, threshold = null, kept = [] }) {
   const nodes = outline?.nodes ?? [], table = new Uint8Array(4 * (nodes.length + 1));
   const set = (node, rgb, a) => { if (node >= 0 && node < nodes.length) table.set([...rgb, Math.round(255 * a)], 4 * (node + 1)); };
   let use = [true, true, true];
@@ -55,10 +58,11 @@ export function styleOf({ outline, answer, colour, mode, level, chosen, hover, f
       set(node, colour === "nodes" ? colourOf(node) : RAMP.subarray(3 * step, 3 * step + 3), colour === "nodes" ? 0.6 : 0.8);
     });
     if (colour === "nodes" || threshold === null) mode = "plain";
-  } else if (colour === "answers" && answer) {
-    const hits = shownHits(answer);
-    hits.forEach((hit, rank) => set(hit.node, ANSWER, 0.72 - 0.42 * rank / Math.max(hits.length, 4)));
-    if (!answer.hits.length) mode = "plain";
+  } else if (colour === "answers" && (answer || kept.length)) {
+    const hits = shownHits(answer), painted = new Set();
+    for (const { answer: other, rgb } of kept) for (const { node } of shownHits(other)) { set(node, painted.has(node) ? SHARED : rgb, 0.62); painted.add(node); }
+    hits.forEach(({ node }, rank) => set(node, painted.has(node) ? SHARED : ANSWER, 0.72 - 0.42 * rank / Math.max(hits.length, 4)));
+    if (!hits.length && !painted.size) mode = "plain";
   } else if (chosen < 0 || colour === "none") mode = "plain";
   if (chosen >= 0 && colour !== "none") {
     if (colour === "nodes" || colour === "relevancy") use = use.map((used, k) => used || k === nodes[chosen]?.level);

@@ -5,6 +5,7 @@ import { ask, listAnswers } from "./asking.js";
 import { acts, choose } from "./choosing.js";
 import { restyle } from "./drawing.js";
 import { $, counted, make } from "./elements.js";
+import { askKeptAgain, keepFromStart } from "./kept.js";
 import { failed, loadVariant, main, page, panes, sceneChanged, start, tell, variantOf } from "./state.js";
 
 const POLL_MS = 4000;
@@ -28,8 +29,9 @@ export async function useVariants() {
   for (const pane of panes) await loadVariant(variantOf(pane));
   fillVariants();
   showOutline();
-  const text = page.waiting ? $("text").value : start.get("q") ?? api.texts[0];   // an exported page begins with its answer
+  const text = page.waiting ? $("text").value : start.get("q") ?? api.first;   // an exported page begins with its answer
   page.waiting = false;
+  await keepFromStart();
   if (text) { $("text").value = text; await ask(); }
   const [node, tree] = (start.get("node") ?? "").split(".");   // a row of another tree is another node
   if (tree === main().tree && main().nodes[node]) choose(Number(node));
@@ -50,6 +52,7 @@ export async function choosePanes() {
     else if (panes[1]?.by !== right) panes[1] = { by: right, answer: null, field: null };
     for (const pane of panes) await loadVariant(variantOf(pane));
     if (changed) { choose(-1); showOutline(); }
+    await askKeptAgain();
     if (page.asked?.text) await ask(true); else listAnswers();
     restyle();
   } catch (error) { failed(error); }

@@ -8,7 +8,7 @@ from PIL import Image
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat import flyaround
 from hilsplat.splat.film import write_film
-from hilsplat.splat.flyaround import FRAMES, closed_path, short_round, write_flyaround
+from hilsplat.splat.flyaround import FRAMES, closed_path, open_path, short_round, write_flyaround
 from hilsplat.splat.sheets import contact_sheet
 from tests.unit.splat.three_gaussians_world import ring
 
@@ -36,6 +36,26 @@ def test_path_of_a_ring_goes_once_round_whatever_the_order():
         # it looks at the origin, upright
         np.testing.assert_allclose(rotation[2], -camera.centre / np.linalg.norm(camera.centre), atol=0.02)
         assert rotation[1, 2] < 0
+
+
+def test_an_open_path_goes_through_its_cameras_in_their_order():
+    cameras = ring(8, 48)
+    stops = [cameras[name] for name in cameras.names[:4]]
+    path = open_path(stops, 31)
+    centres = np.stack([camera.centre for camera in path])
+    for stop, frame in zip(stops, (0, 10, 20, 30), strict=True):
+        np.testing.assert_allclose(centres[frame], stop.centre, atol=0.05)
+        np.testing.assert_allclose(path[frame].cam_from_world[:3, :3], stop.cam_from_world[:3, :3], atol=0.05)
+    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    assert steps.max() < 2.5 * steps.min()
+    for camera in path:
+        np.testing.assert_allclose(camera.K, stops[0].K)
+        np.testing.assert_allclose(np.linalg.det(camera.cam_from_world[:3, :3]), 1)
+
+
+def test_an_open_path_may_stand_still():
+    (camera,) = (ring(1, 48)["000.png"],)
+    assert len(open_path([camera, camera], 3)) == 3
 
 
 def test_hand_shake_is_smoothed():

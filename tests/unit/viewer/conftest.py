@@ -1,5 +1,6 @@
 """A finished desk and the server of its page, without a browser."""
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,3 +33,28 @@ def client(shown) -> Iterator[TestClient]:
     with TestClient(Viewer(shown).app(TOKEN), base_url=ADDRESS, headers=headers) as browser:
         assert browser.get(f"/?token={TOKEN}").status_code == 200
         yield browser
+
+
+@pytest.fixture(scope="module")
+def camera(shown):
+    return shown.scene.cameras[shown.scene.cameras.names[1]]
+
+
+def wire_camera(camera) -> dict:
+    return {
+        "cam_from_world": camera.cam_from_world.tolist(),
+        "K": camera.K.tolist(),
+        "size_hw": list(camera.size_hw),
+    }
+
+
+def in_steps(client, kind: str, **sent) -> tuple[list[tuple[int, int]], bytes]:
+    """How far a file was, line by line, and the file."""
+    told, rest = [], client.post(f"/api/export/{kind}", json=sent).content
+    while True:
+        line, _, rest = rest.partition(b"\n")
+        said = json.loads(line)
+        if "bytes" in said:
+            assert len(rest) == said["bytes"]
+            return told, rest
+        told.append((said["made"], said["of"]))

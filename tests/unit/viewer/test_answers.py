@@ -18,6 +18,7 @@ import jsonschema
 import numpy as np
 import pytest
 from PIL import Image
+from plyfile import PlyData
 from pycocotools import mask as coco_masks
 from starlette.requests import Request
 from starlette.testclient import TestClient
@@ -34,7 +35,7 @@ from hilsplat.viewer.scene_thread import SceneThread
 from hilsplat.viewer.shown import ShownScene
 from tests.unit.finished_desk import SCENE
 from tests.unit.splat.spz_reader import decoded
-from tests.unit.viewer.conftest import ADDRESS, TOKEN
+from tests.unit.viewer.conftest import ADDRESS, TOKEN, in_steps, wire_camera
 
 
 def run_apart(work: Callable[[], Coroutine[None, None, None]]) -> None:
@@ -68,7 +69,7 @@ def test_what_a_script_may_ask_is_described_as_it_is(client):
     bodies = {
         "/api/query": {"text": "mug > handle"},
         "/api/like": {"node": 0},
-        "/api/export/boxes": {"nodes": [0]},
+        "/api/export/boxes": {"groups": [{"name": "mug", "nodes": [0]}]},
         "/api/field": {"text": "mug"},
     }
     for path, methods in described["paths"].items():
@@ -161,20 +162,50 @@ def test_names_are_kept_and_answer_and_need_the_version_that_was_read(client, sc
 
 def test_a_saved_selection_is_the_nodes_gaussians(client, scene, shown, tmp_path):
     nodes = [hit["node"] for hit in ask(client, "mug > handle")["hits"]]
-    (tmp_path / "selection.ply").write_bytes(client.post("/api/export/ply", json={"nodes": nodes}).content)
+    sent = {"groups": [{"name": "mug > handle", "nodes": nodes}]}
+    (tmp_path / "selection.ply").write_bytes(client.post("/api/export/ply", json=sent).content)
     saved = load_ply(tmp_path / "selection.ply")
     rows = scene.gaussians_of(nodes)
     np.testing.assert_array_equal(saved.means, shown.gaussians.means[rows])
     np.testing.assert_array_equal(saved.sh, shown.gaussians.sh[rows])
-    (box,) = client.post("/api/export/boxes", json={"nodes": nodes}).json()["boxes"]
+    (box,) = client.post("/api/export/boxes", json=sent).json()["boxes"]
     (hit,) = scene.query("mug > handle")
     np.testing.assert_allclose(box["corners"], hit.oriented_box.corners(), atol=1e-4)
-    assert client.post("/api/export/ply", json={"nodes": [99]}).status_code == 422
+    compressed = decoded(client.post("/api/export/spz", json=sent).content)
+    assert sorted(compressed.means[:, 0]) == pytest.approx(sorted(saved.means[:, 0]), abs=1e-3)
+    for kind in ("ply", "spz", "boxes", "masks"):
+        missing = {"groups": [{"name": "", "nodes": [99]}]}
+        assert client.post(f"/api/export/{kind}", json=missing).status_code == 422
+
+
+def test_answers_to_several_queries_are_saved_with_their_labels(client, scene, tmp_path):
+    (mug,), (handle,) = scene.query("mug", "whole"), scene.query("mug > handle")
+    groups = [{"name": "mug > hëndle", "nodes": [handle.node]}, {"name": "mug", "nodes": [mug.node]}]
+    sent = {"groups": groups}
+    (tmp_path / "selection.ply").write_bytes(client.post("/api/export/ply", json=sent).content)
+    saved = PlyData.read(tmp_path / "selection.ply")
+    assert saved.comments == ["label 1: mug > h\\xebndle", "label 2: mug"]
+    # the handle belongs to both: it is labelled as the smaller
+    rows = scene.gaussians_of([mug.node, handle.node])
+    expected = np.where(np.isin(rows, scene.gaussians_of([handle.node])), 1, 2)
+    np.testing.assert_array_equal(saved["vertex"]["label"], expected)
+    boxes = client.post("/api/export/boxes", json=sent).json()["boxes"]
+    assert [(box["group"], box["node"]) for box in boxes] == [
+        ("mug > hëndle", handle.node),
+        ("mug", mug.node),
+    ]
+    _, data = in_steps(client, "masks", groups=[*groups, {"name": "cup", "nodes": [mug.node]}])
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        coco = json.loads(archive.read("coco.json"))
+    assert [each["name"] for each in coco["categories"]] == ["mug > hëndle", "mug", "cup"]
+    first = [(each["category_id"], each["node"]) for each in coco["annotations"] if each["image_id"] == 0]
+    assert sorted(first) == [(1, handle.node), (2, mug.node), (3, mug.node)]
+    assert len({each["id"] for each in coco["annotations"]}) == len(coco["annotations"])
 
 
 def test_saved_masks_are_those_of_the_hits_in_every_view(client, scene):
     (hit,) = scene.query("mug > handle")
-    told, data = in_steps(client, "masks", nodes=[hit.node])
+    told, data = in_steps(client, "masks", groups=[{"name": "handle", "nodes": [hit.node]}])
     assert told == [(made, len(scene.views)) for made in range(len(scene.views) + 1)]
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         coco = json.loads(archive.read("coco.json"))
@@ -194,18 +225,6 @@ def test_saved_masks_are_those_of_the_hits_in_every_view(client, scene):
 def test_coco_runs_begin_with_zeros(mask):
     runs = coco_masks.frPyObjects({"size": list(mask.shape), "counts": coco_counts(mask)}, *mask.shape)
     np.testing.assert_array_equal(coco_masks.decode(runs).astype(bool), mask)
-
-
-def in_steps(client, kind: str, **sent) -> tuple[list[tuple[int, int]], bytes]:
-    """How far a file was, line by line, and the file."""
-    told, rest = [], client.post(f"/api/export/{kind}", json=sent).content
-    while True:
-        line, _, rest = rest.partition(b"\n")
-        said = json.loads(line)
-        if "bytes" in said:
-            assert len(rest) == said["bytes"]
-            return told, rest
-        told.append((said["made"], said["of"]))
 
 
 def test_a_person_is_answered_between_the_steps_of_a_file(shown):
@@ -239,6 +258,25 @@ def test_films_have_the_frames_that_were_asked_for(client, tmp_path):
     with av.open(str(tmp_path / "film.mp4")) as film:
         frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
     assert len(frames) == 6 and frames[0].shape == (36, 64, 3) and frames[0].std() > 20
+
+
+def test_a_film_flies_along_a_path(client, camera, tmp_path):
+    views = [wire_camera(camera), {**wire_camera(camera), "cam_from_world": np.eye(4).tolist()}]
+    _, data = in_steps(client, "film", frames=5, side_px=64, path=views)
+    (tmp_path / "film.mp4").write_bytes(data)
+    with av.open(str(tmp_path / "film.mp4")) as film:
+        frames = [frame.to_ndarray(format="rgb24").astype(float) for frame in film.decode(video=0)]
+    still = encoded_frame(client, views[0], frames[0].shape[:2])
+    assert np.abs(frames[0] - still).mean() < 8 < np.abs(frames[-1] - still).mean()
+
+
+def encoded_frame(client, camera, size_hw) -> np.ndarray:
+    """The same view as a picture, at the film's size."""
+    height, width = size_hw
+    scale = np.diag([width / camera["size_hw"][1], height / camera["size_hw"][0], 1.0])
+    small = {**camera, "K": (scale @ np.array(camera["K"])).tolist(), "size_hw": [height, width]}
+    data = client.post("/api/frame", json={"camera": small, "image": "png"}).content
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(float)
 
 
 @pytest.mark.parametrize("side_px", [64, 96])
@@ -335,7 +373,13 @@ def test_gaussians_are_sent_once(client, shown):
 
 def test_an_exported_page_holds_all_that_it_needs(client, shown):
     evil = "mug </script><script>alert(1)</script>".replace(">", "")
-    told, data = in_steps(client, "page", texts=["mug > handle", evil], start="v3")
+    told, data = in_steps(
+        client,
+        "page",
+        kept=[{"text": "mug > handle", "level": "part", "threshold": 0.3}],
+        last={"text": evil},
+        start="v3",
+    )
     nodes = len(shown.answering("default").tree)
     assert told == [(made, nodes) for made in range(nodes + 1)]
     page = data.decode()
@@ -345,6 +389,8 @@ def test_an_exported_page_holds_all_that_it_needs(client, shown):
     assert len(decoded(base64.b64decode(held["splats"]))) == len(shown.gaussians)
     data = json.loads(held["data"])
     assert [answer["text"] for answer in data["answers"]] == ["mug > handle", evil]
+    asked = [{"text": "mug > handle", "level": "part", "threshold": 0.3}, {"text": evil, "level": "auto"}]
+    assert data["asked"] == asked and data["kept"] == 1
     assert len(data["photos"]) == len(data["scene"]["views"]) and data["opening"] == "v3"
     imports = json.loads(re.search(r'<script type="importmap">(.*?)</script>', page, re.S)[1])["imports"]
     for name, address in imports.items():

@@ -85,8 +85,8 @@ def test_nothing_is_read_beside_what_was_opened_before(page, desk):
     save_ply(desk / "gaussians.ply", replace(gaussians, means=gaussians.means[::-1].copy()))
     names = {"variant": "default", "names": {str(handle): "grip"}}
     refused: tuple[Callable, ...] = (
-        lambda: page.post("/api/export/ply", json={"nodes": [handle]}),
-        lambda: page.post("/api/export/page", json={"texts": []}),
+        lambda: page.post("/api/export/ply", json={"groups": [{"name": "handle", "nodes": [handle]}]}),
+        lambda: page.post("/api/export/page", json={}),
         lambda: page.put("/api/names", json=names, headers={"if-match": '"none"'}),
         lambda: page.get("/api/photo/0"),
         lambda: page.get(f"/api/crop/default/{handle}"),
@@ -107,7 +107,7 @@ def test_a_page_that_is_saved_while_the_scene_changes_is_refused(page, desk, mon
         return draw(*of)
 
     monkeypatch.setattr(exports, "crop", crop)
-    lines = page.post("/api/export/page", json={"texts": []}).text.splitlines()
+    lines = page.post("/api/export/page", json={}).text.splitlines()
     assert lines[0].startswith('{"made":0')
     assert len(lines) == 2 and "semantic_tree of photos/desk changed on the disk" in lines[1]
 

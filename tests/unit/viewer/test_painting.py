@@ -12,19 +12,7 @@ from hilsplat.splat.rasterise.api import pixel_weights, render
 from hilsplat.viewer.frames import GHOST, GREY, TINT, Paint, painted
 from hilsplat.viewer.picking import pick, weights_at
 from hilsplat.viewer.wire import Style
-
-
-def wire_camera(camera) -> dict:
-    return {
-        "cam_from_world": camera.cam_from_world.tolist(),
-        "K": camera.K.tolist(),
-        "size_hw": list(camera.size_hw),
-    }
-
-
-@pytest.fixture(scope="module")
-def camera(shown):
-    return shown.scene.cameras[shown.scene.cameras.names[1]]
+from tests.unit.viewer.conftest import wire_camera
 
 
 def table(shown, **colours: tuple[int, int, int, int]) -> str:

@@ -1,0 +1,87 @@
+// Queries that stay while others are asked: each has a colour, and can be hidden, changed or dropped.
+
+import * as api from "./api.js";
+import { restyle } from "./drawing.js";
+import { $, counted, make } from "./elements.js";
+import { answererOf, keptIn, level, main, page, panes, start, tell, threshold, variantOf } from "./state.js";
+import { KEPT, shownHits } from "./styles.js";
+
+const MOST = 12;
+
+// What a query asks, but for who answers it.
+export const asking = (text) => ({ text, level: level(), ...(threshold() === null ? {} : { threshold: threshold() }),
+  ...($("here").checked && page.camera.view >= 0 ? { view: page.camera.view } : {}) });
+
+async function answered(query) {
+  query.answers = [];
+  for (const pane of panes) query.answers.push(await api.query({ variant: variantOf(pane), answerer: answererOf(pane), ...query.asked }));
+}
+
+const free = () => KEPT.findIndex((_, k) => page.kept.every((query) => query.colour !== k));
+
+export async function keep(asked) {
+  if (page.kept.length >= MOST) { tell(`At most ${MOST} queries are kept: drop one first.`, true); return false; }
+  const same = page.kept.findIndex((query) => JSON.stringify(query.asked) === JSON.stringify(asked)), query = same < 0 ? { asked, shown: true, colour: Math.max(0, free()) } : page.kept[same];
+  await answered(query);
+  if (same < 0) page.kept.push(query);
+  showKept();
+  return true;
+}
+
+// Those of the address, or of an exported page.
+export async function keepFromStart() {
+  const kept = api.offline ? api.kept : start.getAll("keep").map((text) => { try { return JSON.parse(text); } catch { return null; } });
+  for (const asked of kept) if (asked?.text) await keep(asked);
+}
+
+// Other answerers, or another tree: everything is asked again.
+export async function askKeptAgain() {
+  for (const query of page.kept) await answered(query);
+  showKept();
+}
+
+// The nodes of every query that is shown, for files.
+export function groups() {
+  const found = keptIn(0).map(({ answer, text }) => ({ name: text, nodes: answer.hits.map((hit) => hit.node) }));
+  const answer = panes[0].answer;
+  if (answer) found.push({ name: answer.text, nodes: answer.hits.map((hit) => hit.node) });
+  return found.filter((group) => group.nodes.length);
+}
+
+let reopen = () => {};
+export const whenReopened = (work) => { reopen = work; };
+
+export function showKept() {
+  $("kept-section").hidden = !page.kept.length && !page.asked?.text;
+  $("keep").hidden = !page.asked?.text || !panes[0].answer?.hits.length || api.offline;
+  $("kept").replaceChildren(...page.kept.map((query) => {
+    const { text, level: at, threshold: least } = query.asked, count = query.answers[0].total;
+    const swatch = make("button", { type: "button", class: `swatch kept-${query.colour}`, "aria-pressed": String(query.shown), "aria-label": `Show ${text}`, title: query.shown ? "Hide" : "Show",
+      onclick: () => { query.shown = !query.shown; showKept(); } });
+    return make("li", {}, swatch,
+      make("button", { type: "button", class: "words", title: "Change it", disabled: api.offline, onclick: () => { drop(query); reopen(query.asked); } },
+        text, make("small", {}, [at === "auto" ? query.answers[0].level : at, counted(count, "answer"), ...(least ? [`from ${least.toFixed(2)}`] : [])].join(", "))),
+      api.offline ? null : make("button", { type: "button", class: "drop", "aria-label": `Drop ${text}`, title: "Drop", onclick: () => drop(query) }, "×"));
+  }));
+  $("overlaps").textContent = overlaps();
+  restyle();
+}
+
+function drop(query) {
+  page.kept = page.kept.filter((other) => other !== query);
+  showKept();
+}
+
+// Nodes that several queries have in common, and those inside another query's.
+function overlaps() {
+  const shown = [...keptIn(0).map(({ answer }) => answer), ...(page.kept.length && panes[0].answer ? [panes[0].answer] : [])], times = new Map();
+  if (!main() || shown.length < 2) return "";
+  const sets = shown.map((answer) => new Set(shownHits(answer).map((hit) => hit.node)));
+  for (const set of sets) for (const node of set) times.set(node, (times.get(node) ?? 0) + 1);
+  const common = [...times.values()].filter((count) => count > 1).length;
+  const inside = sets.reduce((sum, set, k) => sum + [...set].filter((node) => {
+    for (let row = main().nodes[node].parent; row >= 0; row = main().nodes[row].parent) if (sets.some((other, j) => j !== k && other.has(row))) return true;
+    return false;
+  }).length, 0);
+  return [common ? `White: ${counted(common, "node")} of more than one query.` : "", inside ? `${counted(inside, "answer")} inside another query's.` : ""].filter(Boolean).join(" ");
+}

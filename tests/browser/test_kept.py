@@ -1,0 +1,164 @@
+"""Several queries at once, files of them, and films along a path of the user's own."""
+
+import json
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+from plyfile import PlyData
+
+import hilsplat
+from tests.browser.conftest import HEIGHT, WIDTH, drawn, pixels
+from tests.browser.test_ask import answers
+
+
+@pytest.fixture
+def scene(desk):
+    return hilsplat.open(desk)
+
+
+def ask(page, text: str) -> None:
+    page.locator("#text").fill(text)
+    page.keyboard.press("Enter")
+
+
+def keep(page, text: str) -> None:
+    """Ask, and keep the answer by its key."""
+    ask(page, text)
+    answers(page).first.wait_for()
+    page.locator("#view").focus()
+    page.keyboard.press("k")
+    page.get_by_text(f"Kept “{text}”").wait_for()
+
+
+def chips(page):
+    return page.get_by_label("Kept queries").get_by_role("listitem")
+
+
+def greenish(page) -> float:
+    """Share of the picture in the colour of the first kept query."""
+    page.wait_for_timeout(500)
+    picture = pixels(page).astype(int)
+    return float(((picture[..., 1] - picture[..., 0] > 60) & (picture[..., 2] > 60)).mean())
+
+
+def test_kept_queries_have_colours_and_can_be_hidden_and_dropped(opened, desk_address, scene):
+    page = opened(desk_address)
+    keep(page, "book")
+    keep(page, "mug > handle")
+    assert page.evaluate("document.activeElement.id") == "text" and not answers(page).count()
+    assert [chip.inner_text().split("\n")[0] for chip in chips(page).all()] == ["book", "mug > handle"]
+    (book,), (handle,) = scene.query("book"), scene.query("mug > handle")
+    painted = {int(path.get_attribute("data-node")) for path in page.locator("#overlay path.kept").all()}
+    assert painted == {book.node, handle.node}
+    assert greenish(page) > 0.02
+    drawn(page, page.get_by_role("button", name="Show book").click)
+    assert page.get_by_role("button", name="Show book").get_attribute("aria-pressed") == "false"
+    assert greenish(page) < 0.005
+    page.get_by_role("button", name="Drop book").click()
+    assert chips(page).count() == 1
+
+
+def test_what_two_queries_have_in_common_is_told(opened, desk_address):
+    page = opened(desk_address)
+    keep(page, "mug")
+    ask(page, "mug > handle")
+    page.get_by_text("1 answer inside another query's.").wait_for()
+    ask(page, "mug")
+    page.get_by_text("White: 1 node of more than one query.").wait_for()
+    assert page.locator("#overlay text").first.text_content().startswith("mug + ")
+
+
+def test_a_kept_query_is_changed(opened, desk_address):
+    page = opened(desk_address)
+    page.get_by_role("checkbox", name="scores from").check()
+    page.get_by_label("Least score").fill("0.3")
+    keep(page, "book")
+    assert "from 0.30" in chips(page).first.inner_text()
+    page.get_by_role("checkbox", name="scores from").uncheck()
+    chips(page).first.get_by_title("Change it").click()
+    answers(page).first.wait_for()
+    assert page.locator("#text").input_value() == "book"
+    assert page.get_by_role("checkbox", name="scores from").is_checked()
+    assert not chips(page).count()
+
+
+def test_the_address_keeps_them(opened, desk_address):
+    page = opened(desk_address)
+    keep(page, "book")
+    ask(page, "mug > handle")
+    answers(page).first.wait_for()
+    page.wait_for_timeout(1000)
+    again = opened(f"{desk_address}", fragment="#" + page.url.partition("#")[2])
+    assert chips(again).all_inner_texts() == chips(page).all_inner_texts()
+    assert again.locator("#text").input_value() == "mug > handle"
+
+
+def save(page, name: str, folder):
+    page.locator("#save summary").click()
+    with page.expect_download() as saved:
+        page.get_by_role("button", name=name).click()
+    saved.value.save_as(folder / "saved")
+    return folder / "saved"
+
+
+def test_they_are_saved_together(opened, desk_address, scene, tmp_path):
+    page = opened(desk_address)
+    keep(page, "book")
+    ask(page, "mug > handle")
+    answers(page).first.wait_for()
+    ply = PlyData.read(save(page, "Gaussians, PLY", tmp_path))
+    assert ply.comments == ["label 1: book", "label 2: mug > handle"]
+    (book,), (handle,) = scene.query("book"), scene.query("mug > handle")
+    rows = scene.gaussians_of([book.node, handle.node])
+    expected = np.where(np.isin(rows, scene.gaussians_of([handle.node])), 2, 1)
+    np.testing.assert_array_equal(ply["vertex"]["label"], expected)
+    boxes = json.loads(save(page, "Boxes, JSON", tmp_path).read_text())["boxes"]
+    assert [(box["group"], box["node"]) for box in boxes] == [
+        ("book", book.node),
+        ("mug > handle", handle.node),
+    ]
+
+
+def test_an_exported_page_has_them_too(opened, browser, desk_address, tmp_path):
+    page = opened(desk_address)
+    keep(page, "book")
+    keep(page, "mug > handle")
+    saved = save(page, "Page with answers, HTML", tmp_path)
+    context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT})
+    alone = context.new_page()
+    alone.goto(f"file://{saved.rename(tmp_path / 'page.html')}")
+    alone.locator("body[data-ready=yes]").wait_for()
+    alone.evaluate("hilsplat.begun")
+    assert [chip.inner_text().split("\n")[0] for chip in chips(alone).all()] == ["book", "mug > handle"]
+    assert alone.locator("#overlay path.kept").count() == 2
+    context.close()
+
+
+def test_a_film_flies_along_the_path_of_the_user(opened, desk_address, tmp_path):
+    page = opened(desk_address, "server")
+    page.locator("#view").focus()
+    page.keyboard.press("v")
+    page.get_by_text("The path begins here").wait_for()
+    page.get_by_role("option", name="003.png").click()
+    page.locator("#view").focus()
+    page.keyboard.press("v")
+    page.get_by_text("2 views in the path").wait_for()
+    film = save(page, "Film, MP4", tmp_path)
+    with av.open(str(film)) as frames:
+        count = sum(1 for _ in frames.decode(video=0))
+    assert count == 120
+    page.locator("#save summary").click()
+    assert page.locator("#path").input_value() == "path"
+    page.get_by_role("button", name="Clear").click()
+    assert page.locator("#path").input_value() == "around"
+
+
+def test_a_picture_is_saved_at_the_chosen_size(opened, desk_address, tmp_path):
+    page = opened(desk_address, "server")
+    page.locator("#save summary").click()
+    page.get_by_label("Longer side of the picture").select_option("1280")
+    page.locator("#save summary").click()
+    picture = Image.open(save(page, "Picture, PNG", tmp_path))
+    assert max(picture.size) == 1280 and min(picture.size) > HEIGHT
