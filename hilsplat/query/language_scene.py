@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, cast, get_args
+from typing import TYPE_CHECKING, Literal, cast, get_args
 
 import numpy as np
 import scipy.sparse as sp
@@ -35,6 +35,9 @@ from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings
 from hilsplat.splat.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from hilsplat.viewer.embedded import EmbeddedViewer
 
 logger = logging.getLogger(__name__)
 
@@ -66,6 +69,7 @@ class LanguageScene:
         naming: what a vocabulary calls the nodes, and words for what is absent; None: the stage has not run.
         unknown_words: words of a text that the model of texts does not know.
         encode_picture: unit CLIP vector of an RGB image; None: pictures cannot be looked for.
+        finished: where the scene is, and its variant; None: it was put together from parts.
     """
 
     scene: Scene
@@ -83,6 +87,7 @@ class LanguageScene:
     naming: NodeNaming | None = field(default=None, repr=False)
     unknown_words: Callable[[str], list[str]] = field(default=lambda text: [], repr=False)
     encode_picture: PictureEncoder | None = field(default=None, repr=False)
+    finished: FinishedScene | None = field(default=None, repr=False)
     _views: ViewStore = field(default_factory=ViewStore, repr=False)
     _texts: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
     _by_chance: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
@@ -118,7 +123,7 @@ class LanguageScene:
         found: FinishedScene, *, threads: int = 1, device: str = "cpu", opened: Opened | None = None
     ) -> "LanguageScene":
         """Open a finished scene that was located, with its own settings and the names given to its nodes."""
-        return LanguageScene.from_parts(
+        scene = LanguageScene.from_parts(
             found.parts,
             found.evaluate_settings(),
             threads=threads,
@@ -127,6 +132,7 @@ class LanguageScene:
             names=read_names(found.folder, found.parts.semantic_tree),
             naming=NodeNaming.load(found.naming, found.parts.semantic_tree, found.parts.clip),
         )
+        return replace(scene, finished=found)
 
     @staticmethod
     def from_parts(
@@ -181,6 +187,24 @@ class LanguageScene:
             unknown_words=found.clip.unknown_words,
             encode_picture=found.clip.embed_picture,
         )
+
+    def show(self, text: str = "", *, height: int = 640, proxy: str = "") -> "EmbeddedViewer":
+        """Show the scene in a notebook: the page of `hilsplat view` in a frame, served by this process.
+
+        Args:
+            text: what the page asks first; "": nothing.
+            height: of the frame, px.
+            proxy: address under which the browser reaches a port of this machine, with `{port}` in it, if the
+                notebook runs on another one: "/user/me/proxy/{port}/" on a JupyterHub.
+
+        Raises:
+            ArtifactError: the scene was put together from parts, or has too many Gaussians to show.
+        """
+        from hilsplat.viewer.embedded import EmbeddedViewer
+
+        if self.finished is None:
+            raise ArtifactError("the scene was put together from parts", fix="open it with hilsplat.open")
+        return EmbeddedViewer(self.finished, text=text, height=height, proxy=proxy, threads=self.threads)
 
     def trained(self) -> tuple[LanguageField, Code]:
         """The language field, and the code that it is written in.

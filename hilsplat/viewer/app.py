@@ -44,8 +44,8 @@ class Viewer:
         self.thread = SceneThread(shown)
         self.pages = Pages("index.html", static_files())
 
-    def app(self, token: str) -> Guard:
-        """The application, guarded."""
+    def app(self, token: str, *, embedded: bool = False) -> Guard:
+        """The application, guarded; as a page of its own, or as a frame of another."""
         routes = [
             *self.pages.routes(),
             Route("/openapi.json", self.described),
@@ -65,7 +65,7 @@ class Viewer:
             Route("/api/names", self.names, methods=["PUT"]),
             *SavedFiles(self.thread, self.pages.static).routes(),
         ]
-        return guarded(routes, token, {StaleNamesError: 412, StaleSceneError: 409})
+        return guarded(routes, token, {StaleNamesError: 412, StaleSceneError: 409}, embedded=embedded)
 
     async def described(self, request: Request) -> Response:
         """The OpenAPI description."""

@@ -18,10 +18,12 @@ LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
 MAX_BODY_BYTES = 1 << 20
 MAX_PATH = 500
 """Most characters of a path: Python refuses to read numbers of thousands of digits."""
+CONTENT_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
+    "connect-src 'self'; worker-src 'self'; base-uri 'none'; form-action 'none'; "
+)
 HEADERS = {
-    "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
-    "img-src 'self' blob: data:; connect-src 'self'; worker-src 'self'; base-uri 'none'; form-action 'none'; "
-    "frame-ancestors 'none'",
+    "content-security-policy": CONTENT_POLICY + "frame-ancestors 'none'",
     "x-content-type-options": "nosniff",
     "cross-origin-resource-policy": "same-origin",
     "cross-origin-opener-policy": "same-origin",
@@ -36,11 +38,19 @@ class Guard:
         app: what is guarded.
         token: secret of the printed address.
         max_body: most bytes that the page may send at once.
+        embedded: the page is a frame of another one, such as a notebook, perhaps behind a proxy. Browsers
+            give it no cookie, so each of its requests has the token in its address; nobody else knows that,
+            and its host and origin are those of the other page. Scripts and styles are no secret.
     """
 
-    def __init__(self, app: ASGIApp, token: str, max_body: int = MAX_BODY_BYTES) -> None:
-        self.app, self.max_body = app, max_body
+    def __init__(
+        self, app: ASGIApp, token: str, max_body: int = MAX_BODY_BYTES, *, embedded: bool = False
+    ) -> None:
+        self.app, self.max_body, self.embedded = app, max_body, embedded
         self.token = token
+        self.headers = dict(HEADERS)
+        if embedded:
+            self.headers["content-security-policy"] = CONTENT_POLICY + "frame-ancestors *"
         self.cookie = f"hilsplat-{secrets.token_hex(4)}"  # ports share cookies: a name for each server
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -50,20 +60,26 @@ class Guard:
             return
         headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
         given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
-        is_opening = scope["path"] == "/" and hmac.compare_digest(given.encode(), self.token.encode())
-        if refused := self._refusal(scope["method"], scope["path"], headers, is_opening):
-            await PlainTextResponse(refused, 403, HEADERS)(scope, receive, send)
+        has_token = hmac.compare_digest(given.encode(), self.token.encode())
+        is_opening = scope["path"] == "/" and has_token and not self.embedded
+        if self.embedded:
+            is_known = has_token or scope["path"].startswith("/static/")
+            refused = self._sent_as_json(scope["method"], headers) if is_known else "the token is another"
+        else:
+            refused = self._refusal(scope["method"], headers, is_opening)
+        if refused:
+            await PlainTextResponse(refused, 403, self.headers)(scope, receive, send)
             return
         if len(scope["path"]) > MAX_PATH:
-            await PlainTextResponse("the address is too long", 414, HEADERS)(scope, receive, send)
+            await PlainTextResponse("the address is too long", 414, self.headers)(scope, receive, send)
             return
         if int(headers.get("content-length") or 0) > self.max_body or "transfer-encoding" in headers:
-            await PlainTextResponse("too much was sent", 413, HEADERS)(scope, receive, send)
+            await PlainTextResponse("too much was sent", 413, self.headers)(scope, receive, send)
             return
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                more = dict(HEADERS)
+                more = dict(self.headers)
                 if is_opening:
                     more["set-cookie"] = f"{self.cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
                 message["headers"] = [
@@ -74,7 +90,7 @@ class Guard:
 
         await self.app(scope, receive, send_with_headers)
 
-    def _refusal(self, method: str, path: str, headers: dict[str, str], is_opening: bool) -> str:
+    def _refusal(self, method: str, headers: dict[str, str], is_opening: bool) -> str:
         """Why a request is refused; empty if it is not."""
         host = headers.get("host", "")
         name = host.rpartition(":")[0] if host.rpartition(":")[2].isdigit() else host
@@ -88,9 +104,11 @@ class Guard:
             return ""
         if headers.get("origin") not in (f"http://{host}",):
             return "only the page itself may send something"
-        if headers.get("content-type", "").partition(";")[0].strip() != "application/json":
-            return "only JSON may be sent"
-        return ""
+        return self._sent_as_json(method, headers)
+
+    def _sent_as_json(self, method: str, headers: dict[str, str]) -> str:
+        is_json = headers.get("content-type", "").partition(";")[0].strip() == "application/json"
+        return "" if method in ("GET", "HEAD") or is_json else "only JSON may be sent"
 
     def _has_cookie(self, text: str) -> bool:
         try:

@@ -57,7 +57,12 @@ class Pages:
 
 
 def guarded(
-    routes: list[Route], token: str, statuses: Mapping[type[Exception], int], max_body: int = MAX_BODY_BYTES
+    routes: list[Route],
+    token: str,
+    statuses: Mapping[type[Exception], int],
+    max_body: int = MAX_BODY_BYTES,
+    *,
+    embedded: bool = False,
 ) -> Guard:
     """The application: errors become text for the page, some of them with a status of their own."""
     handlers: dict[Any, Any] = {
@@ -65,7 +70,7 @@ def guarded(
         HilsplatError: _told(422),
         ValidationError: _told(400),
     }
-    return Guard(Starlette(routes=routes, exception_handlers=handlers), token, max_body)
+    return Guard(Starlette(routes=routes, exception_handlers=handlers), token, max_body, embedded=embedded)
 
 
 # -- answers --------------------------------------------------------------------------------------

@@ -7,28 +7,31 @@ export const texts = [], kept = [], first = "", opening = "";   // what an expor
 
 // Every question names the state of the scene that this page was loaded with; another state's answers are refused.
 let state = "";
-const at = (path) => `${path}?of=${state}`;
+// In a notebook the page is a frame of another site, which gets no cookie: its address has the token instead. Paths are
+// relative, because a proxy may have put the page anywhere.
+const token = new URLSearchParams(location.search).has("embedded") ? new URLSearchParams(location.search).get("token") : "";
+const at = (path, of = `of=${state}`) => `${path}?${of}${token ? `&token=${token}` : ""}`;
 
 export async function scene() {
-  const described = await (await get("/api/scene")).json();
+  const described = await (await get(at("api/scene", ""))).json();
   state = described.of;
   return described;
 }
-export const changes = async () => (await get("/api/changes")).json();
-export const variant = async (name) => (await get(at(`/api/variant/${encodeURIComponent(name)}`))).json();
-export const splats = async (chunk) => (await get(at(`/api/splats/${chunk}`))).arrayBuffer();
-export const nodes = async (name) => (await get(at(`/api/nodes/${encodeURIComponent(name)}`))).arrayBuffer();
-export const photoUrl = (number) => at(`/api/photo/${number}`);
-export const thumbUrl = (number) => at(`/api/thumb/${number}`);
-export const cropUrl = (variant, node) => at(`/api/crop/${encodeURIComponent(variant)}/${node}`);
-export const sorter = () => new Worker("/static/sorter.js");
+export const changes = async () => (await get(at("api/changes", ""))).json();
+export const variant = async (name) => (await get(at(`api/variant/${encodeURIComponent(name)}`))).json();
+export const splats = async (chunk) => (await get(at(`api/splats/${chunk}`))).arrayBuffer();
+export const nodes = async (name) => (await get(at(`api/nodes/${encodeURIComponent(name)}`))).arrayBuffer();
+export const photoUrl = (number) => at(`api/photo/${number}`);
+export const thumbUrl = (number) => at(`api/thumb/${number}`);
+export const cropUrl = (variant, node) => at(`api/crop/${encodeURIComponent(variant)}/${node}`);
+export const sorter = () => new Worker("static/sorter.js");
 
-export const query = async (asked, signal) => (await send(at("/api/query"), asked, { signal })).json();
-export const like = async (asked, signal) => (await send(at("/api/like"), asked, { signal })).json();
-export const field = async (asked, signal) => (await send(at("/api/field"), { ...asked, order: "page" }, { signal })).arrayBuffer();
-export const pick = async (asked, signal) => (await send(at("/api/pick"), asked, { signal })).json();
-export const frame = async (asked, signal) => (await send(at("/api/frame"), asked, { signal })).blob();
+export const query = async (asked, signal) => (await send(at("api/query"), asked, { signal })).json();
+export const like = async (asked, signal) => (await send(at("api/like"), asked, { signal })).json();
+export const field = async (asked, signal) => (await send(at("api/field"), { ...asked, order: "page" }, { signal })).arrayBuffer();
+export const pick = async (asked, signal) => (await send(at("api/pick"), asked, { signal })).json();
+export const frame = async (asked, signal) => (await send(at("api/frame"), asked, { signal })).blob();
 export const names = async (asked, version) =>
-  (await send(at("/api/names"), asked, { method: "PUT", headers: { "if-match": `"${version}"` } })).json();
-export const saved = async (kind, asked) => (await send(at(`/api/export/${kind}`), asked)).blob();
-export const savedInSteps = async (kind, asked, told, signal) => streamed(await send(at(`/api/export/${kind}`), asked, { signal }), told);
+  (await send(at("api/names"), asked, { method: "PUT", headers: { "if-match": `"${version}"` } })).json();
+export const saved = async (kind, asked) => (await send(at(`api/export/${kind}`), asked)).blob();
+export const savedInSteps = async (kind, asked, told, signal) => streamed(await send(at(`api/export/${kind}`), asked, { signal }), told);

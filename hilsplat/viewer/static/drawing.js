@@ -90,4 +90,4 @@ function remember() {
     history[isNew ? "pushState" : "replaceState"](null, "", `${location.pathname}${api.offline ? location.search : keptSearch()}#${link}`);
   }, 400);
 }
-const keptSearch = () => options.get("painter") ? `?painter=${options.get("painter")}` : "";
+const keptSearch = () => options.has("embedded") ? location.search : options.get("painter") ? `?painter=${options.get("painter")}` : "";

@@ -36,6 +36,7 @@ export async function keepFromStart() {
 
 // Other answerers, or another tree: everything is asked again.
 export async function askKeptAgain() {
+  if (!page.kept.length) return;
   for (const query of page.kept) await answered(query);
   showKept();
 }

@@ -52,8 +52,8 @@ export async function choosePanes() {
     else if (panes[1]?.by !== right) panes[1] = { by: right, answer: null, field: null };
     for (const pane of panes) await loadVariant(variantOf(pane));
     if (changed) { choose(-1); showOutline(); }
-    await askKeptAgain();
     if (page.asked?.text) await ask(true); else listAnswers();
+    await askKeptAgain();
     restyle();
   } catch (error) { failed(error); }
 }
