@@ -10,7 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
@@ -24,7 +23,6 @@ from hilsplat.annotate.labels import (
     cut_to_parents,
     label_path,
     read_labels,
-    traced,
     version_of,
     write_labels,
 )
@@ -87,6 +85,7 @@ class Annotator:
             Route("/api/labels/{number:int}", self.save, methods=["PUT"]),
             Route("/api/shape", self.shape, methods=["POST"]),
             Route("/api/at", self.at, methods=["POST"]),
+            Route("/api/segment", self.segment, methods=["POST"]),
             Route("/api/carry", self.carry, methods=["POST"]),
             Route("/api/import", self.take_in, methods=["POST"]),
             Route("/api/export/{kind}", self.export),
@@ -125,6 +124,7 @@ class Annotator:
                 "of": self.opened.state,
                 "folder": str(self.labels),
                 "proposes": proposals.of,
+                "segments": self.opened.clicks.name,
                 "carries": proposals.gaussians is not None,
                 "views": [
                     {"name": name, "split": scene.split[name], "size_hw": list(cameras[name].size_hw)}
@@ -201,8 +201,8 @@ class Annotator:
     async def shape(self, request: Request) -> Response:
         """Polygons of a region: what was drawn, and a brush stroke, inside the parent."""
         asked, scene = await read(request, wire.Shape), self._of(request).scene
-        mask = await self._do(shaped, asked, scene.cameras[view_name(scene, asked.view)].size_hw)
-        return answer_json({"polygons": traced(mask), "area_px": int(np.count_nonzero(mask))})
+        polygons, area_px = await self._do(shaped, asked, scene.cameras[view_name(scene, asked.view)].size_hw)
+        return answer_json({"polygons": polygons, "area_px": area_px})
 
     # -- proposals --------------------------------------------------------------------------------
 
@@ -214,6 +214,17 @@ class Annotator:
             with opened.unchanged():
                 view = view_name(opened.scene, asked.view)
                 return [vars(proposal) for proposal in opened.proposals.at(view, asked.x, asked.y)]
+
+        return answer_json(await self._propose(find))
+
+    async def segment(self, request: Request) -> Response:
+        """Outlines that the scene's SAM finds around clicks or in a box."""
+        asked, opened = await read(request, wire.Segment), self._of(request)
+
+        def find() -> list[dict[str, Any]]:
+            with opened.same_photographs():
+                view = view_name(opened.scene, asked.view)
+                return [vars(found) for found in opened.clicks.outlines(view, asked.clicks, asked.box)]
 
         return answer_json(await self._propose(find))
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from hilsplat.annotate.clicks import Clicks
 from hilsplat.annotate.proposals import Proposals
 from hilsplat.base.errors import ArtifactError
 from hilsplat.scene.scene import Scene
@@ -36,6 +37,7 @@ class OpenedScene:
         self._witness.note((self.photographs, folder / "gaussians.ply", *proposing))
         self.scene = Scene.load(self.photographs)
         self.proposals = Proposals(self.scene, folder, variant, threads)
+        self.clicks = Clicks(self.scene, folder / variant / "masks")
 
     def changed(self) -> list[str]:
         """Parts that were written anew, or exist by now, or no longer."""

@@ -4,13 +4,23 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from hilsplat.annotate.labels import fill_rings
+from hilsplat.annotate.labels import fill_rings, traced
 from hilsplat.annotate.wire import Shape
 
 
-def shaped(asked: Shape, size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-    """Union of polygons, plus or minus a stroke, cut to the region that it must stay inside."""
-    mask = fill_rings(asked.add, size_hw)
+def shaped(asked: Shape, size_hw: tuple[int, int]) -> tuple[list[list[tuple[int, int]]], int]:
+    """Polygons and area (px) of a region: polygons, plus or minus a stroke, inside another region.
+
+    Polygons that already are the region are returned as they are: few corners are easier to move than many.
+    """
+    drawn = fill_rings(asked.add, size_hw)
+    mask = _mask(asked, drawn)
+    same = len(asked.add) == 1 and np.array_equal(mask, drawn)
+    return (list(asked.add) if same else traced(mask)), int(np.count_nonzero(mask))
+
+
+def _mask(asked: Shape, mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    size_hw = mask.shape
     if asked.stroke is not None:
         painted = np.zeros(size_hw, np.uint8)
         points = np.array(asked.stroke.points, np.int32)

@@ -33,6 +33,14 @@ class At(Message):
     y: int
 
 
+class Segment(Message):
+    """Clicks of one thing in a photograph (x, y, inside), or a box around it (left, top, right, bottom)."""
+
+    view: int
+    clicks: Annotated[tuple[tuple[int, int, bool], ...], Field(max_length=64)] = ()
+    box: tuple[int, int, int, int] | None = None
+
+
 class Carry(Message):
     """Things, and the view to carry them into."""
 

@@ -13,8 +13,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int8, Int32, Int64, UInt8
+from jaxtyping import Bool, Float, Float32, Int8, Int32, Int64, UInt8
 from PIL import Image
 
 from hilsplat.base.artifacts import sha256_of_bytes
@@ -322,7 +323,15 @@ class SamModel:
                 encoded.terms, in_input(points_xy, encoded.frame), fine=True
             )
             return iou, logits
-        return ask_network(self.decoder, encoded.features, in_input(points_xy, encoded.frame))
+        return ask_network(self.decoder, encoded.features, *single(in_input(points_xy, encoded.frame)))
+
+    def decode_clicks(
+        self, encoded: Encoded, points_xy: Float[np.ndarray, "K 2"], inside: Bool[np.ndarray, " K"]
+    ) -> tuple[Float32[np.ndarray, " 3"], Float32[np.ndarray, "3 h w"]]:
+        """Three masks for several points of one thing (px), inside it or outside."""
+        points = in_input(points_xy, encoded.frame)[None]
+        iou, logits = ask_network(self.decoder, encoded.features, points, inside[None].astype(np.float64))
+        return iou[0], logits[0]
 
     @property
     def previews(self) -> bool:
@@ -338,7 +347,7 @@ class SamModel:
             iou, logits, kept = self.factored.decode(encoded.terms, points, fine=False)
             return iou, logits, {"iou": iou, **kept}
         assert self.previewer is not None
-        return *ask_network(self.previewer, encoded.features, points), {"points": points_xy}
+        return *ask_network(self.previewer, encoded.features, *single(points)), {"points": points_xy}
 
     def finish(
         self, encoded: Encoded, prompts: Prompts
@@ -357,17 +366,40 @@ def in_input(points_xy: Float[np.ndarray, "P 2"], frame: Frame) -> Float[np.ndar
 
 
 def ask_network(
-    decoder: Network, features: Mapping[str, np.ndarray], points_xy: Float[np.ndarray, "P 2"]
+    decoder: Network,
+    features: Mapping[str, np.ndarray],
+    points_xy: Float[np.ndarray, "P K 2"],
+    labels: Float[np.ndarray, "P K"],
 ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"]]:
-    """Predicted IoUs and logits of a decoder network for points of its input."""
+    """Predicted IoUs and logits of a decoder network for prompts of K points of its input.
+
+    Labels are 1 for points inside the thing and 0 for points outside.
+    """
     scores, logits = decoder(
-        input_points=points_xy[None, :, None, :],
-        input_labels=np.ones((1, len(points_xy), 1)),
+        input_points=points_xy[None],
+        input_labels=labels[None],
         input_boxes=np.zeros((1, 0, 4)),
         **features,
     )
     require_three_heads(decoder.path, scores, logits)
     return scores[0], logits[0]
+
+
+def single(points_xy: Float[np.ndarray, "P 2"]) -> tuple[np.ndarray, np.ndarray]:
+    """Points as prompts of one point inside each: points and labels of `ask_network`."""
+    return points_xy[:, None], np.ones((len(points_xy), 1))
+
+
+def enlarged(logits: Float32[np.ndarray, "K h w"], frame: Frame) -> Bool[np.ndarray, "K H W"]:
+    """Masks of the size of the image from low-resolution logits, resized as by SamProcessor."""
+    height, width = frame.original_hw
+    found = []
+    for each in logits:
+        if not frame.stretched:
+            each = cv2.resize(each, frame.padded_hw[::-1], interpolation=cv2.INTER_LINEAR)
+            each = each[: frame.resized_hw[0], : frame.resized_hw[1]]
+        found.append(cv2.resize(each, (width, height), interpolation=cv2.INTER_LINEAR) > 0)
+    return np.stack(found)
 
 
 def largest_difference(factored: FactoredDecoder, decoder: Network, side_px: int) -> float:
@@ -392,7 +424,7 @@ def largest_difference(factored: FactoredDecoder, decoder: Network, side_px: int
                 raise ModelError(f"{decoder.path.name} declares no shape of {name}")
             features[name] = rng.standard_normal((1, *shape), np.float32)  # type: ignore[arg-type]
     points = rng.uniform(0, side_px, (CHECKED_PROMPTS, 2))
-    iou, logits = ask_network(decoder, features, points)
+    iou, logits = ask_network(decoder, features, *single(points))
     own_iou, own_logits, _ = factored.decode(factored.image(features), points, fine=True)
     off = np.abs(own_logits - logits).max() / max(1, np.abs(logits).max())
     return float(max(off, np.abs(own_iou - iou).max()))

@@ -12,6 +12,7 @@ from hilsplat.annotate.labels import Label, label_path, read_labels, version_of,
 from hilsplat.base.artifacts import atomic_folder
 from hilsplat.datasets.registry import open_labelled
 from tests.browser.conftest import serving
+from tests.conftest import PROJECT
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, WIDTH, region_mask
 
 SIZE = (HEIGHT, WIDTH + NUM_VIEWS)
@@ -305,3 +306,79 @@ def test_every_control_has_a_name(page):
     controls = "[...document.querySelectorAll('button, input:not([hidden]), select, a, [role=option]')]"
     named = "each.getAttribute('aria-label') || each.textContent.trim() || each.labels?.length"
     assert page.evaluate(f"{controls}.filter((each) => !({named})).map((each) => each.outerHTML)") == []
+
+
+def choosing(page) -> None:
+    page.locator("#view").press("v")
+
+
+def area(root: Path) -> int:
+    (mug,) = kept(root)
+    return int(np.count_nonzero(mug.mask(SIZE)))
+
+
+def test_corners_of_the_chosen_outline_are_moved_added_and_taken_out(page, root):
+    draw_mug(page)
+    before = area(root)
+    choosing(page)
+    page.mouse.move(*place(page, 15, 20))
+    page.mouse.down()
+    page.mouse.move(*place(page, 20, 22), steps=4)
+    page.mouse.move(*place(page, 25, 20), steps=4)
+    page.mouse.up()
+    saved(page)
+    wider = area(root)
+    assert wider > before + 60 and kept(root)[0].mask(SIZE)[19, 21]
+    page.mouse.move(*place(page, 1, 10))  # the left side gets a corner
+    page.mouse.down()
+    page.mouse.move(*place(page, 6, 10), steps=4)
+    page.mouse.up()
+    saved(page)
+    assert area(root) < wider - 20 and not kept(root)[0].mask(SIZE)[10, 2]
+    page.keyboard.down("Alt")
+    page.mouse.click(*place(page, 25, 20))
+    page.keyboard.up("Alt")
+    saved(page)
+    assert not kept(root)[0].mask(SIZE)[19, 21]
+    page.keyboard.press("Control+z")
+    saved(page)
+    assert kept(root)[0].mask(SIZE)[19, 21]
+
+
+def test_sam_outlines_what_is_clicked(opened, browser, desk, tmp_path):
+    folder = tmp_path / "results/photos/desk"
+    shutil.copytree(desk, folder)
+    index = json.loads((folder / "default/masks/index.json").read_text())
+    sam = {"segmenter": "sam", "model": str(PROJECT / "models/sam-tiny")}
+    (folder / "default/masks/index.json").write_text(json.dumps({**index, **sam}))
+    with serving(folder, "annotate", "--data-root", str(tmp_path)) as address:
+        page = opened(address)
+        page.locator("#view").press("s")
+        page.mouse.click(*place(page, 28, 20))
+        page.get_by_text("Enter takes this outline").wait_for()
+        assert page.locator("#drawing .inside").count() == 1
+        assert page.locator("#drawing .offer").count() == 1
+        page.keyboard.down("Alt")
+        page.mouse.click(*place(page, 4, 20))
+        page.keyboard.up("Alt")
+        page.locator("#drawing .outside").wait_for(state="attached")
+        page.get_by_text("Enter takes this outline").wait_for()
+        saved(page)
+        page.locator("#view").press("Enter")
+        saved(page)
+        (found,) = kept(tmp_path)
+        assert found.origin == "proposed" and found.mask(SIZE)[20, 28] and not found.mask(SIZE)[20, 4]
+        # a box, drawn by dragging
+        page.locator("#view").press("s")
+        page.mouse.move(*place(page, 1, 2))
+        page.mouse.down()
+        page.mouse.move(*place(page, 14, 21), steps=4)
+        page.mouse.up()
+        page.get_by_text("Enter takes this outline").wait_for()
+        page.keyboard.press("Escape")
+        assert not page.locator("#drawing .offer").count()
+        page.close()
+
+
+def test_without_a_sam_there_is_no_tool_for_it(page):
+    assert not page.locator("#segment-label").is_visible()

@@ -11,6 +11,7 @@ const UNNAMED = "unnamed", NEAR_PX = 8;
 const sheet = new Sheet(), start = new URLSearchParams(location.hash.slice(1));
 let scene, number = 0, chosen = 0, next = { text: "", level: 1, parent: null };
 let draft = [], stroke = null, cross = null, offer = null, working = Promise.resolve();
+let clicks = [], frame = null, found = [], corner = null;   // of the tool that segments; the corner that is being moved
 
 function tell(text, error = false) { $("status").textContent = text; $("status").classList.toggle("error", error); }
 const store = new Store({ told: tell, changed: refresh });
@@ -32,7 +33,7 @@ function markSaved() { document.body.dataset.saved = String(!store.unsaved && !w
 
 function draw() {
   const brushes = tool() === "brush" || tool() === "erase";
-  sheet.hand({ offer, draft, stroke, cross: tool() === "choose" ? null : cross, brush: brushes ? radius() : 0 });
+  sheet.hand({ offer, draft, stroke, clicks, frame, corners: tool() === "choose" && own() ? corner?.rings ?? own().polygons : [], cross: tool() === "choose" ? null : cross, brush: brushes ? radius() : 0 });
 }
 
 function refresh() {
@@ -59,7 +60,8 @@ function choose(id) {
 
 function drop() {
   draft = [];
-  stroke = offer = null;
+  stroke = offer = frame = corner = null;
+  clicks = found = [];
   $("offers-section").hidden = true;
 }
 
@@ -119,15 +121,77 @@ function closePolygon() {
   draw();
 }
 
+function listOffers(found, rest = null) {
+  $("offers-section").hidden = !found.length;
+  const preview = (each) => { offer = each?.polygons ?? rest; draw(); };
+  $("offers").replaceChildren(...found.map((each) => make("li", {}, make("button", { type: "button", onclick: () => take(each), onpointerenter: () => preview(each), onpointerleave: () => preview(null), onfocus: () => preview(each), onblur: () => preview(null) },
+    each.text ? `${each.text}, ${LEVEL(each)} (${each.what})` : `${LEVEL(each)} (${each.what})`))));
+}
+
 async function propose([x, y]) {
   tell("Looking for outlines…");
   const found = await ask("/api/at", { view: number, x, y });
-  $("offers-section").hidden = !found.length;
-  const preview = (each) => { offer = each?.polygons ?? null; draw(); };
-  $("offers").replaceChildren(...found.map((each) => make("li", {}, make("button", { type: "button", onclick: () => take(each), onpointerenter: () => preview(each), onpointerleave: () => preview(null), onfocus: () => preview(each), onblur: () => preview(null) },
-    each.text ? `${each.text}, ${LEVEL(each)} (${each.what})` : `${LEVEL(each)} (${each.what})`))));
+  listOffers(found);
   tell(found.length ? "Choose an outline; it stays a proposal until you accept or correct it." : `No ${scene.proposes.slice(0, -1)} shows there.`);
   $("offers").querySelector("button")?.focus();
+}
+
+// Clicks of one thing: inside, or outside with Alt; or a box.
+async function segment() {
+  if (!frame && !clicks.some(([, , inside]) => inside)) { draw(); return; }
+  tell(`${scene.segments} looks at the photograph…`);
+  const asked = { clicks, frame }, view = number;
+  const outlines = await ask("/api/segment", { view, ...(frame ? { box: boxOf(frame) } : { clicks }) });
+  if (view !== number || asked.clicks !== clicks || asked.frame !== frame) return;
+  found = outlines;
+  offer = found[0]?.polygons ?? null;
+  listOffers(found, offer);
+  tell(found.length ? "Enter takes this outline, or choose another on the left. Click more of it, or with Alt what is not of it." : "Nothing found there.");
+  draw();
+}
+
+const boxOf = ([[a, b], [c, d]]) => [Math.min(a, c), Math.min(b, d), Math.max(a, c), Math.max(b, d)];
+
+function clicked(at, inside) {
+  frame = null;
+  clicks = [...clicks, [...at, inside]];
+  draw();
+  soon(segment);
+}
+
+// -- corners of the chosen outline -----------------------------------------------------------------
+
+function cornerAt(at) {
+  const rings = own()?.polygons ?? [];
+  let best = null, least = NEAR_PX;
+  rings.forEach((ring, r) => ring.forEach(([x, y], k) => {
+    const away = Math.hypot(x - at[0], y - at[1]) * sheet.scale;
+    if (away < least) { least = away; best = { r, k }; }
+  }));
+  return best && { ...best, rings: rings.map((ring) => ring.map((point) => [...point])) };
+}
+
+// The new outline is drawn by the server, inside its parent.
+function reshape(rings) {
+  const label = own(), view = number;
+  soon(async () => {
+    const made = await ask("/api/shape", { view, add: rings, stroke: null, inside: label.parent ? ringsOf(label.parent) : null });
+    if (view === number && made.polygons.length) store.change([[view, labels().map((each) => each.id === label.id ? { ...each, polygons: made.polygons, origin: edited(each) } : each)]]);
+    corner = null;
+    draw();
+  });
+}
+
+// A press on a side makes a corner there.
+function sideAt(at) {
+  const rings = own()?.polygons ?? [];
+  let best = null, least = NEAR_PX;
+  rings.forEach((ring, r) => ring.forEach(([x, y], k) => {
+    const [u, v] = ring[(k + 1) % ring.length], length = Math.hypot(u - x, v - y) || 1, t = Math.max(0, Math.min(1, ((at[0] - x) * (u - x) + (at[1] - y) * (v - y)) / length ** 2));
+    const away = Math.hypot(x + t * (u - x) - at[0], y + t * (v - y) - at[1]) * sheet.scale;
+    if (away < least) { least = away; best = { r, k: k + 1 }; }
+  }));
+  return best && { ...best, rings: rings.map((ring, r) => r === best.r ? [...ring.slice(0, best.k), at, ...ring.slice(best.k)] : ring) };
 }
 
 function take(each) {
@@ -206,12 +270,17 @@ async function take_in(files) {
 function down(at, event) {
   $("view").focus({ preventScroll: true });
   cross = at;
+  if (tool() === "choose" && corner) return;
   if (tool() === "choose") {
+    const near = event?.altKey ? cornerAt(at) : null;
+    if (near) { const rings = near.rings.map((ring, r) => r === near.r ? ring.filter((_, k) => k !== near.k) : ring).filter((ring) => ring.length > 2); if (rings.length) reshape(rings); return; }
     const hit = event && document.elementFromPoint(event.clientX, event.clientY)?.closest("[data-id]");
     choose(hit ? Number(hit.dataset.id) : 0);
   } else if (tool() === "polygon") {
     const near = draft.length > 2 && Math.hypot(at[0] - draft[0][0], at[1] - draft[0][1]) * sheet.scale < NEAR_PX;
     if (near) closePolygon(); else draft = [...draft, at];
+  } else if (tool() === "segment") {
+    if (event && !event.altKey) frame = [at, at]; else clicked(at, !event?.altKey);
   } else if (tool() === "propose") soon(() => propose(at));
   else stroke = { points: [at], radius: radius(), erase: tool() === "erase" };
   draw();
@@ -219,21 +288,39 @@ function down(at, event) {
 
 function drag(at) {
   cross = at;
+  if (corner) { corner.rings[corner.r][corner.k] = at; corner.moved = true; }
+  if (tool() === "segment" && frame) frame = [frame[0], at];
   const last = stroke?.points.at(-1);
   if (stroke && (at[0] !== last[0] || at[1] !== last[1])) stroke.points.push(at);
   draw();
 }
 
 function up() {
+  if (corner) { if (corner.moved) reshape(corner.rings); else corner = null; draw(); return; }
+  if (tool() === "segment" && frame) {
+    const [[a, b], [c, d]] = frame;
+    if (Math.hypot(c - a, d - b) * sheet.scale < NEAR_PX) { clicked([a, b], true); return; }
+    clicks = [];
+    soon(segment);
+    return;
+  }
   const done = stroke;
   if (done) soon(async () => { await region(null, done); if (stroke === done) stroke = null; draw(); });
 }
 
-attachHands(sheet, { drawing: () => tool() !== "choose", down, drag, up, close: closePolygon, hover: (at) => { cross = at; draw(); } });
+// In the choosing tool, a press on the chosen outline moves a corner of it; any other moves the photograph.
+function grabbed(event) {
+  if (tool() !== "choose" || !own() || event.altKey) return false;
+  const at = sheet.pixel(event);
+  corner = cornerAt(at) ?? sideAt(at);
+  return corner;
+}
+
+attachHands(sheet, { drawing: (event) => tool() !== "choose" || grabbed(event), down, drag, up, close: closePolygon, hover: (at) => { cross = at; draw(); } });
 attachThings(choose);
 
 function escape() {
-  if (draft.length || stroke || !$("offers-section").hidden) drop();
+  if (draft.length || stroke || clicks.length || frame || !$("offers-section").hidden) drop();
   else if (chosen) choose(0);
   draw();
 }
@@ -249,7 +336,8 @@ document.addEventListener("keydown", (event) => {
   const arrow = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[key], onView = event.target === $("view") || event.target === document.body;
   const by = event.shiftKey ? 10 : 1;
   const keys = {
-    v: () => setTool("choose"), p: () => setTool("polygon"), b: () => setTool("brush"), e: () => setTool("erase"), x: () => scene.proposes && setTool("propose"),
+    v: () => setTool("choose"), p: () => setTool("polygon"), b: () => setTool("brush"), e: () => setTool("erase"), x: () => scene.proposes && setTool("propose"), s: () => scene.segments && setTool("segment"),
+    i: () => tool() === "segment" && cross && clicked(cross, true), o: () => tool() === "segment" && cross && clicked(cross, false),
     n: () => fresh(), j: () => fresh(true), t: () => { $("text").focus(); $("text").select(); }, a: () => own()?.origin === "proposed" && accept(), c: () => scene.carries && soon(carry),
     Delete: () => own() && remove(), Backspace: () => { draft = draft.slice(0, -1); draw(); }, "[": () => stand(number - 1), "]": () => stand(number + 1),
     ",": () => resize(-1), ".": () => resize(1), "+": () => sheet.zoom(1.25), "=": () => sheet.zoom(1.25), "-": () => sheet.zoom(0.8), 0: () => sheet.fit(), "?": () => $("help").showModal(),
@@ -257,7 +345,7 @@ document.addEventListener("keydown", (event) => {
   };
   if (onView && arrow) { cross = sheet.inside((cross ?? sheet.size.map((side) => side / 2)).map((value, k) => value + by * arrow[k])); drag(cross); }
   else if (onView && key === " ") { down(cross ?? sheet.inside(sheet.size.map((side) => side / 2)), null); if (stroke) up(); }
-  else if (onView && key === "Enter") closePolygon();
+  else if (onView && key === "Enter") { if (tool() === "segment") { if (found.length) take(found[0]); } else closePolygon(); }
   else if (keys[key] && !(event.target.closest("button, [role=treeitem]") && key === "Enter")) keys[key]();
   else return;
   event.preventDefault();
@@ -286,6 +374,7 @@ async function begin() {
   const name = scene.name.split("/").at(-1);
   document.title = `Annotate ${name} · hilsplat`;
   $("propose-label").hidden = !scene.proposes;
+  $("segment-label").hidden = !scene.segments;
   $("about").textContent = `${scene.name}${scene.proposes ? `. Proposals: ${scene.proposes}` : ""}${scene.carries ? ", and what other photographs have" : ""}.`;
   makeStrip(scene.views, stand);
   await store.load();

@@ -8,7 +8,7 @@ export function attachHands(sheet, { drawing, down, drag, up, hover, close }) {
     host.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, moved: 0 });
     if (pointers.size === 2) { if (acting) up(null); acting = false; apart = 0; return; }
-    acting = event.button === 0 && drawing();
+    acting = event.button === 0 && Boolean(drawing(event));
     if (acting) down(sheet.pixel(event), event);
   });
 

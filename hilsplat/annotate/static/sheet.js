@@ -4,6 +4,7 @@ import { photoUrl } from "./api.js";
 import { $ } from "./elements.js";
 import { colourOf } from "./styles.js";
 
+const MOST_CORNERS = 600;   // of an outline with more, none can be grabbed by sight
 const NS = "http://www.w3.org/2000/svg";
 export const colour = (id) => `rgb(${colourOf(id).join(" ")})`;
 
@@ -76,9 +77,13 @@ export class Sheet {
     this.waiting = state;
   }
 
-  drawHand({ offer, draft, stroke, cross, brush }) {
+  drawHand({ offer, draft, stroke, clicks, frame, corners, cross, brush }) {
     const made = [], middle = ([x, y]) => `${x + 0.5} ${y + 0.5}`, arm = 9 / this.scale;
     if (offer) made.push(element("path", { d: outline(offer), class: "offer" }));
+    if (corners.length) made.push(element("path", { d: outline(corners), class: "draft" }));
+    if (corners.flat().length <= MOST_CORNERS) for (const [x, y] of corners.flat()) made.push(element("circle", { cx: x + 0.5, cy: y + 0.5, r: 3.5 / this.scale, class: "corner" }));
+    if (frame) made.push(element("path", { d: `M${middle(frame[0])}H${frame[1][0] + 0.5}V${frame[1][1] + 0.5}H${frame[0][0] + 0.5}Z`, class: "draft" }));
+    for (const [x, y, inside] of clicks) made.push(element("circle", { cx: x + 0.5, cy: y + 0.5, r: 5 / this.scale, class: inside ? "inside" : "outside" }));
     if (draft.length) made.push(element("path", { d: `M${draft.map(middle).join("L")}${draft.length > 2 ? "Z" : ""}`, class: "draft" }), element("circle", { cx: draft[0][0] + 0.5, cy: draft[0][1] + 0.5, r: 4 / this.scale, class: "draft" }));
     if (stroke) made.push(element("path", { d: `M${[...stroke.points, stroke.points.at(-1)].map(middle).join("L")}`, class: `stroke ${stroke.erase ? "erase" : ""}`, "stroke-width": 2 * stroke.radius + 1 }));
     if (cross && brush) made.push(element("circle", { cx: cross[0] + 0.5, cy: cross[1] + 0.5, r: brush, class: "cross" }));

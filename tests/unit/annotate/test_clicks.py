@@ -1,0 +1,101 @@
+"""Clicks and boxes become outlines by the SAM that made the masks of a scene."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hilsplat.annotate.clicks import KEPT_VIEWS, Clicks
+from hilsplat.annotate.labels import fill_rings
+from hilsplat.base.artifacts import write_index
+from hilsplat.base.errors import SettingsError
+from hilsplat.base.images import write_png
+from hilsplat.base.levels import Level
+from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.scene import Scene
+from tests.conftest import PROJECT
+
+SIZE = (192, 192)
+LEFT, RIGHT = ((60, 90), (26, 30)), ((140, 110), (24, 34))
+"""Middle and half axes of two discs of one colour, px."""
+
+
+def disc(middle: tuple[int, int], axes: tuple[int, int]) -> np.ndarray:
+    mask = np.zeros(SIZE, np.uint8)
+    cv2.ellipse(mask, middle, axes, 0, 0, 360, 1, cv2.FILLED)
+    return mask > 0
+
+
+def iou(found: np.ndarray, expected: np.ndarray) -> float:
+    return np.count_nonzero(found & expected) / np.count_nonzero(found | expected)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Scene:
+    """Photographs of two discs on a grey table."""
+    folder = tmp_path_factory.mktemp("results") / "photos/discs/scene"
+    names = tuple(f"{number:03d}.png" for number in range(KEPT_VIEWS + 1))
+    rng = np.random.default_rng(0)
+    for name in names:
+        pixels = np.full((*SIZE, 3), 120.0) + rng.normal(0, 6, (*SIZE, 1))
+        for each in (LEFT, RIGHT):
+            pixels[disc(*each)] = (215, 60, 40)
+        write_png(folder / "images" / name, np.clip(pixels, 0, 255).astype(np.uint8))
+    many = len(names)
+    poses, sizes = np.tile(np.eye(4), (many, 1, 1)), np.full((many, 2), SIZE, np.int32)
+    cameras = Cameras(names, poses, np.tile(np.diag([200.0, 200, 1]), (many, 1, 1)), sizes)
+    points = np.zeros((0, 3), np.float32)
+    split = dict.fromkeys(names, "train")
+    made = Scene(folder, "photos/discs", "metre", cameras, split, points, points.astype(np.uint8), np.eye(4))
+    made.save()
+    return made
+
+
+@pytest.fixture(scope="module")
+def clicks(scene, tmp_path_factory) -> Clicks:
+    masks = tmp_path_factory.mktemp("masks")
+    write_index(masks, {}, segmenter="sam", model=str(PROJECT / "models/sam-tiny"))
+    return Clicks(scene, masks)
+
+
+def test_a_click_outlines_the_thing_under_it(clicks):
+    best, *others = clicks.outlines("000.png", [(*LEFT[0], True)], None)
+    assert iou(fill_rings(best.polygons, SIZE), disc(*LEFT)) > 0.8
+    assert best.what == "by sam-tiny" and best.level == Level.WHOLE  # the three heads agree
+    assert len(others) < 3
+
+
+def test_a_box_outlines_the_thing_that_fills_it(clicks):
+    (x, y), (a, b) = RIGHT
+    best, *_ = clicks.outlines("000.png", [], (x - a, y - b, x + a, y + b))
+    assert iou(fill_rings(best.polygons, SIZE), disc(*RIGHT)) > 0.8
+
+
+def test_a_click_outside_leaves_it_out(clicks):
+    asked = [(*LEFT[0], True), (*RIGHT[0], False), (10, 10, False)]
+    best, *_ = clicks.outlines("000.png", asked, None)
+    found = fill_rings(best.polygons, SIZE)
+    assert found[LEFT[0][::-1]] and not found[RIGHT[0][::-1]] and not found[10, 10]
+
+
+def test_something_must_be_clicked_inside_the_photograph(clicks):
+    for asked in ([], [(5, 5, False)], [(500, 5, True)], [(-1, 5, True)]):
+        with pytest.raises(SettingsError, match="no pixel"):
+            clicks.outlines("000.png", asked, None)
+
+
+def test_features_of_the_last_photographs_are_kept(clicks, scene):
+    for view in scene.views():
+        clicks.encoded(view)
+    assert list(clicks._encoded) == list(scene.views())[-KEPT_VIEWS:]
+
+
+@pytest.mark.parametrize("segmenter", ["graph", None])
+def test_a_scene_without_a_sam_says_so(scene, tmp_path, segmenter):
+    if segmenter:
+        write_index(tmp_path / "masks", {}, segmenter=segmenter, model=None)
+    without = Clicks(scene, Path(tmp_path / "masks"))
+    assert without.name == ""
+    with pytest.raises(SettingsError, match="without a SAM"):
+        without.outlines("000.png", [(60, 90, True)], None)
