@@ -13,11 +13,11 @@ from hilsplat.base.images import to_float, write_png
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
+from hilsplat.splat.films import contact_sheet
 from hilsplat.splat.flyaround import write_flyaround
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.photometric import psnr, ssim
 from hilsplat.splat.rasterise.api import render
-from hilsplat.splat.sheets import contact_sheet
 from hilsplat.splat.views import load_views
 
 logger = logging.getLogger(__name__)

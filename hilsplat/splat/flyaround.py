@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from hilsplat.base.images import write_png
 from hilsplat.base.parallel import in_order
 from hilsplat.scene.cameras import Camera
-from hilsplat.splat.film import write_film
-from hilsplat.splat.sheets import contact_sheet
+from hilsplat.splat.films import contact_sheet, write_film
 
 FRAMES = 120
 FRAMES_PER_S = 24

@@ -16,7 +16,7 @@ from PIL import Image
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Camera
 from hilsplat.semantic_tree.export import write_selection_ply
-from hilsplat.splat.film import write_film
+from hilsplat.splat.films import write_film
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.rasterise.cpu import blend_forward, project_gaussians
 from hilsplat.viewer.frames import Paint, painted

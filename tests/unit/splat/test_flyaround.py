@@ -7,9 +7,8 @@ from PIL import Image
 
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat import flyaround
-from hilsplat.splat.film import write_film
+from hilsplat.splat.films import contact_sheet, write_film
 from hilsplat.splat.flyaround import FRAMES, closed_path, open_path, short_round, write_flyaround
-from hilsplat.splat.sheets import contact_sheet
 from tests.unit.splat.three_gaussians_world import ring
 
 

@@ -1,4 +1,4 @@
-"""Films: H.264 in MP4, which every player shows."""
+"""Renders as files: films (H.264 in MP4, which every player shows) and contact sheets."""
 
 from collections.abc import Iterable
 from itertools import chain
@@ -7,6 +7,10 @@ from pathlib import Path
 import av
 import numpy as np
 from jaxtyping import UInt8
+
+MAX_SIDE_PX = 320
+"""Longer side of a picture on a sheet."""
+GAP_PX = 4
 
 OPTIONS = {"crf": "20", "preset": "veryfast", "x264-params": "threads=1:mbtree=0"}
 """Macroblock-tree rate control gave other bytes each time, also on one thread (x264 in PyAV 18.1)."""
@@ -34,3 +38,26 @@ def write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_sec
             picture = av.VideoFrame.from_ndarray(even, format="rgb24").reformat(format="yuv420p")
             film.mux(stream.encode(picture))
         film.mux(stream.encode())
+
+
+def contact_sheet(
+    pictures: list[UInt8[np.ndarray, "_ _ 3"]], columns: int, max_side_px: int = MAX_SIDE_PX
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Pictures on a white sheet, row by row, shrunk by whole factors (averages) to at most `max_side_px`."""
+    cells = [_shrunk(picture, -(-max(picture.shape[:2]) // max_side_px)) for picture in pictures]
+    height, width = (max(cell.shape[axis] for cell in cells) + GAP_PX for axis in (0, 1))
+    rows = -(-len(cells) // columns)
+    sheet = np.full((rows * height, min(columns, len(cells)) * width, 3), 255, np.uint8)
+    for k, cell in enumerate(cells):
+        y, x = (k // columns) * height, (k % columns) * width
+        sheet[y : y + cell.shape[0], x : x + cell.shape[1]] = cell
+    return sheet
+
+
+def _shrunk(picture: UInt8[np.ndarray, "_ _ 3"], factor: int) -> UInt8[np.ndarray, "_ _ 3"]:
+    """Averages of blocks of factor x factor pixels; what is left at the border is cut off."""
+    if factor <= 1:
+        return picture
+    height, width = (side // factor for side in picture.shape[:2])
+    blocks = picture[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
+    return np.round(blocks.mean(axis=(1, 3))).astype(np.uint8)
