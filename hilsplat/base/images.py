@@ -4,11 +4,12 @@ import functools
 import io
 import logging
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import Image, ImageCms, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageCms, ImageOps, PngImagePlugin, UnidentifiedImageError
 
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.errors import ImageError
@@ -120,17 +121,23 @@ def _srgb_profile() -> ImageCms.ImageCmsProfile:
     return ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB"))
 
 
-def write_png(path: Path, pixels: np.ndarray, compression: int = 6) -> None:
+def write_png(
+    path: Path, pixels: np.ndarray, compression: int = 6, text: Mapping[str, str] | None = None
+) -> None:
     """Write an 8-bit RGB or grey, or a 16-bit grey image, as PNG, atomically.
 
     Args:
         path: file to write.
         pixels: (H, W, 3) or (H, W).
         compression: level of zlib, 0 to 9.
+        text: what the file says of itself, by key.
     """
+    said = PngImagePlugin.PngInfo()
+    for key, value in (text or {}).items():
+        said.add_text(key, value)
     with atomic_path(path) as temporary:
         Image.fromarray(np.ascontiguousarray(pixels)).save(
-            temporary, format="PNG", compress_level=compression
+            temporary, format="PNG", compress_level=compression, pnginfo=said
         )
 
 

@@ -12,6 +12,7 @@ import typer
 
 from hilsplat.base.artifacts import output_lock, parse_json, provenance_path, require_free_space
 from hilsplat.base.errors import HilsplatError, SettingsError, place_error
+from hilsplat.base.outputs import require_replaceable
 from hilsplat.base.progress import LOG_FORMAT
 from hilsplat.models.store import model_path
 from hilsplat.workflow.stages import stage_code
@@ -82,6 +83,7 @@ def stage(
         device: setting of the rasteriser's device; provenance records the device that `auto` stands for.
 
     Raises:
+        ArtifactError: an output would replace something else than an earlier output of the stage.
         HilsplatError: an input is missing, or changed while the stage ran.
     """
     from hilsplat.base.provenance import Inputs, write_provenance
@@ -90,6 +92,7 @@ def stage(
     start_logging(timestamps=True)
     os.environ["NUMBA_NUM_THREADS"] = str(max(threads, int(os.environ.get("NUMBA_NUM_THREADS", "1"))))
     try:
+        require_replaceable((out, *beside), name, _each(inputs or {}))
         require_free_space(out.parent, MIN_FREE_MIB)
         with output_lock(out):
             read, code = Inputs(name, inputs or {}), stage_code(name, plugins)
@@ -118,6 +121,11 @@ def stage(
             raise problem from error
         logging.getLogger("hilsplat").exception("%s failed on %s", name, out)
         sys.exit(1)
+
+
+def _each(inputs: Mapping[str, Path | Sequence[Path]]) -> Iterator[Path]:
+    for path in inputs.values():
+        yield from [path] if isinstance(path, Path) else path
 
 
 def _command() -> list[str]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from hilsplat.base.artifacts import sha256_of_bytes
 from hilsplat.base.levels import LEVELS
+from hilsplat.base.outputs import require_own_picture
 from hilsplat.query.hits import Hit, counted, doubts_of, hits_of
 from hilsplat.query.language_scene import LanguageScene, path_of
 from hilsplat.query.names import PATH_SEPARATOR
@@ -69,11 +70,13 @@ def answer(
 
     from hilsplat.query.query_panel import query_panel
 
-    panel = (Path(out) if out is not None else found.folder / "queries" / file_name(text)) / "panel.png"
+    folder = Path(out) if out is not None else found.folder / "queries" / file_name(text)
+    panel, selection = folder / "panel.png", folder / "selection.ply"
+    if out is not None:
+        require_own_picture(panel, beside=selection)
     shown = list(dict.fromkeys([*([view] if view else []), *views_of(scene, hits, views)]))[:views]
     asked = "" if view is None else f", of what {view} shows"
     query_panel(scene, text, nodes, shown, panel, note=asked + note, answerer=answerer)
-    selection = panel.with_name("selection.ply")
     write_selection_ply(found.parts.gaussians, scene.gaussians_of(nodes.ids), selection)
     yield f"wrote {panel} and {selection.name}"
 

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.levels import Level
+from hilsplat.base.outputs import SOFTWARE
 from hilsplat.scene.cameras import Cameras
 from hilsplat.splat.gaussians import Gaussians
 
@@ -128,7 +129,7 @@ def _from_above(cameras: Cameras) -> Float[np.ndarray, "3 3"]:
 
 
 def save_figure(figure: Figure, out: Path, dpi: int = 110) -> None:
-    """Write a PNG atomically, without the library's version in its metadata."""
+    """Write a PNG atomically, with this package in its metadata instead of the library's version."""
     packed = {"compress_level": 4}  # half the time of the usual 6, for 4 % more bytes
     with atomic_path(out) as temporary:
         figure.savefig(
@@ -136,7 +137,7 @@ def save_figure(figure: Figure, out: Path, dpi: int = 110) -> None:
             format="png",
             dpi=dpi,
             facecolor="white",
-            metadata={"Software": None},
+            metadata=SOFTWARE,
             pil_kwargs=packed,
         )
 

@@ -11,6 +11,7 @@ from hilsplat.base.artifacts import read_index, read_npz
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.base.outputs import SOFTWARE, require_own_picture
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.crops import square_crop
 from hilsplat.segment.digests import require_same_masks
@@ -158,6 +159,9 @@ def masks_overview(
         ArtifactError: the view has no masks.
         MisalignedArtifactError: the trees belong to other masks.
     """
+    tree_png = out_png.with_name(f"{out_png.stem}_tree.png")
+    for path in (out_png, *([tree_png] if tree_folder else [])):
+        require_own_picture(path)
     views = list(read_index(masks_folder)["views"])
     chosen = view or views[len(views) // 2]
     if chosen not in views:
@@ -166,9 +170,9 @@ def masks_overview(
         )
     masks = HierarchicalMasks.load(Path(masks_folder) / f"{chosen}.npz")
     image = Scene.load(scene_folder).image(chosen)
-    write_png(out_png, masks_picture(image, masks))
+    write_png(out_png, masks_picture(image, masks), text=SOFTWARE)
     if tree_folder is not None:
         require_same_masks(tree_folder, masks_folder)
         parent = read_npz(Path(tree_folder) / f"{chosen}.npz", "parent")["parent"]
-        write_png(out_png.with_name(f"{out_png.stem}_tree.png"), tree_picture(image, masks, parent))
+        write_png(tree_png, tree_picture(image, masks, parent), text=SOFTWARE)
     return chosen

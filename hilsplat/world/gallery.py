@@ -11,6 +11,7 @@ from jaxtyping import Int32
 
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.outputs import SOFTWARE, require_own_picture
 from hilsplat.scene.cameras import Camera
 from hilsplat.world.objects.builder import ObjectModel
 from hilsplat.world.objects.catalogue import TABLETOP, build_object
@@ -129,7 +130,7 @@ def _filled(labels: Int32[np.ndarray, "3 H W"], level: Level) -> Int32[np.ndarra
 
 def _write(figure: "Figure", out: Path) -> None:
     """Write a figure as PNG with a dithered palette of 256 colours: half the size, for web pages."""
-    from PIL import Image
+    from PIL import Image, PngImagePlugin
 
     full = BytesIO()
     figure.savefig(full, format="png")
@@ -137,5 +138,9 @@ def _write(figure: "Figure", out: Path) -> None:
         pixels = picture.convert("RGB")
     palette = pixels.quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=1)
     reduced = pixels.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
+    own = PngImagePlugin.PngInfo()
+    for key, value in SOFTWARE.items():
+        own.add_text(key, value)
+    require_own_picture(out)
     with atomic_path(out) as temporary:
-        reduced.save(temporary, format="PNG", optimize=True)
+        reduced.save(temporary, format="PNG", optimize=True, pnginfo=own)

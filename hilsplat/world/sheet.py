@@ -8,6 +8,7 @@ from jaxtyping import Int32, UInt8
 from hilsplat.base.artifacts import atomic_path, read_index, read_json
 from hilsplat.base.images import list_images, read_image
 from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.base.outputs import SOFTWARE, require_own_picture
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations
 
 VIEWS_SHOWN = 4
@@ -85,8 +86,9 @@ def contact_sheet(truth_folder: Path, images_folder: Path, path: Path) -> None:
         f"{record['objects_placed']} of {record['objects_asked']} objects placed, {len(images)} views",
         fontsize=11,
     )
+    require_own_picture(path)
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png")
+        figure.savefig(temporary, format="png", metadata=SOFTWARE)
 
 
 def _panel(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from hilsplat.base.artifacts import parse_json, write_text
 from hilsplat.base.errors import ArtifactError
+from hilsplat.base.outputs import require_beginning
 from hilsplat.base.tables import write_csv
 from hilsplat.configuration import SECTIONS
 
@@ -50,7 +51,7 @@ def run_efficiency(results: Path, out: Path) -> str:
         the Markdown table.
 
     Raises:
-        ArtifactError: there is no benchmark file, or one cannot be read.
+        ArtifactError: there is no benchmark file, or one cannot be read, or an output is another file.
     """
     files = sorted(Path(results).glob("**/benchmarks/*.jsonl"))
     if not files:
@@ -66,8 +67,11 @@ def run_efficiency(results: Path, out: Path) -> str:
         ]
         for job in jobs
     ]
+    beside = Path(out).with_suffix(".md")
+    for path, begin in ((Path(out), ",".join(columns)), (beside, text.partition("\n")[0])):
+        require_beginning(path, begin)
     write_csv(Path(out), columns, rows)
-    write_text(Path(out).with_suffix(".md"), text)
+    write_text(beside, text)
     return text
 
 

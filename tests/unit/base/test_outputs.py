@@ -1,0 +1,149 @@
+"""A command replaces its own earlier outputs and nothing else."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from hilsplat.base.artifacts import lock_path, provenance_path, write_json
+from hilsplat.base.errors import ArtifactError
+from hilsplat.base.images import write_png
+from hilsplat.base.outputs import SOFTWARE, require_beginning, require_own_picture, require_replaceable
+from hilsplat.cli.main import app
+from hilsplat.cli.stage import stage
+from tests.unit.finished_desk import HEIGHT
+
+
+@pytest.fixture
+def photographs(tmp_path) -> Path:
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for number in range(3):
+        (folder / f"{number}.jpg").write_bytes(b"a photograph")
+    return folder
+
+
+def record(out: Path, stage: str, *names: str) -> None:
+    write_json(provenance_path(out), {"stage": stage, "outputs": {name: {} for name in (out.name, *names)}})
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_what_is_missing_or_empty_may_be_written(tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder/.snakemake_timestamp").touch()
+    (tmp_path / "file").touch()
+    require_replaceable([tmp_path / name for name in ("new", "folder", "file")], "masks", [])
+
+
+def test_an_earlier_output_of_the_same_stage_may_be_replaced(photographs, tmp_path):
+    record(photographs, "masks")
+    require_replaceable([photographs], "masks", [])
+    with pytest.raises(ArtifactError, match="clip did not write it"):
+        require_replaceable([photographs], "clip", [])
+
+
+def test_further_outputs_are_those_of_the_record(photographs, tmp_path):
+    out = tmp_path / "gaussians.ply"
+    out.write_text("ply")
+    record(out, "gaussians", "report")
+    (tmp_path / "report").mkdir()
+    (tmp_path / "report/fit.png").write_text("png")
+    require_replaceable([out, tmp_path / "report"], "gaussians", [])
+    with pytest.raises(ArtifactError, match="photographs exists"):
+        require_replaceable([out, photographs], "gaussians", [])
+
+
+def test_what_a_killed_writer_left_may_be_replaced(photographs):
+    lock_path(photographs).write_text("unfinished\n")
+    require_replaceable([photographs], "masks", [])
+
+
+@pytest.mark.parametrize("broken", ["", "{", "[]", '{"stage": "masks"}', '{"stage": "masks", "outputs": 3}'])
+def test_a_broken_record_is_none(photographs, broken):
+    provenance_path(photographs).write_text(broken)
+    with pytest.raises(ArtifactError, match="did not write it"):
+        require_replaceable([photographs], "masks", [])
+
+
+def test_an_input_is_never_an_output(photographs, tmp_path):
+    record(photographs, "poses")
+    with pytest.raises(ArtifactError, match="is an input"):
+        require_replaceable([photographs], "poses", [photographs])
+    link = tmp_path / "link"
+    link.symlink_to(photographs)
+    with pytest.raises(ArtifactError, match="is an input"):
+        require_replaceable([link], "poses", [photographs])
+    record(tmp_path, "poses")
+    with pytest.raises(ArtifactError, match="holds the input"):
+        require_replaceable([tmp_path], "poses", [photographs])
+
+
+def test_the_working_and_the_home_folder_are_never_outputs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for out, name in ((Path(), "working"), (tmp_path.parent, "working"), (Path.home(), "home")):
+        with pytest.raises(ArtifactError, match=f"is the {name} folder"):
+            require_replaceable([out], "masks", [])
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["poses", "--images", "photographs", "--out", "photographs"],
+        ["masks", "--scene", "scene", "--out", "photographs"],
+        ["coverage-tree", "--masks", "scene", "--out", "photographs"],
+        ["coverage-tree", "--masks", "scene", "--out", "."],
+        ["clip", "--scene", "scene", "--masks", "scene", "--out", "thesis.md"],
+        ["gaussians", "--scene", "scene", "--out", "gaussians.ply", "--report", "photographs"],
+    ],
+)
+def test_commands_leave_what_is_not_theirs(photographs, tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene/index.json").write_text("{}")
+    (tmp_path / "thesis.md").write_text("ten years")
+    before = files(tmp_path)
+    with pytest.raises(ArtifactError, match="output"):
+        app(words, standalone_mode=False)
+    assert files(tmp_path) == before
+
+
+def test_a_stage_replaces_its_output_again(tmp_path):
+    out = tmp_path / "table.csv"
+    for text in ("first", "second"):
+        with stage("table", out):
+            out.write_text(text)
+    assert out.read_text() == "second" and json.loads(provenance_path(out).read_text())["stage"] == "table"
+
+
+def test_pictures_replace_pictures_of_this_package_alone(tmp_path):
+    import numpy as np
+
+    pixels = np.zeros((HEIGHT, HEIGHT, 3), np.uint8)
+    picture, photograph, text = (tmp_path / name for name in ("picture.png", "photograph.png", "thesis.md"))
+    require_own_picture(picture)
+    write_png(picture, pixels, text=SOFTWARE)
+    require_own_picture(picture)
+    write_png(photograph, pixels)
+    (tmp_path / "broken.png").write_text("text")
+    for path in (photograph, tmp_path / "broken.png"):
+        with pytest.raises(ArtifactError, match="hilsplat did not write it"):
+            require_own_picture(path)
+    with pytest.raises(ArtifactError, match="not named as a PNG"):
+        require_own_picture(text)
+    (tmp_path / "selection.ply").write_text("mine")
+    require_own_picture(picture, beside=tmp_path / "selection.ply")
+    with pytest.raises(ArtifactError, match=r"selection.ply exists"):
+        require_own_picture(tmp_path / "other.png", beside=tmp_path / "selection.ply")
+
+
+def test_tables_replace_tables_with_the_same_head_alone(tmp_path):
+    table = tmp_path / "efficiency.csv"
+    require_beginning(table, "stage,seconds")
+    table.write_text("stage,seconds\nmasks,3\n")
+    require_beginning(table, "stage,seconds")
+    table.write_text("name,price\n")
+    with pytest.raises(ArtifactError, match="did not write it"):
+        require_beginning(table, "stage,seconds")
