@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from hilsplat.base.errors import SceneError
+from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.importers.llff import POSES_BOUNDS
 from hilsplat.scene.layouts import MODELS, NO_POSES, TRANSFORMS, polycam_folders, record3d_export
@@ -49,6 +50,47 @@ class KnownView:
     cam_from_source: Float64[np.ndarray, "4 4"]
     is_test: bool = False
     border_px: int = 0
+
+
+def checked(views: list[KnownView], known: KnownPoses) -> list[KnownView]:
+    """Views whose lenses and poses can be those of cameras.
+
+    Raises:
+        SceneError: one cannot, or several views all have the same pose.
+    """
+    for view in views:
+        values = np.array([*view.camera.params, view.camera.width, view.camera.height], np.float64)
+        focal = [view.camera.params[row] for row in view.camera.focal_length_idxs()]
+        pose = view.cam_from_source
+        if not np.isfinite(values).all() or min(focal, default=0) <= 0 or (values[-2:] <= 0).any():
+            fault, found = "lens", f"{view.camera.model_name} {values.tolist()}"
+        elif not np.isfinite(pose).all() or not are_rotations(pose[:3, :3], RIGID_TOLERANCE):
+            fault, found = "rotation", np.array2string(pose[:3, :3], precision=4).replace("\n", "")
+        elif np.abs(pose[:3, 3]).max() > FARTHEST:
+            fault, found = "position", str(pose[:3, 3].tolist())
+        else:
+            continue
+        raise SceneError(
+            f"the {fault} of {view.name} cannot be that of a camera",
+            expected=EXPECTED[fault],
+            found=found,
+            fix=f"export the poses again: {known.files[0]}",
+        )
+    poses = np.stack([view.cam_from_source for view in views]) if views else np.zeros((0, 4, 4))
+    if len(views) > 2 and np.allclose(poses, poses[0]):
+        raise SceneError(
+            f"all {len(views)} views of {known.files[0]} have the same pose", fix="export the poses again"
+        )
+    return views
+
+
+EXPECTED = {
+    "lens": "finite numbers, a focal length and a size above 0",
+    "rotation": "a matrix that neither scales nor mirrors, from a quaternion that is not 0",
+    "position": "coordinates up to 1e9",
+}
+FARTHEST = 1e9
+"""Coordinates beyond it are no longer told apart in 32 bits; of the source's units."""
 
 
 def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | None:

@@ -14,8 +14,9 @@ from hilsplat.base.files import IMAGE_SUFFIXES, list_images
 from hilsplat.base.images import open_image
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.colmap import pycolmap
-from hilsplat.scene.importers.known_poses import KnownPoses, KnownView
+from hilsplat.scene.importers.known_poses import KnownPoses, KnownView, checked
 from hilsplat.scene.importers.llff import llff_views
+from hilsplat.scene.importers.model_files import require_whole_files
 from hilsplat.scene.importers.phone_exports import OPENGL_TO_OPENCV, read_polycam, read_record3d
 from hilsplat.scene.model import camera_of, pose_matrix, reprojection_errors, sparse_points
 
@@ -26,6 +27,10 @@ def known_views(known: KnownPoses) -> list[KnownView]:
     Raises:
         SceneError: they cannot be read.
     """
+    return checked(_described(known), known)
+
+
+def _described(known: KnownPoses) -> list[KnownView]:
     if known.kind == "colmap":
         return read_colmap(known)[0]
     if known.kind == "transforms":
@@ -51,6 +56,7 @@ def read_colmap(
         SceneError: the model cannot be read.
     """
     folder = known.files[0]
+    require_whole_files(folder)
     try:
         model = pycolmap.Reconstruction(folder)
     except (ValueError, RuntimeError, IndexError) as error:
@@ -75,7 +81,7 @@ def read_colmap(
         }
         for name, of_view in reprojection_errors(model).items()
     }
-    return views, sparse_points(model), errors
+    return checked(views, known), sparse_points(model), errors
 
 
 def _find_image(root: Path, name: str) -> Path | None:
@@ -131,7 +137,7 @@ def read_transforms(
         if points is None and isinstance(content.get("ply_file_path"), str):
             _check_inside(file.parent, content["ply_file_path"])
             points = _read_ply_points(file.parent / content["ply_file_path"])
-    return views, points
+    return checked(views, known), points
 
 
 def _read_frame(known: KnownPoses, file: Path, number: int, frame: Mapping[str, Any]) -> KnownView:
