@@ -12,17 +12,14 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import fields, is_dataclass
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from hilsplat.base.errors import ArtifactError, DiskSpaceError, HilsplatError
 from hilsplat.base.processes import FORMER, UNFINISHED, is_unfinished, unfinished_folder
-
-Made = TypeVar("Made")
 
 ZIP64_BYTES = 2**30
 """Larger arrays get an archive entry that may exceed 2 GiB."""
@@ -324,34 +321,6 @@ def read_npz(path: Path, *needed: str) -> dict[str, np.ndarray]:
             fix=remake(path),
         )
     return arrays
-
-
-def read_into(maker: type[Made], path: Path, **more: Any) -> Made:
-    """Make a dataclass from the arrays of an .npz.
-
-    Args:
-        maker: the dataclass; its fields are the names of the arrays and of `more`.
-        path: the file.
-        more: fields that are not in the file.
-
-    Raises:
-        ArtifactError: the file is missing or damaged, or another version of the program wrote it.
-    """
-    arrays = read_npz(path)
-    expected = _arguments(maker) - set(more)
-    if set(arrays) != expected:
-        raise ArtifactError(
-            f"{path} is of another version",
-            expected=", ".join(sorted(expected)),
-            found=", ".join(sorted(arrays)) or "no array",
-            fix=remake(path),
-        )
-    return maker(**arrays, **more)
-
-
-def _arguments(maker: type) -> set[str]:
-    assert is_dataclass(maker), maker
-    return {field.name for field in fields(maker) if field.init}
 
 
 def write_npy(path: Path, array: np.ndarray) -> None:

@@ -7,7 +7,8 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 
-from hilsplat.base.artifacts import read_full_index, read_into, read_npy
+from hilsplat.base.arrays import read_into
+from hilsplat.base.artifacts import read_full_index, read_npy
 from hilsplat.base.levels import Level
 from hilsplat.contributions.quadratic import Quadratic, load_quadratic
 from hilsplat.contributions.streams import mapped

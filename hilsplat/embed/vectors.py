@@ -5,19 +5,40 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Shaped
 
-from hilsplat.base.artifacts import read_npy
+from hilsplat.base.artifacts import read_npy, remake
 from hilsplat.base.errors import ArtifactError
 from hilsplat.segment.digests import require_same_masks
+
+UNIT_TOLERANCE = 2e-3
+"""Vectors are stored as halves."""
 
 
 def mask_embeddings(clip_folder: Path, folder: Path) -> Float32[np.ndarray, "M C"]:
     """CLIP vectors of all masks in the row order of an artifact of theirs; zero where none was computed.
 
     Raises:
+        ArtifactError: a file is missing or damaged, or its vectors are not of length 1 or of the same width.
         MisalignedArtifactError: the vectors were computed from other masks.
     """
     views = require_same_masks(clip_folder, folder)
     parts = [read_npy(Path(clip_folder) / f"{view}.npy") for view in views]
+    widths = {part.shape[1] if part.ndim == 2 else -1 for part in parts}
+    if len(widths) > 1 or -1 in widths:
+        raise ArtifactError(
+            f"the CLIP vectors in {clip_folder} differ in width",
+            found=", ".join(f"{view}: {part.shape}" for view, part in zip(views, parts, strict=True))[:300],
+            fix=remake(Path(clip_folder)),
+        )
+    for view, part in zip(views, parts, strict=True):
+        lengths = np.linalg.norm(part.astype(np.float32), axis=1)
+        wrong = ~((lengths == 0) | (np.abs(lengths - 1) < UNIT_TOLERANCE))  # also NaN
+        if wrong.any():
+            raise ArtifactError(
+                f"{np.count_nonzero(wrong)} CLIP vectors of {view} in {clip_folder} cannot be used",
+                expected="vectors of length 1, or 0 for crops that were not embedded",
+                found=f"length {lengths[wrong][0]}",
+                fix=remake(Path(clip_folder)),
+            )
     return np.concatenate(parts, dtype=np.float32)
 
 

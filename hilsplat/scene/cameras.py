@@ -6,8 +6,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int32
 
-from hilsplat.base.artifacts import read_npz, write_npz
-from hilsplat.base.errors import SceneError
+from hilsplat.base.arrays import require_types
+from hilsplat.base.artifacts import read_npz, remake, write_npz
+from hilsplat.base.errors import ArtifactError, SceneError
+from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
+
+MAX_SIDE_PX = 2**15
+LAST_ROW = (0, 0, 0, 1)
+"""Of a pose."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +86,25 @@ class Cameras:
 
     @staticmethod
     def load(path: Path) -> "Cameras":
-        """Read `cameras.npz`."""
+        """Read `cameras.npz`.
+
+        Raises:
+            ArtifactError: it is missing or damaged, or what it holds cannot be cameras.
+        """
         arrays = read_npz(path, "names", "cam_from_world", "K", "size_hw")
+        numbers = {name: array for name, array in arrays.items() if name != "names"}
+        require_types(Cameras, numbers, path, {"size_hw": (1, MAX_SIDE_PX)})
+        names, poses, K = arrays["names"], arrays["cam_from_world"], arrays["K"]
+        if names.dtype.kind != "U" or names.shape != (len(poses),) or len(set(names.tolist())) != len(names):
+            fault = f"{len(names)} names of {len(poses)} cameras, each another"
+        elif not are_rotations(poses[:, :3, :3], RIGID_TOLERANCE).all() or (poses[:, 3] != LAST_ROW).any():
+            fault = "rigid poses"
+        elif not (K[:, [0, 1], [0, 1]] > 0).all() or (K[:, 2] != (0, 0, 1)).any():
+            fault = "focal lengths above 0"
+        else:
+            fault = ""
+        if fault:
+            raise ArtifactError(f"{path} does not hold cameras", expected=fault, fix=remake(path))
         return Cameras(
             tuple(str(name) for name in arrays["names"]),
             arrays["cam_from_world"],

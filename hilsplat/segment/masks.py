@@ -8,10 +8,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32, Int64, UInt8, UInt32
 
-from hilsplat.base.artifacts import read_npz, write_npz
-from hilsplat.base.errors import EmptyMaskError
+from hilsplat.base.arrays import require_types
+from hilsplat.base.artifacts import read_npz, remake, write_npz
+from hilsplat.base.errors import ArtifactError, EmptyMaskError
 from hilsplat.base.levels import NONE, Level
 from hilsplat.segment.kernels import areas_and_boxes, paint_runs, shared_pixels, window_of_runs
+
+MAX_SIDE_PX = 2**15
+LIMITS = {"level": (1, 3), "predicted_iou": (-1, 2), "stability": (0, 1)}
+"""Of what a file may hold. SAM predicts IoUs a little outside of [0, 1]."""
 
 
 def encode_runs(
@@ -261,6 +266,45 @@ class HierarchicalMasks:
 
     @staticmethod
     def load(path: Path) -> "HierarchicalMasks":
-        """Read `<view>.npz`."""
+        """Read `<view>.npz`, and check that its masks are whole.
+
+        Raises:
+            ArtifactError: it is missing or damaged, or its arrays contradict each other.
+        """
         arrays = read_npz(path, *(field.name for field in fields(HierarchicalMasks)))
-        return HierarchicalMasks.from_arrays(arrays)
+        size = arrays["size_hw"]
+        is_size = size.shape == (2,) and size.dtype.kind in "iu"
+        if not is_size or size.min() < 1 or size.max() > MAX_SIDE_PX:
+            raise _damaged(path, "size_hw", f"two sides from 1 to {MAX_SIDE_PX} px", str(size.tolist()))
+        require_types(HierarchicalMasks, arrays, path, LIMITS)
+        try:
+            found = HierarchicalMasks.from_arrays(arrays)
+        except TypeError as error:
+            raise _damaged(path, "names", "those of masks", str(error)) from error
+        found._require_whole(path)
+        return found
+
+    def _require_whole(self, path: Path) -> None:
+        lengths = np.diff(self.offsets)
+        if len(self.offsets) != len(self) + 1 or self.offsets[0] != 0 or self.offsets[-1] != len(self.runs):
+            ends = f"{len(self.offsets)} from {self.offsets[:1].tolist()} to {self.offsets[-1:].tolist()}"
+            raise _damaged(path, "offsets", f"{len(self) + 1} from 0 to {len(self.runs)}", ends)
+        if (lengths <= 0).any():
+            raise _damaged(path, "offsets", "ascending offsets", f"steps of {int(lengths.min())}")
+        height, width = self.size_hw
+        if len(self):
+            pixels = np.add.reduceat(self.runs.astype(np.int64), self.offsets[:-1])
+            if (pixels != height * width).any():
+                wrong = int(pixels[pixels != height * width][0])
+                raise _damaged(path, "runs", f"{height * width} pixels a mask", f"{wrong} in one")
+        area_px, boxes = areas_and_boxes(self.runs, self.offsets, width)
+        if not (area_px > 0).all() or not np.array_equal(area_px, self.area_px):
+            raise _damaged(path, "area_px", "the areas of the masks", "others")
+        if not np.array_equal(boxes, self.box_xyxy):
+            raise _damaged(path, "box_xyxy", "the boxes of the masks", "others")
+
+
+def _damaged(path: Path, name: str, expected: str, found: str) -> ArtifactError:
+    return ArtifactError(
+        f"{path}: array {name} cannot be right", expected=expected, found=found, fix=remake(path)
+    )

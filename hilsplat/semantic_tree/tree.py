@@ -16,17 +16,17 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Float32, Int32, Int64, UInt8
 
+from hilsplat.base.arrays import read_into
 from hilsplat.base.artifacts import (
     atomic_folder,
     read_full_index,
     read_index,
-    read_into,
     remake,
     write_index,
     write_json,
     write_npz,
 )
-from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log
 from hilsplat.contributions.rows import Contributions
@@ -55,6 +55,10 @@ NodesOf = Callable[[Level, Int64[np.ndarray, " m"]], LevelNodes]
 """A level and the rows of its masks -> its nodes."""
 
 logger = logging.getLogger(__name__)
+
+
+LIMITS = {"level": (1, 3), "quality": (0, 1), "membership": (0, 1 + 1e-5), "views": (0, 2**31 - 1)}
+"""Of the values of a stored tree."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +111,23 @@ class SemanticTree:
     def __len__(self) -> int:
         return len(self.level)
 
+    def _require_whole(self, path: Path) -> None:
+        """Check that rows of nodes exist, and that parents are coarser."""
+        most = len(self) - 1
+        rows = {"parent": self.parent, "node_of_gaussian": self.node_of_gaussian}
+        rows |= {"node_of_mask": self.node_of_mask, "linked_node": self.linked_node}
+        for name, values in rows.items():
+            if values.size and (values.min() < NONE or values.max() > most):
+                raise ArtifactError(
+                    f"{path}: array {name} names nodes that do not exist",
+                    expected=f"-1 to {most}",
+                    found=f"{values.min()} to {values.max()}",
+                    fix=remake(path),
+                )
+        child = self.parent != NONE
+        if (self.level[self.parent[child]] >= self.level[child]).any():
+            raise ArtifactError(f"{path}: a node's parent is not coarser than it", fix=remake(path))
+
     def nodes_of(self, level: Level) -> Int64[np.ndarray, " t"]:
         """Nodes of a level, in order."""
         return np.flatnonzero(self.level == int(level))
@@ -156,10 +177,12 @@ class SemanticTree:
         tree = read_into(
             SemanticTree,
             folder / "tree.npz",
+            LIMITS,
             view_names=tuple(index["views"]),
             gaussians_sha256=index["gaussians_sha256"],
             min_weight=index["min_weight"],
         )
+        tree._require_whole(folder / "tree.npz")
         if clip_folder is None:
             return tree
         tree = tree.with_vectors(mask_embeddings(clip_folder, folder))

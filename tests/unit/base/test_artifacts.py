@@ -11,6 +11,7 @@ import pytest
 import safetensors.numpy
 
 from hilsplat.base import artifacts
+from hilsplat.base.arrays import read_into
 from hilsplat.base.errors import ArtifactError, DiskSpaceError
 
 
@@ -228,6 +229,6 @@ def test_arrays_of_another_version_are_told_from_ours(tmp_path):
 
     artifacts.write_npz(tmp_path / "old.npz", left=np.zeros(2), middle=np.ones(1))
     with pytest.raises(ArtifactError, match=r"another version(.|\n)*left, right(.|\n)*left, middle"):
-        artifacts.read_into(Pair, tmp_path / "old.npz", name="a")
+        read_into(Pair, tmp_path / "old.npz", name="a")
     artifacts.write_npz(tmp_path / "new.npz", left=np.zeros(2), right=np.ones(1))
-    assert artifacts.read_into(Pair, tmp_path / "new.npz", name="a").name == "a"
+    assert read_into(Pair, tmp_path / "new.npz", name="a").name == "a"

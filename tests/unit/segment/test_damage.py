@@ -1,0 +1,160 @@
+"""Damaged files of masks and cameras end in an error that names them, never in a crash or in other masks."""
+
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hilsplat.base.artifacts import read_npz, write_index, write_npy, write_npz
+from hilsplat.base.errors import ArtifactError, HilsplatError
+from hilsplat.embed.vectors import mask_embeddings
+from hilsplat.scene.cameras import Cameras
+from hilsplat.segment.digests import index_entry
+from hilsplat.segment.masks import HierarchicalMasks
+
+FEW = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def some_masks() -> HierarchicalMasks:
+    rng = np.random.default_rng(3)
+    dense = rng.random((4, 9, 7)) < 0.4
+    dense[:, 4, 3] = True
+    scores = np.linspace(0.5, 0.9, 4).astype(np.float32)
+    return HierarchicalMasks.from_dense(dense, np.array([1, 2, 3, 3], np.uint8), scores, scores)
+
+
+def some_cameras() -> Cameras:
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = range(3)
+    K = np.tile(np.diag([30.0, 30, 1]), (3, 1, 1))
+    return Cameras(("a.png", "b.png", "c.png"), poses, K, np.full((3, 2), (24, 36), np.int32))
+
+
+@st.composite
+def damages(draw, names: list[str]):
+    """A change of one array of an archive."""
+    name = draw(st.sampled_from(names))
+    kind = draw(st.sampled_from(["drop", "shape", "dtype", "value", "cut", "add", "empty"]))
+    return name, kind, draw(st.integers(0, 10_000)), draw(st.integers(-(2**40), 2**40))
+
+
+def damaged(arrays: dict[str, np.ndarray], damage: tuple[str, str, int, int]) -> dict[str, np.ndarray]:
+    name, kind, place, value = damage
+    arrays = dict(arrays)
+    array = arrays[name]
+    if kind == "drop":
+        del arrays[name]
+    elif kind == "add":
+        arrays["more"] = array
+    elif kind == "shape":
+        arrays[name] = array[..., None]
+    elif kind == "dtype":
+        arrays[name] = array.astype(
+            np.str_ if place % 2 else (np.float64 if array.dtype.kind in "iu" else np.int16)
+        )
+    elif kind == "empty":
+        arrays[name] = array[:0]
+    elif kind == "cut":
+        arrays[name] = array[: place % max(len(array), 1)]
+    elif array.dtype.kind in "iu":
+        array = array.copy()
+        array.reshape(-1)[place % array.size] = np.int64(value).astype(array.dtype)
+        arrays[name] = array
+    elif array.dtype.kind == "f":
+        array = array.copy()
+        array.reshape(-1)[place % array.size] = [np.nan, np.inf, -np.inf, float(value)][place % 4]
+        arrays[name] = array
+    return arrays
+
+
+def same(found, whole) -> bool:
+    return all(np.array_equal(getattr(found, name), getattr(whole, name)) for name in vars(whole))
+
+
+@FEW
+@given(damage=damages([*some_masks().arrays()]))
+def test_damaged_masks(damage, tmp_path):
+    whole = some_masks()
+    write_npz(tmp_path / "view.npz", **damaged(whole.arrays(), damage))
+    try:
+        found = HierarchicalMasks.load(tmp_path / "view.npz")
+    except HilsplatError as error:
+        assert "view.npz" in str(error)
+        return
+    for other in ("predicted_iou", "stability"):  # any score in range may be right
+        if damage[0] == other and damage[1] == "value":
+            return
+    if damage[:2] == ("level", "value"):
+        assert set(found.level.tolist()) <= {1, 2, 3}
+        return
+    assert same(found, whole), damage
+
+
+@FEW
+@given(damage=damages(["names", "cam_from_world", "K", "size_hw"]))
+def test_damaged_cameras(damage, tmp_path):
+    whole = some_cameras()
+    whole.save(tmp_path / "cameras.npz")
+    write_npz(tmp_path / "cameras.npz", **damaged(read_npz(tmp_path / "cameras.npz"), damage))
+    try:
+        found = Cameras.load(tmp_path / "cameras.npz")
+    except HilsplatError as error:
+        assert "cameras.npz" in str(error)
+        return
+    if damage[1] == "value":  # another number may be right, but it is one of a camera
+        assert np.isfinite(found.cam_from_world).all() and (found.size_hw > 0).all()
+        return
+    assert same(found, whole), damage
+
+
+@FEW
+@given(place=st.integers(0, 100_000), bit=st.integers(0, 7), cut=st.booleans())
+def test_a_flipped_bit_or_a_file_that_is_cut_off(place, bit, cut, tmp_path):
+    whole, path = some_masks(), tmp_path / "view.npz"
+    whole.save(path)
+    data = bytearray(path.read_bytes())
+    if cut:
+        data = data[: place % len(data)]
+    else:
+        data[place % len(data)] ^= 1 << bit
+    path.write_bytes(data)
+    with suppress(HilsplatError):
+        assert same(HierarchicalMasks.load(path), whole)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("level", lambda values: values + 8, "level cannot be right"),
+        ("offsets", lambda values: values[::-1].copy(), "offsets cannot be right"),
+        ("offsets", lambda values: values + 2**40, "offsets cannot be right"),
+        ("runs", lambda values: values * 1000, "runs cannot be right"),
+        ("runs", lambda values: values[:, None], "runs cannot be used"),
+        ("area_px", lambda values: values + 1, "area_px cannot be right"),
+        ("box_xyxy", lambda values: values + 1, "box_xyxy cannot be right"),
+        ("predicted_iou", lambda values: values * np.nan, "predicted_iou cannot be right"),
+    ],
+)
+def test_each_array_of_masks_is_checked(tmp_path: Path, name, change, words):
+    arrays = some_masks().arrays()
+    write_npz(tmp_path / "view.npz", **{**arrays, name: change(arrays[name])})
+    with pytest.raises(ArtifactError, match=words):
+        HierarchicalMasks.load(tmp_path / "view.npz")
+
+
+@pytest.mark.parametrize("fault", [np.nan, np.inf, 0.5])
+def test_clip_vectors_are_of_length_one(tmp_path, fault):
+    masks, clip = tmp_path / "masks", tmp_path / "clip"
+    entry = {"a.png": index_entry(some_masks())}
+    for folder in (masks, clip):
+        write_index(folder, entry, scene="a/b")
+    vectors = np.eye(4, 6, dtype=np.float16)
+    write_npy(clip / "a.png.npy", vectors)
+    assert mask_embeddings(clip, masks).shape == (4, 6)
+    vectors[2] *= fault
+    write_npy(clip / "a.png.npy", vectors)
+    with pytest.raises(ArtifactError, match=r"1 CLIP vectors of a\.png"):
+        mask_embeddings(clip, masks)
