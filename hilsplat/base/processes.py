@@ -1,4 +1,4 @@
-"""Child processes that end with their parent, unfinished files of killed processes, and process pools."""
+"""Child processes that end with their parent, unfinished files of killed processes, pools of both kinds."""
 
 import ctypes
 import fcntl
@@ -14,11 +14,13 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Thread
 from typing import IO, Any, TypeVar
 
+Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 logger = logging.getLogger(__name__)
@@ -224,3 +226,22 @@ def _begin_alone(parent: int, said: Path) -> None:
     end_with_parent(parent)
     with said.open("wb") as stream:
         os.dup2(stream.fileno(), 2)
+
+
+def in_order(work: Callable[[Item], Result], items: Sequence[Item], threads: int) -> Iterator[Result]:
+    """Results of `work` in the order of `items`, up to `threads` at once.
+
+    At most twice as many results are waiting at any time. If one item fails, those not started are dropped.
+    """
+    threads = max(1, threads)
+    with ThreadPoolExecutor(max_workers=threads) as pool:
+        waiting: list[Future[Result]] = []
+        try:
+            for item in items:
+                waiting.append(pool.submit(work, item))
+                if len(waiting) >= 2 * threads:
+                    yield waiting.pop(0).result()
+            while waiting:
+                yield waiting.pop(0).result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)

@@ -12,7 +12,6 @@ import typer
 
 from hilsplat.base.artifacts import output_lock, parse_json, provenance_path, require_free_space
 from hilsplat.base.errors import HilsplatError, SettingsError, place_error
-from hilsplat.base.outputs import require_replaceable
 from hilsplat.base.progress import LOG_FORMAT
 from hilsplat.models.store import model_path
 from hilsplat.workflow.stages import stage_code
@@ -86,7 +85,7 @@ def stage(
         ArtifactError: an output would replace something else than an earlier output of the stage.
         HilsplatError: an input is missing, or changed while the stage ran.
     """
-    from hilsplat.base.provenance import Inputs, write_provenance
+    from hilsplat.base.provenance import Inputs, require_replaceable, write_provenance
     from hilsplat.splat.rasterise.device import choose_device
 
     start_logging(timestamps=True)

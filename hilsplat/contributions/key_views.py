@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from hilsplat.base.parallel import in_order
+from hilsplat.base.processes import in_order
 from hilsplat.contributions.compositing import visible_mass
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.stage import run_masks, train_views

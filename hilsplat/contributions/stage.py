@@ -33,7 +33,7 @@ from hilsplat.base.artifacts import (
 )
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.identity import code_digest
-from hilsplat.base.parallel import in_order
+from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.contributions.quadratic import Gram, Quadratic, StackedWeights

@@ -13,7 +13,7 @@ from tokenizers import Tokenizer
 from hilsplat.base.artifacts import read_full_index, read_json
 from hilsplat.base.errors import MisalignedArtifactError, ModelError
 from hilsplat.base.files import INSTALLED
-from hilsplat.base.parallel import in_order
+from hilsplat.base.processes import in_order
 from hilsplat.models.folder import ModelFolder, input_side_px, open_model_folder
 from hilsplat.models.network import Network, require_one_space
 from hilsplat.models.store import MODELS, user_models

@@ -22,7 +22,7 @@ from hilsplat.base.artifacts import (
 )
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.identity import code_digest
-from hilsplat.base.parallel import in_order
+from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, unit
 from hilsplat.models.folder import open_model_folder

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from hilsplat.base.artifacts import sha256_of_bytes
 from hilsplat.base.levels import LEVELS
-from hilsplat.base.outputs import require_own_picture
+from hilsplat.base.provenance import require_own_picture
 from hilsplat.query.hits import Hit, counted, doubts_of, hits_of
 from hilsplat.query.language_scene import LanguageScene, path_of
 from hilsplat.query.names import PATH_SEPARATOR

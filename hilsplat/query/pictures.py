@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.levels import Level
-from hilsplat.base.outputs import SOFTWARE
+from hilsplat.base.provenance import SOFTWARE
 from hilsplat.scene.cameras import Cameras
 from hilsplat.splat.gaussians import Gaussians
 

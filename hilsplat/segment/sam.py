@@ -21,7 +21,7 @@ from PIL import Image
 from hilsplat.base.artifacts import sha256_of_bytes
 from hilsplat.base.errors import ModelError
 from hilsplat.base.levels import Level
-from hilsplat.base.parallel import in_order
+from hilsplat.base.processes import in_order
 from hilsplat.models.folder import ModelFolder, open_model_folder, side_px
 from hilsplat.models.int8 import CHECKED_GRID, Agreement, agreement_of_masks, int8_network, may_be_int8
 from hilsplat.models.layouts import DECODER, PREVIEW

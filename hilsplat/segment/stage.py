@@ -19,7 +19,7 @@ from hilsplat.base.artifacts import (
 from hilsplat.base.errors import SceneError
 from hilsplat.base.identity import code_digest
 from hilsplat.base.levels import LEVELS
-from hilsplat.base.parallel import in_order
+from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.models.int8 import CHECKED_VIEWS
 from hilsplat.models.memory import available_mib, needs_of

@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation, Slerp
 
 from hilsplat.base.images import write_png
-from hilsplat.base.parallel import in_order
+from hilsplat.base.processes import in_order
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.films import contact_sheet, write_film
 

@@ -11,7 +11,7 @@ from jaxtyping import Int32
 
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.base.outputs import SOFTWARE, require_own_picture
+from hilsplat.base.provenance import SOFTWARE, require_own_picture
 from hilsplat.scene.cameras import Camera
 from hilsplat.world.objects.builder import ObjectModel
 from hilsplat.world.objects.catalogue import TABLETOP, build_object

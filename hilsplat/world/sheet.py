@@ -8,7 +8,7 @@ from jaxtyping import Int32, UInt8
 from hilsplat.base.artifacts import atomic_path, read_index, read_json
 from hilsplat.base.images import list_images, read_image
 from hilsplat.base.levels import LEVELS, NONE, Level
-from hilsplat.base.outputs import SOFTWARE, require_own_picture
+from hilsplat.base.provenance import SOFTWARE, require_own_picture
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations
 
 VIEWS_SHOWN = 4

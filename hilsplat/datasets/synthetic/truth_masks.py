@@ -16,7 +16,7 @@ from jaxtyping import Int32
 from hilsplat.base.artifacts import atomic_folder, read_index, read_json, write_index
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS
-from hilsplat.base.parallel import in_order
+from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.synthetic.faults import Draws, TrueNodes, faulty_masks
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hilsplat.base.artifacts import parse_json, write_text
 from hilsplat.base.errors import ArtifactError
-from hilsplat.base.outputs import require_beginning
+from hilsplat.base.provenance import require_beginning
 from hilsplat.base.tables import write_csv
 from hilsplat.configuration import SECTIONS
 

@@ -8,7 +8,7 @@ import pytest
 from hilsplat.base.artifacts import lock_path, provenance_path, write_json
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.images import write_png
-from hilsplat.base.outputs import SOFTWARE, require_beginning, require_own_picture, require_replaceable
+from hilsplat.base.provenance import SOFTWARE, require_beginning, require_own_picture, require_replaceable
 from hilsplat.cli.main import app
 from hilsplat.cli.stage import stage
 from tests.unit.finished_desk import HEIGHT
