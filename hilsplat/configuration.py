@@ -172,6 +172,11 @@ UPSTREAM: dict[str, tuple[str, ...]] = {
 """Sections that each stage of a variant depends on, directly or through its inputs; see `upstream`."""
 
 
+RESERVED = frozenset(
+    ("annotations", "benchmarks", "export", "gaussians", "logs", "queries", "scene", "world")
+)
+"""Folders of a scene that are no variant."""
+
 SEEDED = re.compile(r"(.+)\.seed([0-9]+)")
 """Name of a variant under another seed than the first: the variant, and the number of the seed."""
 
@@ -324,6 +329,18 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
                 expected=NAME_RULE,
                 fix="rename it in the configuration",
             )
+    for name in run.variants:
+        if _parts_of(name)[0] in RESERVED:
+            raise SettingsError(
+                f"variants.{name}: the folder of a scene has files of this name",
+                expected=f"another name than {', '.join(sorted(RESERVED))}",
+                fix="rename the variant",
+            )
+    for key, texts in run.queries.items():
+        if any(not text.strip() for text in texts):
+            raise SettingsError(
+                f"queries.{key}: a text is empty", fix="take it out, or write what to look for"
+            )
     for variant in dict.fromkeys([*run.variant_names(), *run.variants]):
         run.stages(variant)
     for scope in run.overrides:
@@ -348,6 +365,20 @@ def require_known(where: str, keys: Iterable[str], known: Collection[str]) -> No
             )
 
 
+class _UniqueKeys(yaml.SafeLoader):
+    """YAML in which a key may be given once: of two, the first would be ignored."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if key.tag != "tag:yaml.org,2002:merge" and isinstance(key, yaml.ScalarNode):
+                if key.value in seen:
+                    problem = f"key {key.value!r} is there twice"
+                    raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
 def read_config(path: Path) -> dict[str, Any]:
     """Read a configuration file.
 
@@ -355,12 +386,13 @@ def read_config(path: Path) -> dict[str, Any]:
         SettingsError: it is missing, or is not YAML that holds keys; the message names line and column.
     """
     try:
-        found = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        found = yaml.load(Path(path).read_text(encoding="utf-8"), _UniqueKeys)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        fault = "cannot be used" if isinstance(error, yaml.constructor.ConstructorError) else "is not YAML"
         raise SettingsError(
-            f"{path}{place} is not YAML: {error.problem or error.context}",
+            f"{path}{place} {fault}: {error.problem or error.context}",
             fix="indent with spaces, close what is open, and quote texts with a colon or braces",
         ) from error
     except FileNotFoundError as error:

@@ -5,9 +5,9 @@ stage, or a family of stages, depends on, so a changed knob reruns exactly the s
 `hilsplat settings` prints the knobs, `hilsplat settings --schema` a JSON schema of them for editors.
 """
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 LARGEST = 2_000_000_000
 """Largest whole number of any knob: the libraries take 32 bits, and a run adds up to 10 to its seed."""
@@ -25,10 +25,25 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_truth_value(cls, value: Any, info: Any) -> Any:
+        """Refuse true and false where a number or a word is expected: YAML reads yes and no as these."""
+        if isinstance(value, bool) and not _takes(cls.model_fields[info.field_name].annotation, bool):
+            raise ValueError(
+                "a number or a word is expected; YAML reads yes, no, on and off as true and false"
+            )
+        return value
+
     @property
     def is_random(self) -> bool:
         """Whether the stage's result depends on a variant's seed."""
         return False
+
+
+def _takes(annotation: Any, kind: type) -> bool:
+    """Whether a type, or a part of it, is `kind`, or any type."""
+    return annotation in (kind, Any) or any(_takes(part, kind) for part in get_args(annotation))
 
 
 Probability = Annotated[float, Field(ge=0, le=1)]

@@ -5,6 +5,7 @@ A folder holds `config.json`, what prepares its inputs, and its networks as `.on
 folder, so its digest identifies the model.
 """
 
+import math
 import mmap
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -209,7 +210,7 @@ def _preprocessing_of(path: Path) -> dict[str, Any]:
     """How a picture becomes an input; open_clip's words are translated.
 
     Raises:
-        ModelError: the file cannot be read, or switches off a step.
+        ModelError: the file cannot be read, switches off a step, or has statistics that no image has.
     """
     try:
         found = read_json(path)
@@ -229,6 +230,16 @@ def _preprocessing_of(path: Path) -> dict[str, Any]:
         for ours, theirs in (("image_mean", "mean"), ("image_std", "std")):
             if theirs in found:
                 found[ours] = found[theirs]
+    for key, least in (("image_mean", -math.inf), ("image_std", 0)):
+        values = found.get(key, [])
+        are_numbers = isinstance(values, list) and all(type(value) in (int, float) for value in values)
+        if not are_numbers or not all(least < value < math.inf for value in values):
+            raise ModelError(
+                f"{path}: {key} cannot be used",
+                expected="finite numbers" + (" above 0" if least == 0 else ""),
+                found=str(values)[:80],
+                fix="fetch a whole copy",
+            )
     return found
 
 

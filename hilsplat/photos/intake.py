@@ -5,11 +5,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from hilsplat.base.artifacts import atomic_folder
+from hilsplat.base.artifacts import atomic_folder, read_json, write_json
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import VIDEO_SUFFIXES, list_images, list_videos
 from hilsplat.scene.layouts import has_known_poses, photo_folder, unwrapped
+
+MARK = ".made_from.json"
+"""Hidden file of a folder that was made, which names the files that it was made from."""
 
 
 @dataclass(frozen=True)
@@ -73,18 +77,29 @@ def brought_photographs(source: Path, target: Path, frames: int) -> Iterator[Bro
             expected=f"a folder of photographs, a video ({', '.join(sorted(VIDEO_SUFFIXES))}), or a .zip",
             fix="give the folder that holds the photographs",
         )
-    if target.exists():
+    mark = _mark(videos or [source], frames)
+    if not target.exists():
+        with atomic_folder(target) as folder:
+            notes = make(folder)
+            write_json(folder / MARK, mark)
+    elif (target / MARK).is_file() and read_json(target / MARK) == mark:
+        notes = [f"{target} is there already, from the same files"]  # this command was killed after it
+    else:
         raise SceneError(
             f"{target} is in the way",
             fix="choose another name for the scene, or move that folder away",
         )
-    with atomic_folder(target) as folder:
-        notes = make(folder)
     try:
         yield Brought(unwrapped(target), tuple(notes))
     except BaseException:
         shutil.rmtree(target, ignore_errors=True)
         raise
+
+
+def _mark(files: list[Path], frames: int) -> dict[str, Any]:
+    """What a folder was made from."""
+    found = [(file.name, (stat := file.stat()).st_size, stat.st_mtime_ns) for file in files]
+    return {"files": [list(each) for each in found], "frames": frames}
 
 
 def _videos_of(source: Path) -> list[Path]:

@@ -11,6 +11,7 @@ from PIL import Image
 from hilsplat.base.errors import SceneError
 from hilsplat.photos import archive
 from hilsplat.photos.add import add_scene
+from hilsplat.photos.intake import brought_photographs
 from hilsplat.scene.sheet import read_sheet
 from tests.unit.photos.test_video import pan, write_video
 
@@ -51,7 +52,7 @@ def test_a_video_becomes_photographs_in_the_project(tmp_path, sheet):
     assert (report.num_readable, report.sizes) == (12, {(240, 320): 12})
     assert sources(sheet) == {"desk": "photos/desk"}
     folder = tmp_path / "project/photos/desk"
-    assert sorted(path.name for path in folder.iterdir())[:2] == ["0001.jpg", "0002.jpg"]
+    assert sorted(path.name for path in folder.glob("[!.]*"))[:2] == ["0001.jpg", "0002.jpg"]
     assert json.loads((folder / "origin.json").read_text())["settings"]["frames"] == 12
     assert "12 frames of walk.MP4 are in" in str(report)
     with pytest.raises(SceneError, match="photos/desk is already in"):
@@ -80,6 +81,15 @@ def test_what_is_in_the_way_stays(tmp_path, sheet):
     with pytest.raises(SceneError, match=r"photos/desk is in the way"):
         add_scene(sheet, "desk", write_video(tmp_path / "walk.mp4", pan([0] + [6] * 20)))
     assert len(list(mine.iterdir())) == 1
+
+
+def test_a_command_that_was_killed_after_it_unpacked_goes_on(tmp_path, sheet):
+    made, video = tmp_path / "project/photos/desk", write_video(tmp_path / "walk.mp4", pan([0] + [6] * 20))
+    with brought_photographs(video, made, 10):
+        before = sorted(path.stat().st_mtime_ns for path in made.glob("*.*"))
+    report = add_scene(sheet, "desk", video, frames=10)  # the same again: no frame is taken twice
+    assert report.num_readable == 10 and "is there already, from the same files" in str(report)
+    assert sorted(path.stat().st_mtime_ns for path in made.glob("*.*")) == before
 
 
 def test_live_photos_are_read_as_photographs_and_said(tmp_path, sheet):
@@ -111,7 +121,7 @@ def test_a_zip_is_unpacked_and_its_only_folder_unwrapped(tmp_path, sheet):
     assert report.num_readable == 4
     assert sources(sheet) == {"desk": "photos/desk/Trip 1/best"}
     unpacked = tmp_path / "project/photos/desk"
-    assert sorted(p.name for p in unpacked.rglob("*") if p.is_file()) == ["0.jpg", "1.jpg", "2.jpg", "3.jpg"]
+    assert sorted(p.name for p in unpacked.rglob("[!.]*") if p.is_file()) == ["0.jpg", "1.jpg", "2.jpg", "3.jpg"]
     assert (unpacked / "Trip 1/best/2.jpg").read_bytes() == (photos / "2.jpg").read_bytes()
 
 

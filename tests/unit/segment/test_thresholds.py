@@ -64,3 +64,15 @@ def test_of_two_masks_above_one_the_surer_stays(disc_sam):
     assert candidates.predicted_iou.max() == np.float32(1.06)
     masks = masks_from_candidates(candidates, (32, 32), model, chosen)
     assert masks.predicted_iou.tolist() == [np.float32(1.06)] * 3
+
+
+@pytest.mark.parametrize(
+    ("key", "values"),
+    [("image_std", [0, 1, 1]), ("image_std", [-1, 1, 1]), ("image_std", "x"), ("image_mean", [1e999, 0, 0])],
+)
+def test_statistics_that_no_image_has_are_refused(make_disc_sam, tmp_path, key, values):
+    folder = make_disc_sam(tmp_path / "sam")
+    described = json.loads((folder / "preprocessor_config.json").read_text())
+    (folder / "preprocessor_config.json").write_text(json.dumps({**described, key: values}))
+    with pytest.raises(ModelError, match=f"{key} cannot be used"):
+        SamModel.load(folder)
