@@ -121,7 +121,12 @@ def test_a_zip_is_unpacked_and_its_only_folder_unwrapped(tmp_path, sheet):
     assert report.num_readable == 4
     assert sources(sheet) == {"desk": "photos/desk/Trip 1/best"}
     unpacked = tmp_path / "project/photos/desk"
-    assert sorted(p.name for p in unpacked.rglob("[!.]*") if p.is_file()) == ["0.jpg", "1.jpg", "2.jpg", "3.jpg"]
+    assert sorted(p.name for p in unpacked.rglob("[!.]*") if p.is_file()) == [
+        "0.jpg",
+        "1.jpg",
+        "2.jpg",
+        "3.jpg",
+    ]
     assert (unpacked / "Trip 1/best/2.jpg").read_bytes() == (photos / "2.jpg").read_bytes()
 
 

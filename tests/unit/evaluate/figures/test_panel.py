@@ -61,7 +61,7 @@ def test_panel_with_annotations_is_drawn(block_world, tmp_path):
     save_figure(figure, tmp_path / "panel.png", dpi=60)
     with Image.open(tmp_path / "panel.png") as picture:
         assert picture.width == 780
-        assert "Software" not in picture.info
+        assert picture.info["Software"] == "hilsplat"
 
 
 def test_panel_without_annotations_takes_given_texts(block_world, tmp_path):
