@@ -196,7 +196,7 @@ def compare_decoders(models: Path, photograph: Path, points: int) -> dict[str, f
     above `tie`. Random logits crowd around 0, where the border of a trained SAM's mask is steep.
     """
     from hilsplat.base.images import read_image, resize_to_fit
-    from hilsplat.segment.sam import SamModel, ask_network, in_input, point_grid, single
+    from hilsplat.segment.sam import SamModel, ask_network, in_input, one_point_each, point_grid
 
     model, rounds, many = SamModel.load(models), 8, 64
     assert model.factored is not None
@@ -209,7 +209,8 @@ def compare_decoders(models: Path, photograph: Path, points: int) -> dict[str, f
     for _ in range(rounds):
         clock = time.process_time()
         plain = [
-            ask_network(model.decoder, encoded.features, *single(at[k : k + 8])) for k in range(0, many, 8)
+            ask_network(model.decoder, encoded.features, *one_point_each(at[k : k + 8]))
+            for k in range(0, many, 8)
         ]
         found["plain_ms"].append(time.process_time() - clock)
         clock = time.process_time()

@@ -1,7 +1,7 @@
 """Whether the arrays of an artifact are what its dataclass declares.
 
-Compiled loops believe what they get: an offset out of range ends the process. So arrays are checked once,
-when an artifact is opened, against the annotations of its dataclass (dtype and shape, with sizes of one name
+Compiled loops check no bounds: an offset out of range crashes the process. So arrays are checked once, when
+an artifact is opened, against the annotations of its dataclass (dtype and shape, with sizes of one name
 equal), for finite values, and against limits.
 """
 

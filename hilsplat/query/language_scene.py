@@ -192,7 +192,7 @@ class LanguageScene:
         """Show the scene in a notebook: the page of `hilsplat view` in a frame, served by this process.
 
         Args:
-            text: what the page asks first; "": nothing.
+            text: the first query; "": none.
             height: of the frame, px.
             proxy: address under which the browser reaches a port of this machine, with `{port}` in it, if the
                 notebook runs on another one: "/user/me/proxy/{port}/" on a JupyterHub.

@@ -323,7 +323,9 @@ class SamModel:
                 encoded.terms, in_input(points_xy, encoded.frame), fine=True
             )
             return iou, logits
-        return ask_network(self.decoder, encoded.features, *single(in_input(points_xy, encoded.frame)))
+        return ask_network(
+            self.decoder, encoded.features, *one_point_each(in_input(points_xy, encoded.frame))
+        )
 
     def decode_clicks(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "K 2"], inside: Bool[np.ndarray, " K"]
@@ -347,7 +349,7 @@ class SamModel:
             iou, logits, kept = self.factored.decode(encoded.terms, points, fine=False)
             return iou, logits, {"iou": iou, **kept}
         assert self.previewer is not None
-        return *ask_network(self.previewer, encoded.features, *single(points)), {"points": points_xy}
+        return *ask_network(self.previewer, encoded.features, *one_point_each(points)), {"points": points_xy}
 
     def finish(
         self, encoded: Encoded, prompts: Prompts
@@ -385,7 +387,7 @@ def ask_network(
     return scores[0], logits[0]
 
 
-def single(points_xy: Float[np.ndarray, "P 2"]) -> tuple[np.ndarray, np.ndarray]:
+def one_point_each(points_xy: Float[np.ndarray, "P 2"]) -> tuple[np.ndarray, np.ndarray]:
     """Points as prompts of one point inside each: points and labels of `ask_network`."""
     return points_xy[:, None], np.ones((len(points_xy), 1))
 
@@ -424,7 +426,7 @@ def largest_difference(factored: FactoredDecoder, decoder: Network, side_px: int
                 raise ModelError(f"{decoder.path.name} declares no shape of {name}")
             features[name] = rng.standard_normal((1, *shape), np.float32)  # type: ignore[arg-type]
     points = rng.uniform(0, side_px, (CHECKED_PROMPTS, 2))
-    iou, logits = ask_network(decoder, features, *single(points))
+    iou, logits = ask_network(decoder, features, *one_point_each(points))
     own_iou, own_logits, _ = factored.decode(factored.image(features), points, fine=True)
     off = np.abs(own_logits - logits).max() / max(1, np.abs(logits).max())
     return float(max(off, np.abs(own_iou - iou).max()))

@@ -46,7 +46,7 @@ class Answer(TypedDict):
 
 
 def answer(scene: LanguageScene, asked: Question, answerer: str = "tree") -> Answer:
-    """Ask a scene: hits, relevancy of every node to the last text, doubts.
+    """Query a scene: hits, relevancy of every node to the last text, doubts.
 
     Raises:
         SettingsError: the text is empty, or the view does not exist.

@@ -18,7 +18,7 @@ class EmbeddedViewer:
 
     Args:
         found: the scene.
-        text: what is asked first; "": nothing.
+        text: the first query; "": none.
         height: of the frame, px.
         proxy: address under which a browser elsewhere reaches a port of this machine, with `{port}` in it;
             "": the browser runs on this machine.

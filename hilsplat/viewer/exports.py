@@ -15,12 +15,14 @@ from PIL import Image
 
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Camera
+from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.export import write_selection_ply
 from hilsplat.splat.films import write_film
+from hilsplat.splat.flyaround import closed_path, open_path
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.rasterise.cpu import blend_forward, project_gaussians
 from hilsplat.viewer.frames import Paint, painted
-from hilsplat.viewer.wire import Group
+from hilsplat.viewer.wire import Film, Group
 
 FRAMES_PER_S = 24
 STEP = {"mp4": 1, "gif": 2}
@@ -182,6 +184,20 @@ def _square_around(points: np.ndarray, camera: Camera) -> tuple[float, float, fl
 
 
 # -- films ----------------------------------------------------------------------------------------
+
+
+def flight(asked: Film, scene: Scene) -> list[Camera]:
+    """One camera for each picture of a film: along its path, or around what the training cameras saw."""
+    if len(asked.path) > 1:
+        path = open_path([camera.camera() for camera in asked.path], asked.frames)
+    else:
+        path = closed_path(
+            [scene.cameras[view] for view in scene.views("train") or scene.views()], asked.frames
+        )
+    height, width = path[0].size_hw
+    scale = asked.side_px / max(height, width)
+    size_hw = (max(2, round(height * scale / 2) * 2), max(2, round(width * scale / 2) * 2))
+    return [camera.scaled(size_hw) for camera in path]
 
 
 def film(

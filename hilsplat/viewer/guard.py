@@ -39,7 +39,7 @@ class Guard:
         token: secret of the printed address.
         max_body: most bytes that the page may send at once.
         embedded: the page is a frame of another one, such as a notebook, perhaps behind a proxy. Browsers
-            give it no cookie, so each of its requests has the token in its address; nobody else knows that,
+            give it no cookie, so each of its requests has the token in its address; no other site knows it,
             and its host and origin are those of the other page. Scripts and styles are no secret.
     """
 

@@ -32,7 +32,7 @@ def html_page(shown: "ShownScene", asked: "Page", static: dict[str, bytes]) -> e
 
     Args:
         shown: the scene.
-        asked: variant, the queries whose answers the page holds, and where its camera begins.
+        asked: variant, the queries of the page, and where its camera begins.
         static: files of the page by name.
 
     Raises:

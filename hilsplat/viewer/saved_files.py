@@ -95,7 +95,7 @@ class SavedFiles:
             return partial(
                 exports.film,
                 shown.gaussians,
-                asked.cameras(shown.scene),
+                exports.flight(asked, shown.scene),
                 shown.paint(asked.variant, asked.style),
                 kind=asked.format,
                 threads=shown.threads,

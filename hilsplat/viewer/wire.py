@@ -9,8 +9,6 @@ from jaxtyping import UInt8
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from hilsplat.scene.cameras import Camera
-from hilsplat.scene.scene import Scene
-from hilsplat.splat.flyaround import closed_path, open_path
 
 MAX_SIDE_PX = 4096
 MAX_TEXT = 200
@@ -164,20 +162,6 @@ class Film(Asked):
     side_px: Annotated[int, Field(ge=64, le=1920)] = 640
     frames: Annotated[int, Field(ge=2, le=480)] = 120
     path: Annotated[list[WireCamera], Field(max_length=40)] = []
-
-    def cameras(self, scene: Scene) -> list[Camera]:
-        """The cameras of the flight."""
-        if len(self.path) > 1:
-            around, path = open_path, [camera.camera() for camera in self.path]
-        else:
-            around, path = (
-                closed_path,
-                [scene.cameras[view] for view in scene.views("train") or scene.views()],
-            )
-        height, width = path[0].size_hw
-        scale = self.side_px / max(height, width)
-        size_hw = (max(2, round(height * scale / 2) * 2), max(2, round(width * scale / 2) * 2))
-        return [camera.scaled(size_hw) for camera in around(path, self.frames)]
 
 
 class Group(Message):

@@ -84,6 +84,20 @@ def test_a_kept_query_is_changed(opened, desk_address):
     assert not chips(page).count()
 
 
+def test_a_kept_query_of_a_photograph_is_reopened_at_it(opened, desk_address):
+    page = opened(desk_address)
+    page.get_by_role("checkbox", name="only what this photograph shows").check()
+    view = page.evaluate("hilsplat.camera.view")
+    keep(page, "book")
+    page.get_by_role("checkbox", name="only what this photograph shows").uncheck()
+    page.locator("#view").focus()
+    drawn(page, lambda: page.keyboard.press("ArrowLeft"))
+    chips(page).first.get_by_title("Change it").click()
+    answers(page).first.wait_for()
+    assert page.get_by_role("checkbox", name="only what this photograph shows").is_checked()
+    assert page.evaluate("hilsplat.camera.view") == view
+
+
 def test_the_address_keeps_them(opened, desk_address):
     page = opened(desk_address)
     keep(page, "book")
@@ -151,6 +165,10 @@ def test_a_film_flies_along_the_path_of_the_user(opened, desk_address, tmp_path)
     assert count == 120
     page.locator("#save summary").click()
     assert page.locator("#path").input_value() == "path"
+    page.locator("#path").select_option("around")
+    page.locator("#save summary").click()
+    page.locator("#save summary").click()
+    assert page.locator("#path").input_value() == "around"  # a choice stays
     page.get_by_role("button", name="Clear").click()
     assert page.locator("#path").input_value() == "around"
 

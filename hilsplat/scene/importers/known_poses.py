@@ -90,7 +90,7 @@ EXPECTED = {
     "position": "coordinates up to 1e9",
 }
 FARTHEST = 1e9
-"""Coordinates beyond it are no longer told apart in 32 bits; of the source's units."""
+"""Largest coordinate, in the source's units: 32-bit numbers cannot resolve a scene beyond it."""
 
 
 def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | None:

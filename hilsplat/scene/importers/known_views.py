@@ -27,24 +27,21 @@ def known_views(known: KnownPoses) -> list[KnownView]:
     Raises:
         SceneError: they cannot be read.
     """
-    return checked(_described(known), known)
-
-
-def _described(known: KnownPoses) -> list[KnownView]:
     if known.kind == "colmap":
         return read_colmap(known)[0]
     if known.kind == "transforms":
         return read_transforms(known)[0]
     if known.kind == "polycam":
-        return read_polycam(known)
+        return checked(read_polycam(known), known)
     if known.kind == "record3d":
-        return read_record3d(known)
+        return checked(read_record3d(known), known)
     folder = known.root / "images"
     images = list_images(folder if folder.is_dir() else known.root)
-    return [
+    views = [
         KnownView(image.name, image, camera, pose)
         for image, camera, pose in llff_views(known.files[0], images)
     ]
+    return checked(views, known)
 
 
 def read_colmap(

@@ -1,6 +1,6 @@
 """Whether the binary files of a COLMAP model hold what they announce.
 
-pycolmap believes the counts in them: with a truncated file or a wrong count it fills memory without end.
+pycolmap does not check their counts: given a truncated file or a wrong count, it fills memory without end.
 """
 
 import mmap

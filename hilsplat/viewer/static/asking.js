@@ -93,7 +93,9 @@ export async function keepAnswer() {
   } catch (error) { failed(error); }
 }
 
-whenReopened(({ text, level: at, threshold: least }) => {
+whenReopened(({ text, level: at, threshold: least, view }) => {
+  $("here").checked = view !== undefined;
+  if (view !== undefined) page.camera.standAt(page.scene.views[view], view);
   document.querySelector(`[name=level][value=${at}]`).checked = true;
   $("threshold-on").checked = least !== undefined;
   if (least !== undefined) $("threshold-at").value = least;

@@ -19,13 +19,14 @@ function showPath() {
   const count = page.path.length, flies = $("path").querySelector("[value=path]");
   flies.disabled = count < 2;
   flies.textContent = `along your path (${counted(count, "view")})`;
-  $("path").value = count < 2 ? "around" : "path";
+  if (count < 2) $("path").value = "around";
   $("path-clear").hidden = !count;
 }
 
 function addToPath() {
   page.path.push(page.camera.copy());
   showPath();
+  if (page.path.length > 1) $("path").value = "path";
   tell(page.path.length < 2 ? "The path begins here. Add another view, and films fly along it." : `${counted(page.path.length, "view")} in the path. Save a film to fly along it.`);
 }
 
@@ -92,7 +93,6 @@ export function attachHands() {
     const chosen = selected(), count = chosen.reduce((sum, group) => sum + group.nodes.length, 0);
     $("save-what").textContent = page.chosen >= 0 ? `Of ${chosen[0].name}` : chosen.length ? `Of ${counted(count, "answer")} to ${chosen.map((group) => group.name).join(", ")}` : "Ask or choose something to save its Gaussians, boxes and masks.";
     for (const button of $("save").querySelectorAll("[data-nodes]")) button.disabled = !count || ("long" in button.dataset && !$("saving").hidden);
-    showPath();
   });
   $("save").addEventListener("click", async (event) => {
     const kind = event.target.closest("[data-save]")?.dataset.save;

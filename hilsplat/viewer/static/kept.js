@@ -17,11 +17,15 @@ async function answered(query) {
   for (const pane of panes) query.answers.push(await api.query({ variant: variantOf(pane), answerer: answererOf(pane), ...query.asked }));
 }
 
-const free = () => KEPT.findIndex((_, k) => page.kept.every((query) => query.colour !== k));
+// The colour that the fewest kept queries have.
+function freeColour() {
+  const used = KEPT.map((_, k) => page.kept.filter((query) => query.colour === k).length);
+  return used.indexOf(Math.min(...used));
+}
 
 export async function keep(asked) {
   if (page.kept.length >= MOST) { tell(`At most ${MOST} queries are kept: drop one first.`, true); return false; }
-  const same = page.kept.findIndex((query) => JSON.stringify(query.asked) === JSON.stringify(asked)), query = same < 0 ? { asked, shown: true, colour: Math.max(0, free()) } : page.kept[same];
+  const same = page.kept.findIndex((query) => JSON.stringify(query.asked) === JSON.stringify(asked)), query = same < 0 ? { asked, shown: true, colour: freeColour() } : page.kept[same];
   await answered(query);
   if (same < 0) page.kept.push(query);
   showKept();
