@@ -370,16 +370,18 @@ class LanguageScene:
 
         A part is called as part of its whole, "wheel of car", unless its name says that.
         """
-        if given := self.names.of_node.get(node, ""):
-            return given
-        own = self.naming.of_node[node] if self.naming is not None else ""
-        parent = int(self.tree.parent[node])
-        if not own or parent == NONE:
+        own, parent = self.own_name_of(node), int(self.tree.parent[node])
+        if not own or parent == NONE or node in self.names.of_node:
             return own
         while int(self.tree.parent[parent]) != NONE:
             parent = int(self.tree.parent[parent])
         whole = self.name_of(parent)
         return own if not whole or whole in own else f"{own} of {whole}"
+
+    def own_name_of(self, node: int) -> str:
+        """As `name_of`, without the whole that a part belongs to."""
+        called = self.naming.of_node[node] if self.naming is not None else ""
+        return self.names.of_node.get(node, "") or called
 
     def nodes_shown(self, view: str) -> Bool[np.ndarray, " n"]:
         """Which nodes have a mask of at least `MIN_SHOWN_SHARE` of a view."""

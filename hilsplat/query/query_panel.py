@@ -30,6 +30,8 @@ LEFT_PX = 24
 TITLE_PX = 20
 HEADING_PX = 26
 MAP_PX = 460
+NAMED = 3
+"""Most names of answers in the title."""
 
 
 def query_panel(
@@ -48,7 +50,9 @@ def query_panel(
     """
     last = path_of(text)[-1]
     found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
-    title = f"“{text}” in {scene.scene.name}: {found}{note}"
+    names = list(dict.fromkeys(scene.name_of(int(node)) or "?" for node in hits.ids))
+    called = f" ({', '.join([*names[:NAMED], *(['…'] if names[NAMED:] else [])])})" if names else ""
+    title = f"“{text}” in {scene.scene.name}: {found}{called}{note}"
     doubts = [*wrap(scene.caution_about(text), TITLE_LETTERS), *map(str, doubts_of(hits))]
     height, width = scene.scene.cameras[views[0]].size_hw
     row_px = TITLE_PX + round(CELL_PX * height / width) + GAP_PX

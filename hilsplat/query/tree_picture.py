@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
+from PIL import Image, ImageDraw, ImageFont
 
 from hilsplat.base.artifacts import write_json
 from hilsplat.base.images import write_png
@@ -14,7 +15,9 @@ from hilsplat.semantic_tree.export import readable_nodes, write_tree_ply
 
 CELL_PX = 84
 GAP_PX = 6
-LABEL_PX = 20
+LABEL_PX = 32
+"""A line for the name of a node and one for its number."""
+
 BLOCK_GAP_PX = 18
 MARGIN_PX = 84
 """Left margin, for the names of the levels."""
@@ -26,8 +29,7 @@ COLUMNS = 18
 BACKGROUND = 250
 LINE = (150, 150, 150)
 TEXT = (40, 40, 40)
-FONT = 0  # cv2.FONT_HERSHEY_SIMPLEX
-FONT_SCALE = 0.5
+TEXT_PX = 12
 
 
 def export_tree(folder: Path, variant: str, out: Path, threads: int) -> str:
@@ -56,7 +58,7 @@ def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
     """Draw the tree: one row of crops per level, blocks of a whole and all below it side by side.
 
     Orphans of finer levels have their own blocks at their level. A crop shows the node in the view that
-    shows it largest, with the rest of that view dimmed, above the node's number.
+    shows it largest, with the rest of that view dimmed, above the node's name and number.
     """
     tree = scene.tree
     roots = [node for level in LEVELS for node in tree.nodes_of(level) if tree.parent[node] == NONE]
@@ -93,25 +95,36 @@ def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
         placed.append((node, x, y))
         return x + CELL_PX // 2, used
 
+    labels: list[tuple[str, int, int]] = []
     for number, row in enumerate(rows):
         left, top = MARGIN_PX, number * height + GAP_PX
         for root in row:
             left += place(root, left, top)[1] + BLOCK_GAP_PX
-        for level in LEVELS:
-            _write(canvas, level.label, (MARGIN_PX // 2, top + level.index * ROW_PX + CELL_PX // 2 + 5))
+        labels += [
+            (level.label, MARGIN_PX // 2, top + level.index * ROW_PX + CELL_PX // 2) for level in LEVELS
+        ]
     for node, x, y in placed:
         canvas[y : y + CELL_PX, x : x + CELL_PX] = _crop(scene, node)
-        _write(canvas, str(node), (x + CELL_PX // 2, y + CELL_PX + LABEL_PX - 5))
-    return canvas
+        name, middle, line = scene.own_name_of(node) or "?", x + CELL_PX // 2, LABEL_PX // 2
+        labels += [(name, middle, y + CELL_PX + line // 2), (str(node), middle, y + CELL_PX + line * 3 // 2)]
+    return _labelled(canvas, labels)
 
 
-def _write(canvas: UInt8[np.ndarray, "H W 3"], text: str, middle_xy: tuple[int, int]) -> None:
-    """Write a word with the middle of its base line at a point."""
-    import cv2
+def _labelled(
+    canvas: UInt8[np.ndarray, "H W 3"], labels: list[tuple[str, int, int]]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Write texts around their places (x, y), no wider than a crop."""
+    from matplotlib.font_manager import findfont
 
-    (width, _), _ = cv2.getTextSize(text, FONT, FONT_SCALE, 1)
-    place = (middle_xy[0] - width // 2, middle_xy[1])
-    cv2.putText(canvas, text, place, FONT, FONT_SCALE, TEXT, 1, cv2.LINE_AA)
+    font = ImageFont.truetype(findfont("DejaVu Sans"), TEXT_PX)
+    picture = Image.fromarray(canvas)
+    draw = ImageDraw.Draw(picture)
+    for text, x, y in labels:
+        shown = text
+        while draw.textlength(shown, font) > CELL_PX + GAP_PX // 2:
+            shown = shown.rstrip("…")[:-1] + "…"
+        draw.text((x, y), shown, TEXT, font, anchor="mm")
+    return np.asarray(picture)
 
 
 def _leaves(tree, node: int) -> int:

@@ -1,5 +1,6 @@
 """3D measures of a tree against true nodes, by hand, and the tree's picture."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 from hilsplat.base.levels import Level
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations
 from hilsplat.evaluate.diagnostics.tree_truth import measure_tree
-from hilsplat.query.tree_picture import CELL_PX, tree_picture
+from hilsplat.query.names import NodeNames
+from hilsplat.query.tree_picture import CELL_PX, GAP_PX, LABEL_PX, tree_picture
 from hilsplat.semantic_tree.tree import SemanticTree
 
 TRUTH = HierarchyAnnotations(
@@ -96,3 +98,13 @@ def test_the_picture_has_a_row_of_crops_per_level(block_world):
     assert picture.shape[0] > 3 * CELL_PX
     # the crops are there: more than the background and its lines
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 5
+
+
+def test_the_picture_has_the_names_of_nodes(block_world):
+    answers = block_world.answers
+    without = tree_picture(answers)
+    longer = "a name that is far too long for the width of one crop"
+    named = tree_picture(replace(answers, names=NodeNames({0: longer})))
+    changed = np.argwhere((named != without).any(axis=2))
+    height, width = np.ptp(changed, axis=0)
+    assert 5 < height < LABEL_PX / 2 and CELL_PX / 2 < width < CELL_PX + GAP_PX

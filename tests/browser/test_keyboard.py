@@ -1,0 +1,66 @@
+"""Both pages by the keyboard alone: no test here has a pointer."""
+
+from hilsplat.annotate.labels import label_path, read_labels
+from hilsplat.base.artifacts import read_json
+from tests.browser.conftest import serving
+from tests.browser.test_annotate import SIZE
+
+MOST_STEPS = 80
+
+
+def tab_to(page, selector: str) -> None:
+    """Press Tab until an element has the focus."""
+    for _ in range(MOST_STEPS):
+        if page.evaluate("(selector) => document.activeElement.matches(selector)", selector):
+            return
+        page.keyboard.press("Tab")
+    raise AssertionError(f"Tab never reaches {selector}")
+
+
+def press(page, *keys: str) -> None:
+    for key in keys:
+        page.keyboard.press(key)
+
+
+def test_the_viewer_asks_walks_names_and_saves(opened, desk_address, desk, tmp_path):
+    page = opened(desk_address)
+    page.keyboard.type("mug > handle")  # the text box has the focus
+    press(page, "Enter")
+    tab_to(page, "#answers button")
+    press(page, "Enter", "u")  # the handle is chosen, then the mug that it is part of
+    mug = page.locator("#overlay path.chosen").get_attribute("data-node")
+    press(page, "n")
+    page.keyboard.type("Souvenir")
+    press(page, "Enter")
+    page.get_by_text("Named “Souvenir”").wait_for()
+    try:
+        (names,) = read_json(desk / "names.json")["trees"].values()
+        assert names == {mug: "Souvenir"}
+    finally:
+        (desk / "names.json").unlink()
+    tab_to(page, "#save summary")
+    press(page, "Enter")
+    tab_to(page, "[data-save=boxes]")
+    with page.expect_download() as started:
+        press(page, "Enter")
+    started.value.save_as(tmp_path / "boxes.json")
+    assert read_json(tmp_path / "boxes.json")
+
+
+def test_the_annotator_names_draws_corrects_and_saves(opened, desk, tmp_path):
+    with serving(desk, "annotate", "--data-root", str(tmp_path)) as address:
+        page = opened(address)
+        tab_to(page, "#text")
+        page.keyboard.type("mug")
+        press(page, "Enter")
+        tab_to(page, "#view")
+        for corner in ("Shift+ArrowLeft", "Shift+ArrowRight", "Shift+ArrowDown"):
+            press(page, *(["p"] if corner.endswith("Left") else []), corner, "Space")
+        press(page, "Enter")
+        tab_to(page, "[role=treeitem]")
+        press(page, "Enter")
+        page.locator("body[data-saved=true]").wait_for()
+        path = label_path(tmp_path / "annotated/photos/desk", "000.png")
+        (label,) = read_labels(path, SIZE)
+        assert label.text == "mug"
+        page.close()
