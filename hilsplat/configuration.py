@@ -40,6 +40,10 @@ CONFIG = Path("config/config.yaml")
 """The configuration of the project; files of `--configfile` override it."""
 
 
+LONGEST_SHOWN = 120
+"""Most letters of a value in a message."""
+
+
 class StageSettings(Section):
     """All sections, by name."""
 
@@ -134,6 +138,7 @@ def settings_error(error: ValidationError, where: str, model: type[BaseModel]) -
             lines.append(f"{place}: unknown key; {hint}")
         else:
             found = json.dumps(problem.get("input"), default=str)
+            found = found if len(found) <= LONGEST_SHOWN else f"{found[:LONGEST_SHOWN]}..."
             lines.append(f"{place}: {problem['msg']}; found {found}")
     return SettingsError("settings cannot be used:\n  " + "\n  ".join(lines))
 
@@ -397,13 +402,21 @@ def read_config(path: Path) -> dict[str, Any]:
         ) from error
     except FileNotFoundError as error:
         raise SettingsError(f"{path} is missing", fix="correct its path, which begins here") from error
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, OSError) as error:
+    except (
+        yaml.YAMLError,
+        ValueError,
+        RecursionError,
+        OSError,
+    ) as error:  # ValueError: no such day, no UTF-8
         raise SettingsError(f"{path} cannot be read: {error}", fix="save it as YAML in UTF-8") from error
-    if found is not None and not isinstance(found, dict):
-        raise SettingsError(
-            f"{path} does not hold settings", expected="lines of key: value", found=type(found).__name__
-        )
-    return found or {}
+    if not isinstance(found, dict):
+        kind = "nothing" if found is None else type(found).__name__
+        raise SettingsError(f"{path} does not hold settings", expected="lines of key: value", found=kind)
+    try:
+        json.dumps(found, default=str)
+    except (ValueError, RecursionError, TypeError) as error:  # an alias of what holds it; a list as key
+        raise SettingsError(f"{path} cannot be used: {error}", fix="write keys and values in full") from error
+    return found
 
 
 def merged_config(paths: Sequence[Path], *overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -416,6 +429,16 @@ def merged_config(paths: Sequence[Path], *overrides: Mapping[str, Any]) -> dict[
     for layer in (*map(read_config, paths), *overrides):
         merged = _merge(merged, layer)
     return merged
+
+
+def first_unusable(paths: Sequence[Path]) -> str:
+    """Name the first of the layers of `merged_config` that makes a configuration unusable."""
+    for count, name in enumerate([CONFIG, *paths]):
+        try:
+            parse_run(merged_config(paths[:count]))
+        except SettingsError:
+            return str(name)
+    return "--config"
 
 
 def _merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:

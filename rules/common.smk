@@ -28,9 +28,12 @@ LOCK = prepare_process()
 def own_cores():
     """Return the cores of this machine if it runs the jobs; None on a cluster, which is given --jobs instead."""
     try:
-        return workflow.cores or None
+        cores = workflow.cores
     except WorkflowError:
         return None
+    if cores < 1:
+        raise WorkflowError("with --cores 0 no job could start; expected at least 1")
+    return cores
 
 
 def cache_folder(wildcards, input):

@@ -66,7 +66,7 @@ rule table:
         mem_mb=RESOURCES.memory_mb("table"),
         runtime=RESOURCES.minutes("table"),
     params:
-        labels=PLAN.names(),
+        labels=PLAN.names,
         absent=lambda wildcards: targets.absent_options(PLAN, wildcards.table),
         code=PLAN.code("table"),
     shell:

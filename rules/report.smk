@@ -134,7 +134,7 @@ rule comparison:
     params:
         folder=lambda wildcards, input: str(Path(input.gaussians).parent),
         variants=PLAN.main_variants(),
-        names=PLAN.names(),
+        names=PLAN.names,
         settings=PLAN.settings("figures"),
         evaluate=PLAN.settings("evaluate"),
         queries=PLAN.queries,

@@ -1,6 +1,8 @@
 """Errors that a user can fix: where, expected, found, and the way out."""
 
 import errno
+import resource
+from pathlib import Path
 
 
 class HilsplatError(Exception):
@@ -34,29 +36,58 @@ class HilsplatError(Exception):
         self.args = (f"{self}\n  {name:<9} {value}",)
 
 
-def place_error(error: OSError) -> HilsplatError | None:
-    """An error of the system that a user can fix, in words; None for another one.
+def system_error(error: BaseException) -> HilsplatError | None:
+    """Return an error of the system that a user can fix, in words; None for any other error.
 
-    Missing files are not among them: every reader says which stage writes its file.
+    Libraries report that they cannot start a thread or be loaded in many ways: where memory is limited
+    (`ulimit -v`), this is taken for the reason.
     """
-    problem = PLACES.get(error.errno or 0)
-    if problem is None or error.filename is None:
+    is_limited = resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
+    by_library = isinstance(error, (RuntimeError, ImportError)) or (
+        isinstance(error, OSError) and error.errno is None
+    )
+    if isinstance(error, MemoryError) or (is_limited and by_library):
+        return HilsplatError(
+            f"there is not enough memory: {error or 'an allocation failed'}",
+            fix="end other programs, raise the limit (ulimit -v), or use smaller or fewer images",
+        )
+    problem = PLACES.get(error.errno or 0) if isinstance(error, OSError) else None
+    if problem is None or not isinstance(error, OSError):
         return None
     return HilsplatError(
-        f"{error.filename} {problem}",
+        f"{error.filename or 'standard output, or an open file,'} {problem}",
         found=error.strerror,
         fix="choose another place, or free this one",
     )
+
+
+def require_working_directory() -> None:
+    """Check that the working directory exists; a shell may stand in one that was deleted.
+
+    Raises:
+        HilsplatError: it does not.
+    """
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        raise HilsplatError(
+            "the working directory was deleted", fix="change to a folder that exists, and run again"
+        ) from None
 
 
 PLACES = {
     errno.EACCES: "may not be read or written",
     errno.EPERM: "may not be read or written",
     errno.EROFS: "is on a disk that can only be read",
+    errno.ENOENT: "does not exist, and cannot be created there",
     errno.ENOTDIR: "cannot be: a part of the path is a file",
     errno.EISDIR: "is a folder, where a file is needed",
     errno.EEXIST: "is in the way",
+    errno.ELOOP: "is a symbolic link that leads back to itself",
+    errno.EMFILE: "cannot be opened: too many files are open (ulimit -n)",
     errno.ENAMETOOLONG: "is longer than this disk takes",
+    errno.EFBIG: "would be larger than the limit of this shell (ulimit -f) or disk",
+    errno.EIO: "cannot be read or written: the disk reports an error",
     errno.ENOSPC: "does not fit on the disk, which is full",
     errno.EDQUOT: "does not fit into your share of the disk",
 }

@@ -18,7 +18,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import typer  # noqa: E402
 
-from hilsplat.base.errors import HilsplatError, place_error  # noqa: E402
+from hilsplat.base.errors import HilsplatError, require_working_directory, system_error  # noqa: E402
 from hilsplat.base.processes import end_with_workflow  # noqa: E402
 from hilsplat.cli.apps import app  # noqa: E402
 
@@ -35,14 +35,14 @@ def main() -> None:
     """Run the command; an error that a user can fix ends in a message, without a traceback."""
     end_with_workflow()
     try:
+        require_working_directory()
         app()
-    except HilsplatError as error:
-        logging.getLogger("hilsplat").error("%s", error)
-        sys.exit(1)
-    except OSError as error:
-        if (told := place_error(error)) is None:
+        sys.stdout.flush()
+    except Exception as error:
+        message = error if isinstance(error, HilsplatError) else system_error(error)
+        if message is None:
             raise
-        logging.getLogger("hilsplat").error("%s", told)
+        logging.getLogger("hilsplat").error("%s", message)
         sys.exit(1)
     finally:  # else Python's end searches all that numba and matplotlib made for garbage, for 0.4 s
         gc.freeze()
@@ -55,11 +55,15 @@ def options(
 ) -> None:
     """Handle the options before a command."""
     if log is not None:
+        if log.suffix != ".log" and log.is_file() and log.stat().st_size:
+            raise HilsplatError(
+                f"--log {log} exists and is not named as a log", fix="name a new file, or one in .log"
+            )
         try:
             log.parent.mkdir(parents=True, exist_ok=True)
             file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
         except OSError as error:
-            raise place_error(error) or error from None
+            raise system_error(error) or error from None
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
             os.dup2(file, stream.fileno())  # for libraries that print by themselves, too

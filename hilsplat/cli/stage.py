@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from hilsplat.base.artifacts import output_lock, parse_json, provenance_path, require_free_space
-from hilsplat.base.errors import HilsplatError, SettingsError, place_error
+from hilsplat.base.errors import HilsplatError, SettingsError, system_error
 from hilsplat.base.progress import LOG_FORMAT
 from hilsplat.models.store import model_path
 from hilsplat.workflow.stages import stage_code
@@ -21,7 +21,17 @@ PathOut = Annotated[Path, typer.Option(help="output; written atomically", show_d
 Settings = Annotated[
     str, typer.Option(help="settings of the stage as JSON; missing keys take their defaults")
 ]
-Threads = Annotated[int, typer.Option(min=1, help="number of threads; results do not depend on it")]
+Threads = Annotated[
+    int,
+    typer.Option(
+        min=1,
+        callback=lambda number: min(number, MOST_THREADS),
+        help="number of threads; results do not depend on it",
+    ),
+]
+MOST_THREADS = max(16, os.cpu_count() or 1)
+"""More threads than this only take time and memory to start."""
+
 Memory = Annotated[
     float | None,
     typer.Option(
@@ -116,7 +126,7 @@ def stage(
     except HilsplatError:
         raise
     except Exception as error:  # a bug of ours: the traceback belongs in the log
-        if isinstance(error, OSError) and (problem := place_error(error)) is not None:
+        if (problem := system_error(error)) is not None:
             raise problem from error
         logging.getLogger("hilsplat").exception("%s failed on %s", name, out)
         sys.exit(1)

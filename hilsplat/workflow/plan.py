@@ -390,8 +390,8 @@ class Plan:
         """Parameter: the variants of the main tables, as JSON."""
         return json.dumps(self.run.main_variants)
 
-    def names(self) -> str:
-        """Parameter: variant -> its name in tables and figures, as JSON."""
+    def names(self, _: object) -> str:
+        """Parameter: variant -> its name in tables and figures, as JSON; Snakemake would expand a text."""
         return inert(json.dumps(dict(self.run.labels)))
 
     def queries(self, job: Job) -> str:

@@ -24,10 +24,10 @@ from pathlib import Path
 import yaml
 
 from hilsplat.base.artifacts import write_text
-from hilsplat.base.errors import HilsplatError
+from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.base.processes import jobs_end_with_this_process, remove_leftovers
-from hilsplat.configuration import CONFIG, merged_config, parse_run
+from hilsplat.configuration import CONFIG, first_unusable, merged_config, parse_run
 from hilsplat.scene.sheet import DEFAULT_SHEET, SceneRow, read_sheet
 from hilsplat.workflow.forecast import forecasts
 from hilsplat.workflow.plan import Plan
@@ -140,9 +140,20 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
     parser.add_argument("--configfile", "--configfiles", nargs="+", action="extend", type=Path, default=[])
     given, others = parser.parse_known_args(list(options))
     configs = [project_path(path) for path in (*configs, *given.configfile)]
-    pairs = [word.partition("=") for word in given.config]
-    settings = merged_config(configs, {key: yaml.safe_load(value) for key, _, value in pairs})
-    chosen = parse_run(settings)
+    try:
+        overrides = {
+            key: yaml.safe_load(value) for key, _, value in (word.partition("=") for word in given.config)
+        }
+    except yaml.YAMLError as error:
+        raise SettingsError(
+            f"--config is not YAML: {error}", expected="key=value", found=" ".join(given.config)
+        ) from error
+    settings = merged_config(configs, overrides)
+    try:
+        chosen = parse_run(settings)
+    except SettingsError as error:
+        error.add_line("in", first_unusable(configs))
+        raise
     rows = read_sheet(project_path(chosen.scenes), chosen.groups, chosen.data_root)
     scenes = [target for target in targets if any(target in (row.name, row.scene) for row in rows)]
     files = f"{chosen.results}/"

@@ -420,7 +420,7 @@ def test_no_text_of_a_configuration_can_end_a_script_of_the_report(tmp_path):
         evaluate={"template": f"{hostile} {{}}", "canonical": [hostile]},
     )
     job = Job("photos", "desk")
-    texts = [found.queries(job), found.names(), found.settings("evaluate")(job)]
+    texts = [found.queries(job), found.names(job), found.settings("evaluate")(job)]
     assert not any("<" in text for text in texts)
     queries, names, evaluate = map(json.loads, texts)
     assert (queries, names) == ([hostile], {"default": hostile})
