@@ -43,7 +43,9 @@ def _with_suffix(folder: Path, suffixes: Collection[str]) -> list[Path]:
     return sorted(
         path
         for path in Path(folder).iterdir()
-        if path.is_file() and path.suffix.lower() in suffixes and not path.name.startswith(".")
+        if path.suffix.lower() in suffixes
+        and not path.name.startswith(".")
+        and (path.is_file() or (path.is_symlink() and not path.exists()))  # who reads such a link is told
     )
 
 

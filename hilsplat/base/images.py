@@ -74,6 +74,8 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     path = Path(path)
     try:
         with open_image(path) as image:
+            if (num_frames := _frames(image)) > 1:
+                raise ValueError(f"it holds {num_frames} pictures of one size, as an animation does")
             image.load()
             upright = ImageOps.exif_transpose(image)
             if upright.mode.startswith("I"):  # Pillow would clip what exceeds 255
@@ -95,6 +97,18 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
             found=f"a file of {size} bytes",
             fix="remove it from the folder, or replace it with an intact copy",
         ) from error
+
+
+def _frames(image: Image.Image) -> int:
+    """Return the number of frames of an animation; further pictures of telephones and previews are none."""
+    num_frames = int(getattr(image, "n_frames", 1))
+    if num_frames < 2 or image.format in ("MPO", "HEIF"):
+        return 1
+    size = image.size
+    image.seek(1)
+    same = image.size == size
+    image.seek(0)
+    return num_frames if same else 1
 
 
 def _to_srgb(image: Image.Image, path: Path) -> Image.Image:

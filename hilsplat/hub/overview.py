@@ -2,7 +2,14 @@
 
 from hilsplat.base.errors import HilsplatError
 from hilsplat.embed.model_check import check_model
-from hilsplat.models.store import RECOMMENDED, RELEASES, present_models, real_model, user_models
+from hilsplat.models.store import (
+    RECOMMENDED,
+    RELEASES,
+    broken_models,
+    present_models,
+    real_model,
+    user_models,
+)
 
 COLUMNS = "{:<24} {:<5} {:>8}  {:<11} {:<14} {}"
 
@@ -49,10 +56,10 @@ def check_models() -> tuple[str, int]:
         what `check_model` says about each, and how many do not work.
     """
     texts, num_failed = [], 0
-    for model in present_models():
+    for folder in [*(model.folder for model in present_models()), *broken_models()]:
         try:
-            texts.append(check_model(model.folder))
+            texts.append(check_model(folder))
         except HilsplatError as error:
-            texts.append(f"{model.folder} does not work: {error}")
+            texts.append(f"{folder} does not work: {error}")
             num_failed += 1
     return "\n\n".join(texts) or "there is no model", num_failed

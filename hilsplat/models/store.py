@@ -148,19 +148,27 @@ def present_models(*stores: Path) -> list[PresentModel]:
             user's, and the embedded models of the installation.
     """
     order = {release.name: number for number, release in enumerate(RELEASES)}
-    folders = [
-        path for store in stores or (MODELS, user_models()) for path in store.glob("[!.]*") if path.is_dir()
-    ]
-    if not stores:
-        folders += [project_path(path) for path in EMBEDDED.values()]
     by_name: dict[str, PresentModel] = {}
-    for folder in folders:
+    for folder in _folders(*stores):
         if folder.name not in by_name and (model := read_model(folder)) is not None:
             by_name[folder.name] = model
     return sorted(
         by_name.values(),
         key=lambda model: (model.embedded, order.get(model.folder.name, len(order)), model.folder.name),
     )
+
+
+def broken_models() -> list[Path]:
+    """Return folders that have networks, but no configuration of a model that we read."""
+    folders = {folder.resolve(): folder for folder in _folders()}.values()
+    return [folder for folder in folders if any(folder.rglob("*.onnx")) and read_model(folder) is None]
+
+
+def _folders(*stores: Path) -> list[Path]:
+    folders = [
+        path for store in stores or (MODELS, user_models()) for path in store.glob("[!.]*") if path.is_dir()
+    ]
+    return folders + [project_path(path) for path in EMBEDDED.values() if not stores]
 
 
 def real_model(family: str) -> Path | None:

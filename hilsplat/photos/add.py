@@ -118,6 +118,9 @@ def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
     checked: list[CheckedPhoto] = []
     for path in track(list_images(where), "photographs checked"):
         require_usable_name(path)
+        if not path.exists():
+            unreadable.append((path.name, "it is a link to a file that does not exist"))
+            continue
         if path.stat().st_size == 0:
             unreadable.append((path.name, "the file is empty"))
             continue

@@ -69,7 +69,7 @@ def _check(archive: Path, entries: list[zipfile.ZipInfo]) -> None:
     names: set[str] = set()
     for entry in entries:
         name = PurePosixPath(entry.filename)
-        if name.is_absolute() or ".." in name.parts or "\\" in entry.filename or ":" in entry.filename:
+        if name.is_absolute() or ".." in name.parts or "\\" in entry.filename:
             problem = "leads out of the archive's folder"
         elif stat.S_ISLNK(entry.external_attr >> 16):
             problem = "is a link"

@@ -18,7 +18,7 @@ from hilsplat.base.device import is_installed
 from hilsplat.base.errors import HilsplatError
 from hilsplat.configuration import merged_config
 from hilsplat.models.memory import machine_mib
-from hilsplat.models.store import RECOMMENDED, present_models, user_models
+from hilsplat.models.store import RECOMMENDED, broken_models, present_models, user_models
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.resources import COSTS, JobResources
 
@@ -155,17 +155,17 @@ def models() -> Iterator[Finding]:
 
     real = [model for model in present_models() if not model.embedded]
     missing = {"sam", "clip"} - {model.family for model in real}
-    for model in real or present_models():
+    for folder in [*(model.folder for model in real or present_models()), *broken_models()]:
         try:
-            check_model(model.folder)
-            apart = provider_disagreement(model.folder)
+            check_model(folder)
+            apart = provider_disagreement(folder)
         except HilsplatError as error:
-            yield Finding("models", "fault", str(error), f"hilsplat models get {model.folder.name}")
+            yield Finding("models", "fault", str(error), f"hilsplat models get {folder.name}")
             continue
         if apart:
-            yield Finding("models", "fault", f"{model.folder}: {apart}", "pip install onnxruntime instead")
+            yield Finding("models", "fault", f"{folder}: {apart}", "pip install onnxruntime instead")
         else:
-            yield Finding("models", "ok", f"{model.folder} works on {' and '.join(execution_providers())}")
+            yield Finding("models", "ok", f"{folder} works on {' and '.join(execution_providers())}")
     if missing:
         names = " and no ".join(family.upper() for family in sorted(missing))
         yield Finding(

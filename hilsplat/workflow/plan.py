@@ -101,6 +101,10 @@ class Plan:
         Raises:
             HilsplatError: the message names the setting, and a scene and variant that have it.
         """
+        if self.results.exists() and not self.results.is_dir():
+            raise SettingsError(
+                f"results: {self.results} is not a folder", fix="move that file away, or name another folder"
+            )
         seen: set[Any] = set()
         for row in self.scenes:
             for variant in self.run.variant_names():

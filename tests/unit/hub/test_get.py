@@ -71,6 +71,9 @@ def test_without_a_name_the_recommended_pair_arrives_and_is_used(hub, repositori
     (target / "onnx" / ENCODER).write_bytes(b"damaged")
     report, num_failed = check_models()
     assert num_failed == 1 and "models/sam2.1-hiera-small does not work" in report
+    (target / "config.json").write_text("{")
+    report, num_failed = check_models()
+    assert num_failed == 1 and "has no readable config.json" in report
 
 
 def test_the_origin_names_repository_commit_and_digests(hub, repositories):

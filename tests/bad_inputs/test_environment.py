@@ -1,0 +1,52 @@
+"""What surrounds a command may be unusable: the output, the limits of the shell, the working directory."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.bad_inputs.test_bad_inputs import CONTRIBUTE, MASKS
+
+QUERY = "query photos/desk mug --out answers"
+STAGE = " ".join(CONTRIBUTE)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        (f"{QUERY} > /dev/full", "standard output, or an open file, does not fit on the disk, which is full"),
+        ("--help > /dev/full", "standard output"),
+        (f"ulimit -f 1; {QUERY}", "larger than the limit of this shell (ulimit -f)"),
+        (f"ulimit -f 1; {STAGE}", "larger than the limit of this shell (ulimit -f)"),
+        (f"ulimit -v 300000; {QUERY}", "not enough memory"),
+        (f"mkdir gone; cd gone; rmdir ../gone; {QUERY}", "the working directory was deleted"),
+        ("query photos/desk mug --out /proc/x", "/proc/x does not exist, and cannot be created there"),
+        ("export photos/desk --out /proc/x", "/proc/x does not exist, and cannot be created there"),
+        (f"--log config/config.yaml coverage-tree --masks {MASKS} --out new", "is not named as a log"),
+        ("run -- --cores 0", "with --cores 0 no job could start"),
+        ("run -- --config 'only=[1'", "--config is not YAML"),
+    ],
+)
+def test_what_surrounds_a_command(line: str, words: str, project: Path):
+    *before, command = line.split("; ")
+    script = "; ".join([*before, f"{sys.executable} -m hilsplat {command}"])
+    ended = subprocess.run(script, shell=True, cwd=project, capture_output=True, text=True, timeout=300)
+    said = ended.stdout + ended.stderr
+    assert ended.returncode not in (0, None)
+    assert words in said
+    assert "Traceback" not in said
+    assert not list(project.rglob(".writing-*"))
+
+
+def test_more_threads_than_cores_cost_nothing(project: Path):
+    script = f"{sys.executable} -m hilsplat {QUERY} --threads 100000"
+    assert subprocess.run(script, shell=True, cwd=project, timeout=60, check=True).returncode == 0
+
+
+def test_results_that_are_a_file(project: Path):
+    (project / "elsewhere").write_text("")
+    script = f"{sys.executable} -m hilsplat run -- -n --config results=elsewhere groups=[ci]"
+    ended = subprocess.run(script, shell=True, cwd=project, capture_output=True, text=True, timeout=300)
+    assert ended.returncode == 1
+    assert "elsewhere is not a folder" in ended.stdout + ended.stderr
