@@ -89,6 +89,7 @@ def open_scene(code_name: str, threads: int = 1) -> LanguageScene:
         view_area_px=np.ones((num, 1), np.float32),
         view_names=(VIEW,),
         gaussians_sha256="",
+        cameras_sha256="",
         min_weight=1 / 255,
     )
     cameras = Cameras((VIEW,), np.eye(4)[None], camera.K[None], np.array([SIZE_HW], np.int32))

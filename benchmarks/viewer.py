@@ -7,7 +7,6 @@ paints with WebGL in software (Mesa's llvmpipe), and then the server paints.
 """
 
 import argparse
-import json
 import shutil
 import statistics
 import sys
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 import psutil
 
-from hilsplat.base.artifacts import sha256_of_file
+from hilsplat.base.artifacts import read_index, sha256_of_file, write_index
 from hilsplat.base.tables import markdown_table
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply, save_ply
@@ -63,9 +62,9 @@ def enlarged(folder: Path, times: int, out: Path) -> Path:
         arrays = dict(held)
     arrays["node_of_gaussian"] = arrays["node_of_gaussian"][rows]
     np.savez(tree / "tree.npz", **arrays)
-    index = json.loads((tree / "index.json").read_text())
+    index = read_index(tree)
     index["gaussians_sha256"] = sha256_of_file(out / "gaussians.ply")
-    (tree / "index.json").write_text(json.dumps(index))
+    write_index(tree, index.pop("views"), **index)
     return out
 
 

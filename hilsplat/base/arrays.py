@@ -5,15 +5,19 @@ an artifact is opened, against the annotations of its dataclass (dtype and shape
 equal), for finite values, and against limits.
 """
 
+import json
+import zlib
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
+import safetensors.numpy
 from jaxtyping import AbstractArray, jaxtyped
+from safetensors import SafetensorError, safe_open
 
-from hilsplat.base.artifacts import read_npz, remake
+from hilsplat.base.artifacts import atomic_path, parse_json, read_npz, remake
 from hilsplat.base.errors import ArtifactError
 
 Made = TypeVar("Made")
@@ -75,12 +79,22 @@ def read_into(maker: type[Made], path: Path, limits: Limits | None = None, **mor
         ArtifactError: the file is missing or damaged, another version of the program wrote it, or an array
             is not what the dataclass declares.
     """
-    arrays = read_npz(path)
-    expected = _arguments(maker) - set(more)
-    if set(arrays) != expected:
+    return made(maker, read_npz(path), more, path, limits)
+
+
+def made(
+    maker: type[Made],
+    arrays: Mapping[str, np.ndarray],
+    more: Mapping[str, Any],
+    path: Path,
+    limits: Limits | None = None,
+) -> Made:
+    """Make a dataclass from the arrays of a file and other fields; see `read_into`."""
+    expected = {field.name for field in fields(maker) if field.init}  # type: ignore[arg-type]
+    if {*arrays, *more} != expected:
         raise ArtifactError(
             f"{path} is of another version",
-            expected=", ".join(sorted(expected)),
+            expected=", ".join(sorted(expected - set(more))),
             found=", ".join(sorted(arrays)) or "no array",
             fix=remake(path),
         )
@@ -88,6 +102,39 @@ def read_into(maker: type[Made], path: Path, limits: Limits | None = None, **mor
     return maker(**arrays, **more)
 
 
-def _arguments(maker: type) -> set[str]:
-    assert is_dataclass(maker), maker
-    return {field.name for field in fields(maker) if field.init}
+TENSORS_KEY = "hilsplat"
+"""Entry of a .safetensors file's metadata: JSON of what is known about its arrays, with their checksum."""
+
+
+def write_tensors(path: Path, arrays: Mapping[str, np.ndarray], **about: Any) -> None:
+    """Write a .safetensors file atomically; the same arrays give the same bytes."""
+    arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    known = json.dumps({**about, "crc32": _checksum(arrays, about)}, sort_keys=True)
+    with atomic_path(path) as temporary:
+        safetensors.numpy.save_file(arrays, temporary, metadata={TENSORS_KEY: known})
+
+
+def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Read the arrays of a .safetensors file, and what is known about them.
+
+    Raises:
+        ArtifactError: the file is missing or damaged, or was not written by `write_tensors`.
+    """
+    try:
+        with safe_open(path, framework="np") as file:
+            about = parse_json(file.metadata()[TENSORS_KEY])
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        if about.pop("crc32") != _checksum(arrays, about):
+            raise ValueError("its content was changed after it was written")
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ArtifactError(f"{path} cannot be read: {error}", fix=remake(path)) from error
+    return arrays, about
+
+
+def _checksum(arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> int:
+    total = zlib.crc32(json.dumps(about, sort_keys=True).encode())
+    for name in sorted(arrays):
+        array = arrays[name]
+        total = zlib.crc32(f"{name} {array.dtype.str} {array.shape}".encode(), total)
+        total = zlib.crc32(array.reshape(-1).view(np.uint8).data, total)
+    return total

@@ -1,8 +1,10 @@
 """Atomic writers, readers and digests of artifacts, view caches and output locks."""
 
+import copy
 import ctypes
 import errno
 import fcntl
+import functools
 import hashlib
 import json
 import os
@@ -385,23 +387,87 @@ def visible_files(folder: Path) -> list[Path]:
 
 
 def write_index(folder: Path, views: Mapping[str, Any], **more: Any) -> None:
-    """Complete a folder artifact: write `index.json` with one entry per view, keyed by view name."""
-    write_json(Path(folder) / INDEX, {**more, "views": dict(views)})
+    """Complete a folder artifact: write `index.json`, which seals the folder.
+
+    It has one entry per view, keyed by view name, a checksum of each file but images, and one of itself.
+    """
+    folder = Path(folder)
+    files = sorted(path for path in folder.rglob("*") if path.suffix in SEALED)
+    sums = {path.relative_to(folder).as_posix(): _crc32_of_file(path) for path in files}
+    index = {**more, "views": dict(views), "crc32": sums}
+    write_json(folder / INDEX, {**index, "seal": _seal(index)})
+
+
+SEALED = (".json", ".npy", ".npz", ".safetensors")
+"""Files of an artifact whose checksums are in its index. Images have their own."""
 
 
 def read_index(folder: Path) -> dict[str, Any]:
     """Read a folder artifact's index.
 
     Raises:
-        ArtifactError: there is no index, so the folder is missing or incomplete.
+        ArtifactError: there is no index, so the folder is missing or incomplete, or it was changed.
     """
-    path = Path(folder) / INDEX
-    if not path.is_file():
-        raise ArtifactError(f"{folder} is missing or incomplete: it has no {INDEX}", fix=remake(Path(folder)))
+    return copy.deepcopy(_index(Path(folder)))
+
+
+def _index(folder: Path) -> dict[str, Any]:
+    try:
+        found = (folder / INDEX).stat()
+    except OSError as error:
+        raise ArtifactError(
+            f"{folder} is missing or incomplete: it has no {INDEX}", fix=remake(folder)
+        ) from error
+    return _unsealed(folder / INDEX, found.st_mtime_ns, found.st_size, found.st_ino)
+
+
+@functools.lru_cache(maxsize=16)
+def _unsealed(path: Path, *_: int) -> dict[str, Any]:
+    """Read an index and compare it with its seal; reads of one state of the file share the result."""
     index = read_json(path)
-    if not isinstance(index, dict) or not isinstance(index.get("views", {}), dict):
-        raise ArtifactError(f"{path} is not the index of an artifact", fix=remake(path))
+    if not isinstance(index, dict) or not isinstance(index.get("views"), dict) or "seal" not in index:
+        raise ArtifactError(
+            f"{path} is not the index of an artifact, or is of another version", fix=remake(path)
+        )
+    if index.pop("seal") != _seal(index):
+        raise _changed(path)
     return index
+
+
+def sealed(folder: Path, name: str) -> Path:
+    """Return the path of an artifact's file, after comparing its bytes with the index.
+
+    Raises:
+        ArtifactError: the file is missing, or is not as it was written.
+    """
+    path = Path(folder) / name
+    sums = _index(Path(folder))["crc32"]
+    if not path.is_file():
+        raise ArtifactError(f"{path} is missing", fix=remake(path))
+    if sums.get(name) != _crc32_of_file(path):
+        raise _changed(path)
+    return path
+
+
+def _changed(path: Path) -> ArtifactError:
+    return ArtifactError(
+        f"{path} was changed after it was written",
+        expected=f"the bytes whose checksum is in {INDEX}",
+        fix=remake(path),
+    )
+
+
+def _seal(index: Mapping[str, Any]) -> int:
+    as_read = json.loads(json.dumps(index))  # JSON has no tuples, and its keys are texts
+    return zlib.crc32(json.dumps(as_read, sort_keys=True).encode())
+
+
+def _crc32_of_file(path: Path) -> int:
+    total = 0
+    with path.open("rb") as stream:
+        while block := stream.read(1 << 20):
+            total = zlib.crc32(block, total)
+    return total
 
 
 def read_full_index(folder: Path, *entries: str) -> dict[str, Any]:

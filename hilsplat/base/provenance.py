@@ -1,7 +1,6 @@
 """Provenance of artifacts, written beside them, and what a command may replace: its own earlier outputs."""
 
 import functools
-import json
 import os
 import platform
 import subprocess
@@ -11,8 +10,17 @@ from pathlib import Path
 from typing import Any
 
 from PIL import Image
+from pydantic import BaseModel, ValidationError
 
-from hilsplat.base.artifacts import lock_path, provenance_path, sha256_of_path, visible_files, write_json
+from hilsplat.base.artifacts import (
+    lock_path,
+    provenance_path,
+    read_json,
+    remake,
+    sha256_of_path,
+    visible_files,
+    write_json,
+)
 from hilsplat.base.errors import ArtifactError, HilsplatError
 
 LIBRARIES = (
@@ -154,6 +162,62 @@ def write_provenance(
     )
 
 
+class Written(BaseModel):
+    """An output as it was written.
+
+    Attributes:
+        sha256: as `sha256_of_path`.
+        bytes: as `sizes_of`.
+    """
+
+    sha256: str
+    bytes: dict[str, int]
+
+
+class Read(BaseModel):
+    """An input as a stage read it.
+
+    Attributes:
+        path: file or folder.
+        sha256: as `sha256_of_path`; None: there was nothing.
+        files: for a list of files, the digest of each.
+    """
+
+    path: str
+    sha256: str | None = None
+    files: dict[str, str | None] | None = None
+
+
+class Provenance(BaseModel):
+    """What `write_provenance` records, as far as it is read again; see there."""
+
+    stage: str
+    code: str
+    plugins: tuple[str, ...]
+    settings: dict[str, Any]
+    seed: int | None
+    inputs: dict[str, Read]
+    outputs: dict[str, Written]
+
+
+def read_provenance(artifact: Path) -> Provenance | None:
+    """Read the provenance of an artifact; None if it has none.
+
+    Raises:
+        ArtifactError: it is damaged.
+    """
+    path = provenance_path(artifact)
+    if not path.is_file():
+        return None
+    try:
+        return Provenance.model_validate(read_json(path))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise ArtifactError(
+            f"{path} is damaged: {'.'.join(map(str, first['loc']))}: {first['msg']}", fix=remake(artifact)
+        ) from error
+
+
 def sizes_of(path: Path) -> dict[str, int]:
     """Return the size in bytes of each file of an artifact by its path inside; a file has the path "."."""
     path = Path(path)
@@ -280,12 +344,12 @@ def _foreign(path: Path) -> ArtifactError:
 
 def _recorded_outputs(artifact: Path, stage: str) -> set[Path]:
     try:
-        record = json.loads(provenance_path(artifact).read_text(encoding="utf-8"))
-        if record["stage"] != stage:
-            return set()
-        return {(artifact.parent / name).resolve() for name in record["outputs"]}
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        record = read_provenance(artifact)
+    except ArtifactError:
         return set()
+    if record is None or record.stage != stage:
+        return set()
+    return {(artifact.parent / name).resolve() for name in record.outputs}
 
 
 def _is_something(path: Path) -> bool:

@@ -168,12 +168,12 @@ def load_quadratic(folder: Path, threads: int = 1) -> Quadratic:
     """
     if (folder / "G").is_dir():
         indptr, indices, values = (
-            mapped(folder / "G" / f"{name}.npy") for name in ("indptr", "indices", "values")
+            mapped(folder, f"G/{name}.npy") for name in ("indptr", "indices", "values")
         )
         return Gram(indptr, indices, values, threads)
     if (folder / "W").is_dir():
         names = ("indptr", "indices", "data", "columns", "valid")
-        indptr, indices, data, columns, valid = (mapped(folder / "W" / f"{name}.npy") for name in names)
+        indptr, indices, data, columns, valid = (mapped(folder, f"W/{name}.npy") for name in names)
         shape = (len(indptr) - 1, int(columns[0]))
         return StackedWeights(sp.csr_matrix((data, indices, indptr), shape=shape, copy=False), valid)
     raise ArtifactError(f"{folder} holds neither G nor W", fix="run the contributions stage again")

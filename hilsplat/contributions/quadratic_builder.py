@@ -8,7 +8,15 @@ from pathlib import Path
 import numpy as np
 import scipy.sparse as sp
 
-from hilsplat.base.artifacts import INDEX, atomic_folder, read_index, read_npy, sha256_of_json, write_index
+from hilsplat.base.artifacts import (
+    INDEX,
+    atomic_folder,
+    read_index,
+    read_npy,
+    sealed,
+    sha256_of_json,
+    write_index,
+)
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
 from hilsplat.contributions.gram_builder import GramBuilder
@@ -184,7 +192,7 @@ class QuadraticCheckpoint:
             return 0
         try:
             index = read_index(self._folder)
-            state = {name: read_npy(self._folder / f"{name}.npy") for name in index["arrays"]}
+            state = {name: read_npy(sealed(self._folder, f"{name}.npy")) for name in index["arrays"]}
         except ArtifactError as error:
             logger.warning("discarding an incomplete checkpoint of the contributions: %s", error)
             self.forget()

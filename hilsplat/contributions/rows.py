@@ -8,7 +8,7 @@ import scipy.sparse as sp
 from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 
 from hilsplat.base.arrays import read_into
-from hilsplat.base.artifacts import read_full_index, read_npy
+from hilsplat.base.artifacts import read_full_index, read_npy, sealed
 from hilsplat.base.levels import Level
 from hilsplat.contributions.quadratic import Quadratic, load_quadratic
 from hilsplat.contributions.streams import mapped
@@ -25,6 +25,7 @@ class Contributions:
         views: train views in the order of `view`.
         num_gaussians: N.
         gaussians_sha256: digest of the PLY that the weights belong to.
+        cameras_sha256: digest of the scene's cameras.
         min_weight: smaller weights of a Gaussian at a pixel were dropped.
         view: index of each row's view in `views`.
         mask: row of the mask among its view's masks.
@@ -38,6 +39,7 @@ class Contributions:
     views: tuple[str, ...]
     num_gaussians: int
     gaussians_sha256: str
+    cameras_sha256: str
     min_weight: float
     view: Int32[np.ndarray, " M"]
     mask: Int32[np.ndarray, " M"]
@@ -59,20 +61,20 @@ class Contributions:
 
     def matrix(self, name: str) -> sp.csr_matrix:
         """`A`, `A_half` or `S` (M x N), mapped from its file rather than held in memory."""
-        parts = (mapped(self.folder / name / f"{part}.npy") for part in ("data", "indices", "indptr"))
+        parts = (mapped(self.folder, f"{name}/{part}.npy") for part in ("data", "indices", "indptr"))
         return sp.csr_matrix(tuple(parts), shape=(len(self), self.num_gaussians), copy=False)
 
     def mass(self) -> Float32[np.ndarray, "V N"]:
         """Visible mass of each Gaussian in each train view, px; mapped from its file."""
-        return mapped(self.folder / "mass.npy")
+        return mapped(self.folder, "mass.npy")
 
     def means(self) -> Float32[np.ndarray, "N 3"]:
         """Centres of the Gaussians, scene units."""
-        return read_npy(self.folder / "means.npy")
+        return read_npy(sealed(self.folder, "means.npy"))
 
     def centres(self) -> Float64[np.ndarray, "V 3"]:
         """Centres of the cameras, scene units."""
-        return read_npy(self.folder / "centres.npy")
+        return read_npy(sealed(self.folder, "centres.npy"))
 
     def quadratic(self, threads: int = 1) -> Quadratic:
         """Map G, or the stacked weights if those are smaller."""
@@ -86,13 +88,14 @@ class Contributions:
             ArtifactError: it is missing, damaged or of another version.
         """
         folder = Path(folder)
-        index = read_full_index(folder, "num_gaussians", "gaussians_sha256", "min_weight")
+        index = read_full_index(folder, "num_gaussians", "gaussians_sha256", "cameras_sha256", "min_weight")
         return read_into(
             Contributions,
-            folder / "rows.npz",
+            sealed(folder, "rows.npz"),
             folder=folder,
             views=tuple(index["views"]),
             num_gaussians=index["num_gaussians"],
             gaussians_sha256=index["gaussians_sha256"],
+            cameras_sha256=index["cameras_sha256"],
             min_weight=index["min_weight"],
         )

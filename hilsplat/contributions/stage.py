@@ -186,6 +186,7 @@ def run_contributions(
             scene=scene.name,
             num_gaussians=len(gaussians),
             gaussians_sha256=gaussians_sha256,
+            cameras_sha256=sha256_of_file(scene_folder / "cameras.npz"),
             min_weight=settings.min_weight,
             num_masks=counts["masks"],
             nonzeros=nonzeros,

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.artifacts import sealed
 
 HEADER_BYTES = 128
 
@@ -81,19 +81,13 @@ class MatrixStream:
             stream.close()
 
 
-def mapped(path: Path) -> np.ndarray:
-    """Map an array from its file, read-only.
+def mapped(folder: Path, name: str) -> np.ndarray:
+    """Map an array from a file of an artifact, read-only.
 
     Raises:
-        ArtifactError: the file is missing or damaged.
+        ArtifactError: the file is missing, or is not as it was written.
     """
-    try:
-        # A file without any number cannot be mapped.
-        mode: Literal["r"] | None = "r" if path.stat().st_size > HEADER_BYTES else None
-        return np.load(path, mmap_mode=mode, allow_pickle=False).view(np.ndarray)
-    except FileNotFoundError as error:
-        raise ArtifactError(f"{path} is missing", fix="run the contributions stage again") from error
-    except (ValueError, OSError) as error:
-        raise ArtifactError(
-            f"{path} cannot be read: {error}", fix="delete the folder and run the contributions stage again"
-        ) from error
+    path = sealed(folder, name)
+    # A file without any number cannot be mapped.
+    mode: Literal["r"] | None = "r" if path.stat().st_size > HEADER_BYTES else None
+    return np.load(path, mmap_mode=mode, allow_pickle=False).view(np.ndarray)

@@ -14,6 +14,7 @@ from hilsplat.base.artifacts import (
     atomic_folder,
     read_index,
     read_npz,
+    sealed,
     sha256_of_bytes,
     sha256_of_file,
     sha256_of_json,
@@ -214,8 +215,7 @@ def chosen_masks(semantic_tree_folder: Path, per_node: int) -> dict[str, Int64[n
         semantic_tree_folder: output of the semantic tree's stage.
         per_node: the most crops of a node, by rank.
     """
-    path = Path(semantic_tree_folder) / "tree.npz"
-    rank = read_npz(path, "crop_rank")["crop_rank"]
+    rank = read_npz(sealed(semantic_tree_folder, "tree.npz"), "crop_rank")["crop_rank"]
     is_chosen = (rank >= 0) & (rank < per_node)
     if not is_chosen.any():
         is_chosen[:] = True

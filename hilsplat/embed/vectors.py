@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Shaped
 
-from hilsplat.base.artifacts import read_npy, remake
+from hilsplat.base.artifacts import read_npy, remake, sealed
 from hilsplat.base.errors import ArtifactError
 from hilsplat.segment.digests import require_same_masks
 
@@ -21,7 +21,7 @@ def mask_embeddings(clip_folder: Path, folder: Path) -> Float32[np.ndarray, "M C
         MisalignedArtifactError: the vectors were computed from other masks.
     """
     views = require_same_masks(clip_folder, folder)
-    parts = [read_npy(Path(clip_folder) / f"{view}.npy") for view in views]
+    parts = [read_npy(sealed(clip_folder, f"{view}.npy")) for view in views]
     widths = {part.shape[1] if part.ndim == 2 else -1 for part in parts}
     if len(widths) > 1 or -1 in widths:
         raise ArtifactError(

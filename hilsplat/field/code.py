@@ -5,12 +5,12 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32
-from safetensors import SafetensorError, safe_open
 
-from hilsplat.base.artifacts import parse_json, read_npz, remake
+from hilsplat.base.arrays import read_tensors
+from hilsplat.base.artifacts import read_npz, remake, sealed
 from hilsplat.base.errors import ArtifactError
 from hilsplat.contributions.rows import Contributions
-from hilsplat.field.linear_code import METADATA_KEY, LinearCode
+from hilsplat.field.linear_code import LinearCode
 from hilsplat.segment.digests import require_same_masks
 
 CHUNK_ROWS = 4096
@@ -46,17 +46,15 @@ def load_code(folder: Path) -> Code:
         ArtifactError: the file is missing or damaged.
     """
     path = autoencoder_file(folder)
+    state, about = read_tensors(path)
     try:
-        with safe_open(path, framework="np") as file:
-            about = parse_json(file.metadata()[METADATA_KEY])
-            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         if about.get("code") == "pca":
             return LinearCode(state["mean"], state["basis"])
         from hilsplat.field.network_code import Autoencoder
 
         return Autoencoder.from_arrays(about["channels"], about["latent"], state)
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ArtifactError(f"{path} cannot be read: {error}", fix=remake(path)) from error
+    except (KeyError, ValueError) as error:
+        raise ArtifactError(f"{path} is of another version: {error}", fix=remake(path)) from error
 
 
 def autoencoder_file(folder: Path) -> Path:
@@ -71,4 +69,4 @@ def load_latents(folder: Path, contributions: Contributions) -> Float32[np.ndarr
         MisalignedArtifactError: the latents belong to other masks.
     """
     require_same_masks(folder, contributions.folder)
-    return read_npz(Path(folder) / "latents.npz", "latents")["latents"]
+    return read_npz(sealed(folder, "latents.npz"), "latents")["latents"]

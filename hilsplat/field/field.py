@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilsplat.base.artifacts import read_index, read_npz, sha256_of_file, write_json
+from hilsplat.base.artifacts import read_index, read_npz, sealed, sha256_of_file, write_json
 from hilsplat.base.device import compute_device
 from hilsplat.base.errors import MisalignedArtifactError, SettingsError
 from hilsplat.base.progress import stage_log
@@ -140,5 +140,5 @@ def read_parents(tree_folder: Path, contributions: Contributions) -> dict[str, n
     """
     require_same_masks(tree_folder, contributions.folder)
     return {
-        view: read_npz(Path(tree_folder) / f"{view}.npz", "parent")["parent"] for view in contributions.views
+        view: read_npz(sealed(tree_folder, f"{view}.npz"), "parent")["parent"] for view in contributions.views
     }

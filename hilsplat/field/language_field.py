@@ -1,17 +1,12 @@
 """The language field: one latent per Gaussian and level."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import safetensors.numpy
 from jaxtyping import Float32
-from safetensors import SafetensorError, safe_open
 
-from hilsplat.base.artifacts import atomic_path, parse_json, remake
-from hilsplat.base.errors import ArtifactError
-from hilsplat.field.linear_code import METADATA_KEY
+from hilsplat.base.arrays import made, read_tensors, write_tensors
 
 
 @dataclass(frozen=True)
@@ -31,10 +26,7 @@ class LanguageField:
     def save(self, path: Path) -> None:
         """Write `field.safetensors` atomically; the same field gives the same bytes."""
         about = {"gaussians_sha256": self.gaussians_sha256, "autoencoder_sha256": self.autoencoder_sha256}
-        metadata = {METADATA_KEY: json.dumps(about, sort_keys=True)}
-        features = np.ascontiguousarray(self.features)
-        with atomic_path(path) as temporary:
-            safetensors.numpy.save_file({"features": features}, temporary, metadata=metadata)
+        write_tensors(path, {"features": self.features}, **about)
 
     @staticmethod
     def load(path: Path) -> "LanguageField":
@@ -43,12 +35,7 @@ class LanguageField:
         Raises:
             ArtifactError: the file is missing, damaged or not a language field.
         """
-        try:
-            with safe_open(path, framework="np") as file:
-                about = parse_json(file.metadata()[METADATA_KEY])
-                return LanguageField(file.get_tensor("features"), **about)
-        except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
-            raise ArtifactError(f"{path} cannot be read: {error}", fix=remake(path)) from error
+        return made(LanguageField, *read_tensors(path), path)
 
 
 def report_path(field: Path) -> Path:

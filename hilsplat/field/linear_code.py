@@ -1,15 +1,11 @@
 """A linear code of CLIP vectors, their mean and principal directions: the alternative to the network."""
 
-import json
 from pathlib import Path
 
 import numpy as np
-import safetensors.numpy
 from jaxtyping import Float32
 
-from hilsplat.base.artifacts import atomic_path
-
-METADATA_KEY = "hilsplat"
+from hilsplat.base.arrays import write_tensors
 
 
 class LinearCode:
@@ -78,9 +74,5 @@ class LinearCode:
 
     def save(self, path: Path) -> None:
         """Write a .safetensors file; the same code gives the same bytes."""
-        about = {"code": "pca", "channels": self.channels, "latent": self.latent}
-        metadata = {METADATA_KEY: json.dumps(about, sort_keys=True)}
-        with atomic_path(path) as temporary:
-            safetensors.numpy.save_file(
-                {"mean": self.mean, "basis": np.ascontiguousarray(self.basis)}, temporary, metadata=metadata
-            )
+        arrays = {"mean": self.mean, "basis": self.basis}
+        write_tensors(path, arrays, code="pca", channels=self.channels, latent=self.latent)

@@ -1,6 +1,5 @@
 """The scene autoencoder of LangSplat: a trained network from CLIP vectors to a few numbers and back."""
 
-import json
 from collections.abc import Mapping
 from functools import cached_property
 from itertools import pairwise
@@ -8,12 +7,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import safetensors.numpy
 from jaxtyping import Float32
 
-from hilsplat.base.artifacts import atomic_path
+from hilsplat.base.arrays import write_tensors
 from hilsplat.field.decoder_kernel import PackedLayers
-from hilsplat.field.linear_code import METADATA_KEY
 
 ENCODER_WIDTHS = (256, 128, 64, 32)
 DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
@@ -140,6 +137,4 @@ class Autoencoder:
 
     def save(self, path: Path) -> None:
         """Write a .safetensors file; the same weights give the same bytes."""
-        about = json.dumps({"channels": self.channels, "latent": self.latent}, sort_keys=True)
-        with atomic_path(path) as temporary:
-            safetensors.numpy.save_file(self.arrays, temporary, metadata={METADATA_KEY: about})
+        write_tensors(path, self.arrays, channels=self.channels, latent=self.latent)

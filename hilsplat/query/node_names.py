@@ -16,6 +16,7 @@ from hilsplat.base.artifacts import (
     read_json,
     read_npy,
     remake,
+    sealed,
     sha256_of_file,
     sha256_of_json,
     write_index,
@@ -143,13 +144,13 @@ class NodeNaming:
         made_for = index["tree_sha256"], index["clip_sha256"]
         if made_for != (tree_digest(semantic_tree), _clip_digest(clip_folder)):
             return None
-        rows = read_json(folder / "names.json")
+        rows = read_json(sealed(folder, "names.json"))
         try:
             found = NodeNaming(
                 tuple(str(row["name"]) for row in rows),
                 tuple(tuple((text, float(value)) for text, value in row["candidates"]) for row in rows),
                 tuple(bool(row["surface"]) for row in rows),
-                read_npy(folder / "rivals.npy").astype(np.float32),
+                read_npy(sealed(folder, "rivals.npy")).astype(np.float32),
             )
             if len(rows) != index["nodes"] or found.rivals.ndim != 2:
                 raise ValueError(f"{len(rows)} names, rivals of shape {found.rivals.shape}")

@@ -86,6 +86,9 @@ class OpenedParts:
             require_made_for(code_file, opened.get(sha256_of_file, code_file), scene.name, own)
             code = opened.get(load_code, parts.autoencoder)
             clip.require_width(code.channels, f"autoencoder {parts.autoencoder}")
+        cameras = parts.scene / "cameras.npz"
+        own = {"semantic tree": tree.cameras_sha256}
+        require_made_for(cameras, opened.get(sha256_of_file, cameras), scene.name, own)
         require_made_for(parts.gaussians, opened.get(sha256_of_file, parts.gaussians), scene.name, made_for)
         drawn = is_drawn(parts.scene)
         caution = meaningless(clip.model.folder.name) if is_embedded(clip.model.config) and not drawn else ""

@@ -5,8 +5,11 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from hilsplat.base.artifacts import provenance_path, read_index, read_json, sha256_of_file
+from pydantic import ValidationError
+
+from hilsplat.base.artifacts import provenance_path, read_index, sha256_of_file
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
+from hilsplat.base.provenance import read_provenance
 from hilsplat.settings import EvaluateSettings, Section
 
 KEY_VIEWS = "key-views"
@@ -147,22 +150,27 @@ def refining(folder: Path) -> str:
 
 def is_drawn(scene: Path) -> bool:
     """Whether the views of a `Scene` artifact were drawn from the synthetic world, by its provenance."""
-    record = provenance_path(scene)
-    if not record.is_file():
-        return False
-    images = Path(read_json(record)["inputs"].get("images", {}).get("path", ""))
-    return images.parts[-2:] == ("world", "images")
+    record = read_provenance(scene)
+    images = record.inputs.get("images") if record else None
+    return images is not None and Path(images.path).parts[-2:] == ("world", "images")
 
 
 def _recorded_settings(artifact: Path) -> dict[str, Any]:
     """Settings in an artifact's provenance; none if it has no provenance."""
-    record = provenance_path(artifact)
-    return read_json(record)["settings"] if record.is_file() else {}
+    record = read_provenance(artifact)
+    return record.settings if record else {}
 
 
 def _section(section: type[Section], found: dict[str, Any]) -> Any:
     """A section from recorded settings; knobs missing from the record take their defaults."""
-    return section(**{name: value for name, value in found.items() if name in section.model_fields})
+    try:
+        return section(**{name: value for name, value in found.items() if name in section.model_fields})
+    except ValidationError as error:
+        raise ArtifactError(
+            f"recorded settings cannot be used: {error.errors(include_url=False)[0]['msg']}",
+            expected=f"values of {section.__name__}",
+            fix="remove the damaged provenance of the scores, or run the workflow again",
+        ) from error
 
 
 def finished_variants(folder: Path) -> list[str]:
@@ -182,9 +190,9 @@ def _input_of(artifact: Path, name: str, folder: Path) -> Path:
 
 def _recorded_input(artifact: Path, name: str, folder: Path) -> Path | None:
     """Path of an artifact's input from its provenance, inside the scene's folder, which may have moved."""
-    record = provenance_path(artifact)
-    if record.is_file():
-        path = Path(read_json(record)["inputs"].get(name, {}).get("path", ""))
+    record = read_provenance(artifact)
+    if record is not None and name in record.inputs:
+        path = Path(record.inputs[name].path)
         recorded = folder / path.parent.name / path.name
         if path.name and recorded.exists():
             return recorded

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Int32, UInt8
 
-from hilsplat.base.artifacts import read_index, read_npz
+from hilsplat.base.artifacts import read_index, read_npz, sealed
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, NONE, Level
@@ -173,6 +173,6 @@ def masks_overview(
     write_png(out_png, masks_picture(image, masks), text=SOFTWARE)
     if tree_folder is not None:
         require_same_masks(tree_folder, masks_folder)
-        parent = read_npz(Path(tree_folder) / f"{chosen}.npz", "parent")["parent"]
+        parent = read_npz(sealed(tree_folder, f"{chosen}.npz"), "parent")["parent"]
         write_png(tree_png, tree_picture(image, masks, parent), text=SOFTWARE)
     return chosen

@@ -22,6 +22,7 @@ from hilsplat.base.artifacts import (
     read_full_index,
     read_index,
     remake,
+    sealed,
     write_index,
     write_json,
     write_npz,
@@ -86,6 +87,7 @@ class SemanticTree:
         view_area_px: pixels of its masks in each view.
         view_names: the columns of `view_area_px`.
         gaussians_sha256: digest of the PLY the tree belongs to.
+        cameras_sha256: digest of the scene's cameras.
         min_weight: the contributions dropped smaller weights; views are drawn with the same limit.
     """
 
@@ -106,6 +108,7 @@ class SemanticTree:
     view_area_px: Float32[np.ndarray, "T V"]
     view_names: tuple[str, ...]
     gaussians_sha256: str
+    cameras_sha256: str
     min_weight: float
 
     def __len__(self) -> int:
@@ -173,13 +176,14 @@ class SemanticTree:
             MisalignedArtifactError: the vectors belong to other masks, or to another tree of these masks.
         """
         folder = Path(folder)
-        index = read_full_index(folder, "gaussians_sha256", "min_weight")
+        index = read_full_index(folder, "gaussians_sha256", "cameras_sha256", "min_weight")
         tree = read_into(
             SemanticTree,
-            folder / "tree.npz",
+            sealed(folder, "tree.npz"),
             LIMITS,
             view_names=tuple(index["views"]),
             gaussians_sha256=index["gaussians_sha256"],
+            cameras_sha256=index["cameras_sha256"],
             min_weight=index["min_weight"],
         )
         tree._require_whole(folder / "tree.npz")
@@ -294,6 +298,7 @@ def build_tree(
         view_area_px=view_area.astype(np.float32),
         view_names=contributions.views,
         gaussians_sha256=contributions.gaussians_sha256,
+        cameras_sha256=contributions.cameras_sha256,
         min_weight=contributions.min_weight,
     )
 
@@ -359,5 +364,6 @@ def run_semantic_tree(
                 masks_with_node=int((tree.linked_node >= 0).sum()),
                 masks=len(contributions),
                 gaussians_sha256=contributions.gaussians_sha256,
+                cameras_sha256=contributions.cameras_sha256,
                 min_weight=contributions.min_weight,
             )

@@ -12,10 +12,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from hilsplat.base.artifacts import lock_path, provenance_path, read_json, sha256_of_path
+from hilsplat.base.artifacts import lock_path, provenance_path, sha256_of_path
 from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.base.progress import track
-from hilsplat.base.provenance import sizes_of
+from hilsplat.base.provenance import Provenance, read_provenance, sizes_of
 from hilsplat.datasets.sources import is_exported
 from hilsplat.methods.registry import OURS
 from hilsplat.models.digests import model_digest
@@ -182,25 +182,24 @@ class Records:
             artifact: file or folder.
             expected: how the plan makes it; None compares only with the current code.
         """
-        path = provenance_path(artifact)
-        if not path.is_file():
-            return DAMAGED, "it has no provenance"
         try:
-            record = read_json(path)
-            damage = self._damage(artifact, record)
-            reason = next(self._differences(record, expected), None)
-        except (ArtifactError, KeyError, TypeError, AttributeError):
+            record = read_provenance(artifact)
+        except ArtifactError:
             return DAMAGED, "its provenance is damaged"
+        if record is None:
+            return DAMAGED, "it has no provenance"
+        damage = self._damage(artifact, record)
+        reason = next(self._differences(record, expected), None)
         if damage:
             return DAMAGED, damage
         return (STALE, reason) if reason else (WHOLE, "")
 
-    def _damage(self, artifact: Path, record: Mapping[str, Any]) -> str | None:
+    def _damage(self, artifact: Path, record: Provenance) -> str | None:
         """Return which file is missing or not as it was written."""
         lock = lock_path(artifact)
         unfinished = lock.is_file() and lock.stat().st_size > 0
-        for name, written in record["outputs"].items():
-            path, sizes = artifact.parent / name, written["bytes"]
+        for name, written in record.outputs.items():
+            path, sizes = artifact.parent / name, written.bytes
             if not path.exists():
                 return f"{path.name} is missing"
             found = sizes_of(path)
@@ -209,33 +208,33 @@ class Records:
             if wrong := sorted(file for file in found if sizes.get(file) != found[file]):
                 return f"{path.name if wrong[0] == '.' else wrong[0]} is not as it was written"
             if not self.every_byte and not unfinished:
-                self._digests[path] = written["sha256"]
-            elif self._digest(path) != written["sha256"]:
+                self._digests[path] = written.sha256
+            elif self._digest(path) != written.sha256:
                 return f"{path.name} is not as it was written"
         return None
 
-    def _differences(self, record: Mapping[str, Any], expected: Expected | None) -> Iterator[str]:
+    def _differences(self, record: Provenance, expected: Expected | None) -> Iterator[str]:
         """Yield how an artifact was made differently from now, and which of its inputs changed."""
-        stage, plugins = record["stage"], tuple(record["plugins"])
+        stage, plugins = record.stage, record.plugins
         if expected is not None and stage != IMPORTED:
             if stage != expected.stage:
                 yield f"stage {stage} made it, not {expected.stage}"
-            then, now = record["settings"], expected.settings
+            then, now = record.settings, expected.settings
             for name in sorted(then.keys() | now.keys()):
                 made, wanted = then.get(name), now.get(name)
                 if made != wanted:
                     yield f"it was made with {name} {made!r}, and the configuration says {wanted!r}"
-            if record["seed"] != expected.seed:
-                yield f"it was made with seed {record['seed']}, and the configuration says {expected.seed}"
+            if record.seed != expected.seed:
+                yield f"it was made with seed {record.seed}, and the configuration says {expected.seed}"
             stage, plugins = expected.stage, expected.plugins
         try:
             code = stage_code(stage, plugins)
         except HilsplatError:  # a stage or a reader that this version does not have
             code = ""
-        if code != record["code"]:
+        if code != record.code:
             yield "other code made it"
-        for name, read in record["inputs"].items():
-            files = read["files"] if "files" in read else {read["path"]: read["sha256"]}
+        for name, read in record.inputs.items():
+            files = {read.path: read.sha256} if read.files is None else read.files
             for file, digest in files.items():
                 recorded = Path(file)
                 inside = recorded.parts[:1] in (("results",), (self.results.name,))

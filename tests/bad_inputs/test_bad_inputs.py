@@ -8,7 +8,7 @@ import shutil
 import struct
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +16,16 @@ import pytest
 import yaml
 from PIL import Image
 
+from hilsplat.base.arrays import read_tensors, write_tensors
 from hilsplat.base.artifacts import ViewCache, write_npz
 from hilsplat.base.device import cuda_missing
 from hilsplat.configuration import read_config
 from hilsplat.datasets.images.isat import read_isat
+from hilsplat.scene.scene import Scene
 from hilsplat.splat.ply import load_ply
 from hilsplat.workflow.plan import Plan
 from tests.bad_inputs.conftest import snapshot
+from tests.unit.artifact_changes import change_index, write_record
 from tests.unit.finished_desk import SCENE
 
 MASKS, TREE, CLIP = SCENE / "default/masks", SCENE / "default/coverage_tree", SCENE / "default/clip"
@@ -91,6 +94,39 @@ def change(path: Path, offset: float | bytes, new: bytes) -> Callable[[], object
         path.write_bytes(bytes(content))
 
     return lay
+
+
+def flip(path: Path, share: float) -> Callable[[], object]:
+    """Flip one bit at a share of a file."""
+
+    def lay() -> None:
+        content = bytearray(path.read_bytes())
+        content[int(share * len(content))] ^= 4
+        path.write_bytes(content)
+
+    return lay
+
+
+def edit(path: Path, old: bytes, new: bytes) -> Callable[[], object]:
+    def lay() -> None:
+        content = path.read_bytes()
+        assert content.count(old) == 1
+        path.write_bytes(content.replace(old, new))
+
+    return lay
+
+
+def resave_field(change: Callable[[np.ndarray], np.ndarray]) -> None:
+    arrays, about = read_tensors(FIELD)
+    write_tensors(FIELD, {"features": change(arrays["features"])}, **about)
+
+
+def move_cameras(folder: Path) -> None:
+    scene = Scene.load(folder)
+    poses = scene.cameras.cam_from_world.copy()
+    poses[:, 0, 3] += 1
+    replace(scene.cameras, cam_from_world=poses).save(folder / "cameras.npz")
+    change_index(folder)
 
 
 def as_folder(path: Path) -> Callable[[], object]:
@@ -180,19 +216,19 @@ ROWS = [
         "trees without their array",
         lambda: write_npz(TREE / "000.png.npz", other=np.zeros(1)),
         SOLVE,
-        ("000.png.npz lacks parent", "found", "other", f"--forcerun {TREE}"),
+        ("000.png.npz was changed after it was written", f"--forcerun {TREE}"),
     ),
     Row(
         "latents without their array",
         lambda: write_npz(CODE / "latents.npz", other=np.zeros(1)),
         SOLVE,
-        ("latents.npz lacks latents", f"--forcerun {CODE}"),
+        ("latents.npz was changed after it was written", f"--forcerun {CODE}"),
     ),
     Row(
         "cameras without their arrays",
         lambda: write_npz(SCENE / "scene/cameras.npz", names=np.zeros(1)),
         CONTRIBUTE,
-        ("cameras.npz lacks cam_from_world",),
+        ("cameras.npz was changed after it was written",),
     ),
     Row(
         "an index that is a list",
@@ -211,7 +247,7 @@ ROWS = [
         "a scene's index of the wrong shape",
         write(SCENE / "scene/index.json", '{"views": {}}'),
         CONTRIBUTE,
-        ("is of another version", "name, unit in index.json"),
+        ("index.json is not the index of an artifact, or is of another version",),
     ),
     Row(
         "Gaussians that are a folder",
@@ -251,7 +287,51 @@ ROWS = [
             str(CLIP),
             *OUT,
         ),
-        ("000.png.npy cannot be read", "not numbers", f"--forcerun {CLIP}"),
+        ("000.png.npy was changed after it was written", f"--forcerun {CLIP}"),
+    ),
+    Row("one bit of a field", flip(FIELD, 0.7), ASK, ("field.safetensors cannot be read", "changed after")),
+    Row(
+        "a field of another type",
+        lambda: resave_field(lambda features: features.astype(np.float64)),
+        ASK,
+        ("array features cannot be used", "Float32", "float64"),
+    ),
+    Row(
+        "a field of nan",
+        lambda: resave_field(lambda features: features * np.nan),
+        ASK,
+        ("array features cannot be right", "finite"),
+    ),
+    Row(
+        "a number in an index as text",
+        edit(SCENE / "default/semantic_tree/index.json", b'"min_weight": 0', b'"min_weight": "'),
+        ASK,
+        ("index.json is not valid JSON", "--forcerun"),
+    ),
+    Row(
+        "an index with another number",
+        edit(CONTRIBUTIONS / "index.json", b'"num_gaussians": 8', b'"num_gaussians": 9'),
+        SOLVE,
+        ("index.json was changed after it was written", f"--forcerun {CONTRIBUTIONS}"),
+    ),
+    Row("vectors of nothing", write(CLIP / "index.json", "[]"), ASK, ("is not the index of an artifact",)),
+    Row(
+        "one number of G",
+        flip(CONTRIBUTIONS / "G/values.npy", 0.5),
+        SOLVE,
+        ("G/values.npy was changed after it was written", f"--forcerun {CONTRIBUTIONS}"),
+    ),
+    Row(
+        "cameras of another scene beside a tree",
+        lambda: move_cameras(SCENE / "scene"),
+        ASK,
+        ("the semantic tree of photos/desk was made for another cameras.npz",),
+    ),
+    Row(
+        "provenance whose outputs are a list",
+        lambda: write_record(FIELD, outputs=[]),
+        ASK,
+        ("field.safetensors.provenance.json is damaged: outputs",),
     ),
     # ---- queries
     Row(

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilsplat.base.artifacts import provenance_path, write_json
 from tests.bad_inputs.conftest import snapshot
 from tests.bad_inputs.test_bad_inputs import CODE, CONTRIBUTIONS, TREE
+from tests.unit.artifact_changes import write_record
 from tests.unit.finished_desk import SCENE
 
 SIZE_KIB = 4096
@@ -96,7 +96,7 @@ def test_a_full_disk_is_told_and_costs_nothing(case: str, disk: Path, told: Call
     stage = {"field.safetensors": "field", "gaussians.ply": "gaussians", "scene": "poses"}.get(
         out.name, out.name
     )
-    write_json(provenance_path(out), {"stage": stage, "outputs": {out.name: {}}})
+    write_record(out, stage=stage, outputs={out.name: {"sha256": "", "bytes": {}}})
     textured(Path("photos"))
     leave(disk, kib)
     before = snapshot(disk)

@@ -13,6 +13,7 @@ from hilsplat.base.artifacts import atomic_folder
 from hilsplat.datasets.registry import open_labelled
 from tests.browser.conftest import serving
 from tests.conftest import PROJECT
+from tests.unit.artifact_changes import change_index
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, WIDTH, region_mask
 
 SIZE = (HEIGHT, WIDTH + NUM_VIEWS)
@@ -348,9 +349,7 @@ def test_corners_of_the_chosen_outline_are_moved_added_and_taken_out(page, root)
 def test_sam_outlines_what_is_clicked(opened, browser, desk, tmp_path):
     folder = tmp_path / "results/photos/desk"
     shutil.copytree(desk, folder)
-    index = json.loads((folder / "default/masks/index.json").read_text())
-    sam = {"segmenter": "sam", "model": str(PROJECT / "models/sam-tiny")}
-    (folder / "default/masks/index.json").write_text(json.dumps({**index, **sam}))
+    change_index(folder / "default/masks", segmenter="sam", model=str(PROJECT / "models/sam-tiny"))
     with serving(folder, "annotate", "--data-root", str(tmp_path)) as address:
         page = opened(address)
         page.locator("#view").press("s")

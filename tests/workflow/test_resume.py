@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.unit.artifact_changes import change_index
 from tests.workflow.conftest import SCENE, Project
 
 
@@ -75,6 +76,7 @@ def test_a_killed_stage_resumes(copy_of_finished: Project, name: str, entries: i
 
 def test_one_more_view_costs_one_view(copy_of_finished: Project) -> None:
     """When a view is added, masks and CLIP of the other views come from the cache."""
+    from hilsplat.base.artifacts import read_index
     from hilsplat.scene.scene import Scene
 
     project = copy_of_finished
@@ -83,10 +85,10 @@ def test_one_more_view_costs_one_view(copy_of_finished: Project) -> None:
     cache = {stage: project.root / "results/.cache" / stage for stage in ("masks", "clip")}
 
     def run_with_training_views(views: list[str]) -> dict[str, set[Path]]:
-        index = json.loads((folder / "scene/index.json").read_text())
-        for name, entry in index["views"].items():
+        entries = read_index(folder / "scene")["views"]
+        for name, entry in entries.items():
             entry["split"] = "train" if name in views else "test"
-        (folder / "scene/index.json").write_text(json.dumps(index))
+        change_index(folder / "scene", views=entries)
         for stage in ("masks", "contributions", "semantic_tree", "clip"):
             shutil.rmtree(folder / "default" / stage)
             record = json.loads((folder / f"default/{stage}.provenance.json").read_text())

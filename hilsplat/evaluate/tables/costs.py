@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hilsplat.base.artifacts import provenance_path, read_json
+from hilsplat.base.provenance import read_provenance
 from hilsplat.base.tables import read_csv, write_csv
 from hilsplat.evaluate.tables.efficiency import Job, read_benchmark
 
@@ -140,10 +140,8 @@ def jobs_of(scores: Path) -> dict[str, Job | None]:
 
 
 def _inputs(artifact: Path) -> dict[str, Path]:
-    record = provenance_path(artifact)
-    if not record.is_file():
-        return {}
-    return {name: Path(entry["path"]) for name, entry in read_json(record)["inputs"].items()}
+    record = read_provenance(artifact)
+    return {name: Path(entry.path) for name, entry in record.inputs.items()} if record else {}
 
 
 def _seconds(jobs: Mapping[str, Job | None], stages: tuple[str, ...]) -> float:

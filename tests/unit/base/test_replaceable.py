@@ -5,12 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from hilsplat.base.artifacts import lock_path, provenance_path, write_json
+from hilsplat.base.artifacts import lock_path, provenance_path
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.images import write_png
 from hilsplat.base.provenance import SOFTWARE, require_beginning, require_own_picture, require_replaceable
 from hilsplat.cli.main import app
 from hilsplat.cli.stage import stage
+from tests.unit.artifact_changes import write_record
 from tests.unit.finished_desk import HEIGHT
 
 
@@ -24,7 +25,8 @@ def photographs(tmp_path) -> Path:
 
 
 def record(out: Path, stage: str, *names: str) -> None:
-    write_json(provenance_path(out), {"stage": stage, "outputs": {name: {} for name in (out.name, *names)}})
+    written = {"sha256": "", "bytes": {}}
+    write_record(out, stage=stage, outputs=dict.fromkeys((out.name, *names), written))
 
 
 def files(folder: Path) -> dict[str, bytes]:

@@ -204,6 +204,7 @@ def test_the_smaller_quadratic_is_kept_and_read_back_equal(tmp_path):
         kept = chosen_quadratic(part, keep)
         folder = tmp_path / keep
         kept.save(folder)
+        write_index(folder, {})
         again = load_quadratic(folder)
         assert type(again) is type(kept)
         assert np.array_equal(again.product(features), kept.product(features))

@@ -145,6 +145,7 @@ def block_world(tmp_path_factory) -> BlockWorld:
         view_area_px=np.array([[region(row).sum()] for row in range(len(NODES))], np.float32),
         view_names=("000.png",),
         gaussians_sha256="0",
+        cameras_sha256="0",
         min_weight=1 / 255,
     )
     answers = LanguageScene(

@@ -17,6 +17,7 @@ from hilsplat.field.network_code import Autoencoder, torch_generator
 from hilsplat.field.network_training import loss_gradients, statistics, torch_order, train_autoencoder
 from hilsplat.semantic_tree.tree import SemanticTree, run_semantic_tree
 from hilsplat.settings import AutoencoderSettings, SemanticTreeSettings
+from tests.unit.artifact_changes import change_index
 from tests.unit.two_boxes_world import build_contributions, reverse_masks
 
 QUICK = AutoencoderSettings(code="network", latent=3, epochs=1, min_steps=200)
@@ -217,6 +218,7 @@ def test_targets_of_masks_without_vectors_are_refused(boxes_with_tree):
     own = read_npy(world.clip / "001.png.npy")
     own[2] = 0
     write_npy(world.clip / "001.png.npy", own)
+    change_index(world.clip)
     inputs = world.clip, tree, contributions, world.folder / "autoencoder"
     own_vectors = AutoencoderSettings(latent=2, targets="mask")
     with pytest.raises(ArtifactError, match=r"1 of 24 masks have no CLIP vector(.|\n)*clip\.crops: masks"):

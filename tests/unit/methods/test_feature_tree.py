@@ -36,7 +36,7 @@ def test_the_distance_is_half_of_what_lies_between_masks_of_one_parent():
     sizes = np.full(6, 5)
     view, mask = np.array([0, 0, 0, 0, 0, 1], np.int32), np.array([0, 1, 2, 3, 4, 0], np.int32)
     level = np.array([1, 1, 2, 2, 2, 1], np.uint8)
-    contributions = Contributions(Path(), ("a", "b"), 3, "", 0.0, view, mask, level, sizes, sizes, sizes)
+    contributions = Contributions(Path(), ("a", "b"), 3, "", "", 0.0, view, mask, level, sizes, sizes, sizes)
     parents = {"a": np.array([-1, -1, 0, 0, 1]), "b": np.array([-1])}
     means = np.array([[0, 0], [4, 0], [1, 0], [1, 1], [9, 0], [50, 0]], np.float32)
     assert farthest_alike(means, contributions, parents) == (2.0, 0.5, np.inf)

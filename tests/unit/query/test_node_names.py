@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hilsplat
-from hilsplat.base.artifacts import read_json
+from hilsplat.base.artifacts import read_index, read_json
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.embed.clip import open_clip_of
 from hilsplat.query.answer import answer
@@ -17,6 +17,7 @@ from hilsplat.query.names import write_names
 from hilsplat.query.node_names import COMMON, NodeNaming, Vocabulary, named, run_names, vocabulary_file
 from hilsplat.query.relevancy import margins
 from hilsplat.settings import EvaluateSettings, QuerySettings
+from tests.unit.artifact_changes import change_index
 from tests.unit.finished_desk import SCENE, build_finished_desk
 from tests.unit.query.test_search_scales import tree_of
 
@@ -112,16 +113,15 @@ def test_the_stage_writes_names_that_answers_show(desk, tmp_path):
 def test_names_of_another_tree_are_not_shown_and_damaged_ones_are_refused(desk, tmp_path):
     tree, clip = desk / "default/semantic_tree", desk / "default/clip"
     assert NodeNaming.load(desk / "default/nothing", tree, clip) is None
-    index = read_json(desk / "default/names/index.json")
     other = tmp_path / "names"
-    other.mkdir()
-    (other / "index.json").write_text(json.dumps({**index, "tree_sha256": "another"}))
+    shutil.copytree(desk / "default/names", other)
+    own = read_index(other)["tree_sha256"]
+    change_index(other, tree_sha256="another")
     assert NodeNaming.load(other, tree, clip) is None
-    (other / "index.json").write_text(json.dumps(index))
-    shutil.copy(desk / "default/names/rivals.npy", other)
     whole = read_json(desk / "default/names/names.json")
     for damaged in ([{"name": "mug"}], whole[:-1], [*whole[:-1], 7], {}):
         (other / "names.json").write_text(json.dumps(damaged))
+        change_index(other, tree_sha256=own)
         with pytest.raises(ArtifactError, match=r"names\.json or rivals\.npy is damaged"):
             NodeNaming.load(other, tree, clip)
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilsplat.base.artifacts import provenance_path, write_json
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.field.autoencoder import run_autoencoder
@@ -21,6 +20,7 @@ from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree, run_semantic_tree
 from hilsplat.semantic_tree.view_nodes import ViewNodes
 from hilsplat.settings import AutoencoderSettings, EvaluateSettings, FieldSettings, SemanticTreeSettings
+from tests.unit.artifact_changes import write_record
 from tests.unit.round_gaussians import round_gaussians
 from tests.unit.two_boxes_world import (
     HEIGHT,
@@ -249,7 +249,7 @@ def test_a_scene_opens_with_the_settings_it_was_evaluated_with(tmp_path):
         (folder / name).touch()
     assert FinishedScene.locate(folder).evaluate_settings() == EvaluateSettings()
     settings = {"canonical": ["thing", "surface"], "node_select": 0.9, "a knob of old": 1}
-    write_json(provenance_path(variant / "scores.csv"), {"settings": settings, "inputs": {}})
+    write_record(variant / "scores.csv", settings=settings)
     found = FinishedScene.locate(folder).evaluate_settings()
     assert found.canonical == ("thing", "surface")
     assert found.node_select == 0.9
@@ -268,7 +268,7 @@ def test_a_variant_answers_with_the_field_it_was_scored_with_and_never_with_anot
     inputs = {"field": {"path": "results/synthetic/bear/default/field.safetensors"}}
     (folder / "theta").mkdir()
     (folder / "theta/scores.csv").touch()
-    write_json(provenance_path(folder / "theta/scores.csv"), {"settings": {}, "inputs": inputs})
+    write_record(folder / "theta/scores.csv", inputs=inputs)
     found = FinishedScene.locate(folder, "theta").parts
     assert found.field == folder / "default/field.safetensors"
     assert found.semantic_tree == folder / "default/semantic_tree"
@@ -300,7 +300,7 @@ def test_a_scene_without_labels_opens_with_the_settings_of_its_panel(tmp_path):
         (folder / name).touch()
     panel.parent.mkdir(parents=True)
     settings = {"figures": {}, "evaluate": {"template": "a photo of a {}"}}
-    write_json(provenance_path(panel), {"settings": settings, "inputs": {}})
+    write_record(panel, settings=settings)
     assert FinishedScene.locate(folder).evaluate_settings().template == "a photo of a {}"
 
 

@@ -43,6 +43,7 @@ def tree_of(levels: list[int], parents: list[int]) -> SemanticTree:
         view_area_px=np.ones((n, 1), np.float32),
         view_names=("a.png",),
         gaussians_sha256="",
+        cameras_sha256="",
         min_weight=0.1,
     )
 

@@ -14,6 +14,7 @@ from hilsplat.embed.vectors import mask_embeddings
 from hilsplat.scene.cameras import Cameras
 from hilsplat.segment.digests import index_entry
 from hilsplat.segment.masks import HierarchicalMasks
+from tests.unit.artifact_changes import change_index
 
 FEW = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -149,12 +150,13 @@ def test_each_array_of_masks_is_checked(tmp_path: Path, name, change, words):
 def test_clip_vectors_are_of_length_one(tmp_path, fault):
     masks, clip = tmp_path / "masks", tmp_path / "clip"
     entry = {"a.png": index_entry(some_masks())}
-    for folder in (masks, clip):
-        write_index(folder, entry, scene="a/b")
     vectors = np.eye(4, 6, dtype=np.float16)
     write_npy(clip / "a.png.npy", vectors)
+    for folder in (masks, clip):
+        write_index(folder, entry, scene="a/b")
     assert mask_embeddings(clip, masks).shape == (4, 6)
     vectors[2] *= fault
     write_npy(clip / "a.png.npy", vectors)
+    change_index(clip)
     with pytest.raises(ArtifactError, match=r"1 CLIP vectors of a\.png"):
         mask_embeddings(clip, masks)

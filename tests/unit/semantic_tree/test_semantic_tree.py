@@ -13,6 +13,7 @@ from hilsplat.semantic_tree.level_nodes import level_nodes
 from hilsplat.semantic_tree.nodes import gaussian_nodes, node_parents
 from hilsplat.semantic_tree.tree import SemanticTree, run_semantic_tree
 from hilsplat.settings import SemanticTreeSettings
+from tests.unit.artifact_changes import change_index
 from tests.unit.two_boxes_world import (
     HEIGHT,
     NUM_GAUSSIANS,
@@ -185,6 +186,7 @@ def test_vectors_of_another_tree_are_refused(tree_of_boxes):
     for view in world.regions:
         vectors = read_npy(world.clip / f"{view}.npy")
         write_npy(world.clip / f"{view}.npy", np.zeros_like(vectors))
+    change_index(world.clip)
     with pytest.raises(MisalignedArtifactError, match=r"has no vector for some nodes of (.|\n)*7 of 7"):
         SemanticTree.load(out, world.clip)
 

@@ -49,6 +49,7 @@ def tree_of(node_of_gaussian, level, parent) -> SemanticTree:
         view_area_px=np.ones((num, 1), np.float32),
         view_names=("000.png",),
         gaussians_sha256="",
+        cameras_sha256="",
         min_weight=1 / 255,
     )
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilsplat.base.artifacts import provenance_path, write_json
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.figures.panel import annotated_rows, draw_panel, free_rows, truths_of
@@ -19,6 +18,7 @@ from hilsplat.query.pictures import ANSWER_RGB, TRUTH_RGB, outline, paint_answer
 from hilsplat.query.query_panel import query_panel
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.settings import EvaluateSettings, FiguresSettings
+from tests.unit.artifact_changes import write_record
 
 EVALUATE = EvaluateSettings()
 
@@ -142,7 +142,7 @@ def test_parts_of_a_variant_are_found_through_provenance(tmp_path):
     field.parent.mkdir()
     field.touch()
     path = "results/photos/bear/default/autoencoder"
-    write_json(provenance_path(field), {"inputs": {"autoencoder": {"path": path, "sha256": ""}}})
+    write_record(field, inputs={"autoencoder": {"path": path, "sha256": ""}})
     parts = FinishedScene.locate(folder, "omega-2").parts
     assert parts.field == field
     assert parts.autoencoder == folder / "default" / "autoencoder"

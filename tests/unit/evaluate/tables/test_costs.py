@@ -6,12 +6,13 @@ import math
 
 import pytest
 
-from hilsplat.base.artifacts import provenance_path, write_json
+from hilsplat.base.artifacts import provenance_path, read_json
 from hilsplat.base.errors import ArtifactError
 from hilsplat.evaluate.scores import Score, write_scores
 from hilsplat.evaluate.tables.build import published_values, run_table
 from hilsplat.evaluate.tables.costs import read_costs, time_queries, write_times
 from tests.conftest import PROJECT
+from tests.unit.artifact_changes import write_record
 from tests.unit.evaluate.tables.test_tables import PUBLISHED
 
 
@@ -51,11 +52,11 @@ def scene(tmp_path):
             "hierarchy/level-given@5", 0.5, 1,
         )  # fmt: skip
         write_scores(scores, [row])
-        write_json(provenance_path(scores), {"inputs": inputs})
+        write_record(scores, inputs=inputs)
         own = {
             name: {"path": str(default / name)} for name in ("coverage_tree", "contributions", "autoencoder")
         }
-        write_json(provenance_path(variant / "field.safetensors"), {"inputs": own})
+        write_record(variant / "field.safetensors", inputs=own)
         write_times(scores, "synthetic", "table-1", variant.name, {"field": 0.25})
     return [default / "scores.csv", other / "scores.csv"]
 
@@ -75,10 +76,10 @@ def test_a_job_that_left_no_record_leaves_its_sum_unknown(scene):
 
 
 def test_a_stage_that_nothing_read_costs_nothing(scene):
-    record = provenance_path(scene[0].with_name("field.safetensors"))
-    inputs = json.loads(record.read_text())["inputs"]
+    field = scene[0].with_name("field.safetensors")
+    inputs = read_json(provenance_path(field))["inputs"]
     del inputs["coverage_tree"]
-    write_json(record, {"inputs": inputs})
+    write_record(field, inputs=inputs)
     assert read_costs(scene)[0].prepare_s == 114
 
 
