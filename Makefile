@@ -42,7 +42,7 @@ lint: $(STAMP)
 	snakemake --lint --configfile config/ci.yaml
 
 test: lint
-	python -m pytest --numprocesses $(CORES) --dist loadfile --no-loadscope-reorder tests/workflow tests/browser tests/bad_inputs tests/unit
+	python -m pytest --numprocesses $(CORES) --dist loadfile --no-loadscope-reorder tests/workflow tests/browser tests/bad_inputs tests/damage tests/unit
 
 # The variable turns off mkdocs-material's notice about MkDocs 2, which pyproject.toml excludes.
 docs: $(STAMP)
@@ -62,6 +62,7 @@ published: $(STAMP)
 
 chaos: $(STAMP)
 	python -m tests.chaos --kills $(KILLS)
+	python -m pytest --hypothesis-profile chaos tests/damage
 
 report: run
 	snakemake --report results/report.html

@@ -31,6 +31,7 @@ os.environ["HILSPLAT_MODELS"] = "models"  # whatever the user of this machine ha
 # No test fails for being slow on a busy machine, and every run tries the same examples.
 settings.register_profile("hilsplat", deadline=None, derandomize=True)
 settings.load_profile("hilsplat")
+settings.register_profile("chaos", deadline=None, max_examples=5000)
 
 
 @pytest.fixture(scope="session")

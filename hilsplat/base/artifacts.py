@@ -389,7 +389,7 @@ def visible_files(folder: Path) -> list[Path]:
 def write_index(folder: Path, views: Mapping[str, Any], **more: Any) -> None:
     """Complete a folder artifact: write `index.json`, which seals the folder.
 
-    It has one entry per view, keyed by view name, a checksum of each file but images, and one of itself.
+    It has one entry per view, keyed by view name, a checksum of each file, and one of itself.
     """
     folder = Path(folder)
     files = sorted(path for path in folder.rglob("*") if path.suffix in SEALED)
@@ -398,8 +398,8 @@ def write_index(folder: Path, views: Mapping[str, Any], **more: Any) -> None:
     write_json(folder / INDEX, {**index, "seal": _seal(index)})
 
 
-SEALED = (".json", ".npy", ".npz", ".safetensors")
-"""Files of an artifact whose checksums are in its index. Images have their own."""
+SEALED = (".json", ".npy", ".npz", ".png", ".safetensors")
+"""Files of an artifact whose checksums are in its index."""
 
 
 def read_index(folder: Path) -> dict[str, Any]:

@@ -47,7 +47,7 @@ class Scene:
 
     def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
         """A view's undistorted image, checked against its camera's size."""
-        pixels = read_image(self.image_path(view))
+        pixels = read_image(sealed(self.folder, f"images/{view}"))
         expected = self.cameras[view].size_hw
         if pixels.shape[:2] != expected:
             raise SceneError(

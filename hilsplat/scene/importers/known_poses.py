@@ -8,6 +8,7 @@ from jaxtyping import Float64
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
+from hilsplat.scene.cameras import MAX_SIDE_PX
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.importers.llff import POSES_BOUNDS
 from hilsplat.scene.layouts import MODELS, NO_POSES, TRANSFORMS, polycam_folders, record3d_export
@@ -62,7 +63,8 @@ def checked(views: list[KnownView], known: KnownPoses) -> list[KnownView]:
         values = np.array([*view.camera.params, view.camera.width, view.camera.height], np.float64)
         focal = [view.camera.params[row] for row in view.camera.focal_length_idxs()]
         pose = view.cam_from_source
-        if not np.isfinite(values).all() or min(focal, default=0) <= 0 or (values[-2:] <= 0).any():
+        is_size = (values[-2:] > 0).all() and (values[-2:] <= MAX_SIDE_PX).all()
+        if not np.isfinite(values).all() or min(focal, default=0) <= 0 or not is_size:
             fault, found = "lens", f"{view.camera.model_name} {values.tolist()}"
         elif not np.isfinite(pose).all() or not are_rotations(pose[:3, :3], RIGID_TOLERANCE):
             fault, found = "rotation", np.array2string(pose[:3, :3], precision=4).replace("\n", "")
@@ -85,7 +87,7 @@ def checked(views: list[KnownView], known: KnownPoses) -> list[KnownView]:
 
 
 EXPECTED = {
-    "lens": "finite numbers, a focal length and a size above 0",
+    "lens": f"finite numbers, a focal length above 0, sides of 1 to {MAX_SIDE_PX} px",
     "rotation": "a matrix that neither scales nor mirrors, from a quaternion that is not 0",
     "position": "coordinates up to 1e9",
 }

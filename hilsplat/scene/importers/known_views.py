@@ -13,6 +13,7 @@ from hilsplat.base.errors import SceneError
 from hilsplat.base.files import IMAGE_SUFFIXES, list_images
 from hilsplat.base.images import open_image
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
+from hilsplat.scene.cameras import MAX_SIDE_PX
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.importers.known_poses import KnownPoses, KnownView, checked
 from hilsplat.scene.importers.llff import llff_views
@@ -56,29 +57,29 @@ def read_colmap(
     require_whole_files(folder)
     try:
         model = pycolmap.Reconstruction(folder)
-    except (ValueError, RuntimeError, IndexError) as error:
-        raise SceneError(
-            f"the COLMAP model in {folder} cannot be read: {error}", fix="export it again with COLMAP"
-        ) from error
-    views = []
-    for image_id in sorted(model.reg_image_ids(), key=lambda row: model.images[row].name):
-        image = model.images[image_id]
-        views.append(
+        images = sorted((model.images[row] for row in model.reg_image_ids()), key=lambda image: image.name)
+        views = [
             KnownView(
                 image.name,
                 _find_image(known.root, image.name),
                 pycolmap.Camera(camera_of(image).todict()),
                 pose_matrix(image.cam_from_world()),
             )
-        )
-    errors = {
-        name: {
-            "observations": len(of_view),
-            "reprojection_error_px": round(float(of_view.mean()), 4) if len(of_view) else None,
+            for image in images
+        ]
+        errors = {
+            name: {
+                "observations": len(of_view),
+                "reprojection_error_px": round(float(of_view.mean()), 4) if len(of_view) else None,
+            }
+            for name, of_view in reprojection_errors(model).items()
         }
-        for name, of_view in reprojection_errors(model).items()
-    }
-    return checked(views, known), sparse_points(model), errors
+        points = sparse_points(model)
+    except (ValueError, RuntimeError, IndexError) as error:  # also of parts that name what is not there
+        raise SceneError(
+            f"the COLMAP model in {folder} cannot be read: {error}", fix="export it again with COLMAP"
+        ) from error
+    return checked(views, known), points, errors
 
 
 def _find_image(root: Path, name: str) -> Path | None:
@@ -191,7 +192,7 @@ def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> p
             expected="fl_x (px) or camera_angle_x (radians)",
             fix="export it again",
         ) from error
-    except (TypeError, ValueError, OSError) as error:
+    except (TypeError, ValueError, OverflowError, OSError) as error:
         raise SceneError(f"{where}: intrinsics cannot be used: {error}", fix="export it again") from error
     model = str(frame.get("camera_model", "OPENCV"))
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE") or any(further):
@@ -200,8 +201,13 @@ def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> p
             expected="PINHOLE or OPENCV with k1, k2, p1, p2",
             fix="undistort the images first",
         )
-    if not (focal_x > 0 and focal_y > 0 and width > 0 and height > 0):
-        raise SceneError(f"{where}: focal length and size must be positive", fix="export it again")
+    if not (focal_x > 0 and focal_y > 0 and 0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
+        raise SceneError(
+            f"{where}: focal length and size cannot be those of a photograph",
+            expected=f"more than 0, sides of at most {MAX_SIDE_PX} px",
+            found=f"{focal_x:g} and {focal_y:g}, {width:g} x {height:g} px",
+            fix="export it again",
+        )
     params = [focal_x, focal_y, *centre]
     return pycolmap.Camera(
         model="OPENCV" if any(lens) else "PINHOLE",

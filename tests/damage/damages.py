@@ -1,0 +1,136 @@
+"""Draws of damage for property tests: bytes of any file, values of any JSON, lines of any YAML."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+
+ODD_VALUES = (
+    None,
+    True,
+    -1,
+    0,
+    0.5,
+    1e308,
+    float("inf"),
+    float("nan"),
+    2**70,
+    "",
+    "x",
+    "a/../b",
+    [],
+    {},
+    [[1]],
+)
+ODD_TEXTS = (
+    "",
+    "{",
+    "]",
+    "\t",
+    ": ",
+    "- ",
+    "&a ",
+    "*a",
+    "!!binary ",
+    "1e999",
+    ".nan",
+    "null",
+    "yes",
+    "\0",
+    "é",
+    "'",
+)
+
+
+@st.composite
+def byte_damages(draw) -> tuple[str, float, int]:
+    """A way to damage a file, a place as a share of its length, and a number."""
+    kind = draw(st.sampled_from(["flip", "cut", "zero", "more", "repeat", "empty"]))
+    return kind, draw(st.floats(0, 1, exclude_max=True)), draw(st.integers(0, 255))
+
+
+def damaged_bytes(content: bytes, damage: tuple[str, float, int]) -> bytes:
+    """The content after a damage."""
+    kind, share, number = damage
+    place = int(share * len(content))
+    if kind == "cut":
+        return content[:place]
+    if kind == "zero":
+        return content[:place] + bytes(len(content[place : place + 64])) + content[place + 64 :]
+    if kind == "more":
+        return content + bytes([number]) * 16
+    if kind == "repeat":
+        return content[:place] + content[max(0, place - 8) : place] + content[place:]
+    if kind == "empty":
+        return b""
+    changed = bytearray(content)
+    changed[place] ^= 1 << number % 8
+    return bytes(changed)
+
+
+def damaged_value(draw, value: Any) -> Any:
+    """A JSON value in which something, anywhere, is replaced, dropped or repeated."""
+    if isinstance(value, dict) and value and draw(st.integers(0, 3)):
+        key = draw(st.sampled_from(sorted(value)))
+        what = draw(st.integers(0, 5))
+        if what == 0:
+            return {name: each for name, each in value.items() if name != key}
+        return {**value, key: damaged_value(draw, value[key])}
+    if isinstance(value, list) and value and draw(st.integers(0, 3)):
+        place = draw(st.integers(0, len(value) - 1))
+        what = draw(st.integers(0, 5))
+        if what == 0:
+            return value[:place] + value[place + 1 :]
+        if what == 1:
+            return [*value, value[place]]
+        return [*value[:place], damaged_value(draw, value[place]), *value[place + 1 :]]
+    return draw(st.sampled_from(ODD_VALUES))
+
+
+@st.composite
+def damaged_values(draw, value: Any) -> Any:
+    """A JSON value with one to three damages."""
+    for _ in range(draw(st.integers(1, 3))):
+        value = damaged_value(draw, value)
+    return value
+
+
+@st.composite
+def damaged_texts(draw, text: str) -> str:
+    """A text with lines dropped, repeated or swapped, and odd words in them."""
+    lines = text.splitlines()
+    for _ in range(draw(st.integers(1, 3))):
+        place = draw(st.integers(0, len(lines) - 1))
+        what = draw(st.integers(0, 3))
+        if what == 0:
+            lines.insert(place, draw(st.sampled_from(lines)))
+        elif what == 1:
+            other = draw(st.integers(0, len(lines) - 1))
+            lines[place], lines[other] = lines[other], lines[place]
+        else:
+            at = draw(st.integers(0, len(lines[place])))
+            rest = lines[place][at:] if what == 2 else ""
+            lines[place] = lines[place][:at] + draw(st.sampled_from(ODD_TEXTS)) + rest
+    return "\n".join(lines)
+
+
+def flattened(found: Any) -> list[np.ndarray]:
+    """All arrays, numbers and texts that an object holds, to compare two of them."""
+    if isinstance(found, np.ndarray):
+        return [found]
+    if isinstance(found, Path) or callable(found) or found is None:
+        return []
+    if isinstance(found, dict):
+        return [each for key in sorted(found, key=str) for each in flattened(found[key])]
+    if isinstance(found, list | tuple):
+        return [each for part in found for each in flattened(part)]
+    if hasattr(found, "__dict__"):
+        return flattened({key: value for key, value in vars(found).items() if not key.startswith("__")})
+    return [np.asarray(found)]
+
+
+def equal(one: Any, other: Any) -> bool:
+    """Whether two objects hold the same."""
+    pairs = flattened(one), flattened(other)
+    return len(pairs[0]) == len(pairs[1]) and all(map(np.array_equal, *pairs))
