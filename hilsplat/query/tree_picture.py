@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from hilsplat.base.artifacts import write_json
+from hilsplat.base.artifacts import atomic_folder, write_json
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.query.language_scene import LanguageScene
@@ -47,9 +47,10 @@ def export_tree(folder: Path, variant: str, out: Path, threads: int) -> str:
     found = FinishedScene.locate(folder, variant)
     scene = LanguageScene.of(found, threads=threads)
     nodes = [{**node, "name": scene.name_of(row)} for row, node in enumerate(readable_nodes(scene.tree))]
-    write_json(out / "tree.json", {"scene": scene.scene.name, "nodes": nodes})
-    write_tree_ply(found.parts.gaussians, scene.tree, out / "tree.ply")
-    write_png(out / "tree.png", tree_picture(scene))
+    with atomic_folder(out) as temporary:
+        write_json(temporary / "tree.json", {"scene": scene.scene.name, "nodes": nodes})
+        write_tree_ply(found.parts.gaussians, scene.tree, temporary / "tree.ply")
+        write_png(temporary / "tree.png", tree_picture(scene))
     counts = ", ".join(f"{len(scene.tree.nodes_of(level))} {level.label}" for level in LEVELS)
     return f"wrote tree.json, tree.ply and tree.png to {out} ({counts})"
 

@@ -1,15 +1,16 @@
-"""Kill, freeze, double and starve runs of the ci configuration, which must recover without manual help.
+"""Kill, freeze, double and starve runs and commands, which must recover without manual help.
 
     make chaos                                       # 30 kills, seed 0
     python -m tests.chaos --kills 5 --seed 3 --minutes 20 --work ../chaos
 
 A run is started and, after a random time, hit. It is then started again with the same words, and so on; when
 it gets to its end, its tables are compared with those of an undisturbed run, byte by byte, and the next one
-begins from nothing. The last line says how many kills there were and what they cost. The exit code is 1 if a
-table differs, or if a start without a fault did not end with success.
+begins from nothing. Then commands of people are killed while they write (`commands`). The last line says how
+many kills there were and what they cost. The exit code is 1 if a table differs, or if a start without a fault
+did not end with success.
 
-A full disk needs results on a disk that can be filled, a small tmpfs: that fault is left out, with a notice,
-where this user may not mount one.
+A full and a read-only disk need results on a disk of their own, a small tmpfs: these faults are left out,
+with a notice, where this user may not mount one.
 """
 
 import argparse
@@ -24,6 +25,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from tests.chaos.commands import kill_commands
 from tests.chaos.faults import FAULTS, Run, Victim
 from tests.conftest import PROJECT
 from tests.workflow.conftest import Project, copy_project
@@ -190,9 +192,11 @@ def main() -> None:
     results = root / "results"
     disk = small_disk(results)
     if not disk:
-        print("no full disk: this user may not mount a tmpfs", flush=True)
+        print("no full or read-only disk: this user may not mount a tmpfs", flush=True)
     try:
         tally = torment(project, reference, whole_s, options, disk)
+        chance = random.Random(options.seed)
+        tally.problems += kill_commands(work / "commands", max(1, options.kills // 3), chance)
         kept = bool(tally.problems)
         if kept:
             shutil.copytree(results, root / "results-kept", symlinks=True)

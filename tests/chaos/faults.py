@@ -197,6 +197,7 @@ class Run:
             if is_alive(job.pid) and cpu_seconds(job.pid) is not None:
                 self.problems.append(f"{job.stage} (process {job.pid}) outlived its Snakemake")
                 os.kill(job.pid, signal.SIGKILL)
+        remounted(self.project.root / "results", "rw")
         self._filler.unlink(missing_ok=True)
         return code
 
@@ -238,6 +239,26 @@ class Run:
             stream.write(bytes(max(0, room - LEFT_KIB * 1024)))
         return []
 
+    def lock_the_disk(self, chance: random.Random) -> list[Victim]:
+        """Results become read-only, and writable once the run has ended."""
+        for _ in range(40):  # not while a file is being written
+            if remounted(self.project.root / "results", "ro"):
+                break
+            time.sleep(POLL_S)
+        return []
+
+    def clean_up_elsewhere(self, chance: random.Random) -> list[Victim]:
+        """Another machine of the same name, with other process numbers, cleans up the shared folder."""
+        code = "import sys; from hilsplat.base import processes; processes.remove_leftovers(sys.argv[1])"
+        command = ["unshare", "--pid", "--fork", "--mount-proc", sys.executable, "-c", code, "results"]
+        environment = self.project.environment()
+        ended = subprocess.run(
+            command, cwd=self.project.root, env=environment, capture_output=True, text=True
+        )
+        if ended.returncode:
+            self.problems.append(f"no clean-up in another process namespace: {ended.stderr}")
+        return []
+
     def run_twice(self, chance: random.Random) -> list[Victim]:
         """A second run in the same project has to refuse, and the first one gets to its end."""
         second = subprocess.run(
@@ -253,6 +274,15 @@ class Run:
         ):
             self.problems.append(f"a second run was not refused:\n{second.stdout}{second.stderr}")
         return []
+
+
+def remounted(folder: Path, mode: str) -> bool:
+    """Make a disk of its own read-only (`ro`) or writable (`rw`); False if there is none, or it is in use."""
+    if not folder.is_mount():
+        return False
+    return (
+        subprocess.run(["mount", "-o", f"remount,{mode}", str(folder)], capture_output=True).returncode == 0
+    )
 
 
 def stage_of(pid: int) -> str | None:
@@ -292,5 +322,7 @@ FAULTS = (
     Fault("kill a job", Run.kill_a_job, ends_run=False),
     Fault("freeze the jobs, kill Snakemake", Run.freeze_orphans),
     Fault("fill the disk", Run.fill_the_disk, kills=False, needs_disk=True, ends_run=False),
+    Fault("make results read-only", Run.lock_the_disk, kills=False, needs_disk=True, ends_run=False),
+    Fault("clean up on another machine", Run.clean_up_elsewhere, kills=False, may_fail=False, ends_run=False),
     Fault("start a second run", Run.run_twice, kills=False, may_fail=False, ends_run=False),
 )

@@ -1,0 +1,158 @@
+"""Commands of people, killed while they write: what was there stays, and the same command then succeeds."""
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx2
+
+from hilsplat.annotate.labels import label_path, read_labels
+from tests.conftest import PROJECT
+from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, build_finished_desk
+
+COMMANDS = {
+    "new": ("new", "chair", "photos.zip"),
+    "query": ("query", "photos/desk", "mug", "--out", "answers"),
+    "export": ("export", "photos/desk", "--out", "exported"),
+}
+SIZE = (HEIGHT, WIDTH + NUM_VIEWS)
+POLYGON = [[1, 1], [15, 1], [15, 20], [1, 20]]
+
+
+def prepare(root: Path) -> Path:
+    """A project with a finished scene and an archive of photographs."""
+    project = build_finished_desk(root)
+    shutil.copytree(PROJECT / "config", project / "config")
+    with zipfile.ZipFile(project / "photos.zip", "w") as archive:
+        for path in sorted((project / SCENE / "scene/images").iterdir()):
+            archive.write(path, path.name)
+    return project
+
+
+def started(project: Path, *words: str) -> subprocess.Popen[str]:
+    """A command in a project, in a session of its own."""
+    environment = {**os.environ, "PYTHONPATH": str(PROJECT), "HILSPLAT_MODELS": "models"}
+    return subprocess.Popen(
+        [sys.executable, "-m", "hilsplat", *words],
+        cwd=project,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def contents(project: Path) -> dict[str, bytes]:
+    """Every file that a person sees, but for what differs from run to run."""
+    files = (path for path in sorted(project.rglob("*")) if path.is_file())
+    seen = ((str(path.relative_to(project)), path) for path in files)
+    return {name: path.read_bytes() for name, path in seen if not any(p[0] == "." for p in Path(name).parts)}
+
+
+def kill_command(
+    project: Path, name: str, whole_s: float, expected: dict[str, bytes], chance: random.Random
+) -> Iterator[str]:
+    """Kill a command at some time, then let it get to its end.
+
+    Yields:
+        What a person would have had to look at.
+    """
+    before = contents(project)
+    running = started(project, *COMMANDS[name])
+    try:
+        running.wait(chance.uniform(0, whole_s))
+    except subprocess.TimeoutExpired:
+        os.killpg(running.pid, signal.SIGKILL)
+        running.wait()
+    after = contents(project)
+    for path, content in after.items():
+        if content not in (before.get(path), expected.get(path)):
+            yield f"{name}: {path} is neither as before nor whole after a kill"
+    if lost := before.keys() - after.keys():
+        yield f"{name}: a kill lost {sorted(lost)}"
+    if after == expected:  # it had written everything
+        return
+    again = started(project, *COMMANDS[name])
+    said, _ = again.communicate(timeout=600)
+    if again.returncode:
+        yield f"{name}: the same command failed after a kill:\n{said}"
+    elif contents(project) != expected:
+        found = contents(project)
+        wrong = [path for path in {*expected, *found} if expected.get(path) != found.get(path)]
+        yield f"{name}: after a kill it wrote something else: {sorted(wrong)[:5]}"
+
+
+def kill_commands(root: Path, kills: int, chance: random.Random) -> list[str]:
+    """Kill each command some times.
+
+    Returns:
+        What a person would have had to look at.
+    """
+    project, problems = prepare(root / "desk"), []
+    for name in COMMANDS:
+        copy = root / "whole"
+        shutil.copytree(project, copy)
+        begin = time.monotonic()
+        assert started(copy, *COMMANDS[name]).wait(600) == 0
+        whole_s, expected = time.monotonic() - begin, contents(copy)
+        shutil.rmtree(copy)
+        for number in range(kills):
+            copy = root / f"{name}-{number}"
+            shutil.copytree(project, copy)
+            problems += kill_command(copy, name, whole_s, expected, chance)
+            shutil.rmtree(copy)
+        print(f"{kills} kills of {name}, which takes {whole_s:.1f} s", flush=True)
+    for number in range(kills):
+        copy = root / f"annotate-{number}"
+        shutil.copytree(project, copy)
+        problems += kill_annotator(copy, chance)
+        shutil.rmtree(copy)
+    print(f"{kills} kills of annotate", flush=True)
+    return problems
+
+
+def kill_annotator(project: Path, chance: random.Random) -> Iterator[str]:
+    """Kill the annotation server while it saves one change after the other.
+
+    Yields:
+        What a person would have had to look at: a change that was confirmed and is gone, or a damaged file.
+    """
+    server = started(project, "annotate", "photos/desk", "--no-browser", "--port", "0")
+    address = next(word for line in server.stdout for word in line.split() if word.startswith("http://127"))
+    confirmed = [-1]
+    threading.Thread(target=save_changes, args=(address, confirmed), daemon=True).start()
+    time.sleep(chance.uniform(0.2, 3))
+    os.killpg(server.pid, signal.SIGKILL)
+    server.wait()
+    last = confirmed[0]
+    path = label_path(project / "annotated/photos/desk", "000.png")
+    texts = [label.text for label in read_labels(path, SIZE)] if path.is_file() else []
+    if last >= 0 and texts not in ([f"change {last}"], [f"change {last + 1}"]):
+        yield f"annotate: after a kill {path.name} holds {texts}, and change {last} was confirmed"
+
+
+def save_changes(address: str, confirmed: list[int]) -> None:
+    """Replace the annotations of the first photograph until the server is gone."""
+    base = address.partition("/?")[0]
+    with httpx2.Client(base_url=base, headers={"origin": base, "sec-fetch-site": "same-origin"}) as client:
+        client.get(address)
+        version = "none"
+        while True:
+            label = {"id": 1, "level": 1, "text": f"change {confirmed[0] + 1}", "polygons": [POLYGON]}
+            try:
+                answer = client.put(
+                    "/api/labels/0", json={"labels": [label]}, headers={"if-match": f'"{version}"'}
+                )
+            except httpx2.HTTPError:
+                return
+            version = answer.json()["version"]
+            confirmed[0] += 1
