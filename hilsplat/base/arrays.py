@@ -46,10 +46,9 @@ def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Li
                 continue
             fits: bool = isinstance(array, declared)
             if not fits:
-                expected = declared.__name__.replace("ndarray, ", "")
                 raise ArtifactError(
                     f"{path}: array {name} cannot be used",
-                    expected=expected,
+                    expected=described(declared),
                     found=f"{array.dtype} of shape {array.shape}",
                     fix=remake(path),
                 )
@@ -64,6 +63,11 @@ def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Li
                     found=f"{least} to {most}",
                     fix=remake(path),
                 )
+
+
+def described(declared: type[AbstractArray]) -> str:
+    """Return an annotation of jaxtyping for people: `Float32[N 3]`."""
+    return f"{declared.__name__.partition('[')[0]}[{declared.dim_str.strip()}]"
 
 
 def read_into(maker: type[Made], path: Path, limits: Limits | None = None, **more: Any) -> Made:

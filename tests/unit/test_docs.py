@@ -4,13 +4,23 @@ import ast
 import re
 import shlex
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import pytest
 import typer
+from jaxtyping import AbstractArray
 
+from hilsplat.base.arrays import described
 from hilsplat.cli.main import app
 from hilsplat.configuration import SECTIONS
+from hilsplat.contributions.rows import Contributions
+from hilsplat.field.language_field import LanguageField
+from hilsplat.scene import cameras
+from hilsplat.scene.cameras import Cameras
+from hilsplat.segment import masks
+from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.semantic_tree import tree
+from hilsplat.semantic_tree.tree import SemanticTree
 from tests.conftest import PROJECT
 
 PAGES = sorted(
@@ -123,6 +133,36 @@ def test_every_page_that_the_code_names_exists() -> None:
     for source in sources:
         for name in re.findall(r"docs/\w+\.md", source.read_text()):
             assert (PROJECT / name).exists(), f"{source.relative_to(PROJECT)} names {name}"
+
+
+CHECKED = (
+    ("scene/cameras.npz", Cameras, {"size_hw": (1, cameras.MAX_SIDE_PX)}),
+    ("masks/<view>.npz", HierarchicalMasks, masks.LIMITS),
+    ("contributions/rows.npz", Contributions, {}),
+    ("semantic_tree/tree.npz", SemanticTree, tree.LIMITS),
+    ("field.safetensors", LanguageField, {}),
+)
+"""Files whose arrays are checked when they are opened: the class that declares them, and limits of values."""
+
+
+def checked_arrays() -> list[str]:
+    """A line of a table for each file, from the annotations by which its arrays are checked."""
+    lines = []
+    for file, maker, limits in CHECKED:
+        cells = []
+        for name, declared in get_type_hints(maker).items():
+            if isinstance(declared, type) and issubclass(declared, AbstractArray):
+                low, high = limits.get(name, (None, None))
+                values = f", {low:g} to {high:g}" if low is not None else ""
+                cells.append(f"`{name}` {described(declared)}{values}")
+        lines.append(f"| `{file}` | {'; '.join(cells)} |")
+    return lines
+
+
+def test_the_architecture_lists_the_arrays_that_are_checked() -> None:
+    page = (PROJECT / "docs/architecture.md").read_text()
+    missing = [line for line in checked_arrays() if line not in page]
+    assert not missing, "write these lines:\n" + "\n".join(missing)
 
 
 def test_every_place_in_the_architecture_exists() -> None:
