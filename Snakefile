@@ -26,7 +26,13 @@ wildcard_constraints:
 
 
 include: "rules/world.smk"
-include: "rules/models.smk"
+
+
+if (INSTALLED / "models/training").is_dir():  # of a checkout
+
+    include: "rules/models.smk"
+
+
 include: "rules/scene.smk"
 include: "rules/splat.smk"
 include: "rules/segment.smk"

@@ -31,7 +31,6 @@ from hilsplat.settings import (
     QuerySettings,
     Section,
     SemanticTreeSettings,
-    TrainingSettings,
     WorldSettings,
     knob,
 )
@@ -62,7 +61,6 @@ class StageSettings(Section):
     evaluate: EvaluateSettings = EvaluateSettings()
     query: QuerySettings = QuerySettings()
     figures: FiguresSettings = FiguresSettings()
-    training: TrainingSettings = TrainingSettings()
 
     def with_models(self) -> "StageSettings":
         """All sections with what they take from others: models, crops for the field's targets, one theta."""

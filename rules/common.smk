@@ -9,7 +9,9 @@ from pathlib import Path
 from snakemake.exceptions import WorkflowError
 from snakemake.logging import logger
 
+from hilsplat.base.artifacts import sha256_of_path
 from hilsplat.base.errors import HilsplatError
+from hilsplat.base.files import INSTALLED
 from hilsplat.configuration import merged_config
 from hilsplat.evaluate.tables.build import TABLES, published_values
 from hilsplat.workflow import targets

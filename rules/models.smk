@@ -12,13 +12,13 @@ rule train_models:
         mem_mb=RESOURCES.memory_mb("train_models"),
         runtime=RESOURCES.minutes("train_models"),
     params:
-        settings=PLAN.run.training.model_dump_json(),
+        checkout=str(INSTALLED),
         seed=PLAN.run.seed,
-        code=PLAN.code("models"),
+        code=sha256_of_path(INSTALLED / "models/training"),
         out=lambda wildcards, output: str(Path(output[0]).parent),
         cache=lambda wildcards, output: str(
             Path(output[0]).parents[1] / ".cache/models"
         ),
     shell:
-        "python -m hilsplat --log {log:q} models train --out {params.out:q} --cache {params.cache:q}"
-        " --settings {params.settings:q} --seed {params.seed:q} --threads {threads}"
+        "PYTHONPATH={params.checkout:q} python -m models.training --out {params.out:q} --cache {params.cache:q}"
+        " --seed {params.seed:q} --threads {threads} > {log:q} 2>&1"

@@ -21,7 +21,8 @@ UNCHECKED = (
 an object: checks would take five times as long as the tests themselves."""
 
 # All other modules have the shapes and types of arguments and results checked at every call.
-files = [path.relative_to(PROJECT).with_suffix("") for path in (PROJECT / "hilsplat").rglob("[!_]*.py")]
+sources = [*(PROJECT / "hilsplat").rglob("[!_]*.py"), *(PROJECT / "models/training").glob("[!_]*.py")]
+files = [path.relative_to(PROJECT).with_suffix("") for path in sources]
 checked = [name for name in map(".".join, (file.parts for file in files)) if not name.startswith(UNCHECKED)]
 install_import_hook(checked, "beartype.beartype")
 

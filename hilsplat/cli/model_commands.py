@@ -7,11 +7,6 @@ import typer
 
 from hilsplat.cli.apps import models_app
 from hilsplat.cli.stage import (
-    DEFAULT_CACHE,
-    Seed,
-    Settings,
-    Threads,
-    section_of,
     start_logging,
 )
 
@@ -82,25 +77,3 @@ def models_split(folder: Annotated[Path, typer.Argument(help="folder of an expor
 
     for path in split_clip(folder):
         typer.echo(f"wrote {path}")
-
-
-@models_app.command("train")
-def models_train(
-    out: Annotated[Path, typer.Option(help="folder for sam-tiny and clip-tiny")] = Path("models"),
-    cache: Annotated[Path, typer.Option(help="folder for rendered views and training states")] = DEFAULT_CACHE
-    / "models",
-    settings: Settings = "{}",
-    seed: Seed = 0,
-    threads: Threads = 2,
-    stage: Annotated[
-        list[str] | None, typer.Option(help="step to run: render, sam or clip; default: all")
-    ] = None,
-) -> None:
-    """Train the small SAM and CLIP on training scenes of the synthetic world.
-
-    Training resumes after a kill, and continues if a finished one is given more minutes.
-    """
-    start_logging(timestamps=True)
-    from hilsplat.world.tiny.train import train_models
-
-    train_models(out, cache, section_of("training", settings), seed, threads, stage)

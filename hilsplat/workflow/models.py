@@ -40,7 +40,7 @@ def check_device(stages: StageSettings, where: str) -> None:
     from hilsplat.splat.rasterise.device import choose_device
 
     for section, values in stages:
-        if getattr(values, "device", "") == "cuda" and section != "training":
+        if getattr(values, "device", "") == "cuda":
             try:
                 compute_device("cuda")
                 if section in ("gaussians", "contributions"):

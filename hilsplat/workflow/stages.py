@@ -33,7 +33,6 @@ STAGES: dict[str, str] = {
     "mask_truth": "hilsplat.evaluate.diagnostics.mask_truth:run_mask_truth",
     "tree_truth": "hilsplat.evaluate.diagnostics.tree_truth:run_tree_truth",
     "label_fits": "hilsplat.evaluate.diagnostics.label_fits:run_label_fits",
-    "models": "hilsplat.world.tiny.train:train_models",
 }
 """Stage -> the function that its command calls; a module means all of its functions."""
 

@@ -11,7 +11,7 @@ from hilsplat.segment.candidates import decode_candidates
 from hilsplat.segment.generate import masks_from_candidates
 from hilsplat.segment.sam import REAL_SAM, Encoded, SamModel, Thresholds
 from hilsplat.settings import MasksSettings
-from hilsplat.world.tiny.export import OWN_THRESHOLDS
+from models.training.export import OWN_THRESHOLDS
 from tests.conftest import PROJECT
 
 

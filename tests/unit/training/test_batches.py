@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilsplat.world.tiny.batches import (
+from models.training.batches import (
     CropStage,
     boxes_of,
     class_rows,
@@ -12,8 +12,8 @@ from hilsplat.world.tiny.batches import (
     draw_level_prompts,
     region_edges,
 )
-from hilsplat.world.tiny.data import nested_targets
-from tests.unit.world.tiny.drawn import drawn_views
+from models.training.data import nested_targets
+from tests.unit.training.drawn import drawn_views
 
 
 def test_prompts_reach_a_region_of_one_pixel():

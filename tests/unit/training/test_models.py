@@ -12,12 +12,12 @@ from hilsplat.world.objects.catalogue import GENERATOR_VERSION
 from hilsplat.world.render import label_view, render_view
 from hilsplat.world.scenes.kinds import training_camera
 from hilsplat.world.seeds import TRAINING_SEEDS
-from hilsplat.world.tiny.card import CARD, RECORD, digests
-from hilsplat.world.tiny.crops import list_crops
-from hilsplat.world.tiny.data import HEAD_LEVELS, LabelledViews, normalised
-from hilsplat.world.tiny.measure_sam import draw_regions
-from hilsplat.world.tiny.render import phrases_of, scene_of_seed
-from hilsplat.world.tiny.sam import FRAME_PX
+from models.training.card import CARD, RECORD, digests
+from models.training.crops import list_crops
+from models.training.data import HEAD_LEVELS, LabelledViews, normalised
+from models.training.measure_sam import draw_regions
+from models.training.render import phrases_of, scene_of_seed
+from models.training.sam import FRAME_PX
 from tests.conftest import PROJECT
 from tests.unit.segment.plain import quantise, restore
 

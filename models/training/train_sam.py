@@ -8,13 +8,13 @@ import torch
 from torch import Tensor, nn
 
 from hilsplat.base.levels import LEVELS
-from hilsplat.world.tiny.batches import CropStage, SamBatch, class_rows, draw_batch
-from hilsplat.world.tiny.data import LabelledViews
-from hilsplat.world.tiny.loop import Training, Tuning
-from hilsplat.world.tiny.measure_sam import measure_sam
-from hilsplat.world.tiny.sam import SamDecoder, SamEncoder
-from hilsplat.world.tiny.sam_loss import Teacher, training_loss
-from hilsplat.world.tiny.steps import Budget, Curve
+from models.training.batches import CropStage, SamBatch, class_rows, draw_batch
+from models.training.data import LabelledViews
+from models.training.loop import Training, Tuning
+from models.training.measure_sam import measure_sam
+from models.training.sam import SamDecoder, SamEncoder
+from models.training.sam_loss import Teacher, training_loss
+from models.training.steps import Budget, Curve
 
 CROP_STAGES = (CropStage(0.4, 128, 16, 24), CropStage(0.4, 192, 8, 36), CropStage(0.2, 256, 4, 48))
 """Windows of a step, drawn anew for each: small ones show more scenes, large ones more of one."""

@@ -9,9 +9,9 @@ import torch
 from tokenizers import Tokenizer
 
 from hilsplat.models.layouts import DECODER, PREVIEW
-from hilsplat.world.tiny.clip import CANONICAL, CROP_PX, ClipText, ClipVision, word_tokenizer
-from hilsplat.world.tiny.export import export_clip, export_sam
-from hilsplat.world.tiny.sam import (
+from models.training.clip import CANONICAL, CROP_PX, ClipText, ClipVision, word_tokenizer
+from models.training.export import export_clip, export_sam
+from models.training.sam import (
     EMBEDDING,
     FRAME_PX,
     MASK_STRIDE,

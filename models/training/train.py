@@ -9,26 +9,26 @@ from typing import Any
 import torch
 
 from hilsplat.base.artifacts import atomic_folder, sha256_of_json, write_text
-from hilsplat.base.errors import SettingsError
+from hilsplat.base.errors import ModelError, SettingsError
 from hilsplat.base.progress import stage_log
 from hilsplat.segment.sam import SamModel
-from hilsplat.settings import TrainingSettings
-from hilsplat.world.tiny.card import write_clip_card, write_sam_card
-from hilsplat.world.tiny.crops import list_crops, list_segmented
-from hilsplat.world.tiny.data import LabelledViews
-from hilsplat.world.tiny.export import export_clip, export_sam
-from hilsplat.world.tiny.measure_clip import measure_clip, measure_queries
-from hilsplat.world.tiny.measure_sam import (
+from models.training.card import RECORD, write_clip_card, write_sam_card
+from models.training.crops import list_crops, list_segmented
+from models.training.data import LabelledViews
+from models.training.export import export_clip, export_sam
+from models.training.measure_clip import measure_clip, measure_queries
+from models.training.measure_sam import (
     automatic_masks,
     cached_masks,
     measure_everything,
     measure_sam,
 )
-from hilsplat.world.tiny.render import generator_digest, kind_of_seed, render_training_views, training_seeds
-from hilsplat.world.tiny.steps import Budget, Curve
-from hilsplat.world.tiny.train_clip import train_clip
-from hilsplat.world.tiny.train_sam import train_sam
-from hilsplat.world.tiny.vocabulary import world_vocabulary
+from models.training.render import generator_digest, kind_of_seed, render_training_views, training_seeds
+from models.training.settings import TrainingSettings
+from models.training.steps import Budget, Curve
+from models.training.train_clip import train_clip
+from models.training.train_sam import train_sam
+from models.training.vocabulary import world_vocabulary
 
 logger = logging.getLogger(__name__)
 
@@ -101,6 +101,20 @@ def train_models(
             _make_clip(out, cache, material, settings, seed, threads)
     finally:
         torch.set_num_threads(threads_before)
+
+
+def require_own_models(out: Path) -> None:
+    """Check that training replaces no other model.
+
+    Raises:
+        ModelError: a folder of that name is something else than a trained small model.
+    """
+    for name in ("sam-tiny", "clip-tiny"):
+        folder = Path(out) / name
+        if folder.exists() and any(folder.iterdir()) and not (folder / RECORD).is_file():
+            raise ModelError(
+                f"{folder} is there, and no training wrote it", fix="name another folder, or remove it first"
+            )
 
 
 def rendered(cache: Path, settings: TrainingSettings, threads: int) -> Material:

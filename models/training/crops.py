@@ -11,8 +11,8 @@ from scipy import ndimage
 from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.segment.crops import square_crop
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.world.tiny.clip import CANONICAL, CROP_PX
-from hilsplat.world.tiny.data import LabelledViews
+from models.training.clip import CANONICAL, CROP_PX
+from models.training.data import LabelledViews
 
 FRAMES: tuple[str, ...] = (
     "{}",

@@ -11,12 +11,12 @@ from PIL import Image
 from hilsplat.base.artifacts import sha256_of_file, write_json, write_text
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS
-from hilsplat.world.tiny.clip import CROP_PX, DIMENSIONS
-from hilsplat.world.tiny.data import HEAD_LEVELS, LabelledViews, nested_targets
-from hilsplat.world.tiny.measure_clip import COMMON
-from hilsplat.world.tiny.measure_sam import SIZES, predict_masks
-from hilsplat.world.tiny.sam import FRAME_PX, MASK_STRIDE, SamDecoder, SamEncoder
-from hilsplat.world.tiny.steps import Curve
+from models.training.clip import CROP_PX, DIMENSIONS
+from models.training.data import HEAD_LEVELS, LabelledViews, nested_targets
+from models.training.measure_clip import COMMON
+from models.training.measure_sam import SIZES, predict_masks
+from models.training.sam import FRAME_PX, MASK_STRIDE, SamDecoder, SamEncoder
+from models.training.steps import Curve
 
 RECORD = "training.json"
 CARD = "README.md"
@@ -267,7 +267,7 @@ def _recipe_text(recipe: Mapping[str, Any], curve: Curve, folder: Path) -> str:
     first, last = recipe["training_seeds"]
     lowest, highest = recipe["validation_seeds"]
     return f"""## Recipe
-`hilsplat models train` repeats it: the same steps give the same weights on the same machine with the same
+`python -m models.training` repeats it: the same steps give the same weights on the same machine with the same
 number of threads; elsewhere the last digits of sums differ, and so do the weights.
 
 - generator of the world: version and digest of its output {recipe["generator"]}

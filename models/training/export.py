@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from hilsplat.base.artifacts import atomic_path, write_json
 from hilsplat.models.layouts import DECODER, PREVIEW
 from hilsplat.segment.sam import OWN, Thresholds
-from hilsplat.world.tiny.clip import CROP_PX, DIMENSIONS, ClipText, ClipVision
-from hilsplat.world.tiny.sam import (
+from models.training.clip import CROP_PX, DIMENSIONS, ClipText, ClipVision
+from models.training.sam import (
     FRAME_PX,
     MASK_STRIDE,
     STRIDE,

@@ -11,9 +11,9 @@ from torch import Tensor
 from hilsplat.base.levels import LEVELS
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.world.paints import COLOURS
-from hilsplat.world.tiny.clip import CANONICAL, ClipText, ClipVision
-from hilsplat.world.tiny.crops import CropTable
-from hilsplat.world.tiny.data import LabelledViews, normalised
+from models.training.clip import CANONICAL, ClipText, ClipVision
+from models.training.crops import CropTable
+from models.training.data import LabelledViews, normalised
 
 CHUNK = 256
 COMMON = 20

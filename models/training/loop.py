@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.errors import ArtifactError
-from hilsplat.world.tiny.steps import Budget, Curve, learning_rate, prefetched
+from models.training.steps import Budget, Curve, learning_rate, prefetched
 
 logger = logging.getLogger(__name__)
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilsplat.world.tiny.data import LabelledNode, LabelledViews
+from models.training.data import LabelledNode, LabelledViews
 
 
 def drawn_views(count: int, size: int, seed: int = 0) -> LabelledViews:

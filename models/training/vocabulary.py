@@ -48,7 +48,7 @@ def world_vocabulary() -> str:
         for seed in range(TRAINING_SEEDS.start, TRAINING_SEEDS.start + DRAWS):
             take(build_scene(kind, seed, 1).nodes)
     sections = {"things": things - SURFACES, "parts": parts, "surfaces": things & SURFACES}
-    lines = ["# What clip-tiny was taught, by `hilsplat models train`."]
+    lines = ["# What clip-tiny was taught, by `python -m models.training`."]
     for section, texts in sections.items():
         lines += ["", f"[{section}]", *sorted(texts)]
     return "\n".join(lines) + "\n"

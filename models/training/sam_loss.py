@@ -5,8 +5,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hilsplat.world.tiny.batches import SamBatch
-from hilsplat.world.tiny.sam import HEADS, SEMANTIC, STRIDE, SamDecoder, SamEncoder
+from models.training.batches import SamBatch
+from models.training.sam import HEADS, SEMANTIC, STRIDE, SamDecoder, SamEncoder
 
 SEMANTIC_PIXELS = 1536
 """Pixels per batch that the auxiliary classifier sees besides the prompted ones."""

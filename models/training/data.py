@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Shaped, UInt8
 
 from hilsplat.base.levels import Level
-from hilsplat.world.tiny.export import MEAN, STD
-from hilsplat.world.tiny.sam import HEADS, UNIT_PX
+from models.training.export import MEAN, STD
+from models.training.sam import HEADS, UNIT_PX
 
 HEAD_LEVELS = (Level.SUBPART, Level.PART, Level.WHOLE)
 """Level of each output head."""

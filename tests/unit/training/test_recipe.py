@@ -6,10 +6,10 @@ import pytest
 from hilsplat.base.artifacts import read_json
 from hilsplat.base.errors import SceneError, SettingsError
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
-from hilsplat.settings import TrainingSettings
-from hilsplat.world.tiny.card import RECORD, digests
-from hilsplat.world.tiny.render import MIXTURE, kind_of_seed, phrases_of, scene_of_seed, training_seeds
-from hilsplat.world.tiny.train import train_models
+from models.training.card import RECORD, digests
+from models.training.render import MIXTURE, kind_of_seed, phrases_of, scene_of_seed, training_seeds
+from models.training.settings import TrainingSettings
+from models.training.train import train_models
 
 
 def test_only_training_scenes_are_rendered_for_training():

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hilsplat.world.tiny.data import cut_window, nested_targets, region_centres
-from tests.unit.world.tiny.drawn import drawn_views
+from models.training.data import cut_window, nested_targets, region_centres
+from tests.unit.training.drawn import drawn_views
 
 
 def test_a_missing_subpart_is_its_part_and_a_missing_part_its_whole():

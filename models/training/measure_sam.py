@@ -17,8 +17,8 @@ from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.overlaps import region_ious
 from hilsplat.segment.sam import SamModel
 from hilsplat.settings import MasksSettings
-from hilsplat.world.tiny.data import HEAD_LEVELS, LabelledViews, normalised
-from hilsplat.world.tiny.sam import MASK_STRIDE, STRIDE, SamDecoder, SamEncoder, positional_embeddings
+from models.training.data import HEAD_LEVELS, LabelledViews, normalised
+from models.training.sam import MASK_STRIDE, STRIDE, SamDecoder, SamEncoder, positional_embeddings
 
 LEAST_PX = 100
 """Smaller regions are not scored: a handful of pixels says little about a mask."""

@@ -8,7 +8,7 @@ from tokenizers import Tokenizer, models, normalizers, pre_tokenizers
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hilsplat.world.tiny.sam import Residual, convolution
+from models.training.sam import Residual, convolution
 
 CROP_PX = 64
 """Side of the crops that the model takes."""

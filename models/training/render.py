@@ -28,8 +28,8 @@ from hilsplat.world.render import label_view, render_view
 from hilsplat.world.scenes.kinds import build_scene, training_camera
 from hilsplat.world.scenes.scene import WorldScene
 from hilsplat.world.seeds import TRAINING_SEEDS, require_split
-from hilsplat.world.tiny.data import LabelledNode, LabelledViews
-from hilsplat.world.tiny.sam import FRAME_PX
+from models.training.data import LabelledNode, LabelledViews
+from models.training.sam import FRAME_PX
 
 logger = logging.getLogger(__name__)
 

@@ -7,11 +7,11 @@ import pytest
 
 from hilsplat.segment.crops import square_crop
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.world.tiny.clip import CANONICAL, CROP_PX
-from hilsplat.world.tiny.crops import Captioner, best_node, list_crops, list_segmented, roughen
-from hilsplat.world.tiny.measure_clip import coloured_text
-from hilsplat.world.tiny.train_clip import SIBLINGS, CropDraw, crop_weights
-from tests.unit.world.tiny.drawn import drawn_views
+from models.training.clip import CANONICAL, CROP_PX
+from models.training.crops import Captioner, best_node, list_crops, list_segmented, roughen
+from models.training.measure_clip import coloured_text
+from models.training.train_clip import SIBLINGS, CropDraw, crop_weights
+from tests.unit.training.drawn import drawn_views
 
 
 def drawn_masks(*masks_of_level: tuple[int, np.ndarray]) -> HierarchicalMasks:

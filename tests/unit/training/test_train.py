@@ -5,17 +5,17 @@ import pytest
 import torch
 
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.world.tiny.batches import CropStage
-from hilsplat.world.tiny.clip import contrastive_loss
-from hilsplat.world.tiny.crops import list_crops, list_segmented
-from hilsplat.world.tiny.loop import Tuning
-from hilsplat.world.tiny.measure_clip import measure_clip, measure_queries
-from hilsplat.world.tiny.measure_sam import draw_regions, measure_everything, measure_sam
-from hilsplat.world.tiny.sam_loss import segmentation_loss
-from hilsplat.world.tiny.steps import Budget, learning_rate, prefetched
-from hilsplat.world.tiny.train_clip import train_clip
-from hilsplat.world.tiny.train_sam import stage_of_draw, train_sam
-from tests.unit.world.tiny.drawn import drawn_views
+from models.training.batches import CropStage
+from models.training.clip import contrastive_loss
+from models.training.crops import list_crops, list_segmented
+from models.training.loop import Tuning
+from models.training.measure_clip import measure_clip, measure_queries
+from models.training.measure_sam import draw_regions, measure_everything, measure_sam
+from models.training.sam_loss import segmentation_loss
+from models.training.steps import Budget, learning_rate, prefetched
+from models.training.train_clip import train_clip
+from models.training.train_sam import stage_of_draw, train_sam
+from tests.unit.training.drawn import drawn_views
 
 SMALL = (CropStage(1.0, 64, 4, 8, 128),)
 WINDOWS = {"stages": SMALL, "grown_stages": (CropStage(1.0, 64, 2, 12, 96),)}
@@ -121,7 +121,7 @@ def test_segmentation_loss_is_small_for_the_right_mask_and_ignores_unknown_heads
 
 def test_sampled_pixels_give_the_logits_of_the_whole_mask(trained):
     encoder, decoder, _ = trained
-    from hilsplat.world.tiny.sam import positional_embeddings
+    from models.training.sam import positional_embeddings
 
     generator = torch.Generator().manual_seed(0)
     pixels = torch.randn(2, 3, 64, 64, generator=generator)

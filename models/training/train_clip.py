@@ -8,13 +8,13 @@ from tokenizers import Tokenizer
 from torch import Tensor, nn
 
 from hilsplat.base.levels import LEVELS
-from hilsplat.world.tiny.clip import CANONICAL, ClipText, ClipVision, contrastive_loss, word_tokenizer
-from hilsplat.world.tiny.crops import FRAMES, GENERIC_FRAMES, Captioner, CropTable
-from hilsplat.world.tiny.data import normalised
-from hilsplat.world.tiny.loop import Training, Tuning
-from hilsplat.world.tiny.measure_clip import measure_clip, tokenised
-from hilsplat.world.tiny.steps import Budget, Curve
-from hilsplat.world.tiny.train_sam import has_fast_half
+from models.training.clip import CANONICAL, ClipText, ClipVision, contrastive_loss, word_tokenizer
+from models.training.crops import FRAMES, GENERIC_FRAMES, Captioner, CropTable
+from models.training.data import normalised
+from models.training.loop import Training, Tuning
+from models.training.measure_clip import measure_clip, tokenised
+from models.training.steps import Budget, Curve
+from models.training.train_sam import has_fast_half
 
 TUNING = Tuning(peak=2e-3, warmup=60, measure_every=200)
 BATCH = 192

@@ -9,7 +9,7 @@ from jaxtyping import Float, Float32, Int64, Shaped, UInt8
 from scipy import ndimage
 from torch import Tensor
 
-from hilsplat.world.tiny.data import (
+from models.training.data import (
     LabelledViews,
     cut_window,
     nested_targets,
@@ -17,7 +17,7 @@ from hilsplat.world.tiny.data import (
     recolour,
     region_centres,
 )
-from hilsplat.world.tiny.sam import HEADS, MASK_STRIDE, STRIDE, positional_embeddings
+from models.training.sam import HEADS, MASK_STRIDE, STRIDE, positional_embeddings
 
 MARGIN = 4
 """Margin around a region's box that is compared closely too, mask px."""
