@@ -104,7 +104,7 @@ def _masks_from_truth(
     inputs = {"scene": scene, "truth": truth}
     recorded = {"masks": section, "perturb": faults}
     with stage("truth_masks", out, settings=recorded, seed=faults.seed, threads=threads, inputs=inputs):
-        from hilsplat.datasets.synthetic.truth_masks import run_truth_masks
+        from hilsplat.world.truth_masks import run_truth_masks
 
         run_truth_masks(scene, truth, out, faults, section.min_area_px, threads)
 

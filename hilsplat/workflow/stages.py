@@ -11,7 +11,7 @@ STAGES: dict[str, str] = {
     "masks": "hilsplat.segment.stage:run_masks",
     "key_masks": "hilsplat.contributions.key_views:run_key_masks",
     "guided_masks": "hilsplat.semantic_tree.guided_masks:run_guided_masks",
-    "truth_masks": "hilsplat.datasets.synthetic.truth_masks:run_truth_masks",
+    "truth_masks": "hilsplat.world.truth_masks:run_truth_masks",
     "coverage_tree": "hilsplat.segment.coverage_stage:run_coverage_tree",
     "clip": "hilsplat.embed.stage:run_clip",
     "langsplat": "hilsplat.embed.langsplat_files",

@@ -18,13 +18,13 @@ from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
-from hilsplat.datasets.synthetic.faults import Draws, TrueNodes, faulty_masks
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.stage import train_views
 from hilsplat.settings import PerturbSettings
+from hilsplat.world.mask_faults import Draws, TrueNodes, faulty_masks
 
 logger = logging.getLogger(__name__)
 

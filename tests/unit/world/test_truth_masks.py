@@ -17,11 +17,11 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.cli import segment_commands
 from hilsplat.cli import stage as around
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, write_hierarchy
-from hilsplat.datasets.synthetic.truth_masks import FAULTS, faults_label, run_truth_masks
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import PerturbSettings
+from hilsplat.world.truth_masks import FAULTS, faults_label, run_truth_masks
 
 NAMES = ("000.png", "001.png", "002.png")
 SIZE = (24, 40)

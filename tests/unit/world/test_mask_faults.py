@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.datasets.synthetic.faults import (
+from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
+from hilsplat.settings import PerturbSettings
+from hilsplat.world.mask_faults import (
     Draws,
     TrueNodes,
     beside,
@@ -16,8 +18,6 @@ from hilsplat.datasets.synthetic.faults import (
     longest_border,
     sibling_borders,
 )
-from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
-from hilsplat.settings import PerturbSettings
 
 EXACT = PerturbSettings(
     boundary_px=0,
