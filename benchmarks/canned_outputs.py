@@ -1,4 +1,4 @@
-"""Masks of the graph segmenter in place of what a SAM of random weights returns, after its networks ran."""
+"""Graph segmenter masks that replace the outputs of a SAM with random weights after its networks ran."""
 
 from typing import Any
 
@@ -10,14 +10,14 @@ from hilsplat.segment.graph import segment_graph
 from hilsplat.segment.sam import HEADS, Encoded, Frame, SamModel, in_input
 
 SCALES = (0.07, 0.02, 0.004)
-"""Segments of about 300 masks per photograph."""
+"""Scales that give about 300 masks per photograph."""
 
 LOW_PX, SLOPE, REACH_PX = 256, 5.0, 8.0
-"""Side of SAM's masks, slope of the logits at a border per pixel, and where they level off."""
+"""Side of SAM's masks; slope of the logits at a border per pixel; distance at which they saturate."""
 
 
 def labels_of(image: np.ndarray, frame: Frame) -> list[np.ndarray]:
-    """Region of each pixel of the network's masks, for each head; -1 for none."""
+    """Return, for each head, the region of each pixel of the network's masks; -1 for none."""
     masks, labels = segment_graph(image, SCALES, 16), []
     height, width = (side * LOW_PX // frame.padded_hw[0] for side in frame.resized_hw)
     for level in HEADS:
@@ -29,21 +29,21 @@ def labels_of(image: np.ndarray, frame: Frame) -> list[np.ndarray]:
 
 
 class Regions:
-    """Logits of the regions of one image, in the frame of the network's masks."""
+    """Logits of one image's regions, in the frame of the network's masks."""
 
     def __init__(self, labels: list[np.ndarray], frame: Frame) -> None:
         self.scale, self.labels = LOW_PX / frame.padded_hw[0], labels
         self._known: dict[tuple[int, int], np.ndarray] = {}
 
     def logits(self, points: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
-        """Predicted IoUs (P, 3) and logits (P, 3, h, w) of the regions at points of the network's input."""
+        """Return predicted IoUs (P, 3) and logits (P, 3, h, w) of the regions at points in the input."""
         at = np.minimum((points * self.scale).astype(int), LOW_PX - 1)
         out = np.empty((len(points), len(HEADS), LOW_PX // step, LOW_PX // step), np.float32)
         score = np.full((len(points), len(HEADS)), 0.05, np.float32)
         for row, (x, y) in enumerate(at):
             for head, labels in enumerate(self.labels):
                 label = int(labels[y, x])
-                # a prompt in the middle of its region is surest of it
+                # The predicted IoU is highest for prompts in the middle of a region.
                 field = self._field(head, label)
                 out[row, head] = field[::step, ::step]
                 if label >= 0:
@@ -63,7 +63,7 @@ class Regions:
 
 
 def replace_outputs(model: type[SamModel]) -> None:
-    """Let a `SamModel` run its networks and return canned masks."""
+    """Patch a `SamModel` so that it runs its networks but returns canned masks."""
     encode, decode, preview, finish = model.encode, model.decode, model.preview, model.finish
     known: dict[int, list[np.ndarray]] = {}  # the check of int8 encodes an image twice
 

@@ -1,4 +1,4 @@
-"""A SAM whose network is a table of blobs, so that timings cover everything except the network."""
+"""A SAM whose network is replaced by a table of blobs, so that timings exclude the network."""
 
 import time
 
@@ -14,7 +14,7 @@ REGIONS = ((260, 9.0), (80, 19.0), (25, 38.0))
 
 
 class NetworkClock:
-    """Processor time without that of the network, as a timer for pytest-benchmark."""
+    """Timer for pytest-benchmark: processor time without that of the network."""
 
     def __init__(self) -> None:
         self.network_s = 0.0
@@ -26,7 +26,7 @@ class NetworkClock:
 def blob_logits(
     centres_xy: np.ndarray, radii: np.ndarray, size_hw: tuple[int, int], rng: np.random.Generator
 ) -> np.ndarray:
-    """Logits of wobbly discs, float32 (K, h, w); their slope at the border is 5 per pixel, as in SAM."""
+    """Return logits of wobbly discs, float32 (K, h, w), with SAM's slope at the border, 5 per pixel."""
     y, x = np.mgrid[: size_hw[0], : size_hw[1]].astype(np.float32)
     out = np.empty((len(radii), *size_hw), np.float32)
     for place, ((cx, cy), radius) in enumerate(zip(centres_xy, radii, strict=True)):
@@ -38,7 +38,7 @@ def blob_logits(
 
 
 def blob_masks(number: int, size_hw: tuple[int, int], seed: int = 0) -> HierarchicalMasks:
-    """Wobbly discs of log-normal size all over an image, at one level; about 15 of them cover each pixel."""
+    """Return wobbly discs of log-normal size at one level, about 15 of which cover each pixel."""
     rng = np.random.default_rng(seed)
     height, width = size_hw
     centres = rng.uniform(0, 1, (number, 2)) * (width, height)
@@ -55,7 +55,7 @@ def blob_masks(number: int, size_hw: tuple[int, int], seed: int = 0) -> Hierarch
 
 
 class CannedSam(SamModel):
-    """Answers a prompt with the nearest blob of each head, slightly larger or smaller for each prompt."""
+    """SAM that returns the nearest blob of each head, slightly larger or smaller for each prompt."""
 
     def __init__(self, clock: NetworkClock, seed: int = 0) -> None:
         self.clock = clock
@@ -72,7 +72,7 @@ class CannedSam(SamModel):
             self.heads.append((centres, blob_logits(centres, radii, (LOW_PX, LOW_PX), rng)))
 
     def prompts_per_call(self, wanted: int, asked: int) -> int:
-        """The wanted number, or all that are asked if they are fewer."""
+        """Return the smaller of the wanted and the requested number."""
         return min(wanted, asked)
 
     def encode(self, image: np.ndarray) -> Encoded:
@@ -81,7 +81,7 @@ class CannedSam(SamModel):
         return Encoded({}, frame)
 
     def decode(self, encoded: Encoded, points_xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Scores and logits of the blobs nearest to each point; its time is not counted."""
+        """Return scores and logits of the blobs nearest to each point, without counting the time."""
         start = time.process_time()
         scale = encoded.frame.resized_hw[0] / encoded.frame.original_hw[0] * LOW_PX / self.padded_hw[0]
         low = points_xy * scale

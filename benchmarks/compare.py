@@ -1,10 +1,10 @@
-"""What got slower since another commit: paired, interleaved runs of the benchmarks of both.
+"""Compare benchmark timings with those of another commit, in paired, interleaved runs.
 
     python -m benchmarks.compare main~5 -k forward     # or: make bench BASE=main~5
 
-A time of yesterday says little about a machine that is shared today, so both versions run here and now, in
-turn, each in processes of its own. A case counts as slower if it was slower in every pair, and by more than
-`NOISE` in the median pair.
+Timings from different days are not comparable on a shared machine, so both versions run alternately, each in
+its own processes. A case is slower if it was slower in every pair, and by more than `NOISE` in the median
+pair.
 """
 
 import argparse
@@ -22,20 +22,20 @@ from pathlib import Path
 from benchmarks.table import markdown_table
 
 NOISE = 1.08
-"""Median ratio of times up to which a case counts as equal: runs of the same code differ by as much."""
+"""Median ratio of times up to which a case counts as equal, because runs of the same code differ as much."""
 
 Run = Mapping[str, float]
-"""Name of a case -> its least time, ms."""
+"""Name of a case -> its minimum time, ms."""
 
 
 @dataclass(frozen=True)
 class Paired:
-    """A case in all pairs.
+    """Timings of a case in all pairs.
 
     Attributes:
         case: its name.
-        before_ms: least time with the other commit.
-        now_ms: least time with the working tree.
+        before_ms: minimum time with the other commit.
+        now_ms: minimum time with the working tree.
         ratios: time now over time before, one per pair.
     """
 
@@ -46,25 +46,25 @@ class Paired:
 
     @property
     def verdict(self) -> str:
-        """ "slower" or "faster" if every pair says so and the median pair clearly; otherwise empty."""
+        """ "slower" or "faster" if all pairs agree and the median ratio exceeds `NOISE`, otherwise empty."""
         median = statistics.median(self.ratios)
         if min(self.ratios) > 1 and median > NOISE:
             return "slower"
         return "faster" if max(self.ratios) < 1 and median < 1 / NOISE else ""
 
     def row(self) -> tuple[str, ...]:
-        """Row of the table."""
+        """Return the row of the table."""
         least, median, most = min(self.ratios), statistics.median(self.ratios), max(self.ratios)
         spread = f"{median:.2f} ({least:.2f} to {most:.2f})"
         return self.case, f"{self.before_ms:.2f}", f"{self.now_ms:.2f}", spread, self.verdict
 
 
 def paired(before: Sequence[Run], now: Sequence[Run]) -> list[Paired]:
-    """Compare the cases that every run of both versions has, in the order of the first run.
+    """Compare the cases that are in every run of both versions, in the order of the first run.
 
     Args:
         before: runs of the other commit.
-        now: runs of the working tree; the k-th belongs to the k-th of `before`.
+        now: runs of the working tree, each paired with the run in `before` at the same position.
     """
     common = [case for case in now[0] if all(case in run for run in (*before, *now))]
     return [
@@ -80,7 +80,7 @@ def paired(before: Sequence[Run], now: Sequence[Run]) -> list[Paired]:
 
 @contextmanager
 def checked_out(commit: str, folder: Path) -> Iterator[Path]:
-    """A commit's files in a folder, as a work tree of this repository that is removed afterwards."""
+    """Check a commit out into a folder as a temporary work tree of this repository."""
     subprocess.run(["git", "worktree", "add", "--quiet", "--detach", folder, commit], check=True)
     try:
         yield folder
@@ -89,7 +89,7 @@ def checked_out(commit: str, folder: Path) -> Iterator[Path]:
 
 
 def run_benchmarks(tree: Path, out: Path, options: Sequence[str]) -> Run:
-    """Run a tree's benchmarks in one process and read their least times."""
+    """Run a tree's benchmarks in one process and read their minimum times."""
     command = [sys.executable, "-m", "pytest", "-c", "benchmarks/pytest.ini", "benchmarks", "--out", str(out)]
     environment = os.environ | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
     done = subprocess.run([*command, *options], cwd=tree, env=environment, stdout=subprocess.PIPE, text=True)
@@ -100,7 +100,7 @@ def run_benchmarks(tree: Path, out: Path, options: Sequence[str]) -> Run:
 
 
 def main() -> int:
-    """Compare and print; 1 if a case got slower."""
+    """Compare and print; return 1 if a case is slower, otherwise 0."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.compare", description=__doc__.split("\n")[0])
     parser.add_argument("base", help="commit to compare the working tree with")
     parser.add_argument("-k", dest="select", default="", help="cases to run, as pytest selects them")
@@ -111,7 +111,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as scratch, checked_out(asked.base, Path(scratch, "tree")) as other:
         trees = {"before": other, "now": Path.cwd()}
         for pair in range(asked.pairs):
-            for which in sorted(trees, reverse=pair % 2 == 1):  # each version is first in turn
+            for which in sorted(trees, reverse=pair % 2 == 1):  # the versions alternate in running first
                 print(f"pair {pair + 1} of {asked.pairs}: {which}", file=sys.stderr)
                 out = Path(scratch, f"{which}-{pair}")
                 runs[which].append(run_benchmarks(trees[which], out, options))

@@ -1,11 +1,11 @@
-"""`make bench`: every room's timings in one table, printed and written as Markdown and JSON.
+"""`make bench`: timings of all benchmark modules in one table, printed and written as Markdown and JSON.
 
-A room is one file `test_<room>.py`. A case records in `benchmark.extra_info`:
+The column "room" is the name of a module `test_<room>.py`. A case records in `benchmark.extra_info`:
     case: its name, such as "forward, 100k 800x600, D=3, 1 thread";
-    count, of: how many of what one call handles, for the rate (optional);
+    count, of: number and kind of items that one call handles, for the rate (optional);
     flop: useful floating-point operations of one call, for the share of the peak (optional);
     peak_mib: peak memory beyond that held before (optional).
-The list GOALS of a room (see `goals.Goal`) becomes rows of the second table.
+The list GOALS of a module (see `goals.Goal`) gives the rows of the second table.
 """
 
 import datetime
@@ -25,12 +25,12 @@ HEAD = ("room", "case", "least ms", "median ms", "rounds", "rate", "share of FMA
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """--out FOLDER."""
+    """Add the option --out FOLDER."""
     parser.addoption("--out", type=Path, default=Path("results/benchmarks"), help="folder of the tables")
 
 
 def _cases(session: Any, peak_gflops: float) -> list[dict[str, Any]]:
-    """One record per timed case."""
+    """Return one record per timed case."""
     out = []
     for bench in session.benchmarks:
         if bench.has_error or not bench.stats.data:
@@ -62,7 +62,7 @@ def _row(case: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _machine(peak_gflops: float) -> dict[str, Any]:
-    """The machine and versions that the figures depend on."""
+    """Return the machine and versions that the figures depend on."""
     model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.is_file():
@@ -82,7 +82,7 @@ def _machine(peak_gflops: float) -> dict[str, Any]:
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
-    """Print the tables and write them."""
+    """Print and write the tables."""
     session = getattr(config, "_benchmarksession", None)
     if session is None or not session.benchmarks:
         return
@@ -113,6 +113,6 @@ GOALS: pytest.StashKey[list] = pytest.StashKey()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Gather the goals of the rooms to run."""
+    """Collect the goals of the selected modules."""
     modules = dict.fromkeys(item.module for item in items)
     config.stash[GOALS] = [goal for module in modules for goal in getattr(module, "GOALS", [])]

@@ -1,22 +1,22 @@
-"""Goals of a room: a figure computed from its timings, and its target."""
+"""Goals of a benchmark module: figures computed from its timings, with targets."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 Times = dict[str, float]
-"""Name of a case, as in its row of the table -> its least time, ms."""
+"""Name of a case, as in its row of the table -> its minimum time, ms."""
 
 
 @dataclass(frozen=True)
 class Goal:
-    """One line of the table of goals.
+    """One row of the table of goals.
 
     Attributes:
-        what: the figure.
+        what: name of the figure.
         unit: its unit.
-        limit: the target: an upper limit, or a lower one with `at_least`.
-        figure: computes the figure from the times of all cases; KeyError if a case was not run.
-        at_least: larger is better.
+        limit: the target: an upper limit, or a lower limit if `at_least` is set.
+        figure: computes the figure from the times of all cases; raises KeyError if a case was not run.
+        at_least: whether larger is better.
     """
 
     what: str
@@ -26,7 +26,7 @@ class Goal:
     at_least: bool = False
 
     def row(self, times: Times) -> tuple[str, str, str, str] | None:
-        """Row of the table: what, figure, goal, and whether it is met; None if the cases were not run."""
+        """Return the row (what, figure, goal, whether it is met), or None if the cases were not run."""
         try:
             value = self.figure(times)
         except KeyError:

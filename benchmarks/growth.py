@@ -1,10 +1,10 @@
-"""How seconds and memory of the stages after the fit grow with Gaussians, views, pixels and masks.
+"""Measure how time and memory of the stages after the fit grow with Gaussians, views, pixels and masks.
 
-    python -m benchmarks.growth FOLDER        # thirteen scenes, 4 minutes on two quiet cores
+    python -m benchmarks.growth FOLDER        # thirteen scenes, 4 minutes on two idle cores
 
 Each series makes the base scene of `large_scene` with one quantity at half, once, twice and four times its
-size, and runs every stage in a process of its own. It writes `growth.json` and `growth.png`, and prints
-exponents: the slopes of straight lines through the logarithms. It keeps what already exists.
+size, and runs every stage in its own process. It writes `growth.json` and `growth.png`, and prints
+exponents: the slopes of straight lines through the logarithms. Existing results are reused.
 """
 
 import argparse
@@ -33,7 +33,7 @@ LABELS = {
 
 @dataclass(frozen=True)
 class Size:
-    """Size of a made scene; pixels are those of a view, masks those of a view at all levels together."""
+    """Size of a generated scene; pixels are per view, and masks are per view at all levels together."""
 
     gaussians: int = 50_000
     views: int = 24
@@ -41,11 +41,11 @@ class Size:
     masks: int = 150
 
     def grown(self, quantity: str, factor: float) -> "Size":
-        """The scene with one quantity multiplied."""
+        """Return the size with one quantity multiplied."""
         return replace(self, **{quantity: round(getattr(self, quantity) * factor)})
 
     def options(self) -> list[str]:
-        """Options of `large_scene`; views are 4 : 3."""
+        """Return the options of `large_scene`; views are 4 : 3."""
         width = round((self.pixels * 4 / 3) ** 0.5)
         sizes = {"gaussians": self.gaussians, "views": self.views, "masks": self.masks}
         sizes |= {"width": width, "height": round(width * 3 / 4)}
@@ -56,7 +56,7 @@ QUANTITIES = tuple(Size.__annotations__)
 
 
 def measured(size: Size, folder: Path) -> dict[str, list[float]]:
-    """Seconds and peak MiB of every stage on a made scene, made and timed unless it was before."""
+    """Return seconds and peak MiB of every stage on a generated scene; existing timings are reused."""
     name = f"{size.gaussians}-{size.views}-{size.pixels}-{size.masks}"
     kept = folder / name / "times.json"
     if not kept.exists():
@@ -66,12 +66,12 @@ def measured(size: Size, folder: Path) -> dict[str, list[float]]:
 
 
 def exponent(sizes: list[float], values: list[float]) -> float:
-    """Slope of the straight line through the logarithms: 1 is linear."""
+    """Return the slope of the straight line through the logarithms; 1 is linear growth."""
     return float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
 
 
 def draw(series: dict[str, dict[str, dict[str, list[float]]]]) -> Figure:
-    """One column per quantity, seconds above and peak memory below; each line ends with its exponent."""
+    """Draw a column per quantity, seconds above and peak memory below, with the exponent of each line."""
     figure = Figure(figsize=(3.6 * len(series), 6.4), layout="constrained")
     panels = figure.subplots(len(MEASURES), len(series), sharey="row")
     for column, (quantity, found) in enumerate(series.items()):

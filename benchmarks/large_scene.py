@@ -1,12 +1,12 @@
-"""A synthetic scene as large as a large capture, and the time and memory of each stage of the method.
+"""Time and memory of each stage of the method on a synthetic scene of the size of a large capture.
 
     python -m benchmarks.large_scene LARGE                             # 1M Gaussians, 250 views of 986 x 728
     python -m benchmarks.large_scene SMALL --gaussians 100000 --views 48 --width 800 --height 600
 
-makes a floor with 400 balls on it, a ring of cameras, and masks of each view at three levels (balls, halves,
-eighths; the largest of each level) with a CLIP vector each, and then runs coverage tree, contributions,
-semantic tree, autoencoder and field one after the other, each in its own process. It keeps what already
-exists, and prints times and peaks and writes them to `times.md` and `times.json`.
+The scene is a floor with 400 balls, a ring of cameras, and masks of each view at three levels (balls, halves,
+eighths; the largest of each level) with a CLIP vector each. Coverage tree, contributions, semantic tree,
+autoencoder and field run in order, each in its own process. An existing scene is reused. Times and peaks are
+printed and written to `times.md` and `times.json`.
 """
 
 import argparse
@@ -47,7 +47,7 @@ from hilsplat.splat.ply import save_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 
 ROWS = 20
-"""Number of rows and of columns of balls, a metre apart."""
+"""Number of rows and of columns of balls, which are a metre apart."""
 RADIUS = 0.38
 CHANNELS = 512
 MIN_AREA_PX = 50
@@ -55,10 +55,10 @@ STAGES = ("coverage_tree", "contributions", "semantic_tree", "autoencoder", "fie
 
 
 def made_gaussians(number: int) -> tuple[Gaussians, np.ndarray]:
-    """Gaussians of the balls (seven tenths of all) and the floor, in the order that a fit gives them.
+    """Return Gaussians of the balls (seven tenths of all) and the floor, in the order of a fit's output.
 
     Returns:
-        the Gaussians, and (N, 3) the ball, half and eighth of each, -1 on the floor.
+        The Gaussians, and (N, 3) the ball, half and eighth of each, -1 on the floor.
     """
     rng = np.random.default_rng(0)
     on_balls = number * 7 // 10
@@ -86,7 +86,7 @@ def made_gaussians(number: int) -> tuple[Gaussians, np.ndarray]:
 
 
 def ring_of_cameras(number: int, size_hw: tuple[int, int]) -> Cameras:
-    """Cameras at two heights around the balls, looking at points near the middle."""
+    """Return cameras at two heights around the balls that look at points near the middle."""
     rng = np.random.default_rng(1)
     poses = np.tile(np.eye(4), (number, 1, 1))
     for index in range(number):
@@ -146,7 +146,7 @@ def make(out: Path, number: int, views: int, size_hw: tuple[int, int], masks: in
 
 
 def front_gaussian(weights) -> np.ndarray:
-    """The Gaussian with the largest weight at each pixel, -1 for none."""
+    """Return the Gaussian with the largest weight at each pixel, -1 for none."""
     front = np.full(weights.shape[0], -1, np.int64)
     counts = np.diff(weights.indptr)
     filled = np.flatnonzero(counts)
@@ -158,7 +158,7 @@ def front_gaussian(weights) -> np.ndarray:
 
 
 def stages(out: Path, threads: int) -> dict[str, Callable[[], None]]:
-    """The stages to time."""
+    """Return the stages to time."""
     code = AutoencoderSettings(code="pca", latent=16)
     return {
         "coverage_tree": lambda: run_coverage_tree(

@@ -1,4 +1,4 @@
-"""Peak rate of fused multiply-adds of the machine."""
+"""Peak rate of fused multiply-adds on this machine."""
 
 import time
 from typing import no_type_check
@@ -9,13 +9,13 @@ import numpy as np
 from hilsplat.base.lanes import lane_sum, lanes
 
 CHAINS = 12
-"""Independent sums in flight: enough to hide 4 to 5 cycles of latency on 2 units."""
+"""Number of independent sums, enough to hide a latency of 4 to 5 cycles on 2 units."""
 
 
 @numba.njit
 @no_type_check
 def _multiply_add(rounds, factor, term):
-    """CHAINS x 16 fused multiply-adds per round."""
+    """Compute CHAINS x 16 fused multiply-adds per round."""
     x, y = lanes(factor), lanes(term)
     a, b, c, d, e, f = y, y, y, y, y, y
     g, h, i, j, k, m = y, y, y, y, y, y
@@ -27,7 +27,7 @@ def _multiply_add(rounds, factor, term):
 
 
 def fma_peak_gflops() -> float:
-    """Largest rate of float32 operations of one core, GFLOP/s; a multiply-add counts as two."""
+    """Return the peak float32 rate of one core, GFLOP/s; a multiply-add counts as two operations."""
     rounds = 2_000_000
     factor, term = np.float32(0.999), np.float32(1e-3)
     _multiply_add(1, factor, term)

@@ -1,9 +1,9 @@
-"""Peak memory of one forward and one backward pass, in a separate process (Linux).
+"""Peak memory of one forward and one backward pass, measured in a separate process (Linux).
 
     python -m benchmarks.memory 1000000 2160 3840 3     # Gaussians, height, width, channels
 
-prints the peak of forward, and of forward and backward, beyond the scene itself, MiB. The image and alpha,
-all gradients and everything in between count; the gradients of the image, which are inputs, do not.
+prints the peak of forward, and of forward and backward, in MiB beyond the scene itself. It includes image,
+alpha, all gradients and intermediate arrays, but not the gradients of the image, which are inputs.
 """
 
 import subprocess
@@ -14,7 +14,7 @@ import numpy as np
 
 
 def peaks_mib(num_gaussians: int, size_hw: tuple[int, int], channels: int) -> tuple[float, float]:
-    """Peak of forward, and of forward and backward, measured in a fresh process."""
+    """Return the peak of forward, and of forward and backward, measured in a new process."""
     numbers = [str(number) for number in (num_gaussians, *size_hw, channels)]
     command = [sys.executable, "-m", "benchmarks.memory", *numbers]
     printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
@@ -29,7 +29,7 @@ def _measure(num_gaussians: int, size_hw: tuple[int, int], channels: int) -> tup
         gaussians, camera = random_scene(num, size_hw)
         features = np.ones((num, channels - 3), np.float32)
         grad = np.ones((*size_hw, channels), np.float32), np.ones(size_hw, np.float32)
-        # reset the peak to what the process holds now
+        # This resets the recorded peak to the current memory use.
         Path("/proc/self/clear_refs").write_text("5")
         before = status_mib("VmRSS")
         view = project_gaussians(gaussians, camera, 3, 1)
@@ -39,7 +39,7 @@ def _measure(num_gaussians: int, size_hw: tuple[int, int], channels: int) -> tup
         blend_gradients(gaussians, view, values, image, alpha, *grad, 1)
         return forward, status_mib("VmHWM") - before
 
-    passes(1000, (32, 32))  # loads the kernels
+    passes(1000, (32, 32))  # load the kernels before measuring
     return passes(num_gaussians, size_hw)
 
 

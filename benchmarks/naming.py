@@ -1,11 +1,10 @@
-"""How often the vocabulary names nodes rightly, and how often doubts are right, on finished synthetic scenes.
+"""Measure how often node names and doubts about queries are right, on finished synthetic scenes.
 
     python -m benchmarks.naming results/synthetic/dev-1 results/synthetic-rooms/dev-room
 
 A node counts if it has an IoU above 0.5 with a true node; its name is right if it is the true text or a
-synonym. Texts that are present are those of the matched nodes. Texts that are absent are those of the
-vocabulary that name nothing in the scene; words that the model does not know are always doubted
-and not counted.
+synonym. Present texts are those of the matched nodes. Absent texts are those of the vocabulary that name
+nothing in the scene. Words outside the model's vocabulary are always doubted and are not counted.
 """
 
 import sys
@@ -20,18 +19,18 @@ from hilsplat.evaluate.diagnostics.tree_truth import measure_tree, true_votes
 from hilsplat.query.node_names import Vocabulary, vocabulary_file
 
 ABSENT = 200
-"""Texts for absent things that are asked, at most, spread over the vocabulary."""
+"""Maximum number of queries for absent texts, spread over the vocabulary."""
 
 
 @dataclass
 class Counts:
-    """Right and all of something."""
+    """Number of right cases, and of all cases."""
 
     right: int = 0
     all: int = 0
 
     def add(self, right: bool) -> None:
-        """Count one."""
+        """Count one case."""
         self.right, self.all = self.right + right, self.all + 1
 
     def __str__(self) -> str:
@@ -44,10 +43,10 @@ class Naming:
 
     Attributes:
         top1: the nearest text is right.
-        top5: one of the nearest five is.
-        named: the node got a name.
-        right: the name that it got is right.
-        doubted: a text that is present was doubted when it was asked.
+        top5: one of the nearest five texts is right.
+        named: the node has a name.
+        right: the node's name is right.
+        doubted: the query for a present text raised a doubt.
     """
 
     top1: Counts = field(default_factory=Counts)
@@ -58,7 +57,7 @@ class Naming:
 
 
 def measure(folder: Path, levels: dict[Level, Naming], missed: Counts) -> None:
-    """Add a scene; `missed` counts absent texts that were answered without a doubt."""
+    """Add the counts of a scene; `missed` counts absent texts that were answered without a doubt."""
     scene = hilsplat.open(folder)
     assert scene.naming is not None, f"{folder} has no names: hilsplat run {folder}/default/names"
     truth = HierarchyAnnotations.load(folder / "world/truth")
@@ -85,7 +84,7 @@ def measure(folder: Path, levels: dict[Level, Naming], missed: Counts) -> None:
 
 
 def main() -> None:
-    """Measure the scenes that the command line names."""
+    """Measure the scenes named on the command line."""
     levels, missed = {level: Naming() for level in LEVELS}, Counts()
     for name in sys.argv[1:]:
         measure(Path(name), levels, missed)

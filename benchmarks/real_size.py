@@ -1,12 +1,12 @@
-"""What a released SAM and CLIP cost per photograph, measured with random weights at their real size. By hand:
+"""Time and memory per photograph of a released SAM and CLIP, measured on full-size networks.
 
     python -m benchmarks.real_size                              # SAM ViT-B and CLIP B/16 on three photographs
     python -m benchmarks.real_size --sam sam2.1-small PHOTOS    # another SAM; a folder of your own
 
-Networks of random weights cost what trained ones cost. They are exported once into --models (extra
-export; ViT-B needs 8 GB for that, ViT-H more). A random SAM is sure of no mask, so the work on masks
-outside the network is not in these numbers (`make bench` measures it), and CLIP embeds the graph segmenter's.
-Each step runs in a process of its own, on one core, and prints processor seconds and its peak of memory.
+Run it by hand. Random weights take as long as trained ones. Networks are exported once into --models (extra
+`export`; ViT-B needs 8 GB for that, ViT-H more). A random SAM predicts no confident mask, so the work on
+masks outside the network is excluded (`make bench` measures it), and CLIP embeds masks of the graph
+segmenter. Each step runs in its own process, on one core, and prints processor seconds and peak memory.
 """
 
 import argparse
@@ -24,7 +24,7 @@ KEPT = 0.3
 """Share of the prompts whose masks are decoded after the preview (docs/experiments.md, "Masks")."""
 
 MAX_SIDE_PX = 800
-"""As the group `photos` of the configuration."""
+"""Maximum image side in the configuration group `photos`, px."""
 
 SIZES = {
     "base": {},
@@ -36,11 +36,11 @@ SIZES = {
         "mlp_dim": 5120,
     },
 }
-"""What a SAM's vision encoder has other than ViT-B."""
+"""Settings of a SAM's vision encoder that differ from ViT-B."""
 
 
 def export_sam(size: str, out: Path) -> None:
-    """A SAM of random weights in the layout of the Hugging Face ONNX exports."""
+    """Export a SAM with random weights in the layout of the Hugging Face ONNX exports."""
     import torch
     import transformers
     from optimum.exporters.onnx import main_export
@@ -48,8 +48,8 @@ def export_sam(size: str, out: Path) -> None:
     torch.manual_seed(0)
     config = transformers.SamConfig(transformers.SamVisionConfig(**SIZES[size]).to_dict())
     model = transformers.SamModel(config)
-    # Positions and biases start at zero; then the padding of a picture gives denormal numbers, which cost
-    # several times as much as others.
+    # Zero-initialised positions and biases would give denormal numbers in the padding of an image, and
+    # arithmetic on these takes several times as long.
     with torch.no_grad():
         for parameter in model.parameters():
             if not parameter.any():
@@ -60,7 +60,7 @@ def export_sam(size: str, out: Path) -> None:
 
 
 def export_sam2(out: Path) -> None:
-    """A SAM 2.1 small of random weights in the layout of the published ONNX exports."""
+    """Export a SAM 2.1 small with random weights in the layout of the published ONNX exports."""
     import torch
     import transformers
 
@@ -119,9 +119,9 @@ def export_sam2(out: Path) -> None:
 
 
 def export_clip(out: Path) -> None:
-    """A CLIP B/16 of random weights in the layout of the Hugging Face ONNX exports.
+    """Export a CLIP B/16 with random weights in the layout of the Hugging Face ONNX exports.
 
-    Its tokenizer knows letters alone; the table of tokens has its real size.
+    Its tokenizer has only letters, but the token table has full size.
     """
     import torch
     import transformers
@@ -153,7 +153,7 @@ def export_clip(out: Path) -> None:
 
 
 def measure(step: str, models: Path, photograph: Path, points: int) -> dict[str, float]:
-    """Processor seconds and peak of memory of one step on one photograph, in this process."""
+    """Measure processor seconds and peak memory of one step on one photograph in this process."""
     from hilsplat.base.images import read_image, resize_to_fit
     from hilsplat.models.layouts import LAYOUTS
     from hilsplat.models.network import Network
@@ -187,13 +187,12 @@ def measure(step: str, models: Path, photograph: Path, points: int) -> dict[str,
 
 
 def compare_decoders(models: Path, photograph: Path, points: int) -> dict[str, float]:
-    """Processor milliseconds per prompt of the plain and the factored decoder, in alternating rounds.
+    """Measure processor milliseconds per prompt of the plain and the factored decoder, in alternating rounds.
 
-    The plain network decodes 64 prompts in calls of 8; the factored decoder previews them all and decodes as
-    many again as `KEPT` says. A random SAM is sure of no mask, so the preview rule itself is not run.
-
-    Masks of both are compared pixel by pixel: `unequal_px` of `mask_px` differ, and none of these has a logit
-    above `tie`. Random logits crowd around 0, where the border of a trained SAM's mask is steep.
+    The plain network decodes 64 prompts in calls of 8. The factored decoder previews and decodes all of them;
+    `mean_ms` counts the share `KEPT` of the decoding. A random SAM predicts no confident mask, so the preview
+    rule itself is not run. The masks of both are compared by pixel: `unequal_px` of `mask_px` differ, and no
+    absolute logit there exceeds `tie`. Random logits cluster around 0, where a trained SAM's are steep.
     """
     from hilsplat.base.images import read_image, resize_to_fit
     from hilsplat.segment.sam import SamModel, ask_network, in_input, one_point_each, point_grid
@@ -233,7 +232,7 @@ def compare_decoders(models: Path, photograph: Path, points: int) -> dict[str, f
 
 
 def _picture_half(network):
-    """A `ClipModel` that knows pictures only."""
+    """Return a `ClipModel` with only the image encoder."""
     from hilsplat.embed.clip import ClipModel
 
     model = object.__new__(ClipModel)
@@ -248,7 +247,7 @@ def _picture_half(network):
 
 
 def main() -> None:
-    """Export what is missing, then measure every photograph, each step in a process of its own."""
+    """Export missing models, then measure every photograph, each step in its own process."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("photographs", type=Path, nargs="?", default=PHOTOGRAPHS)
     parser.add_argument("--sam", choices=[*SIZES, "sam2.1-small"], default="base", help="SAM's encoder")
@@ -291,7 +290,7 @@ def main() -> None:
 
 
 def _run(step: str, models: Path, photograph: Path, points: int = 32) -> str:
-    """One step in a process of its own, without the model hub; what it printed."""
+    """Run one step in its own process, without the model hub, and return its output."""
     command = [sys.executable, "-m", "benchmarks.real_size", "--step", step, "--models", str(models)]
     command += ["--points", str(points)]
     environment = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}

@@ -1,12 +1,12 @@
-"""Seconds from photographs to answers with a real SAM and CLIP, by a complete run on two cores. By hand:
+"""Time from photographs to query results with a full-size SAM and CLIP, in a complete run on two cores.
 
-    python -m benchmarks.rehearsal FOLDER                       # SAM 2.1 small, CLIP B/16, settings of a user
+    python -m benchmarks.rehearsal FOLDER                       # SAM 2.1 small, CLIP B/16, default settings
     python -m benchmarks.rehearsal FOLDER --sam base --precision fp32
 
-Networks of random weights at their real size (`real_size`) cost what trained ones cost, but a random SAM is
-sure of no mask. Its networks run in full, and their masks are then replaced by regions of the graph segmenter
-at each prompt (`canned_outputs`), so that everything after them does real work. FOLDER becomes a project with
-one scene; a FOLDER of an earlier rehearsal is refused, since its caches would answer.
+Run it by hand. Full-size networks with random weights (`real_size`) take as long as trained ones, but a
+random SAM predicts no confident mask. Its networks therefore run in full, and their masks are replaced by
+the graph segmenter's regions at each prompt (`canned_outputs`), so that later stages do real work. FOLDER
+becomes a project with one scene. An existing FOLDER is refused, because its caches would be used.
 """
 
 import argparse
@@ -43,11 +43,11 @@ class Finder(importlib.abc.MetaPathFinder):
 
 sys.meta_path.insert(0, Finder())
 """
-"""`sitecustomize.py` of every process of the run: SAM gets canned outputs when it is imported."""
+"""`sitecustomize.py` of all processes of the run, which patches SAM with canned outputs on import."""
 
 
 def make_models(store: Path, sam: str) -> dict[str, Path]:
-    """Export the networks that are missing, each in a process of its own: exporters keep gigabytes."""
+    """Export missing networks, each in its own process, because exporters do not free gigabytes of memory."""
     wanted = {f"sam-{sam}": "sam", "clip": "clip"}
     for name in wanted:
         if not (store / name / "config.json").is_file():
@@ -67,7 +67,7 @@ def export(store: Path, name: str) -> None:
 
 
 def make_project(folder: Path, models: dict[str, Path], precision: str) -> list[str]:
-    """A project with links to the code and the models; returns the options of its run."""
+    """Make a project with links to the code and the models, and return the options of its run."""
     for name in ("Snakefile", "workflow", "rules", "profiles"):
         (folder / name).symlink_to(PROJECT / name)
     shutil.copytree(PROJECT / "config", folder / "config")
@@ -86,11 +86,11 @@ def make_project(folder: Path, models: dict[str, Path], precision: str) -> list[
 
 
 def rehearse(folder: Path, photographs: Path, options: list[str], cores: int) -> dict[str, float]:
-    """Run the project; seconds from the end of `hilsplat new` to each announcement, and to the end."""
+    """Run the project; return the seconds from the end of `hilsplat new` to each milestone and to the end."""
     environment = {**os.environ, "PYTHONPATH": f"{folder / 'patch'}:{PROJECT}"}
     command = [sys.executable, "-m", "hilsplat"]
     name = SCENE.partition("/")[2]
-    # as `hilsplat models get` does: kernels are compiled and int8 networks made
+    # As in `hilsplat models get`, this compiles kernels and makes int8 networks before the timed run.
     plain = {**os.environ, "PYTHONPATH": str(PROJECT)}
     subprocess.run([*command, "models", "check"], cwd=folder, env=plain, check=True)
     subprocess.run([*command, "new", name, str(photographs)], cwd=folder, env=environment, check=True)
@@ -113,7 +113,7 @@ def rehearse(folder: Path, photographs: Path, options: list[str], cores: int) ->
 
 
 def stage_table(folder: Path) -> str:
-    """Seconds, processor seconds and peak memory of every job, from Snakemake's benchmark files."""
+    """Return time, processor time and peak memory of every job, from Snakemake's benchmark files."""
     lines = [f"{'job':32} {'s':>6} {'core s':>7} {'peak MiB':>9}"]
     for path in sorted((folder / "results" / SCENE).rglob("benchmarks/*.jsonl"), key=os.path.getmtime):
         row = json.loads(path.read_text().splitlines()[-1])
@@ -123,7 +123,7 @@ def stage_table(folder: Path) -> str:
 
 
 def main() -> None:
-    """Export, lay the project out, run it, and print the table."""
+    """Export the models, make the project, run it, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("folder", type=Path, help="folder to make")
     parser.add_argument("photographs", type=Path, nargs="?", default=PHOTOGRAPHS)

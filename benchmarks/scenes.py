@@ -1,4 +1,4 @@
-"""Random scenes that cost as much as fitted ones: each pixel blends 33 to 43 Gaussians."""
+"""Random scenes that take as long to render as fitted ones: each pixel blends 33 to 43 Gaussians."""
 
 import math
 
@@ -20,10 +20,10 @@ SPREAD = 0.9
 def random_scene(
     num_gaussians: int, size_hw: tuple[int, int], *, seed: int = 0, sh_degree: int = 3
 ) -> tuple[Gaussians, Camera]:
-    """Anisotropic Gaussians spread evenly over a frustum, and the camera that sees them.
+    """Return anisotropic Gaussians spread evenly over a camera's frustum, and the camera.
 
-    Widths are log-normal and shrink with the root of the number; opacities are logit-normal. Images
-    are nearly opaque: alpha is 0.95 to 0.99 on average.
+    Widths are log-normal and inversely proportional to the root of the number; opacities are logit-normal.
+    The average alpha of an image is 0.95 to 0.99.
     """
     generator = np.random.default_rng(seed)
     height, width = size_hw

@@ -2,7 +2,7 @@
 
 
 def markdown_table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    """A Markdown table that is also readable as text."""
+    """Return a Markdown table that is also readable as text."""
     lines = [head, *rows]
     widths = [max(len(line[k]) for line in lines) for k in range(len(head))]
     text = ["| " + " | ".join(cell.ljust(widths[k]) for k, cell in enumerate(line)) + " |" for line in lines]

@@ -1,4 +1,4 @@
-"""Scoring a view: 20 annotated texts at 986 x 728 px, with given relevancy maps and node masks."""
+"""Time to score a view: 20 annotated texts at 986 x 728 px, with given relevancy maps and node masks."""
 
 import time
 from functools import cache
@@ -20,7 +20,7 @@ one_thread = pytest.mark.benchmark(timer=time.process_time, min_rounds=3, max_ti
 
 
 class Answers:
-    """Answers that cost nothing: a map per text and level, a node per text."""
+    """Precomputed answers: a relevancy map per text and level, and a node per text."""
 
     def __init__(self, texts: list[str], regions: list[np.ndarray]) -> None:
         rng = np.random.default_rng(0)
@@ -46,7 +46,7 @@ class Answers:
 
 @cache
 def annotated_view() -> tuple[Answers, ViewTruth]:
-    """Five things of 200 x 300 px, each with a half, a quarter and a rim."""
+    """Return a view with five objects of 200 x 300 px, each with a half, a quarter and a rim."""
     queries, regions, by_path = [], [], {}
     for thing in range(5):
         top, left = 60 + 250 * (thing // 3), 20 + 320 * (thing % 3)
@@ -77,7 +77,7 @@ def test_scoring_a_view(benchmark, method):
 
 
 def scoring(method: str) -> str:
-    """Name of a case."""
+    """Return the name of a case."""
     return f"scoring a view of 986x728 with 20 queries, {method}"
 
 

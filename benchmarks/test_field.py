@@ -1,8 +1,8 @@
-"""Queries on tree and field, the linkage of masks and the solver, on synthetic scenes of known size.
+"""Timings of queries on tree and field, mask linkage and the solver, on synthetic scenes of known size.
 
-The scene of the queries: 200,000 Gaussians in front of one camera of 986 x 728 px, divided into blocks that
-are the nodes of three levels; CLIP vectors of 512 numbers. The timings are those of an open scene: the view
-was drawn and the text embedded before (the time of the text model depends on the model).
+Queries use a scene of 200,000 Gaussians in front of one camera of 986 x 728 px, divided into blocks that
+are the nodes of three levels, with CLIP vectors of 512 numbers. The scene is open: its view is rendered and
+the text embedded before the timing, because the text model's time depends on the model.
 """
 
 import time
@@ -46,7 +46,7 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 
 @cache
 def open_scene(code_name: str, threads: int = 1) -> LanguageScene:
-    """A scene whose latents have three numbers (network) or sixteen (pca)."""
+    """Return a scene whose latents have three numbers (network) or sixteen (pca)."""
     gaussians, camera = random_scene(200_000, SIZE_HW, sh_degree=0)
     rng = np.random.default_rng(0)
     place = gaussians.means @ camera.K.T
@@ -150,7 +150,7 @@ def test_relevancy_of_nodes_in_a_view(benchmark):
 def test_query_on_the_field(benchmark, code):
     scene = open_scene(code)
     benchmark.extra_info |= {"case": field_case(code), "count": 3 * SIZE_HW[0] * SIZE_HW[1], "of": "px"}
-    scene.field_relevancy(["mug handle"], VIEW, exact=False)  # once per view: rendered, decoded
+    scene.field_relevancy(["mug handle"], VIEW, exact=False)  # renders and decodes once per view
     assert benchmark(lambda: scene.field_relevancy(["mug handle"], VIEW, exact=False)).max() > 0
 
 
@@ -166,7 +166,7 @@ def test_query_on_the_field_by_two_threads(benchmark, code):
 
 @one_thread
 def test_linkage_of_a_synthetic_scene(benchmark):
-    """40 views of 60,000 Gaussians in 25 regions a level, each seen by every second view: 3,000 masks."""
+    """Link 3,000 masks: 25 regions per level in 40 views, each showing half of 60,000 Gaussians."""
     rng = np.random.default_rng(0)
     region = rng.integers(0, 25, 60_000)
     view = np.repeat(np.arange(40, dtype=np.int32), 25)
@@ -192,7 +192,7 @@ def test_linkage_of_a_synthetic_scene(benchmark):
 
 @one_thread
 def test_conjugate_gradient(benchmark):
-    """Ten steps of the quadratic part: 60,000 Gaussians, d = 8, W of eight views of 256 px."""
+    """Run ten steps on the quadratic part: 60,000 Gaussians, d = 8, W of eight views of 256 px."""
     gaussians, camera = random_scene(60_000, (256, 256), sh_degree=0)
     W = sp.vstack([pixel_weights(gaussians, camera, min_weight=1 / 255)] * 8, format="csr")
     labels = np.random.default_rng(0).integers(0, 30, (W.shape[0], 3)) + np.array([0, 30, 60])
@@ -216,7 +216,7 @@ LINKAGE = "evidence and linkage, 40 views, 3000 masks"
 
 
 def field_case(code: str) -> str:
-    """Name of a case of the field."""
+    """Return the name of a field query case."""
     size = "d=3, network" if code == "network" else "d=16, pca"
     return f"query on the field at three levels, {size}, 986x728"
 

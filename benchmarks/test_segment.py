@@ -1,7 +1,7 @@
-"""A view's masks without the network: reading logits, filters, suppression, tree, writing.
+"""Time to make a view's masks without the network: reading logits, filters, suppression, tree, writing.
 
-Timed on one thread by the processor's clock, which stops while the network (a table of blobs, `canned_sam`)
-answers. Cases handle all 3 x 1024 answers to a grid of 32 x 32 prompts.
+Timings are processor time of one thread, without that of the network (a table of blobs, `canned_sam`).
+Cases handle all 3 x 1024 outputs for a grid of 32 x 32 prompts.
 """
 
 import time
@@ -22,7 +22,7 @@ from hilsplat.settings import MasksSettings
 SETTINGS = MasksSettings(
     points_per_batch=64, predicted_iou_min=0.7, stability_min=0.5, nms_score=0, min_area_px=100
 )
-"""The filters drop nothing, so that 1024 candidates per level reach the suppression."""
+"""Filter settings that drop nothing, so that 1024 candidates per level reach the suppression."""
 
 VIEW_HW = (600, 800)
 LANGSPLAT_HW = (728, 986)
@@ -43,7 +43,7 @@ def image() -> np.ndarray:
 
 
 def finish(candidates, model, folder) -> int:
-    """From candidates to files of masks and tree."""
+    """Write masks and tree of candidates, and return the number of masks."""
     masks = masks_from_candidates(candidates, VIEW_HW, model, SETTINGS)
     parent, depth = coverage_tree(masks, 0.9)
     masks.save(folder / "masks.npz")

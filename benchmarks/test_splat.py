@@ -1,7 +1,7 @@
-"""The CPU rasteriser, the photometric loss and a whole fit iteration, on random scenes.
+"""Timings of the CPU rasteriser, the photometric loss and a whole fit iteration on random scenes.
 
-One thread is timed by the processor's clock, which other load disturbs less, more threads by the wall clock.
-Both report the least of many rounds. Useful operations count hits only (a Gaussian blended at a pixel):
+One thread is timed in processor time, which depends less on other load, and two threads in wall time. Both
+report the minimum of many rounds. Only hits (a Gaussian blended at a pixel) count as useful operations:
 22 + 2 D forward, 40 + 4 D backward, where D is the number of colour and feature channels.
 """
 
@@ -39,7 +39,7 @@ SETTINGS = GaussiansSettings(
     opacity_reset_every=4 * HALF_WAY,
     device="cpu",
 )
-"""Half-way through a fit: all harmonics are on, gradients are gathered, density control does not run."""
+"""Settings of the middle of a fit: all harmonics are on, gradients are accumulated, no density control."""
 
 scenes = pytest.mark.parametrize("scene", SIZES)
 threads = pytest.mark.parametrize(
@@ -53,21 +53,21 @@ channels = pytest.mark.parametrize("channels", [3, 9])
 
 
 def name(what: str, scene: str, threads: int, channels: int | None = None) -> str:
-    """Name of a case, as the goals call it."""
+    """Return the name of a case, as used in the goals."""
     width = f", D={channels}" if channels else ""
     return f"{what}, {scene}{width}, {threads} thread{'s' if threads > 1 else ''}"
 
 
 @cache
 def scene_of(scene: str) -> tuple:
-    """Camera, Gaussians, and hits (Gaussians blended at pixels) of a scene."""
+    """Return camera, Gaussians, and number of hits (Gaussians blended at pixels) of a scene."""
     gaussians, camera = random_scene(*SIZES[scene])
     row_start, _, _ = sparse_weights(project_gaussians(gaussians, camera, 3, 2), 0.0, 2)
     return camera, gaussians, int(row_start[-1])
 
 
 def blended(gaussians: Gaussians, view, channels: int) -> np.ndarray:
-    """Colours, then random features up to the number of channels."""
+    """Return colours, followed by random features up to the number of channels."""
     rng = np.random.default_rng(1)
     more = rng.normal(size=(len(gaussians), channels - 3)).astype(np.float32)
     return np.concatenate([view.colours, more], axis=1) if channels > 3 else view.colours
@@ -122,7 +122,7 @@ def test_fit_iteration(benchmark, scene, threads):
     state = FitState(Adam.start(start), ScreenGradients.start(len(start["means"])), rng, step=HALF_WAY)
 
     def reset():
-        # each round begins at the same Gaussians, or the scene would drift away from its hits
+        # Every round starts from the same Gaussians, so that the number of hits stays valid.
         for field in FIELDS:
             state.adam.parameters[field][...] = start[field] if field == "sh" else getattr(gaussians, field)
         state.step, state.order = HALF_WAY, []
@@ -142,19 +142,19 @@ def test_photometric_loss(benchmark, threads):
 
 @pytest.mark.parametrize("channels", [3, 16])
 def test_peak_memory(benchmark, channels):
-    """The timing covers the whole measuring process; only its column of MiB matters."""
+    """Measure peak memory; the timing covers the whole measuring process and is not meaningful."""
     benchmark.extra_info |= {"case": memory_case(channels)}
     _, peak = benchmark.pedantic(lambda: peaks_mib(*SIZES[LARGE], channels), rounds=1)
     benchmark.extra_info["peak_mib"] = peak
 
 
 def memory_case(channels: int) -> str:
-    """Name of a case of memory."""
+    """Return the name of a memory case."""
     return f"memory of forward and backward, {LARGE}, D={channels}"
 
 
 def _ratio(what: str, above: tuple, below: tuple):
-    """Figure of a goal: the time of one case divided by that of another."""
+    """Return a function that divides the time of one case by that of another."""
     return lambda times: times[name(what, *above)] / times[name(what, *below)]
 
 

@@ -1,11 +1,11 @@
-"""The fast solver of the field against the literal trainer on one scene: losses, scores and time. By hand:
+"""Compare the field's fast solver with the literal trainer on one scene: losses, scores and time.
 
     python -m benchmarks.trainers FOLDER                        # dev-1, 6000 iterations, two seeds
     python -m benchmarks.trainers FOLDER --scene tiny --iterations 1000 --seeds 1
 
-Both minimise the paper's objective in our reading (variant `paper`): the same masks, code and weights. FOLDER
-becomes a project; its results stay. Losses are those of the whole objective, over all views. The literal
-trainer's rate is constant, as LangSplat's is; at its 0.0025, noise keeps it 1.5 % above the minimum.
+Run it by hand. Both minimise our reading of the paper's objective (variant `paper`) with equal masks, code
+and weights. FOLDER becomes a project; its results are kept. Losses are of the whole objective, over all
+views. The literal trainer's rate is constant, as in LangSplat; at LangSplat's 0.0025, noise adds 1.5 %.
 """
 
 import argparse

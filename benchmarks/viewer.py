@@ -1,9 +1,9 @@
-"""What a browser gets of a scene, and when it can be looked at, dragged and asked.
+"""Measure the data that a browser loads for a scene, and the time to the first view, a drag and a query.
 
     python -m benchmarks.viewer results/synthetic/table-1 1 5 17      # the scene, and 5 and 17 times as large
 
-In a larger scene each Gaussian is split into as many smaller ones around it, of the same nodes. Chromium
-paints with WebGL in software (Mesa's llvmpipe), and then the server paints.
+In a larger scene, each Gaussian is split into several smaller ones around it, with the same nodes. Chromium
+first renders with WebGL in software (Mesa's llvmpipe); then the server renders.
 """
 
 import argparse
@@ -40,7 +40,7 @@ COLUMNS += ("heap, MB", "server, MiB")
 
 
 def enlarged(folder: Path, times: int, out: Path) -> Path:
-    """A copy of a scene with each Gaussian split into `times`; its tree answers, without names and field."""
+    """Copy a scene's tree, without names and field, and its Gaussians, each split into `times`."""
     gaussians = load_ply(folder / "gaussians.ply")
     rng = np.random.default_rng(0)
     rows = np.repeat(np.arange(len(gaussians)), times)
@@ -69,7 +69,7 @@ def enlarged(folder: Path, times: int, out: Path) -> Path:
 
 
 def opened(browser: Any, folder: Path, painter: str) -> dict[str, float]:
-    """Open the page of a scene once, drag and ask."""
+    """Open the page of a scene once, drag the view and run a query; return the measurements."""
     with serving(folder) as address:
         server = next(
             child for child in psutil.Process().children() if "hilsplat" in " ".join(child.cmdline())
@@ -113,7 +113,7 @@ def dragged(page: Any) -> None:
 
 
 def timed_redraw(page: Any, act: Any) -> float:
-    """Seconds until what was done is drawn."""
+    """Return the seconds until the result of an action is drawn."""
     view = page.locator("#view")
     before, begin = int(view.get_attribute("data-drawn")), time.perf_counter()
     act()

@@ -1,4 +1,4 @@
-"""Pictures of the synthetic world itself, for its manual: one of each class, and some scenes with labels."""
+"""Pictures of the synthetic world for its manual: one of each class, and some scenes with labels."""
 
 import logging
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ OBJECTS = 7
 AZIMUTH_DEG = 25.0
 ELEVATION_DEG = 30.0
 RADIUS = 0.36
-"""Radius to which a class is scaled in its picture; tall ones are scaled by their height."""
+"""Radius to which an object is scaled in its picture; tall objects are scaled by their height."""
 
 _GROUND = Paint(
     "grey", "mottled", (0.66, 0.66, 0.64), (0.63, 0.63, 0.61), 3.0, 0.0, 10.0, 0.1, (5.0, 6.0, 7.0)
@@ -44,7 +44,7 @@ _GROUND = Paint(
 
 
 def draw_classes(out: Path, names: Sequence[str] = TABLETOP, seed: int = 0) -> None:
-    """Write a picture of one object per class of the table, each with its name, as PNG."""
+    """Write a PNG that shows one object of each named tabletop class with its name."""
     from matplotlib.figure import Figure
 
     rows = -(-len(names) // CLASS_COLUMNS)
@@ -61,7 +61,7 @@ def draw_classes(out: Path, names: Sequence[str] = TABLETOP, seed: int = 0) -> N
 
 
 def _alone(model: ObjectModel) -> tuple[WorldScene, Camera]:
-    """A scene with one object on plain ground, and a camera whose view it fills."""
+    """Return a scene with one object on plain ground, and a camera whose view the object fills."""
     centre, radius = footprint_of(model.triangles)
     height = float(model.triangles[..., 2].max())
     scale = min(RADIUS / radius, 2.7 * RADIUS / height)
@@ -78,10 +78,10 @@ def _alone(model: ObjectModel) -> tuple[WorldScene, Camera]:
 
 
 def draw_scenes(kind: str, seeds: Sequence[int], out: Path) -> None:
-    """Write a picture of some scenes of a kind: a view of each and its true labels by level, as PNG.
+    """Write a PNG of some scenes of a kind: a view of each, and its true labels by level.
 
     Raises:
-        SceneError: the kind is unknown.
+        SceneError: if the kind is unknown.
     """
     from matplotlib.figure import Figure
 
@@ -121,7 +121,7 @@ def draw_scenes(kind: str, seeds: Sequence[int], out: Path) -> None:
 
 
 def _filled(labels: Int32[np.ndarray, "3 H W"], level: Level) -> Int32[np.ndarray, "H W"]:
-    """Node per pixel at a level; if it has none, that of the level above."""
+    """Return the node per pixel at a level, or that of the next coarser level with a node."""
     image = labels[0]
     for finer in range(1, level.index + 1):
         image = np.where(labels[finer] >= 0, labels[finer], image)
@@ -129,7 +129,7 @@ def _filled(labels: Int32[np.ndarray, "3 H W"], level: Level) -> Int32[np.ndarra
 
 
 def _write(figure: "Figure", out: Path) -> None:
-    """Write a figure as PNG with a dithered palette of 256 colours: half the size, for web pages."""
+    """Write a figure as PNG with a dithered palette of 256 colours, which halves the file size."""
     from PIL import Image, PngImagePlugin
 
     full = BytesIO()

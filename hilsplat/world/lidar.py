@@ -1,8 +1,8 @@
-"""A scan of a synthetic street by a spinning laser scanner on the roof of the car (metres).
+"""Simulated scan of a synthetic street by a spinning laser scanner on the roof of the car (metres).
 
-It stands in for the top lidar of the Waymo data: 64 beams between 17.6 degrees below the horizon and 2.4
-above. Rays are cast exactly; then each range gets noise, and some returns are lost. The scanner's true
-positions are kept, as in a logged drive: they are not estimated from the images.
+It replaces the top lidar of the Waymo data: 64 beams between 17.6 degrees below the horizon and 2.4 above.
+Rays are cast exactly; then noise is added to each range, and some returns are dropped. As in a logged drive,
+the scanner's positions are recorded and not estimated from the images.
 """
 
 from dataclasses import dataclass
@@ -21,28 +21,28 @@ INCLINATION_DEG = (-17.6, 2.4)
 AZIMUTH_STEPS = 400
 """Directions per turn; Waymo has 2650."""
 POSES = 5
-"""Positions along the drive at which a turn is recorded."""
+"""Number of positions along the drive at which a turn is recorded."""
 ABOVE_CAMERA_M = 0.35
 MAX_RANGE_M = 75.0
 RANGE_NOISE_M = 0.015
-"""Standard deviation of a range."""
+"""Standard deviation of the measured range."""
 LOST_SHARE = 0.05
-"""Share of returns that are lost at random."""
+"""Share of returns that are dropped at random."""
 GLANCING_COSINE = 0.03
-"""A beam that meets a surface at a flatter angle is not returned."""
+"""Minimum cosine between a beam and the surface normal for a return."""
 
 
 @dataclass(frozen=True, eq=False)
 class LidarScan:
-    """P measured points, with the truth about each.
+    """P measured points with their true nodes.
 
     Attributes:
         points: positions in the world of the true cameras, noise included, metres.
         node_ids: nodes that were hit (whole, part, subpart; -1 none).
         pose_index: row of `origins` from which each point was measured.
         range_m: measured distance to that origin.
-        beam: which of the 64 beams, 0 the lowest.
-        origins: where the scanner was.
+        beam: number of the beam, 0 to 63 from the lowest.
+        origins: positions of the scanner.
     """
 
     points: Float32[np.ndarray, "P 3"]
@@ -56,12 +56,12 @@ class LidarScan:
         return len(self.points)
 
     def save(self, path: Path) -> None:
-        """Write all fields as .npz; the same scan gives the same bytes."""
+        """Write all fields as .npz; equal scans give equal bytes."""
         write_npz(path, **{name: getattr(self, name) for name in self.__dataclass_fields__})
 
 
 def beam_directions(azimuth_steps: int) -> Float[np.ndarray, "R 3"]:
-    """Unit vectors of one turn, beam by beam from the lowest, azimuth by azimuth from +x to +y."""
+    """Return the unit vectors of one turn, ordered by beam from the lowest, then by azimuth from +x to +y."""
     share = (np.arange(BEAMS) + 0.5) / BEAMS
     up = np.radians(INCLINATION_DEG[0] + share * (INCLINATION_DEG[1] - INCLINATION_DEG[0]))[:, None]
     around = 2 * np.pi * (np.arange(azimuth_steps) + 0.5)[None] / azimuth_steps
@@ -81,11 +81,11 @@ def scan_street(
     range_noise_m: float = RANGE_NOISE_M,
     lost_share: float = LOST_SHARE,
 ) -> LidarScan:
-    """Scan a scene from some of the positions of its views.
+    """Scan a scene from some of its views' positions.
 
     Args:
-        scene: its seed also determines noise and losses; the sky returns nothing.
-        camera_centres: along the drive, in order; the scanner is above evenly chosen ones.
+        scene: street to scan; its seed also determines noise and losses. The sky returns nothing.
+        camera_centres: positions along the drive, in order; the scanner is above evenly chosen ones.
         azimuth_steps: directions per turn of each beam.
         poses: number of turns recorded.
         range_noise_m: standard deviation of the range.
@@ -104,7 +104,7 @@ def scan_street(
         triangle = scene.triangles[prim].astype(np.float64)
         normal = np.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])
         facing = np.abs((normal * directions).sum(axis=1)) / np.linalg.norm(normal, axis=1)
-        # Drawn for every ray, so that a lost point does not change the noise of the others.
+        # Both are drawn for every ray, so that a lost point does not change the noise of the others.
         noise, luck = rng.normal(0.0, 1.0, len(directions)), rng.random(len(directions))
         ids = np.where((prim >= 0)[:, None], scene.node_ids[prim], NONE)
         kept = (prim >= 0) & ~np.isin(ids[:, 0], sky) & (away < MAX_RANGE_M)

@@ -1,8 +1,8 @@
-"""Faults added to true masks: what a segmenter does wrong, one setting for each kind of mistake.
+"""Faults added to true masks: a segmenter's mistakes, with one setting for each kind.
 
 Every decision uses a random number derived from a name (seed, scene, kind of fault, view, node), so it
-depends neither on the order of views nor on other kinds of faults, and a higher probability adds faults of
-its kind to those of a lower one: sweeps over a knob compare like with like.
+depends neither on the order of views nor on other kinds of faults. A higher probability keeps the faults of
+a lower one and adds more of the same kind, so the steps of a sweep over a setting are comparable.
 """
 
 from collections import defaultdict
@@ -20,18 +20,18 @@ from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import PerturbSettings
 
 REACH = 3.0
-"""A boundary moves at most this many standard deviations."""
+"""Maximum displacement of a boundary, standard deviations."""
 
 WAVES = 48
-"""Number of plane waves that add up to a boundary's displacement."""
+"""Number of plane waves that are summed for a boundary's displacement."""
 
 Borders = dict[int, dict[int, int]]
-"""Node -> touching sibling -> length of their common border, px."""
+"""Node -> adjacent sibling -> length of their common border, px."""
 
 
 @dataclass(frozen=True)
 class Draws:
-    """Random numbers by name, the same in any order and on any number of threads.
+    """Random numbers derived from names, independent of call order and number of threads.
 
     Attributes:
         seed: seed of the faults.
@@ -42,24 +42,24 @@ class Draws:
     scene: str
 
     def generator(self, *name: str | int) -> np.random.Generator:
-        """Generator derived from a name."""
+        """Return a generator derived from a name."""
         digest = sha256_of_json([self.seed, self.scene, *name])
         return np.random.default_rng(int(digest[:32], 16))
 
     def chance(self, *name: str | int) -> float:
-        """Number in [0, 1) derived from a name; an event of probability p happens if it is below p."""
+        """Return a number in [0, 1) derived from a name; an event of probability p happens below p."""
         return int(sha256_of_json([self.seed, self.scene, *name])[:13], 16) / 16**13
 
 
 @dataclass(frozen=True)
 class TrueNodes:
-    """What the faults need to know about a scene as a whole.
+    """Scene-wide data that the faults depend on.
 
     Attributes:
         nodes: all nodes by id.
         background: ids of the surroundings, which are never merged.
-        partner: for each node, the sibling with which it shares the longest border over all views: a
-            systematic merge joins the two. Nodes without a touching sibling are absent.
+        partner: for each node, the sibling with which it shares the longest border over all views; a
+            systematic merge joins the two. Nodes without an adjacent sibling are absent.
     """
 
     nodes: tuple[AnnotatedNode, ...]
@@ -77,7 +77,7 @@ class TrueNodes:
         Args:
             nodes: all nodes by id.
             background: ids of the surroundings.
-            labels: per view the node id per level and pixel, -1 for none.
+            labels: for each view, the node id per level and pixel, -1 for none.
         """
         total: Borders = defaultdict(lambda: defaultdict(int))
         alone = TrueNodes(nodes, frozenset(background), {})
@@ -92,7 +92,7 @@ class TrueNodes:
 
 
 def sibling_borders(labels: Int32[np.ndarray, "H W"], truth: TrueNodes) -> Borders:
-    """Common borders of nodes of one level that have the same parent; the surroundings are left out."""
+    """Return the common borders of sibling nodes of one level, without the surroundings."""
     borders: Borders = defaultdict(lambda: defaultdict(int))
     for first, second in ((labels[:, :-1], labels[:, 1:]), (labels[:-1], labels[1:])):
         differ = (first != second) & (first != NONE) & (second != NONE)
@@ -107,18 +107,18 @@ def sibling_borders(labels: Int32[np.ndarray, "H W"], truth: TrueNodes) -> Borde
 
 
 def longest_border(around: Mapping[int, int]) -> int:
-    """The neighbour with the longest border; ties go to the lower id."""
+    """Return the neighbour with the longest border, or the lower id on a tie."""
     return min(around, key=lambda other: (-around[other], other))
 
 
 def merged_groups(
     ids: Sequence[int], borders: Borders, truth: TrueNodes, view: str, draws: Draws, settings: PerturbSettings
 ) -> list[tuple[int, ...]]:
-    """Nodes of one level that a view shows as one mask, each group ascending.
+    """Group the nodes of one level into the masks of a view, each group in ascending order.
 
-    With probability `merge` a node starts a merge with the touching sibling with which it shares the longest
-    border. A node drawn for a systematic merge joins its `partner` in `systematic_share` of the views in
-    which the two touch.
+    With probability `merge`, a node is merged with the sibling with which it shares the longest border in
+    the view. A node drawn for a systematic merge is merged with its `partner` in `systematic_share` of the
+    views in which the two are adjacent.
     """
     owner = {node: node for node in ids}
 
@@ -146,7 +146,7 @@ def merged_groups(
 
 
 def systematic(fault: str, node: int, view: str, draws: Draws, settings: PerturbSettings) -> bool:
-    """Whether a systematic fault ("merge" or "missing") of a node happens in a view."""
+    """Return whether a systematic fault ("merge" or "missing") of a node happens in a view."""
     probability = getattr(settings, f"systematic_{fault}")
     return (
         draws.chance(f"systematic {fault}", node) < probability
@@ -157,10 +157,10 @@ def systematic(fault: str, node: int, view: str, draws: Draws, settings: Perturb
 def cut_in_two(
     mask: Bool[np.ndarray, "H W"], generator: np.random.Generator
 ) -> tuple[Bool[np.ndarray, "H W"], ...]:
-    """Both sides of a straight line that leaves 30 to 70 % of the mask on either side.
+    """Cut a mask along a straight line that leaves 30 to 70 % of it on either side.
 
     Returns:
-        the two pieces; the mask alone if it is too small to cut.
+        The two pieces, or only the mask if it is too small to cut.
     """
     angle, share = generator.uniform(0, np.pi), generator.uniform(0.3, 0.7)
     y, x = np.nonzero(mask)
@@ -181,20 +181,20 @@ def displaced(
 ) -> Bool[np.ndarray, "H W"]:
     """Move a mask's boundary along its normal by a smooth random amount.
 
-    A pixel stays or becomes inside if its signed distance to the boundary (positive inside, half a pixel next
+    A pixel is inside the new mask if its signed distance to the boundary (positive inside, half a pixel next
     to it) exceeds `amplitude_px` times a random field of unit variance. The field is a sum of plane waves, so
-    it depends on the position alone and not on the amplitude: with the same generator a larger amplitude
-    changes all pixels that a smaller one changes, and more.
+    it depends only on the position: with the same generator, a larger amplitude changes all pixels that a
+    smaller one changes, and more.
 
     Args:
-        mask: not empty.
+        mask: non-empty mask.
         amplitude_px: standard deviation of the displacement; 0 returns the mask itself.
-        smooth_px: standard deviation of the field's correlation, as of a Gaussian.
-        generator: of the field.
+        smooth_px: standard deviation of the field's Gaussian correlation function.
+        generator: source of the field.
 
     Returns:
-        the new mask, never empty: inwards the boundary moves at most half the way to the innermost
-        pixel, so thin things become thinner and do not vanish. Image borders are not boundaries.
+        The new mask, never empty: the boundary moves inwards by at most half the distance to the innermost
+        pixel, so thin regions become thinner but do not vanish. Image borders are not boundaries.
     """
     if amplitude_px == 0:
         return mask
@@ -220,12 +220,12 @@ def displaced(
 
 
 def _distance(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Distance of each inside pixel to the nearest outside one, between centres, px; 0 outside."""
+    """Return each inside pixel's distance to the nearest outside pixel, between centres, px; 0 outside."""
     return cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 
 def beside(level: Level, up: bool) -> Level:
-    """An adjacent level; part has one on either side."""
+    """Return an adjacent level; `up` selects the coarser neighbour of part."""
     if level is not Level.PART:
         return Level.PART
     return Level.WHOLE if up else Level.SUBPART
@@ -239,19 +239,19 @@ def faulty_masks(
     settings: PerturbSettings,
     min_area_px: int,
 ) -> tuple[HierarchicalMasks, dict[str, int]]:
-    """One view's masks: the true regions, with faults in this order.
+    """Return one view's true regions as masks, with faults applied in this order.
 
     1. Dropped views, missing levels.
     2. Merges: a group of nodes becomes one mask (`merged_groups`).
-    3. Missing masks; in a group the lowest node decides, systematic faults of any of its nodes count.
-    4. Splits (`cut_in_two`), then the boundary (`displaced`), each mask by itself, so that masks begin to
-       overlap and to leave gaps.
+    3. Missing masks: the draw of a group's lowest node or a systematic fault of any of its nodes drops it.
+    4. Splits (`cut_in_two`), then boundaries (`displaced`). Each mask is changed separately, so masks may
+       then overlap or leave gaps.
     5. Wrong levels: whole becomes part, subpart becomes part, part becomes either.
 
-    `predicted_iou` is the IoU of the mask with the true region it covers best among its nodes', plus noise;
-    `stability` is the mean of that IoU and 1, plus noise; both are clipped to [0, 1]. A systematic merge is
-    thus doubted as much as any other; a mask at the wrong level is not doubted. SAM's thresholds and
-    suppressions are not applied: the masks are written exactly as specified.
+    `predicted_iou` is the mask's best IoU with the true region of one of its nodes, plus noise. `stability`
+    is the mean of that IoU and 1, plus noise. Both are clipped to [0, 1]. A systematic merge thus lowers the
+    scores as much as any other merge; a wrong level does not lower them. SAM's thresholds and suppressions
+    are not applied: the masks are written exactly as specified.
 
     Args:
         labels: node id per level and pixel, -1 for none.
@@ -262,7 +262,7 @@ def faulty_masks(
         min_area_px: smaller true regions give no mask.
 
     Returns:
-        the masks in `content_order`, and how many of each fault were put in.
+        The masks in `content_order`, and the number of faults of each kind.
     """
     counts = dict.fromkeys(("missing_levels", "merged", "missing", "split", "wrong_level"), 0)
     found: list[tuple[np.ndarray, Level, float, float]] = []
@@ -310,7 +310,7 @@ def faulty_masks(
 def _visible(
     of_level: Int32[np.ndarray, "H W"], truth: TrueNodes, settings: PerturbSettings, min_area_px: int
 ) -> list[int]:
-    """Nodes of a level that are large enough in a view to be masked, ascending."""
+    """Return the nodes of a level that are large enough in a view for a mask, in ascending order."""
     areas = zip(*np.unique(of_level, return_counts=True), strict=True)
     ids = [int(node) for node, area_px in areas if node != NONE and area_px >= min_area_px]
     return [node for node in ids if settings.background or node not in truth.background]
@@ -319,7 +319,7 @@ def _visible(
 def _scores(
     quality: float, draws: Draws, settings: PerturbSettings, name: tuple[str | int, ...]
 ) -> tuple[float, float]:
-    """Predicted IoU and stability of a mask whose true IoU is `quality`."""
+    """Return predicted IoU and stability of a mask whose true IoU is `quality`."""
     predicted, stability = quality, (1 + quality) / 2
     if settings.score_noise:
         noise = settings.score_noise * draws.generator("scores", *name).standard_normal(2)

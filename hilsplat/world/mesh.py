@@ -1,4 +1,4 @@
-"""The true surface of a synthetic scene, read back from its truth folder, and its exact depth."""
+"""The true surface of a synthetic scene, read from its truth folder, and its exact depth."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,10 +15,10 @@ from hilsplat.world.rays import RayCaster
 
 @dataclass(frozen=True, eq=False)
 class TrueMesh:
-    """The triangles of a scene, in the frame of its true cameras.
+    """Triangles of a scene, in the frame of its true cameras.
 
     Attributes:
-        triangles: corners, scene units.
+        triangles: corner positions, scene units.
     """
 
     triangles: Float32[np.ndarray, "F 3 3"]
@@ -28,10 +28,10 @@ class TrueMesh:
         """Read `truth/mesh.ply`.
 
         Raises:
-            ArtifactError: it is missing or not a mesh.
+            ArtifactError: if the file is missing or not a mesh.
         """
         try:
-            # lists of a known length are mapped from the file, not parsed one by one
+            # plyfile memory-maps lists of a known length instead of parsing them one by one.
             record = PlyData.read(path, known_list_len={"face": {"vertex_indices": 3}})
             vertices, faces = record["vertex"], record["face"]["vertex_indices"]
         except FileNotFoundError as error:
@@ -45,11 +45,11 @@ class TrueMesh:
 
     @cached_property
     def caster(self) -> RayCaster:
-        """Casts rays at the triangles; built on first use."""
+        """Ray caster over the triangles; built on first use."""
         return RayCaster(self.triangles)
 
     def depth(self, camera: Camera) -> Float32[np.ndarray, "H W"]:
-        """Depth along the optical axis at each pixel's centre, scene units; inf where there is nothing."""
+        """Return the depth along the optical axis at pixel centres, scene units; inf if nothing is hit."""
         height, width = camera.size_hw
         y, x = np.mgrid[:height, :width] + 0.5
         pixels = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)

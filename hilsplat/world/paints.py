@@ -23,7 +23,7 @@ KINDS = (
     "fur",
     "tiles",
 )
-"""Solid textures, in the order of the shader's numbers."""
+"""Solid textures, in the order of the shader's kind numbers."""
 
 COLOURS: dict[str, Colour] = {
     "red": (0.78, 0.14, 0.12),
@@ -54,7 +54,7 @@ ADJECTIVES: dict[str, str] = {
     "fur": "furry",
     "tiles": "tiled",
 }
-"""Word in a text for a thing with such a texture; other kinds have none."""
+"""Adjective for an object with the texture; other kinds have none."""
 
 SECOND_SHARE: dict[str, float] = {
     "mottled": 0.47,
@@ -70,7 +70,7 @@ SECOND_SHARE: dict[str, float] = {
     "fur": 0.50,
     "tiles": 0.17,
 }
-"""Share of a texture that shows its second colour, on average over space (a test measures it)."""
+"""Average share of a texture in its second colour (measured by a test)."""
 
 # (kinds to draw from, specular strength, shininess) per group of materials.
 GROUPS: dict[str, tuple[tuple[str, ...], float, float]] = {
@@ -92,7 +92,7 @@ PATTERNS = ("stripes", "checks", "spots")
 """Kinds whose second colour may be something other than a shade of the first."""
 
 PATTERN_CONTRAST = 22.0
-"""Least distance between the two colours of a pattern, in L*a*b*."""
+"""Minimum distance between the two colours of a pattern, in L*a*b*."""
 
 WOOD_COLOURS = ("brown", "beige", "orange")
 
@@ -102,16 +102,16 @@ class Paint:
     """One solid material: a texture of two colours, evaluated in object coordinates.
 
     Attributes:
-        colour: word for the first, prevailing colour.
+        colour: word for the prevailing (first) colour.
         kind: texture, one of `KINDS`.
         first: sRGB of the prevailing colour, in [0, 1].
         second: sRGB of the pattern's other colour.
         scale: cells of the pattern per scene unit.
         specular: strength of the highlight.
         shininess: Blinn-Phong exponent.
-        grain: relative amplitude of the fine grain (structure from motion needs it).
+        grain: relative amplitude of the fine grain, which structure from motion needs.
         offset: shift of the texture, scene units; keeps cell borders off object faces.
-        choices: colour words that the thing may have; empty for any.
+        choices: allowed colour words; empty for any.
     """
 
     colour: str
@@ -127,18 +127,18 @@ class Paint:
 
     @property
     def adjective(self) -> str | None:
-        """Word for the texture, if there is one."""
+        """Adjective for the texture, or None."""
         return ADJECTIVES.get(self.kind)
 
     @property
     def seen(self) -> Float[np.ndarray, " 3"]:
-        """Colour of the paint from afar, sRGB: both colours mixed in linear light as the texture does."""
+        """Average colour of the paint, sRGB: both colours mixed in linear light as in the texture."""
         share = SECOND_SHARE[self.kind]
         first, second = (linear_from_srgb(np.array(colour)) for colour in (self.first, self.second))
         return srgb_from_linear((1 - share) * first + share * second)
 
     def paled(self, share: float) -> "Paint":
-        """The same paint with both colours mixed with a light grey by `share`, and its word."""
+        """Return the paint with a share of light grey in both colours, and the matching colour word."""
 
         def mixed(value: float) -> float:
             return (1 - share) * value + share * 0.68
@@ -146,7 +146,7 @@ class Paint:
         return self._changed(mixed)
 
     def shaded(self, factor: float) -> "Paint":
-        """The same paint darker (factor below 1) or nearer to white (above 1), and its word."""
+        """Return the paint darker (factor below 1) or nearer to white, with the matching colour word."""
 
         def moved(value: float) -> float:
             return max(0.03, factor * value) if factor <= 1 else value + (factor - 1) * (0.95 - value)
@@ -154,19 +154,19 @@ class Paint:
         return self._changed(moved)
 
     def recoloured(self, word: str) -> "Paint":
-        """The same texture in another colour, with a second colour a shade away from it."""
+        """Return the same texture in another colour, whose shade becomes the second colour."""
         first = np.array(COLOURS[word])
         second = _relative(first)
         return replace(self, colour=word, first=tuple(first.tolist()), second=tuple(second.tolist()))
 
     def _changed(self, change: Callable[[float], float]) -> "Paint":
-        """The paint with a change of each channel of both colours, and its word."""
+        """Return the paint with each channel of both colours changed, and the matching colour word."""
         first, second = each_channel(self.first, change), each_channel(self.second, change)
         paint = replace(self, first=first, second=second)
         return replace(paint, colour=colour_word(paint.seen))
 
     def row(self) -> Float[np.ndarray, " 14"]:
-        """Numbers for the shader.
+        """Return the shader's parameters for the paint.
 
         Returns:
             Kind, first colour (3) and second colour (3) in linear light, scale, specular, shininess,
@@ -188,18 +188,18 @@ class Paint:
 
 
 def each_channel(colour: Colour, change: Callable[[float], float]) -> Colour:
-    """The colour with a change made to each channel."""
+    """Apply a function to each channel of a colour."""
     red, green, blue = colour
     return change(red), change(green), change(blue)
 
 
 def linear_from_srgb(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
+    """Convert sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
 def srgb_from_linear(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Linear light in [0, 1] to sRGB (IEC 61966-2-1)."""
+    """Convert linear light in [0, 1] to sRGB (IEC 61966-2-1)."""
     return np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055)
 
 
@@ -209,7 +209,7 @@ _XYZ_FROM_RGB = np.array(
 
 
 def lab_from_srgb(colour: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape 3"]:
-    """CIE L*a*b* (D65) of sRGB colours; Euclidean distances in it follow the eye, 2.3 is just visible."""
+    """Convert sRGB to CIE L*a*b* (D65), where a Euclidean distance of 2.3 is just noticeable."""
     xyz = linear_from_srgb(np.asarray(colour, dtype=np.float64)) @ _XYZ_FROM_RGB.T
     t = xyz / _XYZ_FROM_RGB.sum(axis=1)
     f = np.where(t > (6 / 29) ** 3, np.cbrt(t), t / (3 * (6 / 29) ** 2) + 4 / 29)
@@ -222,7 +222,7 @@ _LAB = lab_from_srgb(np.array(list(COLOURS.values())))
 
 
 def colour_word(colour: Float[np.ndarray, " 3"]) -> str:
-    """The colour word whose colour is nearest to an sRGB colour, in L*a*b*.
+    """Return the word of the listed colour nearest to an sRGB colour, in L*a*b*.
 
     Example:
         >>> colour_word(np.array([0.9, 0.1, 0.1]))
@@ -232,7 +232,7 @@ def colour_word(colour: Float[np.ndarray, " 3"]) -> str:
 
 
 def difference(first: Paint, second: Paint) -> float:
-    """How differently two paints look from afar: distance of `Paint.seen` in L*a*b*."""
+    """Return the distance in L*a*b* between the average colours (`Paint.seen`) of two paints."""
     return float(np.linalg.norm(_seen_lab(first) - _seen_lab(second)))
 
 
@@ -242,24 +242,24 @@ def _seen_lab(paint: Paint) -> Float[np.ndarray, " 3"]:
 
 
 def _relative(first: np.ndarray) -> np.ndarray:
-    """A shade of a colour: darker of a light one, lighter of a dark one."""
+    """Return a shade of a colour: darker if it is light, lighter if it is dark."""
     light = float(first.mean()) > 0.5
     return np.clip(first * (0.66 if light else 1.4) + (0.0 if light else 0.04), 0.02, 0.95)
 
 
 class PaintBox:
-    """Draws the paints of one object; colours do not repeat until the box is empty."""
+    """Generator of one object's paints; colours do not repeat until all have been used."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
         self._left: list[str] = []
 
     def draw(self, group: str, *colours: str, scale: float = 1.0) -> Paint:
-        """A paint of the group.
+        """Draw a random paint of a material group.
 
         Args:
             group: one of `GROUPS`.
-            colours: colour words to choose from; by default any not used yet.
+            colours: colour words to choose from; by default all unused ones.
             scale: factor on the pattern's number of cells per unit.
         """
         rng = self._rng
@@ -298,9 +298,9 @@ class PaintBox:
         return self._left
 
     def _patterned(self, paint: Paint) -> Paint:
-        """The paint with a visible second colour that does not change the word for its prevailing colour.
+        """Return the paint with a visible second colour that does not change its colour word.
 
-        A changed word would make the texts wrong: "red mug" for what looks brown from afar.
+        Otherwise texts would be wrong: "red mug" for a mug that looks brown from a distance.
         """
         first = np.array(paint.first)
         for word in self._rng.permutation(list(COLOURS)):

@@ -1,8 +1,8 @@
-"""Rays cast at triangles by Embree, sixteen at a time.
+"""Ray casting at triangles with Embree, in packets of sixteen rays.
 
-Embree comes with embreex, which asks it ray by ray. Here compiled loops call its C interface, in a fifth of
-the time where neighbouring rays take similar ways. The answers are the same to the bit, except where two
-triangles are at one distance: which of them a ray meets then depends on the rays beside it.
+The embreex package provides Embree but casts rays one by one. Compiled loops here call Embree's C interface,
+which takes a fifth of the time for nearly parallel neighbouring rays. Results are bit-identical, except where
+two triangles are at the same distance: the one that is reported then depends on the other rays in the packet.
 """
 
 import ctypes
@@ -19,16 +19,16 @@ from numba import types
 from hilsplat.base.compiled import compiled
 
 LANES = 16
-"""Rays of a packet."""
+"""Number of rays in a packet."""
 
-# Numbers of Embree's headers (rtcore_scene.h, rtcore_geometry.h, rtcore_buffer.h, rtcore_common.h).
+# Constants from Embree's headers (rtcore_scene.h, rtcore_geometry.h, rtcore_buffer.h, rtcore_common.h).
 _ROBUST_SCENE = 4
 _TRIANGLES = 0
 _INDICES, _VERTICES = 0, 1
 _THREE_UINTS, _THREE_FLOATS = 0x5003, 0x9003
 _COHERENT = 1 << 16
 
-# Rows of RTCRayHit16: 12 of the rays, 9 of their hits.
+# Rows of RTCRayHit16: 12 for the rays, 9 for their hits.
 _DIRECTION, _FAR, _MASK, _U, _V, _TRIANGLE, _GEOMETRY = 4, 8, 9, 15, 16, 17, 18
 _RAY_ROWS, _ROWS = 12, 21
 
@@ -39,13 +39,13 @@ _occluded = types.ExternalFunction("rtcOccluded16", _call)
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What R rays meet first.
+    """First hits of R rays.
 
     Attributes:
-        triangle: row of the triangle; -1 where a ray meets none.
+        triangle: row of the triangle; -1 if a ray hits none.
         u: weight of the triangle's second corner at the hit.
         v: weight of its third corner.
-        distance: from the origin, in lengths of the direction; inf where a ray meets none.
+        distance: from the origin, in lengths of the direction; inf if a ray hits none.
     """
 
     triangle: Int32[np.ndarray, " R"]
@@ -55,7 +55,7 @@ class Hits:
 
 
 class RayCaster:
-    """Embree's structure over F triangles, which it copies.
+    """Embree's acceleration structure over a copy of F triangles.
 
     Args:
         triangles: corner positions.
@@ -83,11 +83,11 @@ class RayCaster:
             raise MemoryError(f"Embree could not take {len(corners)} triangles (its error {error})")
 
     def nearest(self, origins: Float32[np.ndarray, "O 3"], directions: Float32[np.ndarray, "R 3"]) -> Hits:
-        """What each ray meets first.
+        """Return the first hit of each ray.
 
         Args:
             origins: one for each ray, or one for all.
-            directions: of any length. Sixteen neighbours are cast together.
+            directions: vectors of any length; sixteen consecutive rays are cast together.
         """
         count = len(directions)
         hits = Hits(np.empty(count, np.int32), *(np.empty(count, np.float32) for _ in range(3)))
@@ -100,7 +100,7 @@ class RayCaster:
         directions: Float32[np.ndarray, "R 3"],
         reach: Float32[np.ndarray, " R"],
     ) -> Bool[np.ndarray, " R"]:
-        """Whether each ray meets something nearer than its reach, in lengths of its direction."""
+        """Return whether each ray hits something within its reach, given in lengths of its direction."""
         found = np.empty(len(directions), np.bool_)
         _blocked(self._scene, *_rows(origins, directions), reach, found)
         return found
@@ -112,10 +112,10 @@ def _rows(*vectors: np.ndarray) -> tuple[np.ndarray, ...]:
 
 @cache
 def _embree() -> tuple[ctypes.CDLL, int]:
-    """Embree's functions and its device, which builds on one thread."""
+    """Return Embree's functions and a single-threaded device."""
     from embreex import rtcore_scene
 
-    embree = ctypes.CDLL(rtcore_scene.__file__)  # linked to Embree, so its symbols are found through it
+    embree = ctypes.CDLL(rtcore_scene.__file__)  # this module is linked to Embree and exposes its symbols
     for name in ("rtcIntersect16", "rtcOccluded16"):
         llvmlite.binding.add_symbol(name, ctypes.cast(getattr(embree, name), ctypes.c_void_p).value)
     pointer, number, size = ctypes.c_void_p, ctypes.c_uint, ctypes.c_size_t
@@ -140,7 +140,7 @@ def _embree() -> tuple[ctypes.CDLL, int]:
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _aligned(rows):
-    """Rows of a packet, none set, at a multiple of 64 bytes, as Embree wants them."""
+    """Return an uninitialised packet aligned to 64 bytes, as Embree requires."""
     space = np.empty((rows + 1) * LANES, np.float32)
     skipped = (-space.ctypes.data // 4) % LANES
     return space[skipped : skipped + rows * LANES].reshape(rows, LANES)
@@ -149,7 +149,7 @@ def _aligned(rows):
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _new_packet(rows):
-    """A packet of rays from 0 on, its lanes' validity, and arguments that say that rays are coherent."""
+    """Return a packet of rays that start at distance 0, its lane mask, and arguments for coherent rays."""
     packet, valid, arguments = _aligned(rows), _aligned(1), np.zeros(8, np.int64)
     packet[:] = 0
     packet.view(np.int32)[_MASK] = -1
@@ -162,7 +162,7 @@ def _new_packet(rows):
 @compiled(forceinline=True)
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _load(packet, valid, origins, directions, first):
-    """Put the next rays into a packet; returns how many."""
+    """Load the next rays into a packet and return their number."""
     step = 1 if len(origins) > 1 else 0
     count = min(LANES, len(directions) - first)
     for lane in range(count):
@@ -202,4 +202,4 @@ def _blocked(scene, origins, directions, reach, found):
             packet[_FAR, lane] = reach[first + lane]
         _occluded(valid.ctypes.data, scene, packet.ctypes.data, arguments.ctypes.data)
         for lane in range(count):
-            found[first + lane] = packet[_FAR, lane] < 0  # -inf: Embree's word for a hit
+            found[first + lane] = packet[_FAR, lane] < 0  # Embree marks a hit with -inf

@@ -1,9 +1,8 @@
-"""Images and exact label images of a scene, by casting rays (Embree) and a compiled shader.
+"""Images and exact label images of a scene, rendered by ray casting (Embree) and a compiled shader.
 
-Soft shadows and ambient occlusion take fixed directions: sub-sample k of every pixel looks at
-stratum k of the light and of the hemisphere, moved a little by a hash of the surface point. A point
-therefore looks the same in every view; random rays would put grain into the shadows that differs
-from view to view, and the Gaussians would average it to a blur.
+Soft shadows and ambient occlusion use fixed directions: sub-sample k of every pixel samples stratum k of the
+light and of the hemisphere, jittered by a hash of the surface point. A point therefore looks the same in
+every view. Random rays would add noise that differs between views and is averaged to a blur in the Gaussians.
 """
 
 import math
@@ -21,20 +20,20 @@ from hilsplat.world.scenes.scene import Style, WorldScene
 from hilsplat.world.textures import albedo, grains, hash01
 
 RAYS_PER_PIXEL = 9
-"""Shadow rays and occlusion rays per pixel, at least; with fewer sub-samples each casts more."""
+"""Minimum number of shadow rays and of occlusion rays per pixel, divided among the sub-samples."""
 
 OCCLUSION_REACH = 0.55
-"""Farther things do not darken a surface, scene units at `Style.scale` 1."""
+"""Maximum distance at which a surface occludes another, scene units at `Style.scale` 1."""
 
 BAND_RAYS = 1 << 15
-"""Rays from the camera that are shaded at once: what is known of each takes 120 bytes."""
+"""Camera rays that are shaded at once; each takes 120 bytes of working memory."""
 
-_LIFT = 2e-3  # rays start this far off the surface, scene units at scale 1
-_HASH_CELLS = 160.0  # cells per unit, at scale 1, of the hash that moves rays: about a pixel at 384 px
+_LIFT = 2e-3  # offset of a ray's start from the surface, scene units at scale 1
+_HASH_CELLS = 160.0  # cells per unit, at scale 1, of the hash that jitters rays: about a pixel at 384 px
 
 
 def label_view(scene: WorldScene, camera: Camera) -> Int32[np.ndarray, "3 H W"]:
-    """True node id per level and pixel, from one ray through each pixel's centre.
+    """Return the true node id per level and pixel, from one ray through each pixel's centre.
 
     Returns:
         Levels whole, part, subpart along the first axis; -1 where the level has no node.
@@ -45,13 +44,13 @@ def label_view(scene: WorldScene, camera: Camera) -> Int32[np.ndarray, "3 H W"]:
 def render_view(
     scene: WorldScene, camera: Camera, samples: int, style: Style | None = None
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Render a view: area light with soft shadow, sky light with occlusion, highlight, solid textures.
+    """Render a view with soft shadows, occluded sky light, highlights and solid textures.
 
     Args:
-        scene: what to render.
-        camera: from where.
+        scene: scene to render.
+        camera: pose, intrinsics and size of the view.
         samples: sub-samples per pixel side; 3 gives clean edges, 1 is for previews.
-        style: light and exposure; None takes the scene's own.
+        style: light and exposure; None uses the scene's own.
     """
     return _rendered(scene, camera, samples, style or scene.style)[0]
 
@@ -59,7 +58,7 @@ def render_view(
 def render_and_label(
     scene: WorldScene, camera: Camera, samples: int
 ) -> tuple[UInt8[np.ndarray, "H W 3"], Int32[np.ndarray, "3 H W"]]:
-    """`render_view` and `label_view`; where `samples` is odd, the middle sub-samples' hits are the labels."""
+    """Render and label a view; if `samples` is odd, the labels reuse the middle sub-samples' hits."""
     image, middle = _rendered(scene, camera, samples, scene.style)
     return image, _labels(scene, middle, camera.size_hw) if samples % 2 else label_view(scene, camera)
 
@@ -72,9 +71,9 @@ def _labels(scene: WorldScene, prim: np.ndarray, size_hw: tuple[int, int]) -> In
 def _rendered(
     scene: WorldScene, camera: Camera, samples: int, style: Style
 ) -> tuple[UInt8[np.ndarray, "H W 3"], Int32[np.ndarray, " P"]]:
-    """A view, and the triangle that the middle sub-sample of each pixel hits (-1 none).
+    """Return a view, and the triangle that the middle sub-sample of each pixel hits (-1 none).
 
-    Rows are taken in bands whose rays stay in the processor's cache.
+    Rows are rendered in bands whose rays fit in the processor's cache.
     """
     height, width = camera.size_hw
     band = max(1, BAND_RAYS // (width * samples**2))
@@ -93,7 +92,7 @@ def _rendered(
 def _reflected(
     scene: WorldScene, hits: Hits, directions: np.ndarray, samples: int, style: Style
 ) -> Float32[np.ndarray, "P 3"]:
-    """Linear light of the pixels whose sub-samples hit something from some directions."""
+    """Return the linear light of pixels from the hits and directions of their sub-samples."""
     prim = hits.triangle
     count = len(prim)
     points, facets, shading, colours = (np.empty((count, 3), np.float32) for _ in range(4))
@@ -119,7 +118,7 @@ def _reflected(
     cells, lift = _HASH_CELLS / style.scale, np.float32(_LIFT * style.scale)
 
     def free(rows: np.ndarray, rays: Callable[..., None], *given: object) -> np.ndarray:
-        """Share of each sub-sample's rays that meet nothing; 0 for sub-samples outside `rows`."""
+        """Return the share of each sub-sample's rays that hit nothing; 0 for sub-samples outside `rows`."""
         share = np.zeros(count, np.float32)
         starts, toward = (np.empty((len(rows), 3), np.float32) for _ in range(2))
         reach = np.empty(len(rows), np.float32)
@@ -150,7 +149,7 @@ def _reflected(
 
 
 def _rays(camera: Camera, samples: int, rows: range | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Rays of all sub-samples of some rows (None: all), pixel by pixel: their origin and unit directions."""
+    """Return the origin and unit directions of all sub-samples of some rows (None: all), pixel by pixel."""
     height, width = camera.size_hw
     rows = rows or range(height)
     step = (np.arange(samples) + 0.5) / samples
@@ -170,7 +169,7 @@ def _rays(camera: Camera, samples: int, rows: range | None = None) -> tuple[np.n
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _directions(x_cam, y_cam, rotation, samples, directions):
-    """Unit directions of the rays through a grid of points at depth 1, pixel by pixel."""
+    """Compute the unit directions of the rays through a grid of points at depth 1, pixel by pixel."""
     i = 0
     for row in range(0, len(y_cam), samples):
         for column in range(0, len(x_cam), samples):
@@ -206,7 +205,7 @@ def _surfaces(
     colours,
     gloss,
 ):
-    """Position, facet normal, shading normal, colour and highlight at each hit."""
+    """Compute position, facet normal, shading normal, colour and highlight at each hit."""
     places = np.zeros((3, len(prim)))  # in the solid texture, scene units
     for i in range(len(prim)):
         f = prim[i]
@@ -255,7 +254,7 @@ def _surfaces(
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _to_light(points, facets, shading, i, light):
-    """Direction and distance of the light, and the cosine at which it falls on point i; 0 from behind."""
+    """Return direction and distance of the light, and its cosine at point i, 0 from behind."""
     lx, ly, lz = light[0] - points[i, 0], light[1] - points[i, 1], light[2] - points[i, 2]
     distance = math.sqrt(lx * lx + ly * ly + lz * lz)
     lx, ly, lz = lx / distance, ly / distance, lz / distance
@@ -268,10 +267,10 @@ def _to_light(points, facets, shading, i, light):
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _receivers(prim, points, facets, shading, gloss, light, samples):
-    """Rows that the sky lights (not the void nor what shines by itself), and those that face the light.
+    """Return the rows that the sky lights (hits on non-luminous surfaces), and those that face the light.
 
-    The first are in the order of their sub-samples: the same one of neighbouring pixels looks the same way,
-    and rays cast together should.
+    Sky rows are ordered by sub-sample: rays cast together should be nearly parallel, and neighbouring pixels
+    use similar directions for the same sub-sample.
     """
     under_sky, lit = np.empty(len(prim), np.int64), np.empty(len(prim), np.int64)
     skies = lights = 0
@@ -290,7 +289,7 @@ def _receivers(prim, points, facets, shading, gloss, light, samples):
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _cell(points, i, cells, salt):
-    """Hash in [0, 1) of the small cell of space that point i lies in."""
+    """Return a hash in [0, 1) of the small cell of space that contains point i."""
     return hash01(
         math.floor(points[i, 0] * cells),
         math.floor(points[i, 1] * cells),
@@ -304,7 +303,7 @@ def _cell(points, i, cells, salt):
 def _light_rays(
     rows, points, facets, lift, samples, ray, rays_each, cells, light, shadow_reach, starts, toward, reach
 ):
-    """From points, by row, to their stratum of the (horizontal, round) light: start, direction, distance."""
+    """Compute start, direction and reach of each row's ray to its stratum of the (flat, round) light."""
     per_pixel = samples * samples
     strata = per_pixel * rays_each
     for n, i in enumerate(rows):
@@ -325,7 +324,7 @@ def _light_rays(
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _sky_rays(rows, points, facets, lift, samples, ray, rays_each, cells, sky_reach, starts, toward, reach):
-    """A cosine-weighted direction of the hemisphere above points, by row, by stratum."""
+    """Compute a cosine-weighted direction above each row's point, from its stratum of the hemisphere."""
     per_pixel = samples * samples
     strata = per_pixel * rays_each
     for n, i in enumerate(rows):
@@ -365,7 +364,7 @@ def _shade(
     samples,
     image,
 ):
-    """Reflected light of every sub-sample, averaged into pixels (linear light, compressed highlights)."""
+    """Average the reflected light of all sub-samples into pixels (linear light, compressed highlights)."""
     per_pixel = samples * samples
     for i in range(len(prim)):
         pixel = i // per_pixel
@@ -373,7 +372,7 @@ def _shade(
             for c in range(3):
                 image[pixel, c] += 0.8 * lights[1, c] / per_pixel
             continue
-        if gloss[i, 1] <= 0:  # shines by itself: the sky, a lit lamp
+        if gloss[i, 1] <= 0:  # self-luminous: the sky, a lit lamp
             for c in range(3):
                 image[pixel, c] += colours[i, c] / per_pixel
             continue
@@ -389,7 +388,7 @@ def _shade(
             sun = lights[0, c] * falloff * lit[i]
             sky = (lights[1, c] * up + lights[2, c] * (1 - up)) * (0.25 + 0.75 * open_sky[i])
             value = exposure * (colours[i, c] * (1.1 * sun * diffuse + 0.85 * sky) + 0.35 * sun * highlight)
-            # Linear up to 0.7, then bent towards 1: no burnt-out patches.
+            # Linear up to 0.7, then compressed towards 1, so that highlights do not clip.
             if value > 0.7:
                 value = 1.0 - 0.3 * math.exp(-(value - 0.7) / 0.3)
             image[pixel, c] += value / per_pixel

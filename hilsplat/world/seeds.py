@@ -1,21 +1,21 @@
-"""Which scene seeds are for training the small models, which for development, and which for the benchmark."""
+"""Scene seeds reserved for training the small models, for development, and for the benchmark."""
 
 from hilsplat.base.errors import SceneError
 
 TRAINING_SEEDS = range(1_000_000, 2_000_000)
-"""Scenes the embedded small models are trained on."""
+"""Scenes that the small embedded models are trained on."""
 
 DEVELOPMENT_SEEDS = range(100, 200)
-"""Scenes for choosing settings; never trained on, never reported."""
+"""Scenes for choosing settings; never used for training or reported results."""
 
 BENCHMARK_SEEDS = range(200, 300)
-"""Scenes that are reported; never trained on, and no setting is chosen on them."""
+"""Scenes for reported results; never used for training or for choosing settings."""
 
 SPLITS = {"training": TRAINING_SEEDS, "development": DEVELOPMENT_SEEDS, "benchmark": BENCHMARK_SEEDS}
 
 
 def split_of_seed(seed: int) -> str:
-    """Name of the split a scene seed belongs to.
+    """Return the name of the split that contains a scene seed.
 
     Returns:
         "training", "development", "benchmark", or "free" for a seed in no split.
@@ -27,10 +27,10 @@ def split_of_seed(seed: int) -> str:
 
 
 def require_split(seed: int, split: str) -> None:
-    """Refuse a scene seed that is not in the split.
+    """Check that a scene seed is in a split.
 
     Raises:
-        SceneError: the seed belongs to another split, or the split is unknown.
+        SceneError: if the seed is not in the split, or the split is unknown.
     """
     if split not in SPLITS:
         raise SceneError(f"unknown split {split!r} of scene seeds", expected=f"one of {', '.join(SPLITS)}")

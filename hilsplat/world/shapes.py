@@ -12,7 +12,7 @@ Number = float | int
 Point = tuple[Number, Number, Number]
 
 SMOOTH_BELOW_DEG = 40.0
-"""Lathed profiles are shaded smoothly over corners that turn by less, sharply over others."""
+"""Corners of lathed profiles are shaded smoothly below this angle and sharply above it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Mesh:
         return Mesh(self.triangles + np.array([x, y, z]), self.normals)
 
     def scaled(self, x: Number, y: Number | None = None, z: Number | None = None) -> "Mesh":
-        """Scale about the origin; one factor scales all axes. Factors are positive."""
+        """Scale about the origin by positive factors; a single factor scales all axes."""
         factors = np.array([x, x if y is None else y, x if z is None else z])
         return Mesh(self.triangles * factors, _unit(self.normals / factors))
 
@@ -46,7 +46,7 @@ class Mesh:
 
 
 def rotation_about(axis: str, degrees: Number) -> Float[np.ndarray, "3 3"]:
-    """Right-handed rotation matrix about "x", "y" or "z"."""
+    """Return the right-handed rotation matrix about "x", "y" or "z"."""
     angle = np.radians(degrees)
     c, s = np.cos(angle), np.sin(angle)
     first, second = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
@@ -57,7 +57,7 @@ def rotation_about(axis: str, degrees: Number) -> Float[np.ndarray, "3 3"]:
 
 
 def joined(*meshes: Mesh) -> Mesh:
-    """Several meshes as one."""
+    """Join several meshes into one."""
     return Mesh(
         np.concatenate([mesh.triangles for mesh in meshes]), np.concatenate([mesh.normals for mesh in meshes])
     )
@@ -68,7 +68,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def _flat(triangles: np.ndarray) -> Mesh:
-    """Flat-shaded mesh: each corner takes the normal of its triangle; degenerate triangles are dropped."""
+    """Return a flat-shaded mesh without degenerate triangles."""
     triangles = np.asarray(triangles, dtype=np.float64)
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     keep = np.linalg.norm(normal, axis=1) > 1e-12
@@ -80,7 +80,7 @@ def _fan(polygon: np.ndarray) -> list[np.ndarray]:
 
 
 def box(size: Point, centre: Point = (0.0, 0.0, 0.0), bevel: Number = 0.0) -> Mesh:
-    """Axis-aligned box with its edges cut off by `bevel`.
+    """Return an axis-aligned box with bevelled edges.
 
     Args:
         size: lengths along x, y, z.
@@ -95,8 +95,8 @@ def box(size: Point, centre: Point = (0.0, 0.0, 0.0), bevel: Number = 0.0) -> Me
 
 @cache
 def _box_corners(bevelled: bool) -> tuple[Float[np.ndarray, "T 3 3"], Float[np.ndarray, "T 3 3"]]:
-    """Triangles of any box: per corner the side of the box on each axis (-1 or 1), and 1 where the bevel
-    insets it. A corner is full along the normal of its face and inset along the other two axes."""
+    """Return the triangles of any box: each corner's side on each axis (-1 or 1), and 1 where a bevel insets
+    it, which is along the two axes other than the normal of its face."""
     triangles: list[np.ndarray] = []
 
     def corner(signs: Sequence[Number] | np.ndarray, full_axis: int) -> np.ndarray:
@@ -142,7 +142,7 @@ def _box_corners(bevelled: bool) -> tuple[Float[np.ndarray, "T 3 3"], Float[np.n
 
 
 def lathe(profile: Sequence[tuple[Number, Number]], segments: int = 28) -> Mesh:
-    """Surface of revolution about z.
+    """Return a surface of revolution about z.
 
     Args:
         profile: (radius, z) from bottom to top along the outside, so that normals point outwards.
@@ -181,7 +181,7 @@ def lathe(profile: Sequence[tuple[Number, Number]], segments: int = 28) -> Mesh:
 
 
 def cylinder(radius: Number, bottom: Number, top: Number, segments: int = 28, bevel: Number = 0.0) -> Mesh:
-    """Closed upright cylinder about z."""
+    """Return a closed upright cylinder about z."""
     if bevel <= 0:
         return lathe([(0, bottom), (radius, bottom), (radius, top), (0, top)], segments)
     return lathe(
@@ -203,7 +203,7 @@ def ellipsoid(
     segments: int = 24,
     rings: int = 12,
 ) -> Mesh:
-    """Ellipsoid with the given half axes."""
+    """Return an ellipsoid with the given semi-axes."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, rings + 1)
     profile = [(max(0.0, float(np.cos(a))), float(np.sin(a))) for a in angle]
     profile[0], profile[-1] = (0.0, -1.0), (0.0, 1.0)
@@ -211,18 +211,18 @@ def ellipsoid(
 
 
 def sphere(radius: Number, centre: Point = (0.0, 0.0, 0.0), segments: int = 24) -> Mesh:
-    """Sphere."""
+    """Return a sphere."""
     return ellipsoid((radius, radius, radius), centre, segments)
 
 
 def sweep(
     path: Sequence[Sequence[Number] | np.ndarray], radius: Number | Sequence[Number], segments: int = 12
 ) -> Mesh:
-    """Round tube along a polyline, closed at both ends.
+    """Return a round tube along a polyline, closed at both ends.
 
     Args:
         path: points of the centre line.
-        radius: of the tube, one for all points or one each.
+        radius: radius of the tube, one for all points or one for each.
         segments: facets around the tube.
     """
     points = np.asarray(path, dtype=np.float64)
@@ -233,7 +233,7 @@ def sweep(
     angle = np.linspace(0, 2 * np.pi, segments + 1)
     rings, normals = [], []
     for point, tangent, r in zip(points, tangents, radii, strict=True):
-        side = _unit(side - (side @ tangent) * tangent)  # carried along: the tube does not twist
+        side = _unit(side - (side @ tangent) * tangent)  # parallel transport, so that the tube does not twist
         other = np.cross(tangent, side)
         direction = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * other
         direction[-1] = direction[0]
@@ -262,13 +262,13 @@ def sweep(
 def arc(
     radii: tuple[Number, Number], start_deg: Number, stop_deg: Number, steps: int = 14
 ) -> list[tuple[float, float, float]]:
-    """Points of an elliptic arc in the x-z plane, as a path for `sweep`; 0 degrees is +x, 90 is +z."""
+    """Return an elliptic arc in the x-z plane as a path for `sweep`; 0 degrees is +x, 90 is +z."""
     angle = np.radians(np.linspace(start_deg, stop_deg, steps + 1))
     return [(float(radii[0] * np.cos(a)), 0.0, float(radii[1] * np.sin(a))) for a in angle]
 
 
 def extrude(outline: Sequence[tuple[Number, Number]], depth: Number) -> Mesh:
-    """Prism over a convex outline in the x-z plane, from y = -depth/2 to y = +depth/2."""
+    """Return a prism over a convex outline in the x-z plane, from y = -depth/2 to y = +depth/2."""
     points = np.asarray(outline, dtype=np.float64)
     shifted = np.roll(points, -1, axis=0)
     area = (points[:, 0] * shifted[:, 1] - shifted[:, 0] * points[:, 1]).sum()
@@ -284,11 +284,11 @@ def extrude(outline: Sequence[tuple[Number, Number]], depth: Number) -> Mesh:
 
 
 def loft(sections: Sequence[Sequence[Point] | np.ndarray]) -> Mesh:
-    """Flat-shaded solid through convex outlines of equally many points, closed at both ends.
+    """Return a closed flat-shaded solid through convex outlines with equal numbers of points.
 
     Args:
-        sections: outlines one after another along the solid, all turning the same way. Whether that
-            is clockwise does not matter: the solid is wound so that its volume is positive.
+        sections: outlines in order along the solid, either all clockwise or all counter-clockwise; the
+            solid is wound so that its volume is positive.
     """
     outlines = [np.asarray(section, dtype=np.float64) for section in sections]
     triangles = [*_fan(outlines[0][::-1]), *_fan(outlines[-1])]
@@ -305,14 +305,14 @@ def loft(sections: Sequence[Sequence[Point] | np.ndarray]) -> Mesh:
 
 
 def disc(radius: Number, back: Number, front: Number, segments: int = 28, bevel: Number = 0.0) -> Mesh:
-    """Closed cylinder about x, from x = back to x = front: what faces the viewer of an object's front."""
+    """Return a closed cylinder about x, from x = back to x = front, for discs on an object's front."""
     return cylinder(radius, back, front, segments, bevel).turned("y", 90)
 
 
 def ring(
     radius: Number, tube: Number, centre: Point = (0.0, 0.0, 0.0), axis: str = "z", segments: int = 28
 ) -> Mesh:
-    """Torus about a coordinate axis."""
+    """Return a torus about a coordinate axis."""
     angle = np.linspace(0, 2 * np.pi, segments + 1)
     around = np.linspace(0, 2 * np.pi, 13)
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)

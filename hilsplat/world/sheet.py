@@ -1,4 +1,4 @@
-"""A contact sheet of a synthetic scene: views, their true labels by level, and the tree of texts."""
+"""Contact sheet of a synthetic scene: views, their true labels by level, and the tree of texts."""
 
 from pathlib import Path
 
@@ -13,14 +13,14 @@ from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnota
 
 VIEWS_SHOWN = 4
 LINES_SHOWN = 52
-"""Lines of the tree in a column; more would not be legible."""
+"""Maximum number of tree lines in a column, for legibility."""
 
 
 def show_world(world_folder: Path, out: Path) -> None:
-    """Draw the contact sheet of a finished world stage (`images` and `truth` below the folder).
+    """Draw the contact sheet of a finished world stage (`images` and `truth` in the folder).
 
     Raises:
-        ArtifactError: the folder is missing or incomplete.
+        ArtifactError: if the folder is missing or incomplete.
     """
     contact_sheet(Path(world_folder) / "truth", Path(world_folder) / "images", out)
 
@@ -28,10 +28,10 @@ def show_world(world_folder: Path, out: Path) -> None:
 def contact_sheet(truth_folder: Path, images_folder: Path, path: Path) -> None:
     """Draw some views with their labels by level, and the tree of texts, as PNG.
 
-    A text of the tree has the colour of its region; one that is annotated in no view is in brackets.
+    Each text is marked in the colour of its region; texts that no view annotates are in brackets.
 
     Raises:
-        ArtifactError: a folder is missing or incomplete.
+        ArtifactError: if a folder is missing or incomplete.
     """
     from matplotlib.figure import Figure
 
@@ -94,7 +94,7 @@ def contact_sheet(truth_folder: Path, images_folder: Path, path: Path) -> None:
 def _panel(
     truth: HierarchyAnnotations, view: str, level: Level, colours: UInt8[np.ndarray, "N 3"]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Labels of a level as colours; if it has no node, the whole is shown in dark grey."""
+    """Return the labels of a level as colours, with the whole in dark grey where the level has no node."""
     labels = truth.label_image(view, level)
     panel = coloured(labels, colours)
     whole = coloured(truth.label_image(view, Level.WHOLE), colours).mean(axis=-1, keepdims=True)
@@ -102,7 +102,7 @@ def _panel(
 
 
 def node_colours(count: int) -> UInt8[np.ndarray, "N 3"]:
-    """A colour per node; neighbours in the list differ much (golden-ratio hues)."""
+    """Return a colour per node; consecutive nodes have very different hues (golden-ratio steps)."""
     hue = (0.13 + 0.618034 * np.arange(count)) % 1
     value = 0.70 + 0.30 * ((np.arange(count) // 3) % 2)
     saturation = 0.55 + 0.35 * ((np.arange(count) // 2) % 2)
@@ -114,13 +114,13 @@ def node_colours(count: int) -> UInt8[np.ndarray, "N 3"]:
 def coloured(
     labels: Int32[np.ndarray, "H W"], colours: UInt8[np.ndarray, "N 3"]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Label image as colours; black where there is no node."""
+    """Return a label image as colours, black where there is no node."""
     table = np.concatenate([colours, np.zeros((1, 3), np.uint8)])  # row -1 is black
     return table[labels]
 
 
 def tree_lines(nodes: tuple[AnnotatedNode, ...]) -> list[tuple[int, AnnotatedNode]]:
-    """Nodes depth first with their depth; of siblings that share a text only the first."""
+    """Return nodes with their depth, depth first; siblings with the same text are listed once."""
     children: dict[int, list[AnnotatedNode]] = {}
     for node in nodes:
         children.setdefault(node.parent, []).append(node)

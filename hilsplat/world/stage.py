@@ -1,4 +1,4 @@
-"""The world stage: a synthetic scene as images, and what is true of it for evaluation."""
+"""The world stage: render a synthetic scene and write its ground truth for evaluation."""
 
 import logging
 from collections.abc import Iterator
@@ -27,19 +27,17 @@ from hilsplat.world.truth import annotated_nodes, smallest_areas, write_mesh
 logger = logging.getLogger(__name__)
 
 MESH_EDGE: dict[str, float] = {"room": 0.08}
-"""Longest edge of the true mesh, scene units, for kinds of scene whose vertices are scored; other kinds keep
-their original triangles."""
+"""Longest mesh edge, scene units, for scene kinds whose vertices are scored; others are not refined."""
 
 
 def parse_source(source: str) -> tuple[str, int]:
-    """Read a source such as "world:tabletop:201".
+    """Parse a source such as "world:tabletop:201".
 
     Returns:
         Kind of scene and its seed.
 
     Raises:
-        SceneError: it has a different form, the kind is unknown, or the seed is one that the small models
-            were trained on.
+        SceneError: if the form differs, the kind is unknown, or the seed is reserved for training.
     """
     words = source.split(":")
     if len(words) != 3 or words[0] != "world" or words[1] not in KINDS or not words[2].isdecimal():
@@ -59,16 +57,16 @@ def parse_source(source: str) -> tuple[str, int]:
 
 
 def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> None:
-    """Render a synthetic scene and write what is true of it.
+    """Render a synthetic scene and write its ground truth.
 
-    Writes two folders, each complete or absent: `out/images` (000.png, 001.png, ...), which is all that the
-    next stages see, and `out/truth` (annotations.json and labels/ in the hierarchy format, cameras.npz,
-    mesh.ply, scene.json, of a street also lidar.npz), which only `evaluate` may read. The bytes depend on
-    source and settings, not on `threads`.
+    Each of the two output folders is complete or absent. The next stages read only `out/images` (000.png,
+    001.png, ...). Only `evaluate` may read `out/truth`: annotations.json and labels/ in the hierarchy format,
+    cameras.npz, mesh.ply, scene.json, and for a street lidar.npz. The bytes depend on source and settings,
+    not on `threads`.
 
     Raises:
-        SceneError: the source does not name a scene, or no object found a place in it.
-        DiskSpaceError: the disk is too full.
+        SceneError: if the source does not name a scene, or no object fits into it.
+        DiskSpaceError: if the disk is too full.
     """
     kind, seed = parse_source(source)
     out = Path(out)
@@ -130,7 +128,7 @@ def _scene(kind: str, seed: int, objects: int) -> WorldScene:
 
 
 def _render(kind: str, seed: int, settings: WorldSettings, row: int) -> tuple[np.ndarray, np.ndarray]:
-    """Image and labels of one view; top level, so that worker processes can call it."""
+    """Render one view and its labels; a module-level function, so that worker processes can import it."""
     scene = _scene(kind, seed, settings.objects)
     cameras = scene_cameras(scene, settings.views, settings.image_px, settings.arc_deg)
     return render_and_label(scene, cameras[cameras.names[row]], settings.samples)
@@ -139,5 +137,5 @@ def _render(kind: str, seed: int, settings: WorldSettings, row: int) -> tuple[np
 def _rendered(
     kind: str, seed: int, settings: WorldSettings, threads: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Image and labels of all views, in their order."""
+    """Yield image and labels of all views in order."""
     return in_processes(_render, [(kind, seed, settings, row) for row in range(settings.views)], threads)

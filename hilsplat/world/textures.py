@@ -1,7 +1,7 @@
-"""Solid textures: colour as a function of a point, compiled, the same from every view.
+"""Solid textures: colour as a compiled function of the position.
 
-Everything is a hash of lattice cells, so there are no image files and no texture coordinates, and a
-surface point has one colour in all views. That is what structure from motion and 3D Gaussians need.
+All textures are computed from hashes of lattice cells, without image files or texture coordinates. A surface
+point has the same colour in all views, as structure from motion and 3D Gaussians require.
 """
 
 import math
@@ -11,7 +11,7 @@ import numpy as np
 
 from hilsplat.base.compiled import compiled
 
-# Steps of the hash of a lattice cell along x, y, z and from salt to salt.
+# Hash increments of a lattice cell per step in x, y, z and salt.
 _X, _Y = np.uint32(0x27D4EB2D), np.uint32(0x165667B1)
 _Z, _SALT = np.uint32(0x1B873593), np.uint32(0x2545F491)
 
@@ -19,7 +19,7 @@ _Z, _SALT = np.uint32(0x1B873593), np.uint32(0x2545F491)
 @compiled(forceinline=True)
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _mixed(h):
-    """Number in [0, 1) of a sum of steps: a chain of 32-bit integer mixing steps."""
+    """Map a key to a number in [0, 1) by a chain of 32-bit integer mixing steps."""
     h = np.uint32((h ^ (h >> np.uint32(15))) * np.uint32(0x2C1B3C6D))
     h = np.uint32((h ^ (h >> np.uint32(12))) * np.uint32(0x297A2D39))
     return np.uint32(h ^ (h >> np.uint32(15))) / 4294967296.0
@@ -28,21 +28,21 @@ def _mixed(h):
 @compiled(forceinline=True)
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _key(i, j, k, salt):
-    """What a lattice cell is mixed from."""
+    """Return the hash key of a lattice cell."""
     return np.uint32(np.uint32(i) * _X + np.uint32(j) * _Y + np.uint32(k) * _Z + np.uint32(salt) * _SALT)
 
 
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def hash01(x: int, y: int, z: int, salt: int) -> float:
-    """Number in [0, 1) of a lattice cell."""
+    """Return the hash of a lattice cell in [0, 1)."""
     return _mixed(_key(x, y, z, salt))
 
 
 @compiled(forceinline=True)
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _value_noise(x, y, z, salt):
-    """`value_noise`, inlined: a loop that calls another function is not vectorised."""
+    """Compute `value_noise` inline, because a loop that calls a function is not vectorised."""
     i, j, k = math.floor(x), math.floor(y), math.floor(z)
     u, v, w = x - i, y - j, z - k
     u, v, w = u * u * (3 - 2 * u), v * v * (3 - 2 * v), w * w * (3 - 2 * w)
@@ -57,14 +57,14 @@ def _value_noise(x, y, z, salt):
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def value_noise(x: float, y: float, z: float, salt: int) -> float:
-    """Smoothly interpolated lattice noise in [0, 1)."""
+    """Return smoothly interpolated lattice noise in [0, 1)."""
     return _value_noise(x, y, z, salt)
 
 
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def fractal_noise(x: float, y: float, z: float, octaves: int, salt: int) -> float:
-    """Sum of octaves of `value_noise`, each of half the size and amplitude, in [0, 1)."""
+    """Return the sum of octaves of `value_noise`, each at half the size and amplitude, in [0, 1)."""
     total, amplitude, reach = 0.0, 0.5, 0.0
     for octave in range(octaves):
         total += amplitude * value_noise(x, y, z, salt + octave)
@@ -77,10 +77,10 @@ def fractal_noise(x: float, y: float, z: float, octaves: int, salt: int) -> floa
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def cell_noise(x: float, y: float, z: float, salt: int) -> tuple[float, float, float]:
-    """Nearest and second nearest of one random point per cell (Worley).
+    """Find the nearest and second nearest of one random point per cell (Worley noise).
 
     Returns:
-        Distances to the two, in cells, and a number in [0, 1) that belongs to the nearest.
+        Distances to the two, in cells, and the nearest point's random number in [0, 1).
     """
     i0, j0, k0 = math.floor(x), math.floor(y), math.floor(z)
     nearest, second, identity = 9.0, 9.0, 0.0
@@ -102,7 +102,7 @@ def cell_noise(x: float, y: float, z: float, salt: int) -> tuple[float, float, f
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def step_between(value: float, low: float, high: float) -> float:
-    """0 below `low`, 1 above `high`, smooth between."""
+    """Return 0 below `low`, 1 above `high` and a smooth transition between."""
     t = min(1.0, max(0.0, (value - low) / (high - low)))
     return t * t * (3 - 2 * t)
 
@@ -110,11 +110,11 @@ def step_between(value: float, low: float, high: float) -> float:
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
-    """Texture at a point given in pattern cells.
+    """Evaluate a texture at a point given in pattern cells.
 
     Args:
         kind: index into `paints.KINDS`.
-        x: first coordinate, in cells of the pattern (and so on for y, z).
+        x: first coordinate, in pattern cells (y and z correspondingly).
 
     Returns:
         Share of the second colour in [0, 1], and a factor on brightness.
@@ -131,7 +131,7 @@ def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
         return 1 - step_between(
             nearest, 0.22 + 0.14 * identity, 0.27 + 0.14 * identity
         ), 0.92 + 0.16 * value_noise(3 * x, 3 * y, 3 * z, 35)
-    if kind == 4:  # wood: rings around a tilted axis, fine fibre along it
+    if kind == 4:  # wood: rings around a tilted axis and fine fibres along it
         rx = x + 0.9 * value_noise(0.4 * x, 0.4 * y, 0.12 * z, 41)
         ry = y + 0.25 * z
         rings = math.sin(
@@ -156,7 +156,7 @@ def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
         streak = value_noise(0.8 * x, 0.8 * y, 11 * z, 81)
         cloud = fractal_noise(0.9 * x, 0.9 * y, 0.9 * z, 3, 83)
         return 0.5 * streak + 0.35 * cloud, 0.85 + 0.3 * streak
-    if kind == 9:  # brick: courses along z, joints along x + y so that no upright face loses them
+    if kind == 9:  # brick: courses along z, joints along x + y so that every upright face shows them
         course = math.floor(0.9 * z)
         along = 0.36 * (x + y) + 0.5 * (course & 1)
         brick = math.floor(along)
@@ -165,7 +165,7 @@ def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
         )
         tone = hash01(brick, course, 0, 91)
         return 1 - step_between(joint, 0.05, 0.1), 0.78 + 0.4 * tone
-    if kind == 11:  # tiles of a floor: squares in x and y, so upright faces show them as stripes
+    if kind == 11:  # floor tiles: squares in x and y, which upright faces show as stripes
         column, row = math.floor(0.4 * x), math.floor(0.4 * y)
         joint = min(min(0.4 * x - column, column + 1 - 0.4 * x), min(0.4 * y - row, row + 1 - 0.4 * y))
         tone = hash01(column, row, 0, 111)
@@ -183,9 +183,9 @@ def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
 @compiled(error_model="numpy")  # a loop that may raise is not vectorised
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def grains(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """`fractal_noise(16 x, 16 y, 16 z, 4, 201)` of many points, on several lanes at once: the same bits.
+    """Return `fractal_noise(16 x, 16 y, 16 z, 4, 201)` of many points, vectorised and bit-identical.
 
-    That is grain of 6 cm down to 8 mm (in scene units): the finest is about a pixel of a 256 px view.
+    The grain measures 0.06 down to 0.008 scene units; the finest is about a pixel of a 256 px view.
     """
     out = np.zeros(len(x))
     amplitude, reach, size = 0.5, 0.0, 16.0
@@ -202,12 +202,12 @@ def grains(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def albedo(material: np.ndarray, x: float, y: float, z: float, grain: float) -> tuple[float, float, float]:
-    """Linear-light colour of a surface point.
+    """Return the linear-light colour of a surface point.
 
     Args:
-        material: a row of `Paint.row`.
-        x: first object coordinate plus the material's, scene units (and so on for y, z).
-        grain: of `grains` at that point.
+        material: parameters from `Paint.row`.
+        x: first object coordinate plus the material's offset, scene units (y and z correspondingly).
+        grain: value of `grains` at the point.
     """
     scale = material[7]
     share, brightness = pattern(int(material[0]), scale * x, scale * y, scale * z)

@@ -1,4 +1,4 @@
-"""The truth about a synthetic scene: annotated regions per view, and its mesh with node ids."""
+"""Ground truth of a synthetic scene: annotated regions per view, and its mesh with node ids."""
 
 from collections import defaultdict
 from collections.abc import Collection
@@ -14,18 +14,18 @@ from hilsplat.scene.cameras import Cameras
 from hilsplat.world.scenes.scene import WorldScene
 
 MIN_SUBPART_AREA = 100 / 384**2
-"""Subparts with a smaller visible region, as a share of the view, are not scored: 100 px of 384 x 384."""
+"""Minimum visible area of a scored subpart, as a share of the view: 100 px of 384 x 384."""
 
 HIDDEN_BY = 2e-3
-"""A point counts as hidden if something is nearer to the camera by this share of its distance."""
+"""A point is hidden if something is nearer to the camera by at least this share of its distance."""
 
 
 def smallest_areas(image_px: int, min_area_px: int) -> dict[Level, float | int]:
-    """Area from which a text is annotated in a view, per level, px.
+    """Return the minimum area of an annotated text in a view, per level, px.
 
     Args:
         image_px: height and width of the view.
-        min_area_px: for wholes and parts, whatever the size of the view.
+        min_area_px: minimum for wholes and parts, regardless of the view's size.
     """
     return {
         Level.WHOLE: min_area_px,
@@ -40,17 +40,17 @@ def annotated_nodes(
     background: Collection[int],
     smallest: dict[Level, float | int],
 ) -> tuple[int, ...]:
-    """Nodes that are scored in a view.
+    """Return the nodes that are scored in a view.
 
-    Nodes that share a text (four legs) answer one query, so their regions are judged together: if the union
-    is large enough, all visible ones are annotated, otherwise none. A single large leg with three small ones
-    left out would make the true region wrong.
+    Nodes with the same text (four legs) match one query, so the size limit applies to their union: either
+    all visible ones are annotated or none. The true region would be wrong if one large leg were annotated
+    and three small ones were not.
 
     Args:
         labels: node id per level and pixel, -1 for none.
         nodes: all nodes of the scene.
         background: ids that are never scored (table, floor, walls).
-        smallest: area per level from which a text is scored, px.
+        smallest: minimum area of a scored text per level, px.
 
     Returns:
         Ids in ascending order.
@@ -74,13 +74,13 @@ def write_mesh(path: Path, scene: WorldScene, cameras: Cameras, longest_edge: fl
     """Write the scene as binary PLY, with node ids of faces and of vertices.
 
     Vertices have x, y, z, the ids `whole`, `part` and `subpart` (-1 none) and `views`, the number of cameras
-    that see them (at most 255); faces have the same three ids. Corners at the same position are one vertex if
-    their faces agree in all ids: at a border each side has its own. Protocols that score vertices, as
-    ScanNet's does, need vertices of even density that a camera saw: a wall of two triangles has four.
+    in which they are visible (at most 255). Faces have the same three ids. Corners at one position share a
+    vertex only if their faces have equal ids, so both sides of a border have their own vertices. Protocols
+    that score vertices, such as ScanNet's, need evenly spaced visible vertices; a plain wall has only four.
 
     Args:
         path: file to write.
-        scene: what is in it. Coordinates are those of the true cameras.
+        scene: scene to write, in the coordinates of the true cameras.
         cameras: the views of the scene.
         longest_edge: longer edges are halved until none is left, scene units; None keeps the triangles.
     """
@@ -88,7 +88,7 @@ def write_mesh(path: Path, scene: WorldScene, cameras: Cameras, longest_edge: fl
     if longest_edge is not None:
         triangles, owner = refined(triangles, longest_edge)
     ids = scene.node_ids[owner]
-    # Ids before the position: float32 holds them exactly up to 2**24.
+    # float32 represents ids exactly up to 2**24, so ids and positions fit in one array.
     rows = np.concatenate([np.repeat(ids, 3, axis=0).astype(np.float32), triangles.reshape(-1, 3)], axis=1)
     unique, index = unique_rows(rows)
     vertices = np.empty(
@@ -133,7 +133,7 @@ def write_mesh(path: Path, scene: WorldScene, cameras: Cameras, longest_edge: fl
 def unique_rows(
     rows: Float32[np.ndarray, "N C"],
 ) -> tuple[Float32[np.ndarray, "U C"], Int64[np.ndarray, " N"]]:
-    """`np.unique(rows, axis=0, return_inverse=True)`, by columns: in a quarter of the time."""
+    """Return `np.unique(rows, axis=0, return_inverse=True)`, sorted by column in a quarter of the time."""
     order = np.lexsort(rows.T[::-1])
     ordered = rows[order]
     is_new = np.append(True, (ordered[1:] != ordered[:-1]).any(axis=1))
@@ -145,7 +145,7 @@ def unique_rows(
 def views_of_points(
     scene: WorldScene, cameras: Cameras, points: Float32[np.ndarray, "N 3"]
 ) -> Int32[np.ndarray, " N"]:
-    """How many of the cameras see each point of the scene's surface: in the image and not hidden."""
+    """Count the cameras in which each point of the scene's surface is inside the image and not hidden."""
     seen = np.zeros(len(points), np.int32)
     for name in cameras.names:
         camera = cameras[name]
@@ -167,17 +167,16 @@ def views_of_points(
 def refined(
     triangles: Float32[np.ndarray, "F 3 3"], longest_edge: float
 ) -> tuple[Float32[np.ndarray, "G 3 3"], Int64[np.ndarray, " G"]]:
-    """Halve all edges longer than a length until none is left.
+    """Halve all edges longer than `longest_edge` until none is left.
 
-    Whether an edge is halved depends on its two ends alone, so that triangles that share it stay
-    joined, without cracks.
+    Whether an edge is halved depends only on its two ends, so no cracks open between adjacent triangles.
 
     Args:
         triangles: corners, scene units.
         longest_edge: scene units.
 
     Returns:
-        The smaller triangles, and the row of `triangles` that each is a piece of.
+        The smaller triangles, and the row of `triangles` that contains each.
     """
     owner = np.arange(len(triangles))
     done, done_owner = [], []
@@ -190,7 +189,7 @@ def refined(
         pieces, owners = [], []
         for number in (1, 2, 3):
             rows = np.flatnonzero(count == number)
-            # Turned so that the long edges come first: 0; 0 and 1; all.
+            # Rotate the corners so that the long edges come first: 0; 0 and 1; all.
             first = long[rows].argmax(axis=1) if number == 1 else (long[rows].argmin(axis=1) + 1) % 3
             order = (first[:, None] + np.arange(3)) % 3
             a, b, c = (triangles[rows, order[:, k]] for k in range(3))

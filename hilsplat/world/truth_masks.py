@@ -1,9 +1,9 @@
 """The diagnostic segmenter `truth-perturbed`: masks from the true labels of a synthetic scene.
 
 It separates errors of the method from errors of the small segmenter. It is the only code before `evaluate`
-that reads annotations, and never a default: the rule and the command pass the truth on only if the settings
-ask for it, the index records what was done, and every row built on such masks has `SEGMENTER` in its column
-of masks.
+that reads annotations, and it is never a default: the rule and the command pass the truth folder only if the
+settings request it, the index records the faults, and every row built on such masks has `SEGMENTER` in its
+masks column.
 """
 
 import logging
@@ -29,7 +29,7 @@ from hilsplat.world.mask_faults import Draws, TrueNodes, faulty_masks
 logger = logging.getLogger(__name__)
 
 SEGMENTER = "truth-perturbed"
-"""Name of the segmenter; the label of its masks begins with it."""
+"""Name of the segmenter, and prefix of its masks' label."""
 
 FAULTS = (
     "boundary_px",
@@ -42,7 +42,7 @@ FAULTS = (
     "systematic_merge",
     "systematic_missing",
 )
-"""Knobs of `PerturbSettings` that change masks; if all are 0, the masks are the truth."""
+"""Settings of `PerturbSettings` that change masks; if all are 0, the masks are exact."""
 
 
 def run_truth_masks(
@@ -53,21 +53,21 @@ def run_truth_masks(
     min_area_px: int,
     threads: int,
 ) -> None:
-    """Write masks of every training view from the true labels, with faults (see `faults.faulty_masks`).
+    """Write masks of every training view from the true labels, with faults (see `mask_faults.faulty_masks`).
 
     Args:
         scene_folder: the `Scene` artifact.
-        truth: the truth folder of a synthetic scene: annotations, and `scene.json`, which names the
+        truth: the truth folder of a synthetic scene, with annotations and `scene.json`, which lists the
             surroundings.
-        out: folder to write: `<view>.npz` (`HierarchicalMasks`) and `index.json`, as the masks stage does;
-            the index also holds the requested faults and, per view, how many were put in.
+        out: folder to write: `<view>.npz` (`HierarchicalMasks`) and `index.json`, as in the masks stage;
+            the index also holds the requested faults and, per view, the number of faults.
         settings: the faults.
         min_area_px: smaller true regions give no mask (`masks.min_area_px`).
-        threads: views processed at once; the result does not depend on it.
+        threads: number of views processed at once; the result does not depend on it.
 
     Raises:
-        MisalignedArtifactError: label images differ in size from the cameras.
-        ArtifactError: the truth folder is missing or incomplete.
+        MisalignedArtifactError: if label images differ in size from the cameras.
+        ArtifactError: if the truth folder is missing or incomplete.
     """
     scene = Scene.load(scene_folder)
     views = train_views(scene)
@@ -119,12 +119,12 @@ def run_truth_masks(
 
 
 def true_labels(annotations: HierarchyAnnotations, view: str) -> Int32[np.ndarray, "3 H W"]:
-    """Node id per level and pixel, -1 if the level has none."""
+    """Return the node id per level and pixel, -1 if the level has none."""
     return np.stack([annotations.label_image(view, level) for level in LEVELS])
 
 
 def faults_label(settings: PerturbSettings) -> str:
-    """How rows name these masks: the segmenter, then "exact", or what differs from the defaults.
+    """Return the label of these masks in tables: the segmenter, then "exact" or the non-default settings.
 
     Example:
         >>> faults_label(PerturbSettings(merge=0.2))

@@ -1,4 +1,4 @@
-"""Building blocks of the synthetic world's cameras."""
+"""Camera construction for the synthetic world."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from hilsplat.scene.cameras import Cameras
 
 
 def looking_at(centre: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
-    """Transform `cam_from_world` of an upright camera at `centre` that looks at `target`."""
+    """Return `cam_from_world` of an upright camera at `centre` that looks at `target`."""
     forward = (target - centre) / np.linalg.norm(target - centre)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -21,13 +21,13 @@ def looking_at(centre: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"])
 
 
 def pinhole(image_px: int, fov_deg: float | int) -> Float[np.ndarray, "3 3"]:
-    """Intrinsics of a square image with the given field of view, px."""
+    """Return the intrinsics of a square image with the given field of view, px."""
     focal = image_px / (2 * np.tan(np.radians(fov_deg) / 2))
     return np.array([[focal, 0.0, image_px / 2], [0.0, focal, image_px / 2], [0.0, 0.0, 1.0]])
 
 
 def on_sphere(azimuth_deg: float, elevation_deg: float, distance: float) -> Float[np.ndarray, " 3"]:
-    """The point at a distance from the origin in a direction."""
+    """Return the point at a distance from the origin in a direction."""
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
     return distance * np.array(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
@@ -37,7 +37,7 @@ def on_sphere(azimuth_deg: float, elevation_deg: float, distance: float) -> Floa
 def numbered_cameras(
     cam_from_world: Sequence[Float[np.ndarray, "4 4"]], K: Float[np.ndarray, "3 3"], image_px: int
 ) -> Cameras:
-    """Square views named 000.png, 001.png, ... that share their intrinsics."""
+    """Return square views named 000.png, 001.png, ... with shared intrinsics."""
     views = len(cam_from_world)
     return Cameras(
         tuple(f"{i:03d}.png" for i in range(views)),

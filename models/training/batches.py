@@ -1,4 +1,4 @@
-"""One step's material for the segmenter: windows, prompts, and the pixels at which masks are compared."""
+"""Training batches for the segmenter: windows, prompts, and the pixels at which masks are compared."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -20,15 +20,15 @@ from models.training.data import (
 from models.training.sam import HEADS, MASK_STRIDE, STRIDE, positional_embeddings
 
 MARGIN = 4
-"""Margin around a region's box that is compared closely too, mask px."""
+"""Margin around a region's box that is sampled as densely as the box, mask px."""
 
 
 @dataclass(frozen=True)
 class CropStage:
-    """One way to fill a step.
+    """Size and number of windows and prompts of a step.
 
     Attributes:
-        share: of all steps.
+        share: share of all steps.
         crop_px: side of the windows.
         batch: windows per step.
         prompts: point prompts per window.
@@ -48,16 +48,16 @@ class SamBatch:
 
     Attributes:
         pixels: the windows.
-        positional: of the windows.
+        positional: positional embeddings of the windows.
         classes: row of the text that names each pixel's region, per head; 0 for none.
         offsets: from each pixel to its region's centre, see `region_centres`.
-        has_region: where there is one.
+        has_region: 1 where there is a region.
         edges: 1 where a neighbour at stride 2 belongs to another region, per head.
         points: x, y of the prompts, px.
-        labels: of the points: 1 inside, 0 outside, -1 no point.
+        labels: labels of the points: 1 inside, 0 outside, -1 no point.
         known: 1 where a prompt has a true mask, per head.
         places: flat indices of mask pixels.
-        weights: how many mask pixels each stands for.
+        weights: number of mask pixels that each represents.
         truth: share of each of these mask pixels that belongs to the prompted region, per head.
     """
 
@@ -75,12 +75,12 @@ class SamBatch:
     truth: Float[Tensor, "B P 3 K"]
 
     def to(self, device: torch.device) -> "SamBatch":
-        """The same on a device."""
+        """Return the batch on a device."""
         return SamBatch(**{field.name: getattr(self, field.name).to(device) for field in fields(self)})
 
 
 def class_rows(views: LabelledViews) -> tuple[dict[str, int], list[np.ndarray]]:
-    """Number the texts of all nodes; per view, the class of each node id, with class 0 (none) at the end."""
+    """Number all texts from 1; return also the class of each node id per view, with 0 (none) at the end."""
     texts = sorted({node.phrases[0] for nodes in views.nodes for node in nodes})
     row = {text: index + 1 for index, text in enumerate(texts)}
     return row, [np.array([*(row[node.phrases[0]] for node in nodes), 0]) for nodes in views.nodes]
@@ -89,17 +89,17 @@ def class_rows(views: LabelledViews) -> tuple[dict[str, int], list[np.ndarray]]:
 def draw_level_prompts(
     rng: np.random.Generator, labels: np.ndarray, targets: np.ndarray, count: int, balanced: float = 0.8
 ) -> Int64[np.ndarray, "count 2"]:
-    """Pixels (x, y) to prompt: for a share of them first a level is drawn, then a region, then its pixel.
+    """Draw pixels (x, y) to prompt; for a share of them a level is drawn first, then a region, then a pixel.
 
-    The region's chance grows with the fourth root of its area: specks are drawn too, but less often than what
-    a grid of prompts would hit. The other prompts are uniform, like that grid.
+    The probability of a region is proportional to the fourth root of its area. Small regions are thus drawn
+    too, but less often than the larger regions that a grid of prompts hits. The other prompts are uniform.
 
     Args:
         rng: source of all choices.
         labels: (3, H, W) node ids, -1 for none.
-        targets: from `nested_targets`, for windows in which a level is missing.
+        targets: from `nested_targets`; used for levels that are missing in the window.
         count: number of prompts.
-        balanced: the share.
+        balanced: share of the prompts drawn by level and region.
     """
     height, width = labels.shape[1:]
     pixels = rng.integers(0, height * width, count)
@@ -121,7 +121,7 @@ def draw_level_prompts(
 
 
 def boxes_of(target: Shaped[np.ndarray, "H W"]) -> dict[int, tuple[int, int, int, int]]:
-    """Box (x0, y0, x1, y1, end exclusive) of each region of a label image."""
+    """Return the box (x0, y0, x1, y1, end exclusive) of each region of a label image."""
     found = ndimage.find_objects((target + 1).astype(np.int32))
     return {
         index: (box[1].start, box[0].start, box[1].stop, box[0].stop)
@@ -133,10 +133,10 @@ def boxes_of(target: Shaped[np.ndarray, "H W"]) -> dict[int, tuple[int, int, int
 def compared_pixels(
     rng: np.random.Generator, blocks: np.ndarray, chosen: Int64[np.ndarray, "P 3"], count: int
 ) -> tuple[Int64[np.ndarray, "P K"], Float32[np.ndarray, "P K"], Float32[np.ndarray, "P 3 K"]]:
-    """Mask pixels per prompt: a quarter anywhere, a quarter in the box of each head's region.
+    """Draw mask pixels per prompt: a quarter anywhere, a quarter in the box of each head's region.
 
-    A mask of thousands of pixels is compared at a few hundred of them (as PointRend and Mask2Former do), with
-    weights that make sums over them estimate sums over all.
+    A mask of thousands of pixels is compared at a few hundred of them (as in PointRend and Mask2Former).
+    Weighted sums over these pixels estimate sums over the whole mask.
 
     Args:
         rng: source of all choices.
@@ -145,7 +145,7 @@ def compared_pixels(
         count: K.
 
     Returns:
-        flat indices, how many mask pixels each stands for (K of them stand for about h w), and the share of
+        Flat indices, the number of mask pixels that each represents (about h w in total), and the share of
         each mask pixel that belongs to the region.
     """
     height, width = blocks.shape[1:3]
@@ -177,7 +177,7 @@ def compared_pixels(
 
 
 def region_edges(blocks: np.ndarray) -> Float32[np.ndarray, "heads h w"]:
-    """1 on both sides of a border with another region to the right or below, per head."""
+    """Return a map per head that is 1 on both sides of each border between regions."""
     first = blocks[..., 0]
     edges = np.zeros(first.shape, np.float32)
     right = first[:, :, 1:] != first[:, :, :-1]
@@ -190,7 +190,7 @@ def region_edges(blocks: np.ndarray) -> Float32[np.ndarray, "heads h w"]:
 
 
 def _strange(rng: np.random.Generator, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    """Occasionally an image in other colours or none: regions must not depend on the hues of this world."""
+    """Occasionally permute or remove an image's colours, so that regions depend less on the world's hues."""
     draw = rng.random()
     if draw < 0.08:
         return np.ascontiguousarray(image[..., rng.permutation(3)])
@@ -202,7 +202,7 @@ def _strange(rng: np.random.Generator, image: UInt8[np.ndarray, "H W 3"]) -> UIn
 def draw_batch(
     views: LabelledViews, classes: Sequence[np.ndarray], stage: CropStage, rng: np.random.Generator
 ) -> SamBatch:
-    """Windows with prompts; a sixth of the prompts has a second point, inside or outside."""
+    """Draw windows with prompts; up to a sixth of the prompts have a second point, inside or outside."""
     rows: list[tuple[np.ndarray, ...]] = []
     windows = []
     centre = slice(STRIDE // 2, None, STRIDE)

@@ -1,4 +1,4 @@
-"""Model cards of the small models: where they come from, how good they are, what they are not."""
+"""Model cards of the small models: recipe, quality and limitations."""
 
 import io
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ LEVEL_COLOURS = {"whole": "#1b6ca8", "part": "#d1791e", "subpart": "#3d8f4f"}
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """SHA-256 of each file of a model, except those that describe it."""
+    """Return the SHA-256 of each file of a model, except its card, record and pictures."""
     folder = Path(folder)
     about = {RECORD, CARD, *PICTURES}
     return {
@@ -36,13 +36,13 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 def draw_curve(path: Path, curve: Curve, series: Mapping[str, str], what: str) -> None:
-    """Draw a small picture of a learning curve.
+    """Draw a learning curve.
 
     Args:
-        path: PNG.
-        curve: its rows.
-        series: name of the column by level label.
-        what: meaning of the values.
+        path: PNG file to write.
+        curve: learning curve.
+        series: column name by level label.
+        what: label of the value axis.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -65,9 +65,9 @@ def draw_curve(path: Path, curve: Curve, series: Mapping[str, str], what: str) -
 def draw_masks(
     path: Path, encoder: SamEncoder, decoder: SamDecoder, views: LabelledViews, rows: int = 4, seed: int = 1
 ) -> None:
-    """Draw what the segmenter makes of single points in some views: image, three heads, three true masks.
+    """Draw the segmenter's masks for single points in some views.
 
-    Columns: the view with the point in red, then subpart, part, whole as predicted and as true.
+    Columns: the view with the point in red, the predicted subpart, part and whole, then the true ones.
     """
     import cv2
 
@@ -117,11 +117,11 @@ def write_sam_card(
 
     Args:
         folder: the model folder.
-        encoder: of the segmenter.
-        decoder: of the segmenter.
-        unseen: views on which nothing was trained.
-        recipe: how it was trained.
-        curve: what was measured on the way.
+        encoder: encoder of the segmenter.
+        decoder: decoder of the segmenter.
+        unseen: views that were not trained on.
+        recipe: training recipe.
+        curve: learning curve.
         metrics: "points" from `measure_sam` and "automatic" from `measure_everything`, each by kind of scene
             ("all" first) and level.
     """
@@ -194,8 +194,8 @@ def write_clip_card(
 
     Args:
         folder: the model folder.
-        recipe: how it was trained.
-        curve: what was measured on the way.
+        recipe: training recipe.
+        curve: learning curve.
         metrics: "black" and "keep" from `measure_clip` by kind of mask and level, "queries" from
             `measure_queries`.
     """

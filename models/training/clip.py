@@ -1,4 +1,4 @@
-"""A small CLIP: crops of masked regions and short phrases, in one space of 128 dimensions."""
+"""A small CLIP: crops of masked regions and short phrases in a common space of 128 dimensions."""
 
 from collections.abc import Iterable
 
@@ -11,17 +11,17 @@ from torch.nn import functional
 from models.training.sam import Residual, convolution
 
 CROP_PX = 64
-"""Side of the crops that the model takes."""
+"""Side of the input crops."""
 DIMENSIONS = 128
 PAD, UNKNOWN = "[PAD]", "[UNK]"
 MAX_WORDS = 16
 
 CANONICAL = ("object", "things", "stuff", "texture")
-"""The phrases that mean nothing in particular; relevancy compares queries with them (LERF)."""
+"""Generic phrases that relevancy compares queries with (LERF)."""
 
 
 def word_tokenizer(phrases: Iterable[str]) -> Tokenizer:
-    """One token per lower-case word of the phrases; id 0 pads, id 1 stands for any other word."""
+    """Return a tokenizer with one token per lower-case word; id 0 is padding, id 1 any other word."""
     splitter = pre_tokenizers.Whitespace()
     words = sorted({word for phrase in phrases for word, _ in splitter.pre_tokenize_str(phrase.lower())})
     vocabulary = {word: row for row, word in enumerate([PAD, UNKNOWN, *words])}
@@ -34,7 +34,7 @@ def word_tokenizer(phrases: Iterable[str]) -> Tokenizer:
 
 
 class ClipVision(nn.Module):
-    """Crop (B, 3, 64, 64) to a unit vector (B, 128)."""
+    """Image encoder, from crops (B, 3, 64, 64) to unit vectors (B, 128)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -52,16 +52,16 @@ class ClipVision(nn.Module):
         self.project = nn.Linear(192, DIMENSIONS)
 
     def forward(self, pixels: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B D"]:
-        """Unit vectors."""
+        """Return the unit vectors of crops."""
         return self.projected(self.layers(pixels))
 
     def projected(self, features: Float[Tensor, "B C h w"]) -> Float[Tensor, "B D"]:
-        """Unit vectors from the output of `layers` for the crops."""
+        """Return unit vectors from the output of `layers` for the crops."""
         return functional.normalize(self.project(features.mean(dim=(2, 3))), dim=-1)
 
 
 class ClipText(nn.Module):
-    """Words (B, W) to a unit vector (B, 128): one attention layer and the mean over words."""
+    """Text encoder, from words (B, W) to unit vectors (B, 128): one attention layer and a mean over words."""
 
     def __init__(self, num_words: int, width: int = 96) -> None:
         super().__init__()
@@ -72,7 +72,7 @@ class ClipText(nn.Module):
         self.width = width
 
     def forward(self, words: Int64[Tensor, "B W"], mask: Int64[Tensor, "B W"]) -> Float[Tensor, "B D"]:
-        """Unit vectors; `mask` is 1 where there is a word."""
+        """Return the unit vectors of texts; `mask` is 1 where there is a word."""
         present = mask.to(self.words.weight.dtype)
         x = self.words(words)
         query, key, value = self.attend(x).split(self.width, dim=-1)
@@ -90,17 +90,17 @@ def contrastive_loss(
     valid: Float[Tensor, "B T"],
     scale: Float[Tensor, ""],
 ) -> Float[Tensor, ""]:
-    """Symmetric contrastive loss; a crop may have several right texts, a text several crops or none.
+    """Return the symmetric contrastive loss.
 
     Args:
         image: unit vectors of crops.
         text: unit vectors of texts.
-        valid: 1 where text j is true of crop i; every crop has one that is.
+        valid: 1 where text j describes crop i; every crop has such a text, but a text may have no crop.
         scale: factor on the cosines (inverse temperature).
 
     Returns:
-        mean of both directions' cross-entropy against uniform targets on the valid pairs; texts that are
-        true of no crop only compete.
+        Mean of both directions' cross-entropy against uniform targets on the valid pairs. Texts without a
+        crop are only negatives.
     """
     logits = scale * image @ text.T
     by_image = -(valid * torch.log_softmax(logits, dim=1)).sum(dim=1) / valid.sum(dim=1)

@@ -1,4 +1,4 @@
-"""Crops that the small CLIP learns from, cut when needed: true, roughened and segmented masks."""
+"""Training crops of the small CLIP, cut on demand from true, roughened and segmented masks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,30 +24,29 @@ FRAMES: tuple[str, ...] = (
     "a photo of the {}",
     "a picture of a {}",
 )
-"""Sentence frames around a phrase; the bare phrase is the usual one."""
+"""Prompt templates around a phrase; the bare phrase has the highest weight."""
 GENERIC_FRAMES: tuple[str, ...] = ("{}", "{}", "a photo of {}", "a photo of a {}", "the {}", "a {}")
 LEAST_PX = 24
-"""Smaller regions are not cut."""
+"""Minimum area of a region, px."""
 SHOWS, SHOWS_NOTHING = 0.5, 0.2
-"""A segmented mask shows the node with which its IoU is above the first value; below the second it shows
-nothing."""
+"""IoU above which a segmented mask is matched to a node, and IoU below which it is matched to none."""
 
 
 @dataclass(frozen=True)
 class CropTable:
-    """N masks that can be cut out of labelled views, with their captions.
+    """N masks in labelled views, with their captions.
 
     Attributes:
         views: the views.
         masks: segmented masks per view; empty if none were requested.
         view: row of the view.
-        node: id of the node that the mask shows, -1 for nothing in particular.
-        level: `Level` of that node, 0 for nothing.
-        thing: which object the node belongs to; equal only within a view.
+        node: id of the node that the mask matches, -1 for none.
+        level: `Level` of that node, 0 for none.
+        thing: id of the node's object, unique within a view.
         segmented: row of the view's segmented masks, -1 for the true region.
         box: x0, y0, x1, y1 of the mask, end exclusive, px.
-        caption: row of `phrase_sets`, -1 for nothing in particular.
-        phrase_sets: the distinct sets of phrases; the first of each is the query.
+        caption: row of `phrase_sets`, -1 for none.
+        phrase_sets: the distinct sets of phrases; the first phrase of each is the query.
     """
 
     views: LabelledViews
@@ -66,13 +65,13 @@ class CropTable:
 
     @property
     def rough(self) -> Bool[np.ndarray, " N"]:
-        """Whether each mask came from the segmenter."""
+        """Whether each mask is from the segmenter."""
         return self.segmented >= 0
 
     def cut(
         self, row: int, background: str = "black", rng: np.random.Generator | None = None
     ) -> UInt8[np.ndarray, "size size 3"]:
-        """The crop of a mask as CLIP sees it; with `rng`, a true mask is roughened first."""
+        """Return the CLIP crop of a mask; with `rng`, a true mask is roughened first."""
         x0, y0, x1, y1 = self.box[row].tolist()
         image = self.views.images[self.view[row]]
         margin = 2 + max(x1 - x0, y1 - y0) // 8 if rng is not None else 0
@@ -94,7 +93,7 @@ class CropTable:
 def _shrunk(
     image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"], side: int
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Both at most `side` wide and high: roughening a large mask at full size costs more than it is worth."""
+    """Shrink both to at most `side` px, because roughening a large mask at full size is too slow."""
     scale = side / max(mask.shape)
     if scale >= 1:
         return image, mask
@@ -106,7 +105,7 @@ def _shrunk(
 
 
 def roughen(rng: np.random.Generator, mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """A mask as a segmenter might have drawn it: grown, rounded, with a piece missing or added."""
+    """Imitate a segmenter's mask: grow or shrink it, round it, and remove or add a piece."""
     rough = mask.astype(np.float32)
     area = float(mask.sum())
     sigma = float(np.clip(0.06 * area**0.5 * rng.uniform(0.2, 2.0), 0.4, 6.0))
@@ -122,16 +121,16 @@ def roughen(rng: np.random.Generator, mask: Bool[np.ndarray, "H W"]) -> Bool[np.
             radius = int(area**0.5 * rng.uniform(0.12, 0.35)) + 1
             cv2.circle(blob, (int(columns[pick]), int(rows[pick])), radius, 1, -1)
             found = np.where(blob > 0, value, found)
-    # A mask that lost its region is not an example of it.
+    # A mask that covers too little of its region is not a valid example.
     return found if (found & mask).sum() > 0.5 * (found | mask).sum() else mask
 
 
 def best_node(
     mask: Bool[np.ndarray, "H W"], level: int, labels: np.ndarray, num_nodes: int
 ) -> tuple[int, float]:
-    """Node whose region has the highest IoU with a mask, over all levels, and that IoU.
+    """Return the node of any level whose region has the highest IoU with a mask, and that IoU.
 
-    Ties go to the node of the given level: a part may be all that is visible of a whole.
+    Ties go to the node of the given level, because a whole and its only visible part have the same region.
     """
     best, best_iou = NONE, 0.0
     area = int(mask.sum())
@@ -153,12 +152,12 @@ def best_node(
 def list_crops(
     views: LabelledViews, masks: Sequence[HierarchicalMasks] = (), least_px: int = LEAST_PX
 ) -> CropTable:
-    """All masks of labelled views: the true regions, and the segmented masks, if any.
+    """List all masks of labelled views: the true regions, and the segmented masks, if any.
 
     Args:
         views: labelled views.
-        masks: of the first views, as the segmenter drew them.
-        least_px: smaller regions are left out.
+        masks: segmented masks of the first views.
+        least_px: smaller regions are omitted.
     """
     rows: list[tuple[int, ...]] = []
     boxes: list[Sequence[int]] = []
@@ -199,7 +198,7 @@ def list_crops(
 
 
 def list_segmented(views: LabelledViews, masks: Sequence[HierarchicalMasks]) -> CropTable:
-    """All segmented masks in their order, whatever they show, without captions."""
+    """List all segmented masks in order, without captions and regardless of their content."""
     view = np.repeat(np.arange(len(masks)), [len(found) for found in masks])
     segmented = np.concatenate([np.arange(len(found)) for found in masks] + [np.zeros(0, np.int64)])
     box = np.concatenate([found.box_xyxy for found in masks] + [np.zeros((0, 4), np.int32)])
@@ -210,14 +209,13 @@ def list_segmented(views: LabelledViews, masks: Sequence[HierarchicalMasks]) -> 
 
 
 class Captioner:
-    """Draws a caption for each crop and says which captions are true of which crops.
+    """Generator of captions for crops, with the pairs of captions and crops that match.
 
-    A small share of crops is described by one of the canonical phrases instead of their own. The
-    draw does not look at the crop, so a canonical phrase comes to mean nothing in particular: the
-    yardstick that relevancy needs.
+    A small share of crops gets a canonical phrase instead of its own. This choice is independent of the
+    crop, so a canonical phrase has no specific meaning, as relevancy requires.
 
-    Every query of the vocabulary and some further phrases are added to the captions of a batch: texts cost
-    little, and they teach a crop at once what else it is and is not.
+    Every query of the vocabulary and some further phrases are added to the captions of a batch as cheap
+    additional positives and negatives.
 
     Args:
         phrase_sets: distinct sets of phrases; the first of each is the query.
@@ -245,11 +243,11 @@ class Captioner:
     def draw(
         self, rng: np.random.Generator, captions: Int64[np.ndarray, " B"]
     ) -> tuple[list[str], Float32[np.ndarray, "B T"]]:
-        """Texts for a batch of crops, and whether text j is true of crop i; text i was drawn for crop i.
+        """Draw texts for a batch of crops, text i for crop i; return also whether text j describes crop i.
 
         Args:
             rng: source of all choices.
-            captions: row of `phrase_sets` per crop, -1 for none (the crop then gets a canonical phrase).
+            captions: row of `phrase_sets` per crop, -1 for none, which selects a canonical phrase.
         """
         texts, drawn = [], np.zeros(len(captions), np.int64)
         for index, caption in enumerate(captions.tolist()):
@@ -259,7 +257,7 @@ class Captioner:
                 phrase, frames = CANONICAL[pick], GENERIC_FRAMES
             else:
                 choice, attributed, draw = self.choices[caption], self.attributed[caption], rng.random()
-                # The first phrase of a node is the text that queries use; "red kettle" is the next in use.
+                # Queries mostly use a node's first phrase, and next most often a phrase such as "red kettle".
                 if draw < 0.4:
                     pick = choice[0]
                 elif draw < 0.6 and len(attributed):

@@ -1,4 +1,4 @@
-"""What the small models learn from: rendered views with labels, cut into windows with targets."""
+"""Training data of the small models: rendered views with labels, cut into windows with targets."""
 
 from dataclasses import dataclass
 
@@ -29,8 +29,8 @@ class LabelledViews:
 
     Attributes:
         images: the views.
-        labels: per view and level (whole, part, subpart), node id per pixel, -1 for none.
-        nodes: per view, the nodes of its scene, by id.
+        labels: node id per view, level (whole, part, subpart) and pixel, -1 for none.
+        nodes: for each view, the nodes of its scene by id.
     """
 
     images: UInt8[np.ndarray, "V S S 3"]
@@ -41,13 +41,13 @@ class LabelledViews:
         return len(self.images)
 
     def spread(self, count: int) -> "LabelledViews":
-        """At most `count` of the views, evenly spread over them."""
+        """Return at most `count` of the views, evenly spaced."""
         rows = np.unique(np.linspace(0, len(self) - 1, min(count, len(self))).round().astype(int))
         return LabelledViews(self.images[rows], self.labels[rows], tuple(self.nodes[row] for row in rows))
 
 
 def normalised(images: Shaped[np.ndarray, "B H W 3"]) -> Float32[np.ndarray, "B 3 H W"]:
-    """Pixels in [0, 255] to what the networks take: channel first, mean and spread as configured."""
+    """Normalise pixels in [0, 255] for the networks and move channels first."""
     scale = (1 / (255 * np.array(STD))).astype(np.float32)
     shift = (np.array(MEAN) / np.array(STD)).astype(np.float32)
     return np.ascontiguousarray((images * scale - shift).transpose(0, 3, 1, 2))
@@ -56,7 +56,7 @@ def normalised(images: Shaped[np.ndarray, "B H W 3"]) -> Float32[np.ndarray, "B 
 def recolour(
     rng: np.random.Generator, image: UInt8[np.ndarray, "H W 3"], strength: float = 1.0
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Photographic variations: exposure, white balance, gamma, saturation, vignette, blur, noise."""
+    """Vary exposure, white balance, contrast, saturation, gamma, vignette, blur and noise at random."""
     size = image.shape[:2]
     if rng.random() < 0.15 * strength:
         small = cv2.resize(image, (size[1] // 2, size[0] // 2), interpolation=cv2.INTER_AREA)
@@ -84,7 +84,7 @@ def recolour(
 
 @dataclass(frozen=True)
 class SegmentExample:
-    """A training window: pixels, labels, its position in its view (x0, y0, side as shares)."""
+    """A training window: pixels, labels, and position in its view (x0, y0, side as shares)."""
 
     image: UInt8[np.ndarray, "S S 3"]
     labels: np.ndarray
@@ -98,14 +98,14 @@ def cut_window(
     size: int,
     zoom: bool = True,
 ) -> SegmentExample:
-    """A random square of a view, possibly mirrored and enlarged or shrunk by up to a quarter.
+    """Cut a random square from a view, possibly mirrored and scaled by up to a quarter.
 
     Args:
         rng: source of all choices.
         image: a square view.
         labels: (3, H, W) node ids.
         size: side of the window in network pixels; the whole view if it is at least the view's side.
-        zoom: scale the window too.
+        zoom: whether to scale the window.
     """
     full = image.shape[0]
     factor = float(np.exp(rng.uniform(-0.22, 0.25))) if zoom else 1.0
@@ -125,7 +125,7 @@ def cut_window(
 
 
 def nested_targets(labels: np.ndarray) -> np.ndarray:
-    """Node id per pixel and head (subpart, part, whole).
+    """Return the node id per pixel and head (subpart, part, whole).
 
     If a pixel has no subpart, its subpart is its part; if it has no part, its part is its whole.
 
@@ -140,14 +140,14 @@ def nested_targets(labels: np.ndarray) -> np.ndarray:
 def region_centres(
     targets: np.ndarray, spacing_px: int = 1
 ) -> tuple[Float32[np.ndarray, "6 H W"], Bool[np.ndarray, "3 H W"]]:
-    """Offset from each pixel to the mean position of its region, per head; where it is defined.
+    """Compute the offset from each pixel to the mean position of its region, per head.
 
     Args:
-        targets: from `nested_targets`, possibly at every n-th pixel only.
-        spacing_px: that n.
+        targets: from `nested_targets`, possibly subsampled.
+        spacing_px: distance between the sampled pixels.
 
     Returns:
-        x and y of each head in turn, in units of 32 px, and a mask of pixels that have a region.
+        x and y for each head in order, in units of 32 px, and a mask of pixels that have a region.
     """
     height, width = targets.shape[1:]
     y, x = np.mgrid[0:height, 0:width].astype(np.float32) * spacing_px

@@ -29,15 +29,15 @@ MEAN = (0.485, 0.456, 0.406)
 STD = (0.229, 0.224, 0.225)
 OPSET = 18
 OWN_THRESHOLDS = Thresholds(predicted_iou_min=0.35, stability_min=0.5, nms_score=0.0, points_per_batch=16)
-"""What suits the small segmenter (docs/experiments.md); it goes into its `config.json`."""
+"""Thresholds tuned for the small segmenter (docs/experiments.md) and stored in its `config.json`."""
 HALF_FROM = 64
-"""Initialisers with at least this many numbers are stored as float16."""
+"""Initialisers with at least this many values are stored as float16."""
 
 
 class _VisionEncoder(nn.Module):
-    """The encoder, and all that prompts share: what they read at their points, and features of every pixel.
+    """The encoder and everything that prompts share: the map sampled at their points, and pixel features.
 
-    They go by the names that SAM's layout has for what an encoder hands to its decoder.
+    The two outputs use the names that SAM's layout gives to the encoder's outputs.
     """
 
     positional: Tensor
@@ -55,7 +55,7 @@ class _VisionEncoder(nn.Module):
 
 
 class _MaskDecoder(nn.Module):
-    """The decoder of what `_VisionEncoder` returns, or its preview."""
+    """The decoder for the outputs of `_VisionEncoder`, or its preview."""
 
     def __init__(self, decoder: SamDecoder, preview: bool) -> None:
         super().__init__()
@@ -68,7 +68,7 @@ class _MaskDecoder(nn.Module):
 
 
 def store_as_half(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Store large float32 initialisers as float16, each behind a Cast: half the size, float32 arithmetic."""
+    """Store large float32 initialisers as float16, each followed by a Cast to keep float32 arithmetic."""
     graph = model.graph
     casts = []
     for initializer in list(graph.initializer):
@@ -93,19 +93,19 @@ def export_onnx(
     dynamic: dict[str, dict[int, str]],
     path: Path,
 ) -> None:
-    """Trace a module and write it with half-size weights.
+    """Trace a module and write it with float16 weights.
 
     Args:
-        module: put into evaluation mode.
+        module: module to export, which is switched to evaluation mode.
         inputs: example inputs by name, in the order of the module's arguments.
         outputs: names of the outputs and their dynamic axes.
         dynamic: dynamic axes of the inputs.
-        path: the .onnx file.
+        path: ONNX file to write.
     """
     module.eval()
     with atomic_path(path) as temporary:
         with warnings.catch_warnings():
-            # The tracing exporter is deprecated but needs no further package and names axes as we want.
+            # The tracing exporter is deprecated, but it needs no further package and supports our axis names.
             warnings.simplefilter("ignore")
             torch.onnx.export(
                 module,
@@ -139,7 +139,7 @@ def export_sam(encoder: SamEncoder, decoder: SamDecoder, folder: Path) -> None:
         export_onnx(
             _MaskDecoder(decoder, preview=name == PREVIEW),
             {
-                # Two points of a prompt and three prompts: axes of length one would be traced as constants.
+                # Three prompts of two points each, because axes of length one would be traced as constants.
                 "input_points": torch.full((2, 3, 2, 2), FRAME_PX / 2.0),
                 "input_labels": torch.ones((2, 3, 2), dtype=torch.int64),
                 "image_embeddings": place.repeat(2, 1, 1, 1),

@@ -1,4 +1,4 @@
-"""The training loop of both small models: an interrupted training resumes, a finished one can be extended."""
+"""Training loop of both small models; interrupted trainings resume, and finished ones can be extended."""
 
 import json
 import logging
@@ -24,13 +24,13 @@ Batch = TypeVar("Batch")
 
 @dataclass(frozen=True)
 class Tuning:
-    """How a model is optimised.
+    """Settings of the optimiser and the training loop.
 
     Attributes:
-        peak: learning rate of the constant stretch.
-        warmup: steps up to it.
-        weight_decay: of AdamW.
-        average: the weights that are kept are a running average with this memory per step.
+        peak: learning rate of the constant phase.
+        warmup: number of warm-up steps.
+        weight_decay: weight decay of AdamW.
+        average: memory per step of the running average that gives the final weights.
         measure_every: steps between rows of the learning curve.
         save_every: steps between saved states.
     """
@@ -48,12 +48,12 @@ class Progress:
     """Progress of a training.
 
     Attributes:
-        step: steps done.
-        minutes: time they took, over all runs.
-        decay_from: step at which the learning rate began to fall, -1 before.
-        decay_steps: how many steps it falls.
-        budget: what the decay was planned for.
-        rows: of the learning curve.
+        step: number of finished steps.
+        minutes: their duration over all runs.
+        decay_from: first step of the learning rate decay, -1 before it.
+        decay_steps: number of decay steps.
+        budget: budget that the decay was planned for.
+        rows: rows of the learning curve.
     """
 
     step: int = 0
@@ -65,24 +65,24 @@ class Progress:
 
     @property
     def is_finished(self) -> bool:
-        """Whether the learning rate has reached its end."""
+        """Whether the learning rate decay is complete."""
         return self.decay_from >= 0 and self.step >= self.decay_from + self.decay_steps
 
 
 class Training:
     """Modules, optimiser and averaged weights of one model, with a state on disk.
 
-    Two files: `<name>.safetensors` holds the current state, `<name>-constant.safetensors` the state when the
-    learning rate began to fall. A larger budget later resumes from the second, as if the decay had never
-    happened: the constant stretch does not depend on its planned length. All randomness follows from the step
-    number, so a resumed run repeats an uninterrupted one.
+    `<name>.safetensors` holds the current state, `<name>-constant.safetensors` the state at the start of the
+    learning rate decay. A run with another budget resumes from the second, as if the decay had not happened:
+    the constant phase does not depend on its planned length. All randomness is derived from the step number,
+    so a resumed run repeats an uninterrupted one.
 
     Args:
-        modules: by name; trained together.
-        tuning: how to optimise.
-        folder: of the state.
-        name: of the state's files; it should name everything that the weights depend on.
-        device: where the modules live.
+        modules: modules by name, trained together.
+        tuning: settings of the optimiser and the loop.
+        folder: folder of the state.
+        name: base name of the state's files; it should identify everything that the weights depend on.
+        device: device of the modules.
     """
 
     def __init__(
@@ -116,13 +116,13 @@ class Training:
         measure: Callable[[], dict[str, float]],
         budget: Budget,
     ) -> Curve:
-        """Train from the state on disk until the budget is used; ends with averaged weights.
+        """Train from the state on disk until the budget is used, then set the averaged weights.
 
         Args:
-            make: the material of a step; prepared in a second thread.
-            loss_of: the loss of that material and its terms for the curve.
-            measure: quality of the modules in their current state (averaged weights).
-            budget: how long.
+            make: returns the batch of a step; runs in a second thread.
+            loss_of: returns the loss of a batch, and its terms for the curve.
+            measure: returns the quality of the modules, which have their averaged weights at that time.
+            budget: duration of the training.
         """
         self._resume(budget)
         curve, since = Curve(self.progress.rows), 0
@@ -180,7 +180,7 @@ class Training:
         return terms
 
     def averages(self) -> "_Averages":
-        """Within this context the modules have their averaged weights, in evaluation mode."""
+        """Return a context in which the modules have their averaged weights and are in evaluation mode."""
         return _Averages(self)
 
     def _resume(self, budget: Budget) -> None:
@@ -205,7 +205,7 @@ class Training:
         for row, values in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{row}.{key}": value for key, value in values.items()}
         plain = {key: value.detach().cpu().clone().contiguous() for key, value in tensors.items()}
-        # The decay's own plan belongs to the run that made it, not to the state before it.
+        # The state before the decay must not contain the plan of one run's decay.
         kept = self.progress if path == self.now else replace(self.progress, decay_from=-1, decay_steps=0)
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary:
@@ -226,7 +226,7 @@ class Training:
             if key.startswith("optimiser."):
                 _, row, what = key.split(".")
                 if value.ndim:
-                    # The fused optimiser walks memory: moments must be laid out as their parameter is.
+                    # The fused optimiser requires moments with the memory layout of their parameter.
                     value = torch.empty_like(parameters[int(row)]).copy_(value)
                 state["state"].setdefault(int(row), {})[what] = value
         self.optimiser.load_state_dict(state)
@@ -234,7 +234,7 @@ class Training:
 
 
 class _Averages:
-    """Swaps averaged weights in and the trained ones back."""
+    """Context that swaps the averaged weights in and restores the trained ones."""
 
     def __init__(self, training: Training) -> None:
         self.training = training

@@ -17,11 +17,11 @@ from models.training.data import LabelledViews, normalised
 
 CHUNK = 256
 COMMON = 20
-"""This many of the commonest texts of each level compete in the smaller of the two questions."""
+"""Number of most common texts of each level in the smaller set of competing texts."""
 
 
 def tokenised(tokenizer: Tokenizer, texts: Sequence[str]) -> tuple[Tensor, Tensor]:
-    """Word ids and attention mask of texts."""
+    """Return word ids and attention mask of texts."""
     encoded = tokenizer.encode_batch(list(texts))
     return (
         torch.tensor([row.ids for row in encoded], dtype=torch.int64),
@@ -33,7 +33,7 @@ def tokenised(tokenizer: Tokenizer, texts: Sequence[str]) -> tuple[Tensor, Tenso
 def embedded_crops(
     vision: ClipVision, crops: CropTable, rows: np.ndarray, background: str = "black"
 ) -> np.ndarray:
-    """Unit vectors of some crops."""
+    """Return the unit vectors of some crops."""
     vision.eval()
     device = next(vision.parameters()).device
     parts = []
@@ -45,7 +45,7 @@ def embedded_crops(
 
 @torch.no_grad()
 def embedded_texts(text: ClipText, tokenizer: Tokenizer, texts: Sequence[str]) -> np.ndarray:
-    """Unit vectors of some texts."""
+    """Return the unit vectors of texts."""
     text.eval()
     device = next(text.parameters()).device
     words, mask = tokenised(tokenizer, texts)
@@ -53,7 +53,7 @@ def embedded_texts(text: ClipText, tokenizer: Tokenizer, texts: Sequence[str]) -
 
 
 def coloured_text(phrases: Sequence[str]) -> str | None:
-    """The phrase that names a node by colour and class, such as "red kettle", if there is one."""
+    """Return the phrase that names a node by colour and class, such as "red kettle", or None."""
     wanted = re.compile(rf"({'|'.join(map(re.escape, COLOURS))}) {re.escape(phrases[0])}")
     return next((phrase for phrase in phrases if wanted.fullmatch(phrase)), None)
 
@@ -66,21 +66,21 @@ def measure_clip(
     rows: np.ndarray | None = None,
     background: str = "black",
 ) -> dict[tuple[str, str], dict[str, float]]:
-    """How often the best of all texts is the crop's own, per kind of mask and level.
+    """Measure how often a crop's own text is the most similar one, per kind of mask and level.
 
     Args:
-        vision: image side.
-        text: text side.
-        tokenizer: of the text side.
-        crops: masks; those that show nothing in particular are left out. All their nodes' texts compete.
-        rows: measure only these.
-        background: of the crops.
+        vision: image encoder.
+        text: text encoder.
+        tokenizer: tokenizer of the text encoder.
+        crops: masks; those without a caption are skipped. The texts of all their nodes compete.
+        rows: rows to measure; None measures all.
+        background: background of the crops.
 
     Returns:
-        by ("exact" or "rough", level): `top1` and `top3` of all texts, `top1_of_level` among the texts of
-        that level, `top1_of_common` among the 20 commonest texts of each level, of the crops that have one
-        of them, share that beats every canonical phrase (`above_canonical`), `coloured`:
-        top-1 among all texts of colour and class, of the crops that have one, `n`.
+        By ("exact" or "rough", level): accuracies `top1` and `top3` among all texts, `top1_of_level` among
+        the level's texts, and `top1_of_common` among the 20 most common texts of each level, for crops that
+        have one of them; `above_canonical`, the share of crops whose text beats every canonical phrase;
+        `coloured`, top-1 among texts of colour and class, for crops that have one; and the number `n`.
     """
     rows = np.arange(len(crops)) if rows is None else rows
     rows = rows[crops.caption[rows] >= 0]
@@ -129,11 +129,11 @@ def measure_clip(
 
 
 def common_texts(text: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """The texts that most masks of each level have, ascending.
+    """Return the rows of the `COMMON` most frequent texts of each level, in ascending order.
 
     Args:
         text: row of each mask's text.
-        level: of each mask; masks of level 0 are not counted.
+        level: level of each mask; masks of level 0 are not counted.
     """
     kept = []
     for at in LEVELS:
@@ -151,21 +151,21 @@ def measure_queries(
     crops: CropTable,
     least_px: int = 100,
 ) -> dict[str, dict[str, float]]:
-    """Both models together, one view at a time: a text's best automatic mask of its level against the truth.
+    """Measure both models together: each text's most similar automatic mask in a view against the truth.
 
     Args:
-        vision: image side.
-        text: text side.
-        tokenizer: of the text side.
+        vision: image encoder.
+        text: text encoder.
+        tokenizer: tokenizer of the text encoder.
         views: labelled views.
-        masks: automatic masks of each.
-        crops: from `list_segmented` of the same views and masks.
+        masks: automatic masks of each view.
+        crops: from `list_segmented` for the same views and masks.
         least_px: smaller regions are not queried.
 
     Returns:
-        per level: mean `iou` of the mask most similar to the text with the union of all regions that the
-        text names; `instance`, the same with the region it fits best; `best`, of the best mask of the
-        level with the best region; `n` pairs of view and text.
+        For each level: `iou`, the mean IoU of the mask most similar to the text and the union of all regions
+        of the text; `instance`, the same with the region (or the union) that fits the mask best; `best`, the
+        same with the best mask of the level; `n`, the number of pairs of view and text.
     """
     vectors = embedded_crops(vision, crops, np.arange(len(crops)))
     found: dict[str, list[tuple[float, float, float]]] = {level.label: [] for level in LEVELS}

@@ -1,4 +1,4 @@
-"""Measure the small segmenter: single points, and the pipeline's own automatic masks."""
+"""Measure the small segmenter on single points and on the pipeline's automatic masks."""
 
 from functools import lru_cache
 from pathlib import Path
@@ -21,18 +21,18 @@ from models.training.data import HEAD_LEVELS, LabelledViews, normalised
 from models.training.sam import MASK_STRIDE, STRIDE, SamDecoder, SamEncoder, positional_embeddings
 
 LEAST_PX = 100
-"""Smaller regions are not scored: a handful of pixels says little about a mask."""
+"""Minimum area of a scored region, because the IoU of a few pixels is not informative."""
 SIZES = {"small": (0, 400), "medium": (400, 1600), "large": (1600, np.inf)}
-"""Sizes of regions, px: from, below."""
+"""Area classes of regions, px: inclusive minimum, exclusive maximum."""
 PER_LEVEL = 8
-"""Regions scored per view and level."""
+"""Maximum number of regions scored per view and level."""
 
 
 @torch.no_grad()
 def predict_masks(
     encoder: SamEncoder, decoder: SamDecoder, image: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Scores (P, 3) and mask logits (P, 3, S/2, S/2) for single points (P, 2) of a square view."""
+    """Return scores (P, 3) and mask logits (P, 3, S/2, S/2) for single points (P, 2) of a square view."""
     encoder.eval()
     decoder.eval()
     device = next(encoder.parameters()).device
@@ -47,7 +47,7 @@ def predict_masks(
 def draw_regions(
     rng: np.random.Generator, labels: np.ndarray, per_level: int
 ) -> list[tuple[int, int, float, float]]:
-    """Row of head, node, and a random pixel (x, y) of each drawn region, at most `per_level` per level."""
+    """Draw regions, at most `per_level` per level; return head, node and a random pixel (x, y) of each."""
     drawn = []
     for head, level in enumerate(HEAD_LEVELS):
         at_level = labels[level.index]
@@ -62,12 +62,12 @@ def draw_regions(
 def measure_sam(
     encoder: SamEncoder, decoder: SamDecoder, views: LabelledViews, per_level: int = PER_LEVEL, seed: int = 0
 ) -> dict[str, dict[str, float]]:
-    """Mean IoU of single-point prompts, per level, every region of at least 100 px counting alike.
+    """Measure the masks of single-point prompts per level, with equal weight for regions of at least 100 px.
 
-    A region is drawn first and a pixel in it second; the mask compared is the one of that level's head.
+    A region is drawn first and a pixel in it second; the mask of the region's level is compared with it.
 
     Returns:
-        per level: mean `iou`; `best`, the same for the best of the three heads; share of prompts
+        For each level: mean `iou`; `best`, the same for the best of the three heads; share of prompts
         `above_75` % IoU; `correlation` of predicted and true IoU; `n`; and for each of `SIZES` the mean
         `iou_<size>` (0 if there is none) and `n_<size>`.
     """
@@ -111,13 +111,13 @@ def measure_sam(
 def automatic_masks(
     folder: Path, views: LabelledViews, workers: int, points_per_side: int = MasksSettings().points_per_side
 ) -> list[HierarchicalMasks]:
-    """The masks that the pipeline's own stage makes of each view with an exported segmenter.
+    """Segment views with an exported segmenter as the pipeline's masks stage does.
 
     Args:
         folder: model folder.
-        views: what to segment.
-        workers: processes.
-        points_per_side: of the grid of prompts; everything else as in the settings' defaults.
+        views: views to segment.
+        workers: number of processes.
+        points_per_side: size of the prompt grid; other settings have their defaults.
     """
     if not len(views):
         return []
@@ -135,16 +135,16 @@ def cached_masks(
     points_per_side: int | None,
     workers: int,
 ) -> list[HierarchicalMasks]:
-    """`automatic_masks` of the first views, kept in a cache by the digests of segmenter and pictures.
+    """Return `automatic_masks` of the first views, cached by the digests of segmenter and images.
 
     Args:
         cache: folder that may be deleted at any time.
         folder: model folder.
-        digest: of the segmenter.
-        views: what to segment.
-        count: how many of them.
-        points_per_side: of the grid of prompts; None for the settings' default.
-        workers: processes.
+        digest: digest of the segmenter.
+        views: views to segment.
+        count: number of views to segment.
+        points_per_side: size of the prompt grid; None for the settings' default.
+        workers: number of processes.
     """
     side = MasksSettings().points_per_side if points_per_side is None else points_per_side
     settings = MasksSettings(points_per_side=side).model_dump_json()
@@ -166,7 +166,7 @@ def _segment_into(folder: Path, digest: str, points_per_side: int, image: np.nda
 
 @lru_cache(maxsize=1)
 def _opened(folder: Path, digest: str) -> SamModel:
-    """The model, which stays open between calls; `digest` tells models of the same folder apart."""
+    """Load the model and keep it open between calls; `digest` distinguishes models of one folder."""
     return SamModel.load(folder)
 
 
@@ -177,11 +177,11 @@ def _segment(folder: Path, digest: str, points_per_side: int, image: np.ndarray)
 
 
 def measure_everything(masks: list[HierarchicalMasks], views: LabelledViews) -> dict[str, dict[str, float]]:
-    """How many regions of at least 100 px some automatic mask of their level covers.
+    """Measure how well automatic masks cover the regions of at least 100 px at their level.
 
     Returns:
-        per level: `recall` at IoU 0.5, `iou` of the best mask, both averaged over regions; `masks` per
-        view and how many of them fit some region with IoU 0.5 (`precision`); regions `n`.
+        For each level: `recall` at IoU 0.5 and `iou` of the best mask, averaged over regions; `masks` per
+        view; `precision`, the share of masks with IoU 0.5 with some region; `n` regions.
     """
     report = {}
     for level in LEVELS:

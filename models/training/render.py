@@ -1,4 +1,4 @@
-"""Views of random training scenes, rendered once into a cache."""
+"""Views of random training scenes, rendered into a cache."""
 
 import json
 import logging
@@ -38,15 +38,15 @@ MIXTURE: dict[str, tuple[float, int, int]] = {
     "room": (0.2, 6, 14),
     "street": (0.2, 6, 14),
 }
-"""Kinds of training scenes: share, and the least and most objects asked for."""
+"""Kinds of training scenes: share, and the minimum and maximum number of requested objects."""
 SAMPLES = 2
-"""Sub-samples per pixel side; half the time of the benchmark's 3, and no visible difference in a crop."""
+"""Sub-samples per pixel side; half the time of the benchmark's 3, with no visible difference in a crop."""
 
 
 def phrases_of(nodes: Sequence[AnnotatedNode]) -> tuple[LabelledNode, ...]:
-    """Nodes with their phrases: the text, its synonyms, and the bare word of a part.
+    """Return nodes with their phrases: the text, its synonyms, and the bare word of a part.
 
-    The bare word ("head" of "bear head") is what people type after a path's first term.
+    The bare word ("head" of "bear head") is the usual second term of a path.
     """
     labelled = []
     for node in nodes:
@@ -62,7 +62,7 @@ def phrases_of(nodes: Sequence[AnnotatedNode]) -> tuple[LabelledNode, ...]:
 
 
 def kind_of_seed(seed: int) -> tuple[str, int]:
-    """Kind of a training scene and number of objects to request; both follow from its seed."""
+    """Return the kind of a training scene and its number of objects, both derived from the seed."""
     rng = np.random.default_rng((seed, 11))
     kinds = list(MIXTURE)
     kind = kinds[int(rng.choice(len(kinds), p=[MIXTURE[name][0] for name in kinds]))]
@@ -71,10 +71,10 @@ def kind_of_seed(seed: int) -> tuple[str, int]:
 
 
 def scene_of_seed(seed: int) -> WorldScene:
-    """A training scene.
+    """Build a training scene.
 
     Raises:
-        SceneError: the seed is not in the training split.
+        SceneError: if the seed is not in the training split.
     """
     require_split(seed, "training")
     kind, objects = kind_of_seed(seed)
@@ -98,9 +98,9 @@ def render_training_scene(seed: int, views: int, path: Path) -> None:
 
 @cache
 def generator_digest() -> str:
-    """Version of the generator and a digest of what it makes: an object of each class, a scene of each kind.
+    """Return the generator's version and a digest of an object of each class and a scene of each kind.
 
-    A digest of its output, not of its code: an edit that changes no pixel and no text keeps the cache.
+    The digest covers output, not code, so an edit that changes no pixel and no text keeps the cache valid.
     """
     parts: list[bytes] = []
     for build, names in (
@@ -125,15 +125,15 @@ def generator_digest() -> str:
 
 
 def render_training_views(cache: Path, seeds: Sequence[int], views: int, workers: int) -> LabelledViews:
-    """Views of some training scenes, rendered if the cache lacks them.
+    """Return views of some training scenes, and render those that the cache lacks.
 
     Args:
-        cache: folder that may be deleted at any time; its entries depend on the generator's code.
-        seeds: of training scenes.
-        views: per scene.
-        workers: processes that render.
+        cache: folder that may be deleted at any time; its entries depend on the generator's output.
+        seeds: seeds of training scenes.
+        views: number of views per scene.
+        workers: number of rendering processes.
     """
-    # An interrupted run resumes; a changed generator renders everything anew.
+    # The folder's name depends on the generator, so that changed scenes are rendered again.
     recipe = {
         "generator": generator_digest(),
         "views": views,
@@ -149,7 +149,7 @@ def render_training_views(cache: Path, seeds: Sequence[int], views: int, workers
         jobs = in_processes(render_training_scene, missing, workers, chunk=4)
         for _ in track(jobs, "training scenes", total=len(missing)):
             pass
-    # Filled in place: thousands of views are gigabytes, and joining a list of them would need twice that.
+    # Arrays are filled in place: views take gigabytes, and joining a list of them would need twice that.
     images = np.empty((len(paths) * views, FRAME_PX, FRAME_PX, 3), np.uint8)
     labels = np.empty((len(paths) * views, len(LEVELS), FRAME_PX, FRAME_PX), np.int16)
     nodes: list[tuple[LabelledNode, ...]] = []
@@ -165,6 +165,6 @@ def render_training_views(cache: Path, seeds: Sequence[int], views: int, workers
 
 
 def training_seeds(scenes: int, validation: int) -> tuple[list[int], list[int]]:
-    """Seeds of the scenes to train on, and of others (from the far end of the range) to measure on."""
+    """Return the seeds of training scenes, and of validation scenes from the end of the range."""
     first, last = TRAINING_SEEDS.start, TRAINING_SEEDS.stop
     return list(range(first, first + scenes)), list(range(last - validation, last))

@@ -1,10 +1,9 @@
 """A small promptable segmenter with SAM's interface: point prompts in, three nested masks out.
 
-Three choices make it trainable in minutes on a CPU, in a world whose objects it will meet again: a dense
-U-shaped encoder whose embedding also says, for every pixel, where the centre of its region is at each level;
-a decoder that is one tiny pixel network whose weights are written by the prompt (dynamic convolution,
-CondInst); and full-resolution pixel features that end with resize and a 3x3 convolution, so that masks show
-no checkerboard.
+Three choices make it trainable in minutes on a CPU, for a world whose classes it has seen: a dense U-shaped
+encoder that also predicts the centre of each pixel's region at each level; a decoder that is a tiny pixel
+network with weights generated from the prompt (dynamic convolution, CondInst); and stride-2 pixel features
+computed by resize and a 3x3 convolution, so that masks have no checkerboard artifacts.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,13 +15,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 FRAME_PX = 384
-"""Side of the square frame that the exported model takes."""
+"""Side of the exported model's square input, px."""
 STRIDE = 4
 """Image pixels per pixel of the embedding."""
 MASK_STRIDE = 2
 """Image pixels per pixel of a predicted mask."""
 UNIT_PX = 32.0
-"""Relative coordinates and offsets to centres are measured in this many pixels."""
+"""Unit of relative coordinates and of offsets to centres, px."""
 HEADS = ("subpart", "part", "whole")
 """Order of the three output masks, as in SAM: fine to coarse."""
 
@@ -37,17 +36,17 @@ POSITIONAL = 2 + 4 * FREQUENCIES
 HIDDEN = 16
 TOKEN = 160
 BAND = 6
-"""Rows of a mask that the decoder answers at once, an even number: the hidden values of 16 prompts there fit
-into a core's cache, those of whole masks do not, and reading and writing them takes longer than the sums."""
+"""Mask rows that the decoder computes at once, an even number. The hidden values of 16 prompts in a band fit
+into a core's cache; for whole masks they do not, and memory access takes longer than the arithmetic."""
 STEM = 24
 WIDTHS = (64, 128, 192, 256)
 """Channels at strides 4, 8, 16, 32."""
 DEPTHS = (2, 2, 3, 2)
-"""Residual blocks at each."""
+"""Residual blocks at the same strides."""
 
 
 def convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
-    """3x3 convolution, batch normalisation, ReLU."""
+    """Return a 3x3 convolution with batch normalisation and ReLU."""
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1, bias=False),
         nn.BatchNorm2d(outputs),
@@ -66,16 +65,16 @@ class Residual(nn.Module):
         )
 
     def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H W"]:
-        """Same shape as the input."""
+        """Return a tensor of the input's shape."""
         return functional.relu(x + self.second(self.first(x)))
 
 
 class SamEncoder(nn.Module):
-    """Image to embedding: (B, 3, S, S) to (B, 166, S/4, S/4); S is a multiple of 32.
+    """Image encoder, from (B, 3, S, S) to (B, 166, S/4, S/4); S is a multiple of 32.
 
-    Channels of the embedding: 96 that hold 24 features at stride 2 (pixel-unshuffled, nothing lost),
-    6 offsets from a pixel to the centre of its region per head (x, y; in units of 32 px), and 64 that
-    say what the pixel shows. All that prompts share is computed here, once per image.
+    Channels of the embedding: 96 for 24 features at stride 2 (pixel-unshuffled, lossless), 6 offsets
+    from a pixel to the centre of its region per head (x, y; in units of 32 px), and 64 semantic ones.
+    It is computed once per image for all prompts.
     """
 
     def __init__(self) -> None:
@@ -99,11 +98,11 @@ class SamEncoder(nn.Module):
         self.pixel = nn.Conv2d(32, PIXEL, 1)
 
     def forward(self, pixels: Float[Tensor, "B 3 S S"]) -> Float[Tensor, "B C s s"]:
-        """Embedding at stride 4."""
+        """Return the embedding at stride 4."""
         return torch.cat(self.features(pixels)[:3], dim=1)
 
     def features(self, pixels: Float[Tensor, "B 3 S S"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The embedding's three groups of channels, and what the sharp features at stride 2 come from."""
+        """Return the embedding's three channel groups, and the layer before the pixel features (stride 2)."""
         stem = self.stem(pixels)
         pyramid, x = [], stem
         for down in self.downs:
@@ -121,15 +120,15 @@ class SamEncoder(nn.Module):
 
 
 def positional_embeddings(windows: Float[Tensor, "B 3"], cells: int) -> Float[Tensor, "B C cells cells"]:
-    """Positions of the cells of the embedding.
+    """Return the positional embeddings of the cells.
 
     Args:
-        windows: x0, y0 and side of the image's window that each row of the batch shows, as shares of
-            the whole image; (0, 0, 1) is the whole image.
+        windows: x0, y0 and side of each batch row's window as shares of the whole image; (0, 0, 1) is
+            the whole image.
         cells: side of the embedding.
 
     Returns:
-        two channels with x and y in the network's own frame (units of 32 px), then sines and cosines
+        Two channels with x and y in the network's input frame (units of 32 px), then sines and cosines
         of the position in the whole image.
     """
     steps = (torch.arange(cells, dtype=torch.float32) + 0.5) / cells
@@ -150,7 +149,7 @@ def positional_embeddings(windows: Float[Tensor, "B 3"], cells: int) -> Float[Te
 def shared_features(
     embeddings: Float[Tensor, "B C s s"], positional: Float[Tensor, "B D s s"]
 ) -> Float[Tensor, "B K_and_1 h w"]:
-    """Features of every pixel at stride 2, the same for all prompts of an image; the last is 1 everywhere."""
+    """Return the pixel features at stride 2 shared by all prompts of an image; the last is constant 1."""
     pixel = functional.pixel_shuffle(embeddings[:, :PACKED], STRIDE // MASK_STRIDE)
     side = int(embeddings.shape[-1]) * (STRIDE // MASK_STRIDE)
     here = positional[:, :2]
@@ -164,12 +163,11 @@ def shared_features(
 
 
 class SamDecoder(nn.Module):
-    """Prompts to masks: the prompt writes the weights of a two-layer network run at every pixel.
+    """Mask decoder: the weights of a two-layer network at every pixel are generated from the prompt.
 
-    The pixel network sees 24 shared features, the pixel's position relative to the prompt, and, for each
-    head, how far the centre that the pixel votes for is from the one the prompted pixel votes for (difference
-    and squared distance). All of these are affine in features shared by all prompts, so its first layer is
-    one matrix product per image.
+    Inputs of the pixel network are 24 shared features, the pixel's position relative to the prompt, and, for
+    each head, the offset and squared distance between the region centres predicted at the pixel and at the
+    prompt. All are affine in features that prompts share, so the first layer is one matrix product per image.
     """
 
     def __init__(self) -> None:
@@ -185,7 +183,7 @@ class SamDecoder(nn.Module):
         )
         with torch.no_grad():
             self.weights.weight.mul_(0.3)
-            # Most pixels are outside a mask: start there.
+            # Most pixels are outside a mask, so the initial bias is negative.
             self.weights.bias[-len(HEADS) :] = -2.0
 
     def forward(
@@ -195,11 +193,11 @@ class SamDecoder(nn.Module):
         embeddings: Float[Tensor, "B C s s"],
         positional: Float[Tensor, "B D s s"],
     ) -> tuple[Float[Tensor, "B P 3"], Float[Tensor, "B P 3 h w"]]:
-        """Predicted IoU and mask logits at stride 2, heads in the order subpart, part, whole.
+        """Return predicted IoU and mask logits at stride 2, with heads in the order subpart, part, whole.
 
         Args:
             points: x, y in pixels of the encoder's frame.
-            labels: 1 inside the region, 0 outside, negative: no point (padding).
+            labels: 1 inside the region, 0 outside, negative for padding.
             embeddings: from the encoder.
             positional: from `positional_embeddings`.
         """
@@ -213,19 +211,19 @@ class SamDecoder(nn.Module):
         place: Float[Tensor, "B C_and_D s s"],
         shared: Float[Tensor, "B K_and_1 h w"],
     ) -> tuple[Float[Tensor, "B P 3"], Float[Tensor, "B P 3 h w"]]:
-        """`forward` from what prompts of an image share; what the exported decoder computes.
+        """Compute `forward` from inputs shared by an image's prompts, as in the exported decoder.
 
         Args:
             points: as in `forward`.
             labels: as in `forward`.
-            place: embeddings and positional embeddings, which a prompt reads at its points.
-            shared: `shared_features`.
+            place: embeddings and positional embeddings, sampled at the points.
+            shared: output of `shared_features`.
         """
         token, *written = self.written(points, labels, place)
         bands, seen = [], []
         for band in self.bands(written, points, shared, BAND):
             bands.append(band)
-            # Every fourth pixel gives area and confidence well enough, in a quarter of the time.
+            # Every fourth pixel is enough for area and confidence, and takes a quarter of the time.
             seen.append(band[..., ::2, ::2].flatten(3))
         return self.seen_iou(token, torch.cat(seen, dim=-1)), torch.cat(bands, dim=3)
 
@@ -236,9 +234,9 @@ class SamDecoder(nn.Module):
         place: Float[Tensor, "B C_and_D s s"],
         shared: Float[Tensor, "B K_and_1 h w"],
     ) -> tuple[Float[Tensor, "B P 3"], Float[Tensor, "B P 3 half_h half_w"]]:
-        """`masks` with every second row and column of the logits, in a quarter of the time.
+        """Compute `masks` at every second row and column, in a quarter of the time.
 
-        The predicted IoUs are those of `masks`, which needs no other pixels for them.
+        The predicted IoUs equal those of `masks`, which depend only on these pixels.
         """
         token, *written = self.written(points, labels, place)
         bands = self.bands(written, points, shared[:, :, ::2, ::2], BAND // 2)
@@ -252,16 +250,16 @@ class SamDecoder(nn.Module):
         shared: Float[Tensor, "B K_and_1 h w"],
         rows: int,
     ) -> Iterator[Float[Tensor, "B P 3 rows w"]]:
-        """Mask logits in bands of so many rows.
+        """Yield mask logits in bands of rows.
 
         Args:
-            written: matrix and bias of both layers, as prompts wrote them.
+            written: matrix and bias of both layers, from `written`.
             points: the prompts; their number stays variable in the exported graph.
             shared: features of the pixels, as in `masks`.
-            rows: of a band.
+            rows: number of rows of a band.
         """
         first, bias, second, shift = written
-        # the bias is the weight of the feature that is 1 everywhere
+        # The bias is the weight of the constant feature 1.
         first = torch.cat([first, bias[..., None]], dim=-1).flatten(1, 2)  # (B, P * H, K + 1)
         side = int(shared.shape[-1])  # constant in the exported graph
         hidden_shape = (points.shape[0], points.shape[1], HIDDEN, -1)
@@ -273,7 +271,7 @@ class SamDecoder(nn.Module):
     def seen_iou(
         self, token: Float[Tensor, "B P T"], sampled: Float[Tensor, "B P 3 n"]
     ) -> Float[Tensor, "B P 3"]:
-        """`predicted_iou` from every second row and column of a mask."""
+        """Return `predicted_iou` from every second row and column of a mask."""
         return self.predicted_iou(token, sampled, sampled.new_full((1, 1, 1), 4.0))
 
     def at_pixels(
@@ -285,7 +283,7 @@ class SamDecoder(nn.Module):
         pixels: Int64[Tensor, "B P K"],
         weights: Float[Tensor, "B P K"],
     ) -> tuple[Float[Tensor, "B P 3"], Float[Tensor, "B P 3 K"]]:
-        """The same as `forward` at some pixels per prompt: what training needs, in a fraction of the time.
+        """Compute `forward` at some pixels per prompt for training, in a fraction of the time.
 
         Args:
             points: as in `forward`.
@@ -293,7 +291,7 @@ class SamDecoder(nn.Module):
             embeddings: as in `forward`.
             positional: as in `forward`.
             pixels: flat indices into the mask.
-            weights: how many mask pixels each of them stands for.
+            weights: number of mask pixels that each represents.
         """
         place = torch.cat([embeddings, positional], dim=1)
         token, first, bias, second, shift = self.written(points, labels, place)
@@ -312,7 +310,7 @@ class SamDecoder(nn.Module):
         labels: Int64[Tensor, "B P N"],
         place: Float[Tensor, "B C_and_D s s"],
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Token of each prompt, and the weights it writes: matrix and bias of both layers."""
+        """Return each prompt's token and its generated weights: matrix and bias of both layers."""
         cells = int(place.shape[-1])  # constant in the exported graph
         grid = points / (cells * STRIDE) * 2 - 1
         sampled = functional.grid_sample(place, grid, padding_mode="border", align_corners=False)
@@ -323,7 +321,7 @@ class SamDecoder(nn.Module):
         token = self.token[0](self.point(features) + self.label(labels.clamp(-1, 1) + 1)) * valid
         token = self.token[1:](token.sum(dim=2) / valid.sum(dim=2).clamp(min=1.0))  # (B, P, T)
 
-        # What the prompt compares each pixel with: its place, and the centres it votes for.
+        # The anchor is the prompt's position and the centres predicted there; pixels are compared with it.
         here = sampled[..., EMBEDDING : EMBEDDING + 2]
         centres = sampled[..., PACKED : PACKED + OFFSETS] + here.repeat(1, 1, 1, len(HEADS))
         anchor = torch.cat([here, centres], dim=-1) * inside
@@ -342,9 +340,9 @@ class SamDecoder(nn.Module):
         """Estimate each mask's IoU from its area, its confidence and the prompt; no gradient to the mask.
 
         Args:
-            token: of the prompts.
-            logits: at some pixels of the mask.
-            weights: how many mask pixels each of them stands for.
+            token: tokens of the prompts.
+            logits: logits at some pixels of the mask.
+            weights: number of mask pixels that each represents.
         """
         weights = weights[:, :, None]
         share = torch.sigmoid(logits.detach())
@@ -360,9 +358,9 @@ class SamDecoder(nn.Module):
 def _around_anchor(
     weights: Float[Tensor, "B P H K"], bias: Float[Tensor, "B P H"], anchor: Float[Tensor, "B P 8"]
 ) -> tuple[Float[Tensor, "B P H K"], Float[Tensor, "B P H"]]:
-    """Turn a layer on prompt-relative inputs into the same layer on shared inputs.
+    """Convert a layer on prompt-relative inputs into the same layer on shared inputs.
 
-    With a the anchor and c a pixel's place, w.(c - a) = w.c - w.a, and
+    With a the anchor and c a pixel's position, w.(c - a) = w.c - w.a, and
     q |c - a|^2 = q |c|^2 - 2 q a.c + q |a|^2: the squared term only shifts the linear weights.
     """
     linear = weights[..., PIXEL : PIXEL + 2 + OFFSETS]  # (B, P, H, 8)

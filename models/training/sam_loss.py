@@ -1,4 +1,4 @@
-"""Auxiliary training targets of the small segmenter, and the losses of all its outputs."""
+"""Losses of all outputs of the small segmenter, including auxiliary training outputs."""
 
 import torch
 from jaxtyping import Float
@@ -9,7 +9,7 @@ from models.training.batches import SamBatch
 from models.training.sam import HEADS, SEMANTIC, STRIDE, SamDecoder, SamEncoder
 
 SEMANTIC_PIXELS = 1536
-"""Pixels per batch that the auxiliary classifier sees besides the prompted ones."""
+"""Random pixels per batch for the auxiliary classifier, in addition to the prompted ones."""
 
 
 def segmentation_loss(
@@ -19,15 +19,15 @@ def segmentation_loss(
     weights: Float[Tensor, "B P K"],
     known: Float[Tensor, "B P 3"],
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """Loss of masks (dice and cross-entropy per area) and of the predicted IoU.
+    """Return the losses of the masks (dice and cross-entropy per area) and of the predicted IoU.
 
-    A prompt on an unlabelled pixel has no true mask: only its predicted IoU is trained, towards 0.
+    A prompt on an unlabelled pixel has no true mask, so only its predicted IoU is trained, towards 0.
 
     Args:
         scores: predicted IoU.
-        logits: of the masks, at K pixels of each.
-        truth: true shares there.
-        weights: how many mask pixels each of them stands for.
+        logits: logits at K pixels of each mask.
+        truth: true share of each of these pixels.
+        weights: number of mask pixels that each represents.
         known: 1 where there is a true mask.
     """
     weights = weights[:, :, None]
@@ -35,7 +35,7 @@ def segmentation_loss(
     area = (weights * truth).sum(dim=-1)
     dice = 1 - (2 * (weights * share * truth).sum(dim=-1) + 1) / ((weights * share).sum(dim=-1) + area + 1)
     entropy = functional.binary_cross_entropy_with_logits(logits, truth, reduction="none")
-    # Per area of the region, so that a region of 50 px counts as much as the floor.
+    # Cross-entropy is divided by the region's area, so that 50 px count as much as the floor.
     entropy = (weights * entropy).sum(dim=-1) / (2 * area + 64)
     masks = ((dice + entropy) * known).sum() / known.sum().clamp(min=1.0)
     with torch.no_grad():
@@ -48,7 +48,7 @@ def segmentation_loss(
 
 
 class Teacher(nn.Module):
-    """Training only: which text names a pixel's region and where regions end, at each head."""
+    """Auxiliary outputs for training: the text class of a pixel's region, and region borders, per head."""
 
     def __init__(self, num_classes: int) -> None:
         super().__init__()
@@ -58,7 +58,7 @@ class Teacher(nn.Module):
     def recognised(
         self, semantic: Float[Tensor, "B C s s"], batch: SamBatch, generator: torch.Generator
     ) -> Float[Tensor, ""]:
-        """Cross-entropy at prompted pixels (all sizes of region alike) and at random ones."""
+        """Return the cross-entropy at prompted pixels, which balance region sizes, and at random pixels."""
         rows, _, height, width = semantic.shape
         cell = (batch.points[:, :, 0] / STRIDE).long().clamp(0, width - 1)
         first = torch.arange(rows, device=cell.device)[:, None] * height * width
@@ -72,7 +72,7 @@ class Teacher(nn.Module):
         return functional.cross_entropy(logits.flatten(0, 1), wanted.flatten())
 
     def bordered(self, sharp: Float[Tensor, "B C h w"], batch: SamBatch) -> Float[Tensor, ""]:
-        """Cross-entropy of the border maps; borders count four times."""
+        """Return the cross-entropy of the border maps, in which borders have fourfold weight."""
         logits = self.edge(sharp).float()
         entropy = functional.binary_cross_entropy_with_logits(logits, batch.edges, reduction="none")
         return (entropy * (1 + 3 * batch.edges)).mean()
@@ -86,15 +86,15 @@ def training_loss(
     generator: torch.Generator,
     half: bool,
 ) -> tuple[Float[Tensor, ""], dict[str, float]]:
-    """Everything the segmenter is trained on: one step's loss, and its terms.
+    """Return the total loss of one step, and its terms.
 
     Args:
-        encoder: of the segmenter.
-        decoder: of the segmenter.
+        encoder: encoder of the segmenter.
+        decoder: decoder of the segmenter.
         teacher: auxiliary outputs.
         batch: windows and targets.
         generator: draws the pixels of the auxiliary classifier.
-        half: run the encoder's convolutions in bfloat16.
+        half: whether to run the encoder's convolutions in bfloat16.
     """
     with torch.autocast(batch.pixels.device.type, torch.bfloat16, enabled=half):
         packed, offsets, semantic, sharp = encoder.features(batch.pixels)

@@ -1,4 +1,4 @@
-"""What both trainings share: budget, learning rate, batches prepared ahead, learning curve."""
+"""Budget, learning rate, prefetched batches and learning curve of both trainings."""
 
 import logging
 from collections.abc import Callable, Generator
@@ -12,12 +12,12 @@ logger = logging.getLogger(__name__)
 Batch = TypeVar("Batch")
 
 DECAY_SHARE = 0.25
-"""Last part of a budget, during which the learning rate falls to almost nothing."""
+"""Final share of a budget, during which the learning rate decays."""
 
 
 @dataclass
 class Curve:
-    """What a training run measured on the way: rows of equal keys, the first being `step`."""
+    """Learning curve: rows with equal keys, the first of which is `step`."""
 
     rows: list[dict[str, float]] = field(default_factory=list)
 
@@ -29,9 +29,9 @@ class Curve:
 
 @dataclass(frozen=True)
 class Budget:
-    """How long to train: minutes or steps, whichever ends first; 0 sets no limit.
+    """Duration of a training: minutes or steps, whichever ends first; 0 sets no limit.
 
-    Steps repeat themselves on one machine; minutes fit the schedule to the machine at hand.
+    A number of steps is reproducible on one machine; minutes adapt the schedule to the machine's speed.
     """
 
     minutes: float = 0.0
@@ -42,14 +42,14 @@ class Budget:
             raise ValueError("a training needs minutes or steps")
 
     def is_time_to_decay(self, step: int, minutes: float) -> bool:
-        """Whether the learning rate should begin to fall."""
+        """Return whether the learning rate decay should begin."""
         by_steps = self.steps > 0 and step >= int((1 - DECAY_SHARE) * self.steps)
         return by_steps or (self.minutes > 0 and minutes >= (1 - DECAY_SHARE) * self.minutes)
 
     def decay_steps(self, step: int, minutes: float) -> int:
-        """Steps over which it falls when it begins now: what is left, or a quarter, whichever is less.
+        """Return the length of a decay that begins now: the remaining steps, or at least a quarter of all.
 
-        A state that is already past the budget (trained with a larger one before) decays over a quarter.
+        The shorter of two limits applies. The minimum is for a state that is already past the budget.
         """
         left = []
         if self.steps > 0:
@@ -61,7 +61,7 @@ class Budget:
 
 
 def learning_rate(step: int, peak: float, warmup: int, decay_from: int = -1, decay_steps: int = 0) -> float:
-    """Linear warm-up, a constant stretch, then a straight line down to 1 % of the peak."""
+    """Return the rate of a step: linear warm-up, a constant phase, then linear decay to 1 % of the peak."""
     rate = peak * min(1.0, (step + 1) / warmup)
     if decay_from >= 0:
         rate *= max(0.01, 1 - (step - decay_from) / max(1, decay_steps))
@@ -69,7 +69,7 @@ def learning_rate(step: int, peak: float, warmup: int, decay_from: int = -1, dec
 
 
 def prefetched(make: Callable[[int], Batch], first: int = 0) -> Generator[Batch, None, None]:
-    """Yield make(first), make(first + 1), ..., each prepared while its predecessor is being used."""
+    """Yield make(first), make(first + 1), ..., each prepared while its predecessor is in use."""
     with ThreadPoolExecutor(1) as pool:
         upcoming = pool.submit(make, first)
         for step in count(first + 1):

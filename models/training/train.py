@@ -1,4 +1,4 @@
-"""The recipe of the embedded small models: render, train, measure, export, describe."""
+"""Recipe of the small embedded models: render, train, measure, export, and write the model cards."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -33,25 +33,25 @@ from models.training.vocabulary import world_vocabulary
 logger = logging.getLogger(__name__)
 
 RECIPE_VERSIONS = {"sam": 2, "clip": 3}
-"""Raise it when networks, windows or losses change: a training in the cache then starts again."""
+"""Increment a version when networks, windows or losses change, so that cached trainings start again."""
 STAGES = ("render", "sam", "clip")
 AUTOMATIC_VIEWS = 48
-"""Unseen views that are segmented without prompts to measure recall."""
+"""Number of unseen views that are segmented automatically to measure recall."""
 
 
 ROUGH_PROMPTS = 20
-"""Prompts per image side when training views are segmented for CLIP; fewer than at run time are enough."""
+"""Prompts per image side when training views are segmented for CLIP, fewer than at run time."""
 
 
 @dataclass(frozen=True)
 class Material:
-    """Rendered views and what they come from.
+    """Rendered views and their origin.
 
     Attributes:
-        training: views to train on.
-        unseen: views of other scenes, to measure on.
-        unseen_kinds: kind of scene of each of them.
-        described: what a card says of them.
+        training: views for training.
+        unseen: views of other scenes, for validation.
+        unseen_kinds: scene kind of each unseen view.
+        described: description of the views for the cards.
     """
 
     training: LabelledViews
@@ -70,20 +70,20 @@ def train_models(
 ) -> None:
     """Train the small SAM and CLIP on training scenes of the synthetic world, and write both model folders.
 
-    Views and the states of both trainings are kept in the cache: an interrupted run resumes, and a finished
-    one given more minutes or steps resumes from before its learning rate fell.
+    Views and training states are cached: an interrupted run resumes, and a finished one with a new budget
+    resumes from the state before its learning rate decay.
 
     Args:
-        out: folder that will hold `sam-tiny` and `clip-tiny`.
-        cache: rendered views and training states.
-        settings: numbers of scenes, and how long to train.
-        seed: of everything random but the scenes.
-        threads: of torch; also the number of rendering and segmenting processes.
-        stages: of `STAGES`, all of them by default; `clip` needs a `sam-tiny` in `out`.
+        out: folder for `sam-tiny` and `clip-tiny`.
+        cache: folder of rendered views and training states.
+        settings: numbers of scenes, and duration of the training.
+        seed: seed of everything random except the scenes.
+        threads: threads of torch, and number of rendering and segmenting processes.
+        stages: some of `STAGES`, by default all; `clip` needs `sam-tiny` in `out`.
 
     Raises:
-        SettingsError: a stage is unknown.
-        ModelError: `clip` is asked for and `out` holds no segmenter.
+        SettingsError: if a stage is unknown.
+        ModelError: if `clip` is requested and `out` has no segmenter.
     """
     stages = STAGES if stages is None else tuple(stages)
     if not set(stages) <= set(STAGES):
@@ -104,10 +104,10 @@ def train_models(
 
 
 def require_own_models(out: Path) -> None:
-    """Check that training replaces no other model.
+    """Check that training does not replace another model.
 
     Raises:
-        ModelError: a folder of that name is something else than a trained small model.
+        ModelError: if an output folder contains something other than a model trained by this package.
     """
     for name in ("sam-tiny", "clip-tiny"):
         folder = Path(out) / name
@@ -118,7 +118,7 @@ def require_own_models(out: Path) -> None:
 
 
 def rendered(cache: Path, settings: TrainingSettings, threads: int) -> Material:
-    """Render the views of a recipe that the cache lacks."""
+    """Return the views of a recipe, and render those that the cache lacks."""
     train_seeds, other_seeds = training_seeds(settings.scenes, settings.validation_scenes)
     with stage_log("render", "training scenes") as counts:
         training = render_training_views(cache, train_seeds, settings.views, threads)
@@ -139,7 +139,7 @@ def rendered(cache: Path, settings: TrainingSettings, threads: int) -> Material:
 
 
 def _state_name(model: str, material: Material, seed: int, more: Mapping[str, Any]) -> str:
-    """Names a training by everything that its weights depend on, except how long it lasts."""
+    """Return a name derived from everything that the weights depend on, except the budget."""
     key = {"model": model, "seed": seed, "version": RECIPE_VERSIONS[model], **material.described, **more}
     return f"{model}-{sha256_of_json(key)[:12]}"
 
@@ -153,7 +153,7 @@ def _described(
     threads: int,
     curve: Curve,
 ) -> dict[str, Any]:
-    """The recipe as it goes into a card."""
+    """Return the recipe for a card."""
     return material.described | {
         "budget": asdict(budget),
         "steps": int(curve.rows[-1]["step"]),
@@ -227,7 +227,7 @@ def _make_clip(
 
 
 def by_kind(material: Material) -> dict[str, LabelledViews]:
-    """Unseen views, all of them and by kind of scene."""
+    """Return all unseen views, and those of each scene kind."""
     groups = {"all": material.unseen}
     for kind in dict.fromkeys(material.unseen_kinds):
         rows = [row for row, of_view in enumerate(material.unseen_kinds) if of_view == kind]

@@ -19,16 +19,16 @@ from models.training.train_sam import has_fast_half
 TUNING = Tuning(peak=2e-3, warmup=60, measure_every=200)
 BATCH = 192
 THING_SHARE = 0.5
-"""Crops of a batch drawn several at a time from one object: its other parts are the hard negatives."""
+"""Share of a batch drawn in groups from one object, whose other parts are hard negatives."""
 SIBLINGS = 6
-"""How many at a time, at most."""
+"""Maximum number of crops in such a group."""
 KEPT_SHARE = 0.2
-"""Crops whose surroundings are kept, so that the setting `keep` works too."""
+"""Share of crops whose surroundings are kept, so that the setting `keep` works too."""
 QUICK_CROPS = 3000
 
 
 def crop_weights(crops: CropTable, nothing: float = 0.03, rough: float = 0.45) -> np.ndarray:
-    """Probability of each crop: levels equally often, the segmenter's masks for a share of each level."""
+    """Return the probability of each crop: equal for all levels, with a share for the segmenter's masks."""
     weights = np.zeros(len(crops))
     for level in (0, *map(int, LEVELS)):
         at_level = crops.level == level
@@ -42,24 +42,24 @@ def crop_weights(crops: CropTable, nothing: float = 0.03, rough: float = 0.45) -
 
 
 class CropDraw:
-    """Draws batches of rows: some one by one, some as groups of crops of one object.
+    """Generator of batches of rows, drawn partly one by one and partly in groups from one object.
 
     Args:
-        crops: what there is.
-        batch: rows of a batch.
+        crops: crops to draw from.
+        batch: number of rows in a batch.
     """
 
     def __init__(self, crops: CropTable, batch: int) -> None:
         self.ends = np.cumsum(crop_weights(crops))
         self.batch = batch
-        # Rows of one object of one view are adjacent in this order.
+        # In this order, rows of the same object in the same view are adjacent.
         key = crops.view * (int(crops.thing.max(initial=0)) + 2) + crops.thing + 1
         self.order = np.argsort(key, kind="stable")
         self.first = np.searchsorted(key[self.order], key, side="left")
         self.last = np.searchsorted(key[self.order], key, side="right")
 
     def draw(self, rng: np.random.Generator) -> np.ndarray:
-        """Rows of a batch."""
+        """Draw the rows of a batch."""
         seeds = np.searchsorted(self.ends, rng.random(self.batch) * self.ends[-1], side="right")
         seeds = np.minimum(seeds, len(self.ends) - 1)
         rows = list(seeds[: round(self.batch * (1 - THING_SHARE))])
@@ -73,7 +73,7 @@ class CropDraw:
 
 
 def jittered(rng: np.random.Generator, pixels: np.ndarray) -> np.ndarray:
-    """Crops in different light, mirrored, some noisy or blurred; a black background stays black."""
+    """Vary light, mirroring, noise and blur of crops at random; noise leaves a black background black."""
     count = len(pixels)
     pixels = pixels.astype(np.float32)
     seen = pixels.max(axis=3, keepdims=True) > 0
@@ -109,12 +109,12 @@ def train_clip(
     Args:
         crops: masks with their captions.
         validation: masks of other scenes, for the learning curve.
-        budget: how long.
-        seed: of initial weights, batches and captions.
+        budget: duration of the training.
+        seed: seed of initial weights, batches and captions.
         state: folder of the training's state.
-        name: of the state's files.
+        name: base name of the state's files.
         batch: crops per step.
-        tuning: how to optimise.
+        tuning: settings of the optimiser and the loop.
         device: "cpu" or "cuda".
     """
     torch.manual_seed(seed)
@@ -162,7 +162,7 @@ def train_clip(
 
 
 class Scale(nn.Module):
-    """The factor on the cosines, as its logarithm."""
+    """Logarithm of the factor on the cosines."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -17,19 +17,19 @@ from models.training.sam_loss import Teacher, training_loss
 from models.training.steps import Budget, Curve
 
 CROP_STAGES = (CropStage(0.4, 128, 16, 24), CropStage(0.4, 192, 8, 36), CropStage(0.2, 256, 4, 48))
-"""Windows of a step, drawn anew for each: small ones show more scenes, large ones more of one."""
+"""Window sizes, drawn for each step: small windows cover more scenes, large ones more of each scene."""
 GROWN_STAGES = (CropStage(0.3, 192, 8, 36), CropStage(0.4, 256, 4, 48), CropStage(0.3, 384, 2, 96))
-"""The same later on: whole views among them, as the segmenter will see them. In the first training that ended
-with these, the IoU of wholes rose by 0.04 in 700 steps."""
+"""Window sizes later in the training, which include whole views as at run time. In the first training that
+ended with them, the IoU of wholes rose by 0.04 in 700 steps."""
 GROWN_AT = 9500
-"""Step from which windows are the grown ones; they are in any case while the learning rate falls."""
+"""First step with `GROWN_STAGES`, which are also used during the whole learning rate decay."""
 TUNING = Tuning(peak=2e-3)
 QUICK_VIEWS = 24
-"""Unseen views behind each row of the learning curve."""
+"""Number of unseen views measured for each row of the learning curve."""
 
 
 def has_fast_half(device: torch.device) -> bool:
-    """Whether bfloat16 convolutions are faster than float32: on GPUs, and on CPUs that multiply them."""
+    """Return whether the device has fast bfloat16 convolutions: some GPUs, and CPUs with AVX512-BF16."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported()
     supported = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
@@ -37,7 +37,7 @@ def has_fast_half(device: torch.device) -> bool:
 
 
 def stage_of_draw(draw: float, stages: Sequence[CropStage]) -> CropStage:
-    """The stage that a uniform number in [0, 1) falls to, by their shares."""
+    """Return the stage selected by a uniform number in [0, 1), in proportion to the shares."""
     ends = np.cumsum([stage.share for stage in stages])
     return stages[min(len(stages) - 1, int(np.searchsorted(ends, draw, side="right")))]
 
@@ -59,13 +59,13 @@ def train_sam(
     Args:
         views: labelled views.
         validation: views of other scenes, for the learning curve.
-        budget: how long.
-        seed: of initial weights, windows and prompts.
+        budget: duration of the training.
+        seed: seed of initial weights, windows and prompts.
         state: folder of the training's state.
-        name: of the state's files.
+        name: base name of the state's files.
         stages: windows and prompts of the steps.
-        grown_stages: the same from step `GROWN_AT` on, and while the learning rate falls.
-        tuning: how to optimise.
+        grown_stages: the same starting at step `GROWN_AT`, and during the learning rate decay.
+        tuning: settings of the optimiser and the loop.
         device: "cpu" or "cuda".
     """
     torch.manual_seed(seed)
@@ -80,7 +80,7 @@ def train_sam(
 
     def make(step: int) -> SamBatch:
         rng = np.random.default_rng((seed, 1, step))
-        # The first step of the fall was prepared before it was known to be one.
+        # The first batch of the decay is prefetched before the decay begins, so it is excluded.
         falling = 0 <= training.progress.decay_from < step
         windows = grown_stages if falling or step >= GROWN_AT else stages
         return draw_batch(views, classes, stage_of_draw(rng.random(), windows), rng)

@@ -1,4 +1,4 @@
-"""The texts that the embedded CLIP was taught, as the vocabulary that names nodes."""
+"""Vocabulary for naming nodes: the texts that the embedded CLIP was trained on."""
 
 from collections.abc import Iterable
 
@@ -19,7 +19,7 @@ from hilsplat.world.scenes.kinds import KINDS, build_scene
 from hilsplat.world.seeds import TRAINING_SEEDS
 
 DRAWS = 8
-"""Objects of each class: a class draws some of its parts at random."""
+"""Objects drawn per class, because some parts of a class are random."""
 
 SURFACES = {
     *("ceiling", "curb", "floor", "ground", "lane marker", "road"),
@@ -28,7 +28,7 @@ SURFACES = {
 
 
 def world_vocabulary() -> str:
-    """The vocabulary of the synthetic world: a file for `hilsplat.query.vocabulary`."""
+    """Return the vocabulary of the synthetic world as file content for `hilsplat.query.vocabulary`."""
     things: set[str] = set()
     parts: set[str] = set()
 

@@ -1,4 +1,4 @@
-"""A finished scene that each test gets a copy of, and commands in this process."""
+"""A finished scene, of which each test gets a copy, and a fixture that runs commands in this process."""
 
 import logging
 import shutil
@@ -16,7 +16,7 @@ from tests.unit.finished_desk import build_finished_desk
 
 @pytest.fixture(scope="session")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A project with a scene, every stage of which ran."""
+    """A project with a complete scene."""
     project = build_finished_desk(tmp_path_factory.mktemp("desk"))
     for part in ("config", "models/sam-tiny", "models/clip-tiny"):
         shutil.copytree(PROJECT / part, project / part)
@@ -25,7 +25,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def project(desk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of it, and the place in which commands run."""
+    """A copy of the project, set as the working directory."""
     copy = tmp_path / "project"
     shutil.copytree(desk, copy, ignore=shutil.ignore_patterns("sam-tiny", "clip-tiny"))
     for model in ("sam-tiny", "clip-tiny"):
@@ -36,7 +36,7 @@ def project(desk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
 
 @pytest.fixture
 def told(capsys, caplog, monkeypatch) -> Callable[..., str]:
-    """Run a command, or call a function, that must refuse; returns what it says to the person."""
+    """A function that runs a command or calls a function, which must refuse, and returns the message."""
 
     def run(command: tuple[str, ...] | Callable[[], object]) -> str:
         handlers = list(logging.getLogger().handlers)
@@ -58,7 +58,7 @@ def told(capsys, caplog, monkeypatch) -> Callable[..., str]:
 
 
 def snapshot(folder: Path) -> dict[str, bytes]:
-    """Bytes of all files that a person would miss: without logs, locks and caches."""
+    """Return the bytes of all files except hidden files and caches."""
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))

@@ -1,6 +1,6 @@
-"""Bad inputs, one row each: what is bad, the command, the words it must say, and nothing may be lost.
+"""Bad inputs, one row each: the input, the command, and words that the message must contain.
 
-No row may end in a traceback, and whatever stood in the project before the command stands there after it.
+No command may end with a traceback or change a file that was in the project before.
 """
 
 import json
@@ -53,10 +53,10 @@ class Row:
     """One bad input.
 
     Attributes:
-        what: in words.
+        what: description of the input.
         lay: puts it into the project, which is the working directory.
         command: words after `hilsplat`, or a function that refuses.
-        words: what the message must hold.
+        words: texts that the message must contain.
     """
 
     what: str
@@ -66,7 +66,7 @@ class Row:
 
 
 def nothing() -> None:
-    """The command itself is the bad input."""
+    """Do nothing, because the command itself is the bad input."""
 
 
 def write(path: Path | str, content: str | bytes) -> Callable[[], object]:
@@ -78,14 +78,14 @@ def write(path: Path | str, content: str | bytes) -> Callable[[], object]:
 
 
 def change(path: Path, offset: float | bytes, new: bytes) -> Callable[[], object]:
-    """Overwrite bytes at a share of a file, or everywhere after a mark."""
+    """Overwrite bytes at a share of a file's length, or after every occurrence of a mark."""
 
     def lay() -> None:
         content = bytearray(path.read_bytes())
         if isinstance(offset, bytes):
             at = content.find(offset)
             while at >= 0:
-                place = at + (8 if offset == b"PK\x03\x04" else 10)  # the method of compression
+                place = at + (8 if offset == b"PK\x03\x04" else 10)  # offset of the compression method
                 content[place : place + len(new)] = new
                 at = content.find(offset, at + 1)
         else:
@@ -97,7 +97,7 @@ def change(path: Path, offset: float | bytes, new: bytes) -> Callable[[], object
 
 
 def flip(path: Path, share: float) -> Callable[[], object]:
-    """Flip one bit at a share of a file."""
+    """Flip one bit at a share of a file's length."""
 
     def lay() -> None:
         content = bytearray(path.read_bytes())
@@ -152,7 +152,7 @@ def both(*lays: Callable[[], object]) -> Callable[[], object]:
 
 
 def png_of(width: int, height: int) -> bytes:
-    """The beginning of a PNG that states a size."""
+    """Return the beginning of a PNG with the given size in its header."""
     header = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     return (
         b"\x89PNG\r\n\x1a\n"
@@ -170,7 +170,7 @@ def transforms(**frame: object) -> Callable[[], object]:
 
 
 def plan(**config: object) -> Callable[[], object]:
-    """The beginning of `snakemake` with these settings, before anything runs."""
+    """Return a function that parses the configuration with these settings, as `snakemake` does first."""
 
     def parse() -> None:
         shipped = yaml.safe_load(Path("config/config.yaml").read_text())
@@ -184,7 +184,7 @@ def isat(**info: object) -> str:
 
 
 ROWS = [
-    # ---- damaged artifacts: the message has the line that makes them again
+    # ---- damaged artifacts: the message has the command that rebuilds them
     Row(
         "masks with bytes that do not unpack",
         change(MASKS / "000.png.npz", 0.5, b"\xff" * 40),
@@ -433,7 +433,7 @@ ROWS = [
         lambda: read_isat(Path("l.json")),
         ("nested too deeply",),
     ),
-    # ---- places
+    # ---- output paths
     Row(
         "an output below a file",
         nothing,
@@ -506,7 +506,7 @@ ROWS = [
         ("models", "check", "models/copy"),
         ("models/copy has no readable config.json",),
     ),
-    # ---- the configuration: refused while the workflow is parsed
+    # ---- configuration, refused while the workflow is parsed
     Row(
         "a missing model",
         nothing,

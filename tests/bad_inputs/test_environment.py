@@ -1,4 +1,4 @@
-"""What surrounds a command may be unusable: the output, the limits of the shell, the working directory."""
+"""Commands in an unusable environment: full output, shell limits, a deleted working directory."""
 
 import subprocess
 import sys

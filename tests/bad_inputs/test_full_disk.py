@@ -1,4 +1,4 @@
-"""A disk that fills up while a stage writes: it is told, the former output stays, and nothing else does."""
+"""A disk that fills up while a stage writes: it is reported, and only the former output remains."""
 
 import shutil
 import subprocess
@@ -19,7 +19,7 @@ SIZE_KIB = 4096
 
 @pytest.fixture
 def disk(project: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A small disk in the project, which a stage does not refuse from the start."""
+    """A small disk in the project, without the stages' initial check of free space."""
     place = project / "disk"
     place.mkdir()
     command = ["mount", "-t", "tmpfs", "-o", f"size={SIZE_KIB}k", "tmpfs", str(place)]
@@ -37,13 +37,13 @@ def disk(project: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def leave(disk: Path, kib: int) -> None:
-    """Fill the disk up to some KiB."""
+    """Fill the disk except for some KiB."""
     with (disk / "filler").open("wb") as stream:
         stream.write(bytes(shutil.disk_usage(disk).free - kib * 1024))
 
 
 def textured(folder: Path) -> None:
-    """Photographs of many features."""
+    """Write photographs with many features."""
     rng = np.random.default_rng(0)
     folder.mkdir()
     for number in range(4):
@@ -63,7 +63,7 @@ SOLVE = (
 )
 FIT = ("gaussians", *SCENE_IN, "--settings", '{"iterations": 20}', *CACHE, "--report", "disk/gaussians")
 STAGES = {
-    # output: command, KiB that are left
+    # output: command, KiB of free space
     "field.safetensors": (SOLVE, 4),
     "masks": (("masks", *SCENE_IN, "--settings", '{"segmenter": "graph"}', *CACHE), 4),
     "gaussians.ply": (FIT, 16),
@@ -102,7 +102,7 @@ def test_a_full_disk_is_told_and_costs_nothing(case: str, disk: Path, told: Call
     before = snapshot(disk)
     text = told((*command, "--out", str(out)))
     assert "Traceback" not in text
-    # `world` knows how much it needs, and says so before it begins.
+    # `world` checks the space that it needs before it begins.
     words = ("too little space on the disk of disk/world", "at least 5 MiB free", "0 MiB free")
     if case != "world":
         words = ("no space left while writing", f"of {SIZE_KIB // 1024} MiB on that disk")

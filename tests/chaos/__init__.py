@@ -1,1 +1,1 @@
-"""Faults that a run must survive without a person: `make chaos`."""
+"""Faults that a run must survive without manual help: `make chaos`."""

@@ -1,16 +1,15 @@
-"""Kill, freeze, double and starve runs and commands, which must recover without manual help.
+"""Inject faults into runs and commands, which must recover without manual help.
 
     make chaos                                       # 30 kills, seed 0
     python -m tests.chaos --kills 5 --seed 3 --minutes 20 --work ../chaos
 
-A run is started and, after a random time, hit. It is then started again with the same words, and so on; when
-it gets to its end, its tables are compared with those of an undisturbed run, byte by byte, and the next one
-begins from nothing. Then commands of people are killed while they write (`commands`). The last line says how
-many kills there were and what they cost. The exit code is 1 if a table differs, or if a start without a fault
-did not end with success.
+A run is started and, after a random time, hit by a fault; then the same command is started again. When the
+run is complete, its tables are compared byte by byte with those of an undisturbed run, and the next run
+starts without results. After that, user commands are killed while they write (`commands`). The final report
+lists kills and their cost. The exit code is 1 if a table differs, or if a start without a fault failed.
 
-A full and a read-only disk need results on a disk of their own, a small tmpfs: these faults are left out,
-with a notice, where this user may not mount one.
+The faults of a full and a read-only disk need results on a small tmpfs; they are skipped with a notice if
+this user may not mount one.
 """
 
 import argparse
@@ -31,22 +30,22 @@ from tests.conftest import PROJECT
 from tests.workflow.conftest import Project, copy_project
 
 DISK_MIB = 1000
-"""Size of the disk of results: the ci configuration needs less than a tenth of it."""
+"""Size of the results disk, MiB; the ci configuration needs less than a tenth of it."""
 
 SLACK_S = 3600
-"""A start that was not hit may take this long beyond the undisturbed run."""
+"""Maximum time of a start without a fault, in addition to that of the undisturbed run."""
 
 
 @dataclass
 class Tally:
-    """What happened so far.
+    """Faults, costs and problems so far.
 
     Attributes:
-        lost_s: seconds of the clock that each kill cost.
-        lost_cpu_s: processor seconds that each kill cost.
-        faults: how often each fault hit.
-        finished: runs that got to their end.
-        problems: what a person would have had to look at.
+        lost_s: wall seconds lost by each kill.
+        lost_cpu_s: processor seconds lost by each kill.
+        faults: number of times that each fault was injected.
+        finished: number of complete runs.
+        problems: problems that need manual intervention.
     """
 
     lost_s: list[float] = field(default_factory=list)
@@ -59,24 +58,24 @@ class Tally:
 
     @property
     def kills(self) -> int:
-        """Kills so far."""
+        """Number of kills so far."""
         return len(self.lost_s) + len(self.waiting)
 
     def settle(self, again: tuple[float, float] | None) -> None:
         """Count the kills since the last start.
 
         Args:
-            again: seconds, and processor seconds, until the new start began a job: the cost of the last kill.
+            again: wall and processor seconds until the new start began a job, added to the last kill's cost.
         """
         for victims in self.waiting:
             again_s, again_cpu_s = (again or (0.0, 0.0)) if victims is self.waiting[-1] else (0.0, 0.0)
-            # Victims worked side by side: the clock counts the one that lost most.
+            # Victims ran in parallel, so the lost wall time is the largest of theirs.
             self.lost_s.append(again_s + max((victim.lost_s for victim in victims), default=0.0))
             self.lost_cpu_s.append(again_cpu_s + sum(victim.lost_cpu_s for victim in victims))
         self.waiting = []
 
     def report(self) -> str:
-        """The last lines of the program."""
+        """Return the final lines of output."""
         lines = [f"{len(self.lost_s)} kills, {self.finished} runs that got to their end"]
         lines += [f"  {name}: {count}" for name, count in sorted(self.faults.items())]
         for what, values in (("seconds", self.lost_s), ("processor seconds", self.lost_cpu_s)):
@@ -91,7 +90,7 @@ class Tally:
 
 
 def tables(project: Project) -> dict[str, bytes]:
-    """Every table that does not hold what jobs took."""
+    """Return every table except those of timings."""
     files = project.files("results/tables")
     return {
         name: content
@@ -101,7 +100,7 @@ def tables(project: Project) -> dict[str, bytes]:
 
 
 def undisturbed(work: Path) -> tuple[Project, float]:
-    """A copy of the project in which the run got to its end, and the seconds that it took."""
+    """Return a copy of the project with a complete run, and the duration of the run in seconds."""
     project, seconds = Project(work / "undisturbed"), work / "undisturbed.seconds"
     if not seconds.exists():
         shutil.rmtree(project.root, ignore_errors=True)
@@ -114,7 +113,7 @@ def undisturbed(work: Path) -> tuple[Project, float]:
 
 
 def small_disk(folder: Path) -> bool:
-    """Mount a disk of its own there; False where this user may not."""
+    """Mount a small disk at a folder; return False if this user may not."""
     folder.mkdir(parents=True)
     command = ["mount", "-t", "tmpfs", "-o", f"size={DISK_MIB}m", "tmpfs", str(folder)]
     try:
@@ -126,7 +125,7 @@ def small_disk(folder: Path) -> bool:
 def torment(
     project: Project, reference: Project, whole_s: float, options: argparse.Namespace, disk: bool
 ) -> Tally:
-    """Hit runs until there were enough kills, and let the last one get to its end."""
+    """Inject faults into runs until there are enough kills, and let the last run complete."""
     chance, tally = random.Random(options.seed), Tally()
     faults = [fault for fault in FAULTS if disk or not fault.needs_disk]
     deadline = time.monotonic() + 60 * options.minutes
@@ -166,7 +165,7 @@ def torment(
 
 
 def differences(reference: Project, project: Project) -> list[str]:
-    """What is not as after an undisturbed run."""
+    """Return the differences from an undisturbed run."""
     expected, found, results = tables(reference), tables(project), project.root / "results"
     names = sorted(name for name in expected.keys() | found.keys() if expected.get(name) != found.get(name))
     left = sorted(str(path) for path in results.rglob(".writing-*"))

@@ -1,4 +1,4 @@
-"""Commands of people, killed while they write: what was there stays, and the same command then succeeds."""
+"""Kill user commands while they write: existing files must stay, and the same command must then succeed."""
 
 import os
 import random
@@ -28,7 +28,7 @@ POLYGON = [[1, 1], [15, 1], [15, 20], [1, 20]]
 
 
 def prepare(root: Path) -> Path:
-    """A project with a finished scene and an archive of photographs."""
+    """Return a project with a finished scene and an archive of photographs."""
     project = build_finished_desk(root)
     shutil.copytree(PROJECT / "config", project / "config")
     with zipfile.ZipFile(project / "photos.zip", "w") as archive:
@@ -38,7 +38,7 @@ def prepare(root: Path) -> Path:
 
 
 def started(project: Path, *words: str) -> subprocess.Popen[str]:
-    """A command in a project, in a session of its own."""
+    """Start a command in a project, in its own session."""
     environment = {**os.environ, "PYTHONPATH": str(PROJECT), "HILSPLAT_MODELS": "models"}
     return subprocess.Popen(
         [sys.executable, "-m", "hilsplat", *words],
@@ -52,7 +52,7 @@ def started(project: Path, *words: str) -> subprocess.Popen[str]:
 
 
 def contents(project: Path) -> dict[str, bytes]:
-    """Every file that a person sees, but for what differs from run to run."""
+    """Return the content of every file that is not hidden."""
     files = (path for path in sorted(project.rglob("*")) if path.is_file())
     seen = ((str(path.relative_to(project)), path) for path in files)
     return {name: path.read_bytes() for name, path in seen if not any(p[0] == "." for p in Path(name).parts)}
@@ -61,10 +61,10 @@ def contents(project: Path) -> dict[str, bytes]:
 def kill_command(
     project: Path, name: str, whole_s: float, expected: dict[str, bytes], chance: random.Random
 ) -> Iterator[str]:
-    """Kill a command at some time, then let it get to its end.
+    """Kill a command at a random time, then run it to completion.
 
     Yields:
-        What a person would have had to look at.
+        Problems that need manual intervention.
     """
     before = contents(project)
     running = started(project, *COMMANDS[name])
@@ -79,7 +79,7 @@ def kill_command(
             yield f"{name}: {path} is neither as before nor whole after a kill"
     if lost := before.keys() - after.keys():
         yield f"{name}: a kill lost {sorted(lost)}"
-    if after == expected:  # it had written everything
+    if after == expected:  # everything was written before the kill
         return
     again = started(project, *COMMANDS[name])
     said, _ = again.communicate(timeout=600)
@@ -92,10 +92,10 @@ def kill_command(
 
 
 def kill_commands(root: Path, kills: int, chance: random.Random) -> list[str]:
-    """Kill each command some times.
+    """Kill each command several times.
 
     Returns:
-        What a person would have had to look at.
+        Problems that need manual intervention.
     """
     project, problems = prepare(root / "desk"), []
     for name in COMMANDS:
@@ -121,10 +121,10 @@ def kill_commands(root: Path, kills: int, chance: random.Random) -> list[str]:
 
 
 def kill_annotator(project: Path, chance: random.Random) -> Iterator[str]:
-    """Kill the annotation server while it saves one change after the other.
+    """Kill the annotation server while it saves a series of changes.
 
     Yields:
-        What a person would have had to look at: a change that was confirmed and is gone, or a damaged file.
+        Problems that need manual intervention: a confirmed change that is missing, or a damaged file.
     """
     server = started(project, "annotate", "photos/desk", "--no-browser", "--port", "0")
     address = next(word for line in server.stdout for word in line.split() if word.startswith("http://127"))
@@ -141,7 +141,7 @@ def kill_annotator(project: Path, chance: random.Random) -> Iterator[str]:
 
 
 def save_changes(address: str, confirmed: list[int]) -> None:
-    """Replace the annotations of the first photograph until the server is gone."""
+    """Replace the annotations of the first photograph until the server has ended."""
     base = address.partition("/?")[0]
     with httpx2.Client(base_url=base, headers={"origin": base, "sec-fetch-site": "same-origin"}) as client:
         client.get(address)

@@ -1,4 +1,4 @@
-"""A run of Snakemake that can be hit, what hits it, and what that costs."""
+"""Runs of Snakemake, faults to inject into them, and the cost of these faults."""
 
 import contextlib
 import os
@@ -18,26 +18,26 @@ from tests.workflow.conftest import Project
 POLL_S = 0.25
 TICKS = os.sysconf("SC_CLK_TCK")
 LEFT_KIB = 64
-"""What a full disk still takes."""
+"""Space left on a full disk."""
 WAKE_S = 60
-"""A job that was frozen while it began may take so long to see that its Snakemake has ended."""
+"""Maximum time in which a job that was frozen at its start detects that its Snakemake has ended."""
 
 
 @dataclass
 class Victim:
-    """A job, and how much of its work is not kept anywhere yet.
+    """A job, and the amount of its work that is not stored yet.
 
     Attributes:
         pid: its process.
         stage: its subcommand.
-        cache: where the stage keeps finished views or a checkpoint.
-        begun_s: when it was first seen, as the next.
-        kept_s: when it last put something there.
-        kept_cpu_s: processor seconds that it had taken by then.
-        first_s: what it took to its first view, which a new start takes again; likewise in processor time.
-        seen_s: when it was last seen.
-        cpu_s: processor seconds that it has taken.
-        entries: what the cache holds.
+        cache: folder in which the stage stores finished views or a checkpoint.
+        begun_s: monotonic time at which it was first observed.
+        kept_s: monotonic time of its last change of the cache.
+        kept_cpu_s: processor seconds used up to then.
+        first_s: duration up to its first stored view, which a new start repeats (also `first_cpu_s`).
+        seen_s: monotonic time at which it was last observed.
+        cpu_s: processor seconds used so far.
+        entries: entries of the cache.
     """
 
     pid: int
@@ -53,7 +53,7 @@ class Victim:
     entries: frozenset[tuple[str, int]] | None = None
 
     def look(self) -> bool:
-        """Read what it has taken and kept; False if it has ended."""
+        """Update processor time and cache entries; return False if the job has ended."""
         cpu_s = cpu_seconds(self.pid)
         if cpu_s is None:
             return False
@@ -68,18 +68,18 @@ class Victim:
 
     @property
     def lost_s(self) -> float:
-        """At most so much is done again: what came after the last view that was kept, and up to the first."""
+        """Upper limit of repeated work: the time since the last stored view, plus that up to the first."""
         whole = self.seen_s - self.begun_s
         return min(whole, self.seen_s - self.kept_s + (self.first_s if self.first_s is not None else 0.0))
 
     @property
     def lost_cpu_s(self) -> float:
-        """The same in processor seconds."""
+        """The upper limit in processor seconds."""
         return min(self.cpu_s, self.cpu_s - self.kept_cpu_s + self.first_cpu_s)
 
 
 def kept_files(cache: Path) -> frozenset[tuple[str, int]]:
-    """Finished entries of a cache, with their times."""
+    """Return the finished entries of a cache with their modification times."""
     found = set()
     for path in (path for path in cache.rglob("*") if "/." not in str(path.relative_to(cache.parent))):
         try:
@@ -90,7 +90,7 @@ def kept_files(cache: Path) -> frozenset[tuple[str, int]]:
 
 
 def cpu_seconds(pid: int) -> float | None:
-    """Processor seconds of a process and of the children that it waited for; None if it has ended."""
+    """Return the processor seconds of a process and its reaped children, or None if it has ended."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
@@ -99,7 +99,7 @@ def cpu_seconds(pid: int) -> float | None:
 
 
 def children(pid: int) -> list[int]:
-    """Processes that a process started, whichever of its threads did."""
+    """Return the processes that any thread of a process started."""
     found: list[int] = []
     for task in Path(f"/proc/{pid}/task").glob("*/children"):
         try:
@@ -110,13 +110,13 @@ def children(pid: int) -> list[int]:
 
 
 class Run:
-    """Snakemake in a project, started as a person starts it.
+    """A run of Snakemake in a project, started as by a user.
 
     Args:
-        project: where.
+        project: project to run.
 
     Attributes:
-        problems: what a person would have had to look at.
+        problems: problems that need manual intervention.
     """
 
     def __init__(self, project: Project) -> None:
@@ -139,19 +139,19 @@ class Run:
 
     @property
     def command(self) -> list[str]:
-        """What a person types."""
+        """The command that a user types."""
         return [sys.executable, "-m", "hilsplat", "run", "--config", "config/ci.yaml", "--", "--cores", "2"]
 
     def said(self) -> str:
-        """The end of what it printed."""
+        """Return the end of its output."""
         return self._log.read_text()[-4000:]
 
     def is_running(self) -> bool:
-        """Whether it has not ended."""
+        """Return whether it has not ended."""
         return self.process.poll() is None
 
     def look(self) -> list[Victim]:
-        """The jobs that run now."""
+        """Return the running jobs."""
         for pid in children(self.process.pid):
             if pid not in self.jobs and (stage := stage_of(pid)) is not None:
                 now = time.monotonic()
@@ -161,11 +161,11 @@ class Run:
         return [job for job in self.jobs.values() if job.look()]
 
     def what_runs(self) -> str:
-        """The stages that run now."""
+        """Return the running stages."""
         return ", ".join(job.stage for job in self.look()) or "nothing"
 
     def wait_for_a_job(self, limit_s: float) -> tuple[float, float] | None:
-        """Seconds, and processor seconds, until its first job; None if it ends without any."""
+        """Return wall and processor seconds up to its first job, or None if it ends without a job."""
         while self.is_running() and time.monotonic() < self.start_s + limit_s:
             if self.look():
                 return time.monotonic() - self.start_s, cpu_seconds(self.process.pid) or 0.0
@@ -173,21 +173,21 @@ class Run:
         return None
 
     def watch_for(self, seconds: float) -> None:
-        """Let it work, and see what its jobs keep."""
+        """Let it run for some time, and observe the caches of its jobs."""
         until = time.monotonic() + seconds
         while self.is_running() and time.monotonic() < until:
             self.look()
             time.sleep(POLL_S)
 
     def wait(self, limit_s: float = 7200) -> int:
-        """Its exit code; jobs that outlive it are a problem."""
+        """Wait for it and return its exit code; jobs that outlive it are a problem."""
         try:
             code = self.process.wait(timeout=limit_s)
         except subprocess.TimeoutExpired:
             self.problems.append(f"it did not end within {limit_s:.0f} s:\n{self.said()}")
             os.killpg(self.process.pid, signal.SIGKILL)
             code = self.process.wait()
-        for pid in self._frozen:  # it must not work beside the next run
+        for pid in self._frozen:  # or it would run beside the next run
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGCONT)
         until = time.monotonic() + WAKE_S
@@ -201,22 +201,22 @@ class Run:
         self._filler.unlink(missing_ok=True)
         return code
 
-    # ---- what hits it: each returns the jobs whose work was lost --------------------------------------
+    # ---- faults: each returns the jobs whose work was lost --------------------------------------------
 
     def kill_snakemake(self, chance: random.Random) -> list[Victim]:
-        """As the kernel does when memory ends."""
+        """Kill only Snakemake, as the kernel does when memory runs out."""
         victims = self.look()
         self.process.kill()
         return victims
 
     def kill_all(self, chance: random.Random) -> list[Victim]:
-        """As a machine that loses its power, in so far as processes go."""
+        """Kill all processes, as in a power failure."""
         victims = self.look()
         os.killpg(self.process.pid, signal.SIGKILL)
         return victims
 
     def kill_a_job(self, chance: random.Random) -> list[Victim]:
-        """The others go on, and the run ends with an error."""
+        """Kill one job; the others continue, and the run ends with an error."""
         victims = self.look()
         chosen = chance.sample(victims, min(1, len(victims)))
         for victim in chosen:
@@ -224,7 +224,7 @@ class Run:
         return chosen
 
     def freeze_orphans(self, chance: random.Random) -> list[Victim]:
-        """Jobs that sleep when their Snakemake is killed, and wake later."""
+        """Freeze the jobs, kill their Snakemake, and wake the jobs later."""
         victims = self.look()
         for victim in victims:
             os.kill(victim.pid, signal.SIGSTOP)
@@ -233,22 +233,22 @@ class Run:
         return victims
 
     def fill_the_disk(self, chance: random.Random) -> list[Victim]:
-        """Jobs fail; the disk has room again once the run has ended."""
-        with contextlib.suppress(OSError), self._filler.open("wb") as stream:  # jobs write, too
+        """Fill the disk until the run has ended, so that jobs fail."""
+        with contextlib.suppress(OSError), self._filler.open("wb") as stream:  # jobs also write
             room = shutil.disk_usage(self._filler.parent).free
             stream.write(bytes(max(0, room - LEFT_KIB * 1024)))
         return []
 
     def lock_the_disk(self, chance: random.Random) -> list[Victim]:
-        """Results become read-only, and writable once the run has ended."""
-        for _ in range(40):  # not while a file is being written
+        """Make results read-only until the run has ended."""
+        for _ in range(40):  # a remount fails while a file is being written
             if remounted(self.project.root / "results", "ro"):
                 break
             time.sleep(POLL_S)
         return []
 
     def clean_up_elsewhere(self, chance: random.Random) -> list[Victim]:
-        """Another machine of the same name, with other process numbers, cleans up the shared folder."""
+        """Clean up the shared folder as another machine of the same name, with other process numbers."""
         code = "import sys; from hilsplat.base import processes; processes.remove_leftovers(sys.argv[1])"
         command = ["unshare", "--pid", "--fork", "--mount-proc", sys.executable, "-c", code, "results"]
         environment = self.project.environment()
@@ -260,7 +260,7 @@ class Run:
         return []
 
     def run_twice(self, chance: random.Random) -> list[Victim]:
-        """A second run in the same project has to refuse, and the first one gets to its end."""
+        """Start a second run in the same project, which must refuse without disturbing the first."""
         second = subprocess.run(
             self.command,
             cwd=self.project.root,
@@ -277,7 +277,7 @@ class Run:
 
 
 def remounted(folder: Path, mode: str) -> bool:
-    """Make a disk of its own read-only (`ro`) or writable (`rw`); False if there is none, or it is in use."""
+    """Remount a disk read-only (`ro`) or writable (`rw`); return False if it is no mount or is in use."""
     if not folder.is_mount():
         return False
     return (
@@ -286,26 +286,26 @@ def remounted(folder: Path, mode: str) -> bool:
 
 
 def stage_of(pid: int) -> str | None:
-    """The subcommand of a job; None for other processes."""
+    """Return the subcommand of a job, or None for other processes."""
     try:
         words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
     except OSError:
         return None
-    # a job has a log, `hilsplat run` has none
+    # Jobs have the option --log; `hilsplat run` does not.
     return words[words.index("--log") + 2] if "hilsplat" in words and "--log" in words else None
 
 
 @dataclass(frozen=True)
 class Fault:
-    """Something that happens to a run.
+    """A fault to inject into a run.
 
     Attributes:
-        name: in words.
-        strike: makes it happen.
+        name: description of the fault.
+        strike: injects the fault.
         kills: whether it counts as a kill.
-        needs_disk: whether results must have a disk of their own.
+        needs_disk: whether results must be on a separate disk.
         may_fail: whether the run may end with an error.
-        ends_run: whether it ends at once.
+        ends_run: whether the run ends immediately.
     """
 
     name: str

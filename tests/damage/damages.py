@@ -1,4 +1,4 @@
-"""Draws of damage for property tests: bytes of any file, values of any JSON, lines of any YAML."""
+"""Hypothesis strategies for damage to the bytes of a file, the values of JSON, and the lines of YAML."""
 
 from pathlib import Path
 from typing import Any
@@ -45,13 +45,13 @@ ODD_TEXTS = (
 
 @st.composite
 def byte_damages(draw) -> tuple[str, float, int]:
-    """A way to damage a file, a place as a share of its length, and a number."""
+    """Draw a kind of damage, a position as a share of the file's length, and a number."""
     kind = draw(st.sampled_from(["flip", "cut", "zero", "more", "repeat", "empty"]))
     return kind, draw(st.floats(0, 1, exclude_max=True)), draw(st.integers(0, 255))
 
 
 def damaged_bytes(content: bytes, damage: tuple[str, float, int]) -> bytes:
-    """The content after a damage."""
+    """Apply damage to the content of a file."""
     kind, share, number = damage
     place = int(share * len(content))
     if kind == "cut":
@@ -70,7 +70,7 @@ def damaged_bytes(content: bytes, damage: tuple[str, float, int]) -> bytes:
 
 
 def damaged_value(draw, value: Any) -> Any:
-    """A JSON value in which something, anywhere, is replaced, dropped or repeated."""
+    """Draw a JSON value in which a random element is replaced, dropped or repeated."""
     if isinstance(value, dict) and value and draw(st.integers(0, 3)):
         key = draw(st.sampled_from(sorted(value)))
         what = draw(st.integers(0, 5))
@@ -90,7 +90,7 @@ def damaged_value(draw, value: Any) -> Any:
 
 @st.composite
 def damaged_values(draw, value: Any) -> Any:
-    """A JSON value with one to three damages."""
+    """Draw a JSON value with one to three changes."""
     for _ in range(draw(st.integers(1, 3))):
         value = damaged_value(draw, value)
     return value
@@ -98,7 +98,7 @@ def damaged_values(draw, value: Any) -> Any:
 
 @st.composite
 def damaged_texts(draw, text: str) -> str:
-    """A text with lines dropped, repeated or swapped, and odd words in them."""
+    """Draw a text with repeated, swapped or truncated lines and odd words in them."""
     lines = text.splitlines()
     for _ in range(draw(st.integers(1, 3))):
         place = draw(st.integers(0, len(lines) - 1))
@@ -116,7 +116,7 @@ def damaged_texts(draw, text: str) -> str:
 
 
 def flattened(found: Any) -> list[np.ndarray]:
-    """All arrays, numbers and texts that an object holds, to compare two of them."""
+    """Return all arrays, numbers and texts in an object, for comparison."""
     if isinstance(found, np.ndarray):
         return [found]
     if isinstance(found, Path) or callable(found) or found is None:
@@ -131,6 +131,6 @@ def flattened(found: Any) -> list[np.ndarray]:
 
 
 def equal(one: Any, other: Any) -> bool:
-    """Whether two objects hold the same."""
+    """Return whether two objects have equal content."""
     pairs = flattened(one), flattened(other)
     return len(pairs[0]) == len(pairs[1]) and all(map(np.array_equal, *pairs))

@@ -1,4 +1,4 @@
-"""Damaged files of masks and cameras end in an error that names them, never in a crash or in other masks."""
+"""Damaged mask and camera files raise an error that names them; they never crash or give other masks."""
 
 from pathlib import Path
 
@@ -35,7 +35,7 @@ def some_cameras() -> Cameras:
 
 @st.composite
 def damages(draw, names: list[str]):
-    """A change of one array of an archive."""
+    """Draw a change of one array in an archive."""
     name = draw(st.sampled_from(names))
     kind = draw(st.sampled_from(["drop", "shape", "dtype", "value", "cut", "add", "empty"]))
     return name, kind, draw(st.integers(0, 10_000)), draw(st.integers(-(2**40), 2**40))
@@ -84,7 +84,7 @@ def test_damaged_masks(damage, tmp_path):
     except HilsplatError as error:
         assert "view.npz" in str(error)
         return
-    for other in ("predicted_iou", "stability"):  # any score in range may be right
+    for other in ("predicted_iou", "stability"):  # any score in the valid range is accepted
         if damage[0] == other and damage[1] == "value":
             return
     if damage[:2] == ("level", "value"):
@@ -104,7 +104,7 @@ def test_damaged_cameras(damage, tmp_path):
     except HilsplatError as error:
         assert "cameras.npz" in str(error)
         return
-    if damage[1] == "value":  # another number may be right, but it is one of a camera
+    if damage[1] == "value":  # other numbers are accepted if they are valid for a camera
         assert np.isfinite(found.cam_from_world).all() and (found.size_hw > 0).all()
         return
     assert same(found, whole), damage

@@ -1,4 +1,4 @@
-"""A damaged artifact ends in an error that names it, or reads as it was; nothing crashes."""
+"""A damaged artifact raises an error that names it, or reads as before the damage; nothing crashes."""
 
 from collections.abc import Callable
 from pathlib import Path

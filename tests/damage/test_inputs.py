@@ -1,4 +1,4 @@
-"""Damaged files that people bring end in an error that names them; whatever is accepted can be used."""
+"""Damaged input files raise an error that names them, and accepted input is always usable."""
 
 import copy
 import json
@@ -27,7 +27,7 @@ ANY = settings(suppress_health_check=list(HealthCheck))
 
 
 def accepted(read: Callable[[], Any]) -> Any:
-    """What a reader returns, or None if it refuses with a message."""
+    """Return the result of a reader, or None if it refuses with a message."""
     try:
         return read()
     except HilsplatError as error:
@@ -55,7 +55,7 @@ TRANSFORMS = {
 
 
 def usable(views: list) -> bool:
-    if not views:  # refused later, as too few
+    if not views:  # refused later because there are too few
         return True
     poses = np.stack([view.cam_from_source for view in views])
     lenses = np.concatenate([np.asarray(view.camera.params) for view in views])

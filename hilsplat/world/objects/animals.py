@@ -1,4 +1,4 @@
-"""Animals as toys: one function draws one class of object."""
+"""Toy animals: each function draws one class of object."""
 
 import numpy as np
 
@@ -40,7 +40,7 @@ def _duck(b: Builder) -> None:
     b.put(hat, cloth, lathe([(0.13, top - 0.02), (0.19, top + 0.07), (0.15, top + 0.13), (0, top + 0.14)]))
     brim = b.subpart(hat, "brim", "edge", at="of")
     b.put(brim, b.paints.draw("cloth"), ring(0.15, 0.05, (0, 0, top)), cylinder(0.15, top - 0.03, top + 0.03))
-    hat_x = x - 0.02  # the cap sits a little to the back
+    hat_x = x - 0.02  # the cap is slightly behind the middle
     b.shift((hat, brim), hat_x, 0, 0)
     wing_paint, tips = b.paints.draw("plain"), b.paints.draw("plain")
     for side in (-1, 1):
@@ -232,4 +232,4 @@ MAKERS: dict[str, Maker] = {
     "turtle": Maker(_turtle, ("tortoise",)),
     "rabbit": Maker(_rabbit, ("bunny", "hare")),
 }
-"""Classes that this file draws."""
+"""Classes drawn by this module."""

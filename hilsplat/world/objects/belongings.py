@@ -1,4 +1,4 @@
-"""Things that people carry or keep: one function draws one class of object."""
+"""Things that people carry or keep: each function draws one class of object."""
 
 import numpy as np
 
@@ -201,7 +201,7 @@ def _lantern(b: Builder) -> None:
     )
     flame = b.subpart(lamp, "flame", "light")
     for a in range(0, 360, 90):
-        # A flame painted on each side of the glass: what is inside a solid globe would never be seen.
+        # The flame is on each side of the glass, because the inside of an opaque globe is never visible.
         shape = (
             lathe([(0, -0.02), (0.085, 0.06), (0.06, 0.14), (0, 0.25)])
             .scaled(0.30, 1, 1)
@@ -270,7 +270,7 @@ def _chest(b: Builder) -> None:
     back = (-d / 2, h + 0.02)
 
     def opened(mesh):
-        """Hinged at the upper back edge, open by 50 degrees."""
+        """Rotate a mesh by 50 degrees about the hinge at the upper back edge."""
         return mesh.moved(r, 0, 0).turned("y", -50).moved(back[0], 0, back[1])
 
     b.put(lid, b.paints.draw("wood"), opened(extrude(half, w)))
@@ -298,4 +298,4 @@ MAKERS: dict[str, Maker] = {
     "lantern": Maker(_lantern, ("oil lantern", "storm lantern")),
     "treasure chest": Maker(_chest, ("pirate chest", "money chest")),
 }
-"""Classes that this file draws."""
+"""Classes drawn by this module."""

@@ -1,4 +1,4 @@
-"""How an object of the synthetic world is put together: a true tree of whole, parts and subparts."""
+"""Construction of an object of the synthetic world as a true tree of whole, parts and subparts."""
 
 from collections import defaultdict
 from collections.abc import Callable
@@ -15,14 +15,14 @@ from hilsplat.world.shapes import Mesh, joined
 Word = TypeVar("Word", bound="str | None")
 
 PARENT_CONTRAST = 24.0
-"""Least distance in L*a*b* between a subpart and the part it sits on."""
+"""Minimum distance in L*a*b* between a subpart and its part."""
 
 NEIGHBOUR_CONTRAST = 11.0
-"""Least distance in L*a*b* between other parts and subparts of an object that touch."""
+"""Minimum distance in L*a*b* between other adjacent parts and subparts of an object."""
 
 _SHADES = (1.0, 0.85, 1.15, 0.72, 1.3, 0.6, 1.45, 0.5, 1.6)
-_TOUCH = 0.03  # boxes nearer than this touch, share of the object's size
-_PREVAILS = {1: 0.5, 2: 0.6, 3: 0.6}  # share of a surface from which a colour or material names it, by level
+_TOUCH = 0.03  # maximum gap between touching boxes, as a share of the object's size
+_PREVAILS = {1: 0.5, 2: 0.6, 3: 0.6}  # minimum share of a surface whose colour or material is named, by level
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class ModelNode:
     Attributes:
         level: 1 whole, 2 part, 3 subpart.
         parent: row of the node one level up in the object, -1 for the whole.
-        text: the query that it answers, such as "bear head".
-        synonyms: other texts that name it.
+        text: canonical query for the node, such as "bear head".
+        synonyms: equivalent queries.
         colour: word for its prevailing colour.
     """
 
@@ -46,16 +46,16 @@ class ModelNode:
 
 @dataclass(frozen=True, eq=False)
 class ObjectModel:
-    """One object in its own frame: it stands on z = 0, its front faces +x.
+    """One object in its own frame, with its lowest point at z = 0 and its front towards +x.
 
     Attributes:
         name: class, such as "bear".
         nodes: its tree; row 0 is the whole.
         triangles: corner positions.
         normals: shading normals at the corners.
-        node_ids: rows of `nodes` that a triangle belongs to (whole, part, subpart; -1 none).
+        node_ids: rows in `nodes` of each triangle (whole, part, subpart; -1 none).
         material_ids: rows of `materials`.
-        materials: numbers for the shader, `Paint.row`.
+        materials: shader parameters (`Paint.row`).
     """
 
     name: str
@@ -68,7 +68,7 @@ class ObjectModel:
 
 
 class Builder:
-    """Collects the nodes and meshes of one object while its maker runs."""
+    """Nodes and meshes of one object while its maker runs."""
 
     def __init__(self, name: str, aliases: tuple[str, ...], rng: np.random.Generator) -> None:
         self.name, self.aliases, self.rng = name, aliases, rng
@@ -77,25 +77,25 @@ class Builder:
         self._pieces: list[tuple[int, Mesh, Paint]] = []
 
     def between(self, low: float | int, high: float | int) -> float:
-        """A random size."""
+        """Draw a uniform random number."""
         return float(self.rng.uniform(low, high))
 
     def chance(self, probability: float) -> bool:
-        """A random choice."""
+        """Return True with the given probability."""
         return bool(self.rng.random() < probability)
 
     def part(self, word: str, *aliases: str) -> int:
-        """A new part of the object; `word` is its name without the object's."""
+        """Add a part and return its node; `word` is its name without the object's."""
         self._nodes.append(_Named(2, 0, word, aliases))
         return len(self._nodes) - 1
 
     def subpart(self, part: int, word: str, *aliases: str, at: str = "on") -> int:
-        """A new subpart of a part; `at` is the preposition of "knob on the kettle lid"."""
+        """Add a subpart and return its node; `at` is the preposition, as in "knob on the kettle lid"."""
         self._nodes.append(_Named(3, part, word, aliases, at))
         return len(self._nodes) - 1
 
     def put(self, node: int, paint: Paint, *meshes: Mesh) -> None:
-        """Add meshes that belong to a part or subpart."""
+        """Add meshes to a part or subpart."""
         self._pieces.append((node, joined(*meshes), paint))
 
     def shift(self, nodes: tuple[int, ...], x: float | int, y: float | int, z: float | int) -> None:
@@ -106,11 +106,11 @@ class Builder:
         ]
 
     def turn(self, degrees: float | int) -> None:
-        """Turn everything added so far about the vertical axis."""
+        """Rotate everything added so far about the vertical axis."""
         self._pieces = [(node, mesh.turned("z", degrees), paint) for node, mesh, paint in self._pieces]
 
     def build(self) -> ObjectModel:
-        """The finished object: it stands on z = 0, and parts that touch differ in colour."""
+        """Return the object with its lowest point at z = 0 and contrast between parts that touch."""
         triples: list[tuple[int, int, int]] = []
         for level, parent, *_ in self._nodes:
             row = len(triples)
@@ -138,11 +138,11 @@ class Builder:
         )
 
     def _contrasted(self) -> list[tuple[int, Mesh, Paint]]:
-        """The pieces, repainted where a part or subpart looks too much like what it touches.
+        """Return the pieces, with parts and subparts repainted that look too similar to a neighbour.
 
-        Nodes of the same name (four legs) are one group and keep one look. Groups are settled in the
-        order in which they were made: the main paint of each becomes a shade of itself, or another
-        colour if no shade will do, until it differs from its parent and from earlier neighbours.
+        Nodes of the same name (four legs) form a group with a common look. Groups are processed in order of
+        creation. The main paint of each is replaced by a shade of itself, or by another colour if no shade
+        is sufficient, so that it differs from its parent and from earlier neighbours.
         """
         groups: dict[tuple[int, str, str], list[int]] = {}
         surface: dict[int, dict[Paint, float]] = defaultdict(lambda: defaultdict(float))
@@ -187,7 +187,7 @@ class Builder:
         return [(node, mesh, repaint.get((node, paint), paint)) for node, mesh, paint in self._pieces]
 
     def _described(self, row: int, area: dict[Paint, float]) -> ModelNode:
-        """Texts of a node: its canonical name, then aliases, relations and attributes."""
+        """Return a node with its texts: the canonical name, then aliases, relations and attributes."""
         level, parent, word, aliases, at = self._nodes[row]
         if level == 1:
             text, others = self.name, [*self.aliases]
@@ -210,7 +210,7 @@ class Builder:
 
 
 class _Named(NamedTuple):
-    """A node while its object is built: `at` is the preposition in front of its parent."""
+    """A node of an unfinished object; `at` is the preposition before its parent."""
 
     level: int
     parent: int
@@ -225,15 +225,15 @@ def _surface(mesh: Mesh) -> float:
 
 
 def _touch(first: np.ndarray, second: np.ndarray, reach: float) -> bool:
-    """Whether two boxes (lowest and highest corner) are nearer than `reach` on every axis."""
+    """Return whether two boxes (lowest and highest corner) are nearer than `reach` on every axis."""
     return bool((np.maximum(first[0], second[0]) - np.minimum(first[1], second[1]) < reach).all())
 
 
 def _distinct(paint: Paint, rivals: list[tuple[Paint, float]]) -> Paint:
-    """The paint, or the nearest one that differs from every rival by its distance."""
+    """Return the paint with the smallest change that meets the minimum distance to every rival."""
 
     def short(candidate: Paint) -> float:
-        """By how much the distance to the worst rival falls short; 0 if none does."""
+        """Return the largest shortfall of a candidate's distance to a rival, 0 if there is none."""
         return max([0.0, *(least - difference(candidate, rival) for rival, least in rivals)])
 
     shades = [paint if factor == 1 else paint.shaded(factor) for factor in _SHADES]
@@ -241,13 +241,13 @@ def _distinct(paint: Paint, rivals: list[tuple[Paint, float]]) -> Paint:
     tried = [shade for shade in shades if shade.colour in allowed]
     tried += [paint.recoloured(word) for word in allowed if word != paint.colour]
     tried = tried or [paint]
-    return min(tried, key=short)  # the first of equals: the smallest sufficient change
+    return min(tried, key=short)  # on a tie the first, which is the smallest change
 
 
 def _prevailing(
     area: dict[Paint, float], least: float, word_of: Callable[[Paint], Word]
 ) -> tuple[Word, bool]:
-    """The word of most of a surface, and whether that is at least the given share of it."""
+    """Return the word for most of a surface, and whether it covers at least the share `least`."""
     per_word: dict[Word, float] = defaultdict(float)
     for paint, size in area.items():
         per_word[word_of(paint)] += size
@@ -256,7 +256,7 @@ def _prevailing(
 
 
 class Maker(NamedTuple):
-    """How objects of a class are drawn.
+    """Generator of random objects of a class.
 
     Attributes:
         draw: adds parts, subparts and meshes to a builder; sizes and paints are random.

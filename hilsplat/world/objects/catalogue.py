@@ -1,4 +1,4 @@
-"""All classes of objects that the synthetic world knows, and which kind of scene they stand in."""
+"""All object classes of the synthetic world, by kind of scene."""
 
 import numpy as np
 
@@ -21,8 +21,8 @@ from hilsplat.world.objects import (
 from hilsplat.world.objects.builder import Builder, Maker, ObjectModel
 
 GENERATOR_VERSION = 2
-"""Changes whenever the same seed would give a different scene or different texts; small models trained on
-another version do not fit."""
+"""Incremented whenever a seed gives a different scene or different texts; small models must be trained on
+the same version."""
 
 _MAKERS: dict[str, Maker] = {
     **toys.MAKERS,
@@ -37,7 +37,7 @@ _MAKERS: dict[str, Maker] = {
 }
 
 TABLETOP: tuple[str, ...] = tuple(_MAKERS)
-"""Classes that stand on a table; all have about the same size there."""
+"""Classes of tabletop scenes, where all objects have about the same size."""
 
 FURNITURE: dict[str, Maker] = {
     **furniture.MAKERS,
@@ -46,51 +46,51 @@ FURNITURE: dict[str, Maker] = {
     "chair": household.MAKERS["chair"],
     "cabinet": household.MAKERS["cabinet"],
 }
-"""Classes of a furnished room at their real size, in metres; a `lamp` is a floor lamp there."""
+"""Classes of furniture and fixtures in a room, full size, in metres; `lamp` is a floor lamp here."""
 
 ROOM_THINGS: tuple[str, ...] = (
     *("bear", "snowman", "robot", "rocket", "car", "house", "penguin", "rabbit", "train"),
     *("mug", "kettle", "bottle", "cake", "fruit basket", "toaster"),
     *("radio", "camera", "backpack", "lantern", "plant", "cactus", "clock"),
 )
-"""Classes of the table that stand on furniture in a room; the small chairs and cabinets do not."""
+"""Tabletop classes that are placed on furniture in a room; small chairs and cabinets are excluded."""
 
 STREET: dict[str, Maker] = street.MAKERS
-"""Classes of a street at their real size, in metres; a `car` is not a toy there."""
+"""Classes of a street, full size, in metres; `car` is not a toy here."""
 
 
 def build_object(name: str, rng: np.random.Generator) -> ObjectModel:
-    """Draw one object of a class of the table: sizes, colours, materials.
+    """Draw an object of a tabletop class with random sizes, colours and materials.
 
     Raises:
-        SceneError: there is no such class.
+        SceneError: if there is no such class.
     """
     return _drawn(name, maker_of(name), rng)
 
 
 def build_furniture(name: str, rng: np.random.Generator) -> ObjectModel:
-    """Draw one piece of furniture or one fixture of a room, in metres.
+    """Draw a piece of furniture or a fixture of a room, in metres.
 
     Raises:
-        SceneError: there is no such class.
+        SceneError: if there is no such class.
     """
     return _drawn(name, _known(name, FURNITURE, "class of furniture"), rng)
 
 
 def build_street_object(name: str, rng: np.random.Generator) -> ObjectModel:
-    """Draw one vehicle, person, plant, building or piece of furniture of a street, in metres.
+    """Draw a vehicle, person, plant, building or piece of street furniture, in metres.
 
     Raises:
-        SceneError: there is no such class.
+        SceneError: if there is no such class.
     """
     return _drawn(name, _known(name, STREET, "class of a street"), rng)
 
 
 def maker_of(name: str) -> Maker:
-    """How a class of the table is drawn, and its other names.
+    """Return the maker of a tabletop class.
 
     Raises:
-        SceneError: there is no such class.
+        SceneError: if there is no such class.
     """
     return _known(name, _MAKERS, "object class")
 

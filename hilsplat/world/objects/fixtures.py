@@ -1,4 +1,4 @@
-"""Fixtures on the walls of a room at their real size, in metres: backs are at x = 0, fronts face +x."""
+"""Fixtures on the walls of a room, full size, in metres. Backs are at x = 0, fronts face +x."""
 
 import numpy as np
 
@@ -158,7 +158,7 @@ def _picture(b: Builder) -> None:
 
 
 def _upright(outline: list[tuple[float, float]], depth: float) -> Mesh:
-    """A plate over a convex outline in the y-z plane, its middle at x = 0."""
+    """Return a plate over a convex outline in the y-z plane, centred at x = 0."""
     return extrude(outline, depth).turned("z", 90)
 
 
@@ -199,4 +199,4 @@ MAKERS: dict[str, Maker] = {
     "picture": Maker(_picture, ("framed picture", "wall painting")),
     "mirror": Maker(_mirror, ("wall mirror", "round mirror")),
 }
-"""Classes that this file draws."""
+"""Classes drawn by this module."""

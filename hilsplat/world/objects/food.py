@@ -1,4 +1,4 @@
-"""Things to eat, and what they come in: one function draws one class of object."""
+"""Food and its containers: each function draws one class of object."""
 
 import numpy as np
 
@@ -304,4 +304,4 @@ MAKERS: dict[str, Maker] = {
     "fruit basket": Maker(_fruit_basket, ("fruit bowl", "basket of fruit")),
     "ice cream": Maker(_ice_cream, ("ice cream sundae", "gelato")),
 }
-"""Classes that this file draws."""
+"""Classes drawn by this module."""

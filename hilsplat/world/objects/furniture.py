@@ -1,4 +1,4 @@
-"""Furniture at its real size, in metres: what one sits, lies or works on. Backs face -x, fronts +x."""
+"""Full-size seats, beds, tables, a lamp and a rug, in metres. Backs face -x, fronts +x."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from hilsplat.world.shapes import Mesh, box, cylinder, ellipsoid, joined, lathe,
 
 
 def _legs(b: Builder, x: float, y: float, top: float, paint: Paint, foot_paint: Paint, width: float) -> None:
-    """Four square legs at (+-x, +-y), each with a foot of another colour."""
+    """Add four square legs at (+-x, +-y), each with a foot in another colour."""
     foot_height = max(0.05, 0.22 * top)
     for px in (-x, x):
         for py in (-y, y):
@@ -25,7 +25,7 @@ def _legs(b: Builder, x: float, y: float, top: float, paint: Paint, foot_paint: 
 
 
 def _pillow(size: tuple[float, float, float]) -> Mesh:
-    """A soft pillow about the origin: a bevelled box and a bulge."""
+    """Return a soft pillow about the origin: a bevelled box and a bulge."""
     x, y, z = size
     return joined(box(size, bevel=0.42 * min(size)), ellipsoid((0.44 * x, 0.44 * y, 0.62 * z)))
 
@@ -330,4 +330,4 @@ MAKERS: dict[str, Maker] = {
     "rug": Maker(_rug, ("carpet", "mat")),
     "stool": Maker(_stool, ("footstool", "bar stool")),
 }
-"""Classes that this file draws."""
+"""Classes drawn by this module."""

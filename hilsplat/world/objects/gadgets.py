@@ -1,4 +1,4 @@
-"""Gadgets and instruments: one function draws one class of object."""
+"""Gadgets and instruments: each function draws one class of object."""
 
 import numpy as np
 
@@ -290,7 +290,7 @@ def _toaster(b: Builder) -> None:
         b.paints.draw("plastic"),
         box((0.085, 0.06, 0.25), (0, -end - 0.07, h * 0.50), 0.015),
     )
-    b.turn(35)  # lever and side are seen from the front
+    b.turn(35)  # so that lever and side are visible from the front
 
 
 def _headphones(b: Builder) -> None:
@@ -333,7 +333,7 @@ def _headphones(b: Builder) -> None:
             metal,
             cylinder(0.125, -0.025, 0.025, 24, 0.01).turned("x", 90).moved(0, side * (r + 0.12), z - 0.18),
         )
-    b.turn(b.between(35, 60))  # from the front both cups show their outside or inside
+    b.turn(b.between(35, 60))  # so that both cups show their outside or inside to the front
 
 
 MAKERS: dict[str, Maker] = {
@@ -343,4 +343,4 @@ MAKERS: dict[str, Maker] = {
     "toaster": Maker(_toaster, ("bread toaster",)),
     "headphones": Maker(_headphones, ("headset", "earphones")),
 }
-"""Classes that this file draws."""
+"""Classes drawn by this module."""

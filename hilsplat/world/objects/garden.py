@@ -1,4 +1,4 @@
-"""Things of a garden, in small: one function draws one class of object."""
+"""Miniature garden objects: each function draws one class of object."""
 
 import numpy as np
 
@@ -279,4 +279,4 @@ MAKERS: dict[str, Maker] = {
     "birdhouse": Maker(_birdhouse, ("nesting box", "bird house")),
     "watering can": Maker(_watering_can, ("garden can", "sprinkling can")),
 }
-"""Classes that this file draws."""
+"""Classes drawn by this module."""

@@ -1,4 +1,4 @@
-"""Things of a household, in small: one function draws one class of object."""
+"""Miniature household objects: each function draws one class of object."""
 
 import numpy as np
 
@@ -313,4 +313,4 @@ MAKERS: dict[str, Maker] = {
     "plant": Maker(_plant, ("potted plant", "flower plant")),
     "clock": Maker(_clock, ("alarm clock", "timepiece")),
 }
-"""Classes that this file draws."""
+"""Classes drawn by this module."""

@@ -1,4 +1,4 @@
-"""Things of a kitchen table: one function draws one class of object."""
+"""Kitchen objects: each function draws one class of object."""
 
 import numpy as np
 
@@ -200,4 +200,4 @@ MAKERS: dict[str, Maker] = {
     "bottle": Maker(_bottle, ("flask", "glass bottle")),
     "cake": Maker(_cake, ("birthday cake", "torte")),
 }
-"""Classes that this file draws."""
+"""Classes drawn by this module."""

@@ -1,4 +1,4 @@
-"""Furniture at its real size, in metres: shelves, kitchen and screens. Backs face -x, fronts +x."""
+"""Full-size shelves, kitchen furniture and screens, in metres. Backs face -x, fronts +x."""
 
 from hilsplat.world.objects.builder import Builder, Maker
 from hilsplat.world.shapes import box, cylinder, lathe, sphere, sweep
@@ -38,7 +38,7 @@ def _bookshelf(b: Builder) -> None:
 
 
 def _book_row(b: Builder, depth: float, width: float, bottom: float, clear: float) -> None:
-    """A row of books, from one side for some of the way, the last one leaning a little."""
+    """Add a row of books that fills part of a shelf from one side; the last book leans slightly."""
     books = b.part("books", "row of books")
     end = width / 2 - 0.06 - (b.between(0.1, 0.35) if b.chance(0.7) else 0.0)
     y, mirror = -width / 2 + 0.055, -1 if b.chance(0.5) else 1
@@ -56,7 +56,7 @@ def _book_row(b: Builder, depth: float, width: float, bottom: float, clear: floa
 
 
 def _crates(b: Builder, depth: float, width: float, bottom: float, gap: float) -> None:
-    """Two boxes side by side, each with a label."""
+    """Add two boxes side by side, each with a label."""
     cloth, label = b.paints.draw("cloth"), b.paints.draw("plain")
     crate_w, crate_h = (width - 0.16) / 2, gap * b.between(0.62, 0.76)
     for side in (-1, 1):
@@ -329,4 +329,4 @@ MAKERS: dict[str, Maker] = {
     "television": Maker(_television, ("tv", "tv screen")),
     "monitor": Maker(_monitor, ("computer monitor", "computer screen")),
 }
-"""Classes that this file draws."""
+"""Classes drawn by this module."""

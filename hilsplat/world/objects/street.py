@@ -1,4 +1,4 @@
-"""Furniture and plants of a street. Things face +x and stand on z = 0; lengths are metres."""
+"""Street furniture and plants. Objects face +x, with their base at z = 0; lengths are metres."""
 
 import numpy as np
 
@@ -43,7 +43,7 @@ def _tree(b: Builder) -> None:
 
 
 def _outwards(point: tuple[float, float, float], middle: float) -> np.ndarray:
-    """Unit vector from (0, 0, middle) to a point."""
+    """Return the unit vector from (0, 0, middle) to a point."""
     away = np.array(point) - np.array([0.0, 0.0, middle])
     return away / np.linalg.norm(away)
 

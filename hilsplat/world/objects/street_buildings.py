@@ -1,4 +1,4 @@
-"""Buildings of a street. Their front is the plane x = 0 and faces +x; lengths are metres."""
+"""Buildings of a street. Their front is in the plane x = 0 and faces +x; lengths are metres."""
 
 from hilsplat.world.objects.builder import Builder, Maker
 from hilsplat.world.objects.street_paints import PASTELS, glass, lacquer, lit, panel, plain, plaster
@@ -9,7 +9,7 @@ DEPTH = 6.0
 
 
 def _wall(b: Builder, *avoid: str) -> Paint:
-    """A wall paint that differs from the colours to avoid."""
+    """Return a wall paint in none of the colours to avoid."""
     if b.chance(0.35):
         return b.paints.draw(
             "brick", *(c for c in ("red", "brown", "beige", "orange", "grey") if c not in avoid), scale=1.9
@@ -18,7 +18,7 @@ def _wall(b: Builder, *avoid: str) -> Paint:
 
 
 def _block(w: float, bottom: float, top: float, out: float = 0.0) -> Mesh:
-    """A storey of the house; `out` is how far its front projects beyond x = 0."""
+    """Return a storey of the house whose front projects beyond x = 0 by `out`."""
     return box((DEPTH + out, w, top - bottom), ((out - DEPTH) / 2, 0, (bottom + top) / 2))
 
 
@@ -75,7 +75,7 @@ def _building(b: Builder) -> None:
 
 
 def _awning(b: Builder, low: int, front: float, y: float, pitch: float) -> None:
-    """A sloping cloth over a shop window."""
+    """Add a sloping cloth over a shop window."""
     node, first, second = (
         b.subpart(low, "awning", "canopy"),
         plain(b, "white"),
@@ -100,7 +100,7 @@ def _upper_floors(
     pane: Paint,
     avoid: str,
 ) -> None:
-    """The facade above the ground floor: windows, shutters, a balcony."""
+    """Add the facade above the ground floor: windows, shutters, a balcony."""
     facade = b.part("facade", "upper floors", "front wall")
     b.put(facade, _wall(b, avoid), _block(w, ground, ground + storeys * storey + 0.3))
     windows = b.subpart(facade, "windows", "window panes")
@@ -142,7 +142,7 @@ def _upper_floors(
 
 
 def _roof(b: Builder, w: float, eaves: float) -> None:
-    """A gabled roof with its ridge along the street, or a flat one with a parapet."""
+    """Add a gabled roof with its ridge along the street, or a flat one with a parapet."""
     roof = b.part("roof")
     tiles = b.paints.draw("brick", "red", "brown", "orange", "grey", "black", scale=1.7)
     chimney, dormer = b.subpart(roof, "chimney"), b.subpart(roof, "dormer window", "skylight")
@@ -173,4 +173,4 @@ def _roof(b: Builder, w: float, eaves: float) -> None:
 
 
 MAKERS: dict[str, Maker] = {"building": Maker(_building, ("town house", "apartment building"))}
-"""Classes that this file draws."""
+"""Classes drawn by this module."""

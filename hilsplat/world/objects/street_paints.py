@@ -1,4 +1,4 @@
-"""Paints and pieces that several things of a street share. Lengths are metres."""
+"""Paints and pieces shared by several street objects. Lengths are metres."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,7 +19,7 @@ PASTELS = {
     "red": (0.72, 0.38, 0.32),
     "grey": (0.66, 0.66, 0.66),
 }
-"""sRGB of plastered walls by colour word; the words are those of `COLOURS`."""
+"""sRGB of plastered walls by colour word (a key of `COLOURS`)."""
 
 FOLIAGE = {
     "green": ((0.20, 0.46, 0.14), (0.42, 0.62, 0.22)),
@@ -33,13 +33,13 @@ def _faded(colour: Colour, factor: float) -> Colour:
 
 
 def lacquer(b: Builder, *colours: str) -> Paint:
-    """Glossy paint of one colour, as on vehicles."""
+    """Return a glossy paint of one colour, as on vehicles."""
     paint = b.paints.draw("plain", *colours)
     return replace(paint, second=_faded(paint.first, 0.86), specular=0.4, shininess=50.0)
 
 
 def glass(b: Builder) -> Paint:
-    """Dark, glossy and a little cloudy: a window pane with some visible detail."""
+    """Return dark, glossy, slightly cloudy glass, so that a window pane has some visible detail."""
     paint = b.paints.draw("plain", "black")
     first, second = ((0.15, 0.19, 0.26), (0.36, 0.45, 0.55))
     choices = ("black", "grey", "blue", "teal")
@@ -49,51 +49,51 @@ def glass(b: Builder) -> Paint:
 
 
 def rubber(b: Builder) -> Paint:
-    """Tyres."""
+    """Return the paint of tyres."""
     return replace(b.paints.draw("plain", "black"), specular=0.05)
 
 
 def lit(paint: Paint) -> Paint:
-    """The same colour, self-luminous (the shader's rule: no shininess, no shading)."""
+    """Return the paint as self-luminous, because the shader does not shade a paint without shininess."""
     return replace(paint, specular=0.0, shininess=0.0)
 
 
 def plaster(b: Builder, *colours: str) -> Paint:
-    """A painted wall with stains."""
+    """Return the paint of a stained wall."""
     paint = b.paints.draw("plain", *(colours or tuple(PASTELS)))
     first = PASTELS[paint.colour]
     return replace(paint, first=first, second=_faded(first, 0.84), scale=5.0, grain=0.34).shaded(
         1.0
-    )  # the word it looks like
+    )  # recomputes the colour word
 
 
 def foliage(b: Builder, *colours: str) -> Paint:
-    """Leaves: clumps of light and shade."""
+    """Return the paint of leaves, with clumps of light and shade."""
     paint = b.paints.draw("plain", *(colours or ("green",)))
     shade, light = FOLIAGE[paint.colour]
     return replace(paint, first=shade, second=light, scale=20.0, grain=0.36, specular=0.03)
 
 
 def plain(b: Builder, colour: str) -> Paint:
-    """A plain paint in exactly the listed colour."""
+    """Return a plain paint in exactly the listed colour."""
     return replace(b.paints.draw("plain", colour), first=COLOURS[colour])
 
 
 def wheel(x: Number, y: Number, radius: Number, width: Number) -> Mesh:
-    """A tyre that touches z = 0 and rolls along x."""
+    """Return a tyre that touches z = 0 and rolls along x."""
     return cylinder(radius, -width / 2, width / 2, 20, 0.03).turned("x", 90).moved(x, y, radius)
 
 
 def post(radius: Number, height: Number) -> Mesh:
-    """An upright pole."""
+    """Return an upright pole."""
     return cylinder(radius, 0.0, height, 14)
 
 
 def limb(path: Sequence[Sequence[Number]], radii: Sequence[Number]) -> Mesh:
-    """An arm or a leg."""
+    """Return an arm or a leg."""
     return sweep(path, radii, 10)
 
 
 def panel(thickness: Number, width: Number, height: Number, x: Number, y: Number, z: Number) -> Mesh:
-    """A thin upright plate that faces x; (x, y, z) is its middle."""
+    """Return a thin upright plate that faces x, with its centre at (x, y, z)."""
     return box((thickness, width, height), (x, y, z), min(0.02, 0.3 * thickness))

@@ -1,4 +1,4 @@
-"""People of a street: pedestrian and cyclist. They face +x and stand on z = 0; lengths are metres."""
+"""Pedestrian and cyclist. They face +x, with their base at z = 0; lengths are metres."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ SKIN = ("beige", "brown", "pink")
 
 
 def _head(b: Builder, skin: Paint, x: float, z: float, radius: float) -> None:
-    """A head whose middle is at (x, 0, z), with hair or a hat."""
+    """Add a head with hair or a hat, centred at (x, 0, z)."""
     head = b.part("head")
     b.put(head, skin, ellipsoid((radius * 0.92, radius * 0.85, radius * 1.1), (x, 0, z), 18, 10))
     b.put(head, skin, cylinder(radius * 0.5, z - radius * 1.5, z - radius * 0.6, 12).moved(x, 0, 0))
@@ -177,4 +177,4 @@ MAKERS: dict[str, Maker] = {
     "pedestrian": Maker(_pedestrian, ("person", "walker")),
     "cyclist": Maker(_cyclist, ("bicyclist", "bike rider")),
 }
-"""Classes that this file draws."""
+"""Classes drawn by this module."""

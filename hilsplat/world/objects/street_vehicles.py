@@ -1,4 +1,4 @@
-"""Vehicles of a street: car, truck, bus. They face +x and stand on z = 0; lengths are metres."""
+"""Car, truck and bus. They face +x, with their base at z = 0; lengths are metres."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ def _wheels(b: Builder, places: list[float], half_width: float, radius: float, w
 
 
 def _lights_and_plates(b: Builder, node: int, front: float, back: float, w: float, z: float) -> None:
-    """Headlights, tail lights and licence plates on the two ends of a body."""
+    """Add headlights, tail lights and licence plates to the two ends of a body."""
     head = b.subpart(node, "headlights", "front lights")
     tail = b.subpart(node, "tail lights", "rear lights")
     bright, red = lit(plain(b, "white")), plain(b, "red")
@@ -82,7 +82,7 @@ def _car(b: Builder) -> None:
 
 
 def _contrasting(b: Builder, paint: Paint) -> Paint:
-    """A colour that stands out from another paint."""
+    """Return a paint that contrasts with another."""
     light = sum(paint.first) > 1.5
     return lacquer(b, *(("red", "blue", "green", "purple") if light else ("white", "yellow", "beige")))
 
@@ -162,4 +162,4 @@ MAKERS: dict[str, Maker] = {
     "truck": Maker(_truck, ("vehicle", "lorry")),
     "bus": Maker(_bus, ("vehicle", "coach")),
 }
-"""Classes that this file draws."""
+"""Classes drawn by this module."""

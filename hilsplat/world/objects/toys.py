@@ -1,4 +1,4 @@
-"""Toys and models: one function draws one class of object."""
+"""Toys and models: each function draws one class of object."""
 
 import numpy as np
 
@@ -338,4 +338,4 @@ MAKERS: dict[str, Maker] = {
     "car": Maker(_car, ("toy car", "automobile")),
     "house": Maker(_house, ("toy house", "cottage")),
 }
-"""Classes that this file draws."""
+"""Classes drawn by this module."""

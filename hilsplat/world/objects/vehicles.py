@@ -1,4 +1,4 @@
-"""Vehicles as toys: one function draws one class of object."""
+"""Toy vehicles: each function draws one class of object."""
 
 from hilsplat.world.objects.builder import Builder, Maker
 from hilsplat.world.shapes import box, cylinder, disc, ellipsoid, extrude, lathe, loft, sweep
@@ -184,7 +184,7 @@ def _sailboat(b: Builder) -> None:
         .turned("x", 90)
         .moved(mast_x + 0.05 + foot * 0.28, 0, low - 0.10 + tall * 0.30),
     )
-    b.turn(55)  # from the front the sails are broad
+    b.turn(55)  # so that the sails are broad from the front
 
 
 def _airplane(b: Builder) -> None:
@@ -351,4 +351,4 @@ MAKERS: dict[str, Maker] = {
     "airplane": Maker(_airplane, ("plane", "aircraft")),
     "tractor": Maker(_tractor, ("toy tractor", "farm tractor")),
 }
-"""Classes that this file draws."""
+"""Classes drawn by this module."""

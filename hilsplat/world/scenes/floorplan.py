@@ -1,5 +1,4 @@
-"""Placement of furniture in a room: boxes along the walls that keep clear of each other and of the cameras'
-path."""
+"""Placement of furniture along the walls of a room, without collisions and clear of the camera path."""
 
 from dataclasses import dataclass
 
@@ -9,23 +8,23 @@ from jaxtyping import Float
 from hilsplat.world.shapes import rotation_about
 
 WALL_GAP = 0.03
-"""Furniture stands this far off its wall, and the skirting fits in between, m."""
+"""Distance between furniture and wall, where the skirting fits, m."""
 PIECE_GAP = 0.05
 PATH_GAP = 0.28
-"""Least distance, from above, of the cameras' path to what is as tall as they are, m."""
+"""Minimum horizontal distance of the camera path from objects taller than `PATH_LOW`, m."""
 PATH_LOW = 1.16
-"""Cameras are always well above this height, m; lower things may stand under their path."""
+"""Height well below all cameras, m; objects up to this height may be under the camera path."""
 TRIES = 120
 
 
 @dataclass(frozen=True)
 class Room:
-    """The inside of a room, with the middle of its floor at the origin; walls 0 to 3 face +x, +y, -x, -y.
+    """Interior of a room, with the middle of its floor at the origin; walls 0 to 3 face +x, +y, -x, -y.
 
     Attributes:
         width: length along x, m.
         depth: length along y, m.
-        height: of the ceiling, m.
+        height: height of the ceiling, m.
     """
 
     width: float
@@ -33,17 +32,17 @@ class Room:
     height: float
 
     def wall_length(self, wall: int) -> float:
-        """Length of a wall, m."""
+        """Return the length of a wall, m."""
         return self.depth if wall % 2 == 0 else self.width
 
     def at_wall(self, wall: int, along: float, away: float) -> Float[np.ndarray, " 2"]:
-        """Point before a wall: `along` from its middle, `away` from it into the room, m."""
+        """Return the point `away` from a wall into the room and `along` it from its middle, m."""
         half = self.width / 2 if wall % 2 == 0 else self.depth / 2
         return rotation_about("z", yaw_of_wall(wall))[:2, :2] @ np.array([away - half, along])
 
 
 def yaw_of_wall(wall: int) -> float:
-    """Rotation with which a thing with its back to the wall faces the room, degrees."""
+    """Return the yaw of an object whose back is to the wall, degrees."""
     return 90.0 * wall
 
 
@@ -61,40 +60,40 @@ class Space:
 
     @staticmethod
     def of(corners: Float[np.ndarray, "N 3"]) -> "Space":
-        """The box around some points."""
+        """Return the bounding box of points."""
         return Space(tuple(corners.min(axis=0).tolist()), tuple(corners.max(axis=0).tolist()))
 
     def meets(self, other: "Space", gap: float) -> bool:
-        """Whether two boxes come nearer than `gap` on every axis (heights: whether they overlap)."""
+        """Return whether two boxes are nearer than `gap` in x and y and overlap in z."""
         sides = all(self.low[a] < other.high[a] + gap and other.low[a] < self.high[a] + gap for a in range(2))
         return sides and self.low[2] < other.high[2] and other.low[2] < self.high[2]
 
     def beyond(self, room: Room, gap: float) -> bool:
-        """Whether the box extends beyond the room, less a margin of `gap` at the walls."""
+        """Return whether the box extends beyond the room reduced by a margin of `gap` at the walls."""
         half = (room.width / 2 - gap, room.depth / 2 - gap)
         return any(self.low[a] < -half[a] or self.high[a] > half[a] for a in range(2))
 
     def distance_xy(self, points: Float[np.ndarray, "N 2"]) -> float:
-        """Least distance of the points to the box, from above."""
+        """Return the minimum horizontal distance of the points from the box."""
         low, high = np.array(self.low[:2]), np.array(self.high[:2])
         return float(np.linalg.norm(np.maximum(0, np.maximum(low - points, points - high)), axis=1).min())
 
 
 class FloorPlan:
-    """The occupied space of a room while it is being furnished."""
+    """Occupied space of a room while it is being furnished."""
 
     def __init__(self, room: Room, path: Float[np.ndarray, "N 2"]) -> None:
         self.room, self.path = room, path
         self.taken: list[Space] = []
 
     def free(self, space: Space, gap: float = PIECE_GAP) -> bool:
-        """Whether a box of space is inside the room and clear of occupied space and of the cameras' path."""
+        """Return whether a box is inside the room and clear of occupied space and of the camera path."""
         if space.beyond(self.room, 0.0) or any(space.meets(other, gap) for other in self.taken):
             return False
         return space.high[2] <= PATH_LOW or space.distance_xy(self.path) >= PATH_GAP
 
     def take(self, space: Space) -> None:
-        """Mark a box of space as occupied."""
+        """Mark a box as occupied."""
         self.taken.append(space)
 
     def wall_spot(
@@ -106,18 +105,18 @@ class FloorPlan:
         walls: tuple[int, ...] = (0, 1, 2, 3),
         gap: float = WALL_GAP,
     ) -> tuple[int, Float[np.ndarray, " 2"], Space] | None:
-        """A random free place at a wall for a thing that faces the room.
+        """Find a random free place at a wall for an object that faces the room.
 
         Args:
-            rng: where to try.
-            size: of the thing in its own frame: depth, width, height, m.
+            rng: source of the candidate places.
+            size: depth, width and height of the object in its own frame, m.
             base_z: height of its lowest point, m.
-            clear: room to leave free before it, m; not taken from others afterwards.
+            clear: depth that must be free in front of it, m; it is not reserved afterwards.
             walls: allowed walls.
-            gap: between it and the wall, m.
+            gap: distance from the wall, m.
 
         Returns:
-            The wall, the middle of the thing from above, and the space it takes; None if there is none.
+            The wall, the object's centre in x and y, and the space it occupies; None if no place is found.
         """
         for _ in range(TRIES):
             wall = int(rng.choice(walls))
@@ -141,7 +140,7 @@ class FloorPlan:
 def turned_space(
     spot: Float[np.ndarray, " 2"], size: Float[np.ndarray, " 3"], yaw_deg: float | int, base_z: float | int
 ) -> Space:
-    """The space of a thing whose middle, from above, is at `spot`; `yaw_deg` is a multiple of 90."""
+    """Return the space of an object centred at `spot` in x and y; `yaw_deg` is a multiple of 90."""
     depth, width = (size[0], size[1]) if round(yaw_deg / 90) % 2 == 0 else (size[1], size[0])
     return Space(
         (float(spot[0] - depth / 2), float(spot[1] - width / 2), float(base_z)),

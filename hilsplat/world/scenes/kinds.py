@@ -1,4 +1,4 @@
-"""The kinds of scene that the synthetic world knows: how each is built and seen."""
+"""Kinds of synthetic scene, with the functions that build and view them."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -15,10 +15,10 @@ class SceneKind(NamedTuple):
     """One kind of scene.
 
     Attributes:
-        build: the scene of a seed with a number of objects.
-        cameras: views of a scene, (scene, views, image_px, arc_deg); neighbours are close enough for
-            structure from motion.
-        training_camera: a random camera for the small models, (scene, random, image_px).
+        build: builds a scene, (seed, objects).
+        cameras: returns views of a scene, (scene, views, image_px, arc_deg); neighbours are close enough
+            for structure from motion.
+        training_camera: returns a random camera for training, (scene, rng, image_px).
     """
 
     build: Callable[[int, int], WorldScene]
@@ -31,7 +31,7 @@ KINDS: dict[str, SceneKind] = {
     "room": SceneKind(room.build_room, room_cameras.loop_cameras, room_cameras.training_camera),
     "street": SceneKind(street.build_street, street.drive_cameras, street.training_camera),
 }
-"""Kinds by their name in the scene sheet."""
+"""Scene kinds by their name in the scene sheet."""
 
 
 def build_scene(kind: str, seed: int, objects: int) -> WorldScene:
@@ -40,10 +40,10 @@ def build_scene(kind: str, seed: int, objects: int) -> WorldScene:
     Args:
         kind: one of `KINDS`.
         seed: not negative; the same seed and number of objects give the same scene.
-        objects: how many to place.
+        objects: number of objects to place.
 
     Raises:
-        SceneError: the kind is unknown, or a number is out of range.
+        SceneError: if the kind is unknown or a number is out of range.
     """
     if kind not in KINDS:
         raise SceneError(
@@ -60,10 +60,10 @@ def build_scene(kind: str, seed: int, objects: int) -> WorldScene:
 
 
 def scene_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int) -> Cameras:
-    """The views of a scene that its stage renders."""
+    """Return the views of a scene that the world stage renders."""
     return KINDS[scene.kind].cameras(scene, views, image_px, arc_deg)
 
 
 def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int) -> Camera:
-    """A random view of a training scene."""
+    """Return a random view of a training scene."""
     return KINDS[scene.kind].training_camera(scene, rng, image_px)

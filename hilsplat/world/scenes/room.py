@@ -1,4 +1,4 @@
-"""Room scenes: furniture along the walls, things on it (stand-ins for ScanNet, ScanNet200 and Replica)."""
+"""Room scenes: furniture along the walls with small objects on it, as in ScanNet, ScanNet200 and Replica."""
 
 import logging
 from dataclasses import replace
@@ -19,19 +19,19 @@ from hilsplat.world.shapes import rotation_about
 logger = logging.getLogger(__name__)
 
 FURNITURE_SHARE = 0.65
-"""Share of the requested objects that are furniture; the others are things that stand on it."""
+"""Share of furniture among the requested objects; the others are small objects on it ("things")."""
 PATTERN_FACTOR = 2.0
-"""Things are drawn about half a metre in size and placed at half that: their patterns shrink with them."""
+"""Factor on the pattern frequency of things, which are drawn about 0.5 m large and placed at half that."""
 
 
 class Piece(NamedTuple):
-    """How a piece of furniture is placed.
+    """Placement of a class of furniture.
 
     Attributes:
         name: its class.
-        above: height kept free above it for what stands on it, m.
-        clear: room kept free before it, m.
-        partners: what is placed with it if there is room: class and where ("before", "beside", "on").
+        above: height kept free above it for the things on it, m.
+        clear: depth kept free in front of it, m.
+        partners: classes placed with it if they fit, and where ("before", "beside", "on").
     """
 
     name: str
@@ -50,7 +50,7 @@ LARGE: tuple[Piece, ...] = (
     Piece("refrigerator", 0.0, 0.4),
     Piece("cabinet", 0.45, 0.3),
 )
-"""Pieces that stand at a wall; drawn in random order, each once before any is repeated."""
+"""Pieces placed at a wall, drawn in random order; none repeats before all have been drawn."""
 
 SUPPORTS: dict[str, str] = {
     "table": "table top",
@@ -60,25 +60,25 @@ SUPPORTS: dict[str, str] = {
     "counter": "counter top",
     "tv stand": "tv stand top",
 }
-"""Furniture that things stand on, and the node whose top carries them."""
+"""Furniture that can carry things, and the text of the node that carries them."""
 
 THING_SIZES: dict[str, tuple[float, float]] = {
     "mug": (0.15, 0.2), "kettle": (0.24, 0.3), "bottle": (0.3, 0.36), "cake": (0.22, 0.28),
     "fruit basket": (0.22, 0.28), "toaster": (0.2, 0.26), "radio": (0.22, 0.28), "camera": (0.18, 0.24),
     "lantern": (0.3, 0.36), "clock": (0.26, 0.32), "backpack": (0.4, 0.46), "plant": (0.42, 0.55),
 }  # fmt: skip
-"""Heights of some things, m; a little larger than life, so that their subparts show across a room."""
+"""Heights of some things, m; slightly oversized, so that their subparts are visible across a room."""
 TOY_SIZE = (0.34, 0.44)
 """Heights of all other things, m."""
 MAX_THING_RADIUS = 0.21
 EDGE = 0.03
-"""Distance that things keep from the edge of what carries them, and from the wall behind a counter, m."""
+"""Minimum distance of things from the edge of their support, and from the wall behind a counter, m."""
 MAX_FLAT = 0.05
-"""Whatever lies on a board and is no higher than this carries things too, m."""
+"""Maximum height above a board of a flat item that can itself carry things, m."""
 
 
 class _Furnishing:
-    """A room while it is being furnished: the scene so far, occupied space, and what can carry things."""
+    """A room while it is being furnished: the scene so far, occupied space, and supports for things."""
 
     def __init__(self, seed: int, room: Room, path: np.ndarray) -> None:
         self.seed, self.plan = seed, FloorPlan(room, path)
@@ -88,7 +88,7 @@ class _Furnishing:
         self._drawn = 0
 
     def model(self, name: str, *, thing: bool = False) -> ObjectModel:
-        """The next object of a class."""
+        """Draw the next object of a class."""
         self._drawn += 1
         rng = np.random.default_rng([self.seed, 22, self._drawn])
         return build_object(name, rng) if thing else build_furniture(name, rng)
@@ -102,7 +102,7 @@ class _Furnishing:
         base_z: float = 0.0,
         scale: float = 1.0,
     ) -> Space:
-        """Add an object whose middle, from above, comes to `spot`; returns the space it takes."""
+        """Add an object centred at `spot` in x and y and return the space it occupies."""
         low, high = model.triangles.min(axis=(0, 1)) * scale, model.triangles.max(axis=(0, 1)) * scale
         middle = (low + high)[:2] / 2
         xy = spot - rotation_about("z", yaw_deg)[:2, :2] @ middle
@@ -127,12 +127,12 @@ class _Furnishing:
 
 
 class Support(NamedTuple):
-    """The top of a piece of furniture.
+    """Top of a piece of furniture.
 
     Attributes:
         top: the space of its board.
-        flat: spaces of what lies on it, such as a table runner.
-        stand: middle and radius of the footprints already on it.
+        flat: spaces of flat items on it, such as a table runner.
+        stand: centre and radius of the footprints already on it.
     """
 
     top: Space
@@ -140,14 +140,14 @@ class Support(NamedTuple):
     stand: list[tuple[np.ndarray, float]]
 
     def height_at(self, spot: np.ndarray, radius: float) -> float:
-        """Height at which a thing of a footprint stands there: on the board, or on what lies on it."""
+        """Return the base height of a thing with this footprint: the board or the highest flat item below."""
         reach = np.array([radius, radius])
         below = Space((*(spot - reach).tolist(), -1.0), (*(spot + reach).tolist(), 1e3))
         return max([self.top.high[2], *(space.high[2] for space in self.flat if space.meets(below, 0.0))])
 
 
 def _support(model: ObjectModel, triangles: np.ndarray, text: str) -> Support:
-    """What an object that was added as `triangles` can carry on the node of a text."""
+    """Return the support that the node named `text` of an object added as `triangles` provides."""
     node = next(row for row, found in enumerate(model.nodes) if found.text == text)
     own = model.node_ids[:, model.nodes[node].level - 1] == node
     board = own & (model.node_ids[:, 2] == NONE) if model.nodes[node].level == 2 else own
@@ -161,20 +161,20 @@ def _support(model: ObjectModel, triangles: np.ndarray, text: str) -> Support:
 
 
 def size_of(model: ObjectModel) -> Float[np.ndarray, " 3"]:
-    """Depth, width and height of an object in its own frame, scene units."""
+    """Return depth, width and height of an object in its own frame, scene units."""
     return np.ptp(model.triangles.reshape(-1, 3), axis=0)
 
 
 def build_room(seed: int, objects: int) -> WorldScene:
-    """A room of about 4 x 5 m with furniture at its walls; the unit is the metre, the floor z = 0.
+    """Build a room of about 4 x 5 m with furniture at its walls, in metres, with its floor at z = 0.
 
-    A door, a window with a curtain and two pictures (or a mirror) come with every room. Of `objects`, about
-    two thirds are furniture, the others things that stand on it (or on the floor if nothing can carry them);
-    objects without a place are left out. More objects fill the room, but the loop of the cameras stays free.
+    Every room has a door, a window with a curtain, and two pictures (or a picture and a mirror). About two
+    thirds of `objects` are furniture; the others are things on it, or on the floor if no support is free.
+    Objects that do not fit are omitted, and the camera loop stays free.
 
     Args:
-        seed: not negative; same seed and number of objects, same scene.
-        objects: how many pieces of furniture and things to place.
+        seed: not negative; the same seed and number of objects give the same scene.
+        objects: number of pieces of furniture and things to place.
     """
     rng = np.random.default_rng([seed, 21])
     room = Room(float(rng.uniform(4.4, 5.0)), float(rng.uniform(3.8, 4.3)), 2.55)
@@ -194,7 +194,7 @@ def build_room(seed: int, objects: int) -> WorldScene:
 
 
 def _add_fixtures(work: _Furnishing, rng: np.random.Generator) -> int:
-    """Door, window and curtain, on different walls; returns how many."""
+    """Add a door, and a window with a curtain on another wall; return the number of objects."""
     room, plan = work.plan.room, work.plan
     door_wall, window_wall = (int(wall) for wall in rng.permutation(4)[:2])
     model = work.model("door")
@@ -203,7 +203,7 @@ def _add_fixtures(work: _Furnishing, rng: np.random.Generator) -> int:
     along = float(rng.choice([-1, 1]) * reach * rng.uniform(0.6, 1.0))
     yaw = yaw_of_wall(door_wall)
     work.put("door", model, room.at_wall(door_wall, along, size[0] / 2), yaw)
-    # The way in stays free, and so does the swing of the door.
+    # The entrance and the swing of the door stay free.
     plan.take(turned_space(room.at_wall(door_wall, along, 0.4), np.array([0.8, size[1], 2.1]), yaw, 0.0))
     window, curtain = work.model("window"), work.model("curtain")
     yaw, sill = yaw_of_wall(window_wall), 0.92
@@ -217,11 +217,11 @@ def _add_fixtures(work: _Furnishing, rng: np.random.Generator) -> int:
 
 
 def _furnish(work: _Furnishing, rng: np.random.Generator, count: int) -> int:
-    """Place large pieces at the walls with their partners, and a table in the middle; returns how many."""
+    """Place large pieces with their partners at the walls, and a table in the middle; return their number."""
     done, failures = 0, 0
     queue: list[Piece] = []
     with_rug = count >= 4 and bool(rng.random() < 0.5)
-    # A table goes where the others leave room; lamp and stool come once there are enough pieces.
+    # The table is placed last, in the space that is left; lamp and stool need a minimum number of pieces.
     extras = [(5, "lamp"), (7, "stool")]
     table_at = count - 1 - with_rug if count >= 3 else count
     while done < count and failures < 2 * len(LARGE):
@@ -261,11 +261,11 @@ def _put_at_wall(work: _Furnishing, rng: np.random.Generator, piece: Piece) -> b
 
 
 ON_TOP: dict[str, float] = {"television": -0.03, "monitor": -0.12, "sink": 0.0}
-"""How far in front of the middle of its support a partner placed on it stands, m."""
+"""Offset of a partner towards the front of its support, from the support's middle, m."""
 
 
 def _put_partner(work: _Furnishing, rng: np.random.Generator, owner_row: int, name: str, where: str) -> bool:
-    """Place a partner of a piece before it, beside it or on it; returns whether there was room."""
+    """Place a partner of a piece before it, beside it or on it; return whether it fits."""
     model = work.model(name)
     size = size_of(model)
     owner = work.placed[owner_row]
@@ -296,7 +296,7 @@ def _put_partner(work: _Furnishing, rng: np.random.Generator, owner_row: int, na
 
 
 def _put_table(work: _Furnishing, rng: np.random.Generator, with_rug: bool) -> int:
-    """A table near the middle of the room, perhaps on a rug; returns the number of pieces."""
+    """Place a table near the middle of the room, optionally on a rug; return the number of pieces."""
     model, rug = work.model("table"), work.model("rug")
     size = size_of(rug) if with_rug else size_of(model)
     base_z = float(size_of(rug)[2]) if with_rug else 0.0
@@ -314,7 +314,7 @@ def _put_table(work: _Furnishing, rng: np.random.Generator, with_rug: bool) -> i
 
 
 def _hang_pictures(work: _Furnishing, rng: np.random.Generator) -> int:
-    """Hang a picture, and another or a mirror, where walls are free at eye height; returns how many."""
+    """Hang a picture, and another or a mirror, on free wall space at eye height; return their number."""
     hung = 0
     for name in ("picture", str(rng.choice(["picture", "mirror"]))):
         model = work.model(name)
@@ -334,7 +334,7 @@ def _thing_names(rng: np.random.Generator, count: int) -> list[str]:
 
 
 def _add_thing(work: _Furnishing, rng: np.random.Generator, name: str) -> bool:
-    """Stand a thing on furniture, on the emptiest support first, else on the floor at a wall."""
+    """Place a thing on the emptiest possible support, else on the floor at a wall; return whether it fits."""
     model = work.model(name, thing=True)
     _, radius = footprint_of(model.triangles)
     height = float(model.triangles[..., 2].max())
@@ -376,7 +376,7 @@ def _stand(
     base_z: float,
     scale: float,
 ) -> None:
-    """Put a thing down, its front roughly towards the middle of the room."""
+    """Place a thing with its front roughly towards the middle of the room."""
     yaw = float(np.degrees(np.arctan2(-spot[1], -spot[0])) + rng.uniform(-50, 50))
-    # The circle around the footprint turns about its own middle: any yaw keeps it in place.
+    # The footprint is a circle that rotates about its centre, so any yaw keeps it in place.
     work.put(name, model, spot, yaw, base_z, scale)

@@ -1,4 +1,4 @@
-"""Cameras of room scenes: a loop that structure from motion can reconstruct, and random ones for training."""
+"""Cameras of room scenes: a loop for structure from motion, and random ones for training."""
 
 from collections.abc import Sequence
 
@@ -12,36 +12,36 @@ from hilsplat.world.views import looking_at, numbered_cameras, pinhole
 
 FOV_DEG = 62.0
 EYE_HEIGHTS = (1.34, 1.7)
-"""Heights of the cameras, alternating, m; the difference gives parallax that the loop alone lacks."""
+"""Alternating heights of the cameras, m; the difference adds parallax that the loop alone lacks."""
 PATH_SHARE = 0.27
-"""Semi-axes of the cameras' loop, as shares of the room's width and depth."""
+"""Semi-axes of the camera loop, as shares of the room's width and depth."""
 LOOK_AT_Z = 0.78
 
 
 def path_points(room: Room, azimuths_deg: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 2"]:
-    """Points of the cameras' loop, an ellipse about the middle of the room, from above."""
+    """Return x and y of points on the camera loop, an ellipse about the middle of the room."""
     angle = np.radians(azimuths_deg)
     axes = PATH_SHARE * np.array([room.width, room.depth])
     return np.stack([np.cos(angle), np.sin(angle)], axis=1) * axes
 
 
 def room_of(scene: WorldScene) -> Room:
-    """The inside of a room scene."""
+    """Return the interior dimensions of a room scene."""
     high = scene.triangles.reshape(-1, 3).max(axis=0)
     return Room(2 * float(high[0]), 2 * float(high[1]), float(high[2]))
 
 
 def loop_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int = 360.0) -> Cameras:
-    """Cameras on a loop through the room, alternating between two heights, that look across its middle.
+    """Return cameras on a loop through the room that look across its middle from two alternating heights.
 
-    Looking across shows the far wall with everything in front of it, and the middle from all sides; a camera
-    that turns on the spot and looks outwards would give no parallax.
+    The views show the far wall with everything in front of it, and the middle from all sides. A camera that
+    rotates in place and looks outwards would give no parallax.
 
     Args:
-        scene: its seed also determines the jitter.
+        scene: room to view; its seed also determines the jitter.
         views: number of cameras, named 000.png, 001.png, ...
         image_px: height and width.
-        arc_deg: azimuth of the loop that is used, about +x; a full ring does not repeat its first.
+        arc_deg: azimuth covered, centred on +x; a full ring does not repeat its first azimuth.
     """
     rng = np.random.default_rng([scene.seed, 25])
     room = room_of(scene)
@@ -57,9 +57,9 @@ def loop_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | 
 
 
 def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int = 256) -> Camera:
-    """A random camera for training: like those of `loop_cameras`, and closer ones on one object.
+    """Return a random camera for training: a third as in `loop_cameras`, the others near one object.
 
-    A third looks across the room, the others at an object, from a free place inside the room.
+    The position is inside the room and outside all objects.
     """
     room = room_of(scene)
     boxes = _boxes(scene)
@@ -77,7 +77,7 @@ def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int =
 
 
 def _boxes(scene: WorldScene) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Lowest and highest corners of all placed objects."""
+    """Return the lowest and highest corners of all placed objects."""
     found = []
     for thing in scene.placed:
         points = scene.triangles[scene.node_ids[:, 0] == thing.node].reshape(-1, 3)
@@ -92,7 +92,7 @@ def _free_centre(
     size: float,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """A position in the room, outside all objects, from which something of this size fills much of a view."""
+    """Return a position outside all objects from which an object of this size fills much of a view."""
     half = np.array([room.width, room.depth]) / 2 - 0.2
     for _ in range(200):
         azimuth, distance = rng.uniform(0, 2 * np.pi), size * rng.uniform(1.7, 3.2) + 0.35
@@ -102,6 +102,6 @@ def _free_centre(
             ((centre < low - 0.12) | (centre > high + 0.12)).any() for low, high in boxes
         ):
             return centre
-    # In a corner enclosed by furniture only the loop is certain to be free.
+    # Near an object enclosed by furniture, only the loop is certain to be free.
     spot = path_points(room, np.array([rng.uniform(0, 360)]))[0]
     return np.array([*spot, rng.uniform(1.3, 1.75)])

@@ -12,7 +12,7 @@ WALL_PALE, FLOOR_PALE, CEILING_PALE = 0.6, 0.4, 0.2
 
 
 def add_shell(assembly: Assembly, room: Room, rng: np.random.Generator) -> list[int]:
-    """Floor, ceiling and walls with skirting: never flat in colour, for structure from motion."""
+    """Add floor, walls with skirting and ceiling, textured for structure from motion; return their ids."""
     paints = PaintBox(rng)
     w, d, h = room.width, room.depth, room.height
     floor = paints.draw(str(rng.choice(["wood", "wood", "stone", "collage", "cloth"])), scale=0.45).paled(
@@ -38,16 +38,16 @@ def add_shell(assembly: Assembly, room: Room, rng: np.random.Generator) -> list[
 
 
 def _plane(x: float, y: float) -> Mesh:
-    """A rectangle about the origin that faces up."""
+    """Return a rectangle about the origin that faces up."""
     corners = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]]) / 2
     triangles = corners[[[0, 1, 2], [0, 2, 3]]]
     return Mesh(triangles, np.broadcast_to([0.0, 0.0, 1.0], triangles.shape).copy())
 
 
 def room_style(room: Room, rng: np.random.Generator) -> Style:
-    """Light of a closed room: a wide lamp in the ceiling's plane and much light from all sides.
+    """Draw the light of a closed room: a wide ceiling lamp and strong ambient light.
 
-    The lamp shines into the room, not on the ceiling, which would burn out around it.
+    The lamp does not light the ceiling, which would be overexposed around it.
     """
     warm = rng.uniform(-1, 1)
     place = rng.uniform(-0.4, 0.4, 2)

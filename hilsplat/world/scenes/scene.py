@@ -1,4 +1,4 @@
-"""A scene of the synthetic world: triangles with the nodes they belong to."""
+"""A scene of the synthetic world: triangles with their nodes."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -21,15 +21,14 @@ class Style:
 
     Attributes:
         light_position: centre of the round area light, scene units.
-        light_radius: its radius, scene units.
+        light_radius: radius of the light, scene units.
         light_colour: linear RGB of its light on a surface that faces it.
         sky_colour: linear RGB of the light from above.
         ground_colour: linear RGB of the light from below.
-        exposure: factor on everything.
-        scale: how much larger than a tabletop the scene is; grain, hidden sky and the hash that moves rays
-            follow it (1 for a table, 4 for a street).
-        shadow_reach: farther things cast no shadow, scene units; keeps the dome of the sky from hiding the
-            sun.
+        exposure: factor on all reflected light.
+        scale: size of the scene relative to a tabletop (1 for a table, 4 for a street), which scales
+            grain, occlusion distance and ray jitter.
+        shadow_reach: maximum distance of shadow casters, scene units; keeps the sky dome from hiding the sun.
     """
 
     light_position: tuple[float, float, float] = (1.3, 1.0, 3.6)
@@ -43,7 +42,7 @@ class Style:
 
     @staticmethod
     def draw(rng: np.random.Generator) -> "Style":
-        """A random style."""
+        """Draw a random style."""
         azimuth, away = rng.uniform(0, 2 * np.pi), rng.uniform(0.8, 2.2)
         warm = rng.uniform(-1.3, 1.3)
         light = np.array([1.0 + 0.06 * warm, 0.97, 0.92 - 0.12 * warm]) * rng.uniform(0.8, 1.2)
@@ -60,16 +59,16 @@ class Style:
 
 @dataclass(frozen=True)
 class PlacedObject:
-    """Where an object stands.
+    """Class and position of a placed object.
 
     Attributes:
         name: its class.
-        node: id of its whole among the nodes of the scene.
-        centre_xy: middle of its footprint, scene units.
-        footprint: radius of the circle that holds it from above, scene units.
+        node: id of its whole in the scene.
+        centre_xy: centre of its footprint, scene units.
+        footprint: radius of the circle that encloses it in the x-y plane, scene units.
         height: scene units.
-        yaw_deg: turn about the vertical axis; its front faces +x at 0.
-        base_z: height of what it stands on, scene units.
+        yaw_deg: rotation about the vertical axis; its front faces +x at 0.
+        base_z: height of the surface under it, scene units.
     """
 
     name: str
@@ -83,22 +82,22 @@ class PlacedObject:
 
 @dataclass(frozen=True, eq=False)
 class WorldScene:
-    """A scene as triangles with the nodes they belong to. z is up.
+    """A scene as triangles with their nodes. z is up.
 
     Attributes:
         kind: kind of scene.
-        seed: everything random in it follows from this and from the number of objects.
+        seed: with the number of objects, determines everything random in the scene.
         asked: number of requested objects.
-        placed: the objects that found a place.
+        placed: objects that were placed.
         triangles: corner positions, scene units.
         normals: shading normals at the corners.
-        coords: object coordinates of the corners, scene units; solid textures live in them.
-        node_ids: nodes that each triangle belongs to (whole, part, subpart; -1 none).
+        coords: object coordinates of the corners, scene units; solid textures are evaluated at them.
+        node_ids: nodes of each triangle (whole, part, subpart; -1 none).
         material_ids: row of `materials` of each triangle.
-        materials: numbers for the shader, `Paint.row`.
+        materials: shader parameters (`Paint.row`).
         nodes: all nodes by id. Those of the surroundings (table, floor, wall) are wholes without parts.
-        background: ids of the surroundings. They are labelled but never scored: large easy regions would
-            raise every mean.
+        background: ids of the surroundings. They are labelled but never scored, because large, easy regions
+            would raise every mean.
         style: light of this scene.
     """
 
@@ -118,12 +117,12 @@ class WorldScene:
 
     @cached_property
     def caster(self) -> RayCaster:
-        """Casts rays at the triangles; built on first use."""
+        """Ray caster over the triangles; built on first use."""
         return RayCaster(self.triangles)
 
 
 class Assembly:
-    """Collects triangles, materials and nodes of a scene while it is built.
+    """Triangles, materials and nodes of a scene under construction.
 
     Args:
         scale: scene units per unit of the solid textures, as in `Style.scale`.
@@ -142,7 +141,7 @@ class Assembly:
     def add_object(
         self, model: ObjectModel, scale: float, xy: np.ndarray, yaw_deg: float, base_z: float = 0.0
     ) -> int:
-        """Add an object, scaled, turned, then moved; returns the id of its whole."""
+        """Scale, rotate and move an object, add it, and return the id of its whole."""
         first, materials = len(self.nodes), sum(len(rows) for rows in self.materials)
         for row, node in enumerate(model.nodes):
             parent = NONE if node.parent == NONE else first + node.parent
@@ -158,7 +157,7 @@ class Assembly:
         return first
 
     def add_surroundings(self, text: str, synonyms: tuple[str, ...], pieces: list[tuple[Mesh, Paint]]) -> int:
-        """Add a whole without parts, such as the floor; returns its node id."""
+        """Add a whole without parts, such as the floor, and return its node id."""
         node = len(self.nodes)
         self.nodes.append(AnnotatedNode(node, 1, NONE, text, synonyms))
         for mesh, paint in pieces:
@@ -179,7 +178,7 @@ class Assembly:
         background: Collection[int],
         style: Style,
     ) -> WorldScene:
-        """The scene with everything added so far."""
+        """Return the scene with everything added so far."""
         return WorldScene(
             kind,
             seed,
@@ -198,7 +197,7 @@ class Assembly:
 
 
 def footprint_of(triangles: Float[np.ndarray, "F 3 3"]) -> tuple[Float[np.ndarray, " 2"], float]:
-    """Centre and radius of a circle in the x-y plane that holds the triangles, seen from above."""
+    """Return centre and radius of a circle that encloses the triangles in the x-y plane."""
     points = triangles.reshape(-1, 3)[:, :2]
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     return centre, float(np.linalg.norm(points - centre, axis=1).max())

@@ -1,6 +1,6 @@
-"""Streets: a drive between houses, past vehicles, people, trees and signs (stand-in for Waymo). Metres.
+"""Street scenes: a drive past houses, vehicles, people, trees and signs, as in Waymo. Lengths are metres.
 
-x runs along the street, y to the left of a driver who heads for +x, z up; the road is z = 0.
+x points along the street, y to the left of a driver who heads for +x, and z up; the road is z = 0.
 """
 
 import logging
@@ -21,33 +21,33 @@ from hilsplat.world.views import looking_at, numbered_cameras, pinhole
 logger = logging.getLogger(__name__)
 
 COUNTED = ("car", "pedestrian", "heavy", "cyclist", "car", "pedestrian", "car")
-"""Mixture of the requested vehicles and people; "heavy" is a truck or a bus."""
+"""Mix of the requested vehicles and people; "heavy" is a truck or a bus."""
 FURNITURE = (
     "traffic light", "traffic sign", "tree", "street lamp", "tree", "bush", "fence", "tree", "traffic sign",
     "bush", "street lamp", "tree", "fence", "bush",
 )  # fmt: skip
-"""What is added to every street, as far as there is room."""
+"""Objects added to every street if they fit."""
 STREET_X = (-26.0, 42.0)
-"""The rows of buildings; both ends of the street are closed by buildings across."""
+"""Extent of the rows of buildings, m; other buildings close both ends of the street."""
 THINGS_X = (-9.0, 25.0)
-"""Where vehicles, people and furniture stand: in view of the drive."""
+"""Extent of vehicles, people and furniture, m, in view of the drive."""
 GAP = 0.12
 TRIES = 200
 
 LANE_Y = -LANE / 2
-"""The driver's lane (traffic keeps to the right)."""
+"""Middle of the driver's lane, m (traffic keeps to the right)."""
 DRIVE_X = (-13.0, 10.5)
 CAMERA_Z = 1.8
 MAX_STEP = 0.51
-"""Largest distance between neighbouring views along the street, m."""
+"""Maximum distance between neighbouring views along the street, m."""
 SWEEP_VIEWS = 16
-"""Number of views in which the camera swings from left to right and back."""
+"""Number of views in which the camera sweeps from left to right and back."""
 SWEEP_DEG = 36.0
-"""How far it looks to either side of straight ahead."""
+"""Amplitude of the sweep to either side of straight ahead."""
 SWAY_M = 0.8
-"""How far it moves to either side of the lane's middle in one sweep. Without it, structure from motion was
-off by 2.5 m instead of 0.04 m: views that turn while they move straight ahead have hardly any parallax in
-common, and the two sides of the street came out at different scales."""
+"""Lateral amplitude of the camera about the lane's middle in one sweep. Without it, the error of structure
+from motion was 2.5 m instead of 0.04 m: views that rotate on a straight path share little parallax, so the
+two sides of the street were reconstructed at different scales."""
 FOV_DEG = 62.0
 SUN_DISTANCE = 1000.0
 
@@ -60,7 +60,7 @@ class _Boxes:
         self.high = np.zeros((0, 3))
 
     def free(self, low: Float[np.ndarray, "P 3"], high: Float[np.ndarray, "P 3"]) -> bool:
-        """Whether boxes, grown by the gap, intersect no occupied one."""
+        """Return whether no box, grown by `GAP`, intersects an occupied one."""
         apart = (low[:, None] - GAP > self.high) | (high[:, None] + GAP < self.low)
         return bool(apart.any(axis=2).all())
 
@@ -70,7 +70,7 @@ class _Boxes:
 
 
 class _Spot(NamedTuple):
-    """A place for a thing: (x, y), the height it stands on, and its rotation."""
+    """Place for an object: (x, y), base height and rotation."""
 
     x: float
     y: float
@@ -81,7 +81,7 @@ class _Spot(NamedTuple):
 def part_boxes(
     triangles: Float[np.ndarray, "F 3 3"], parts: np.ndarray
 ) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]]:
-    """Lowest and highest corner of the box around each part of a thing."""
+    """Return the lowest and highest corner of the box around each part of an object."""
     pieces = [triangles[parts == part].reshape(-1, 3) for part in np.unique(parts)]
     return np.stack([p.min(axis=0) for p in pieces]), np.stack([p.max(axis=0) for p in pieces])
 
@@ -97,12 +97,12 @@ class _Street:
         self.drawn = 0
 
     def draw(self, name: str) -> ObjectModel:
-        """The next thing of a class; its appearance depends on the seed and on how many were drawn before."""
+        """Draw the next object of a class; its look depends on the seed and the number drawn before."""
         self.drawn += 1
         return build_street_object(name, np.random.default_rng([self.seed, 22, self.drawn]))
 
     def put(self, model: ObjectModel, spot: _Spot) -> PlacedObject | None:
-        """Place a thing at a spot, unless it would intersect another."""
+        """Place an object at a spot and return it, or return None if it would intersect another."""
         turned = model.triangles @ rotation_about("z", spot.yaw_deg).T + np.array([spot.x, spot.y, spot.z])
         low, high = part_boxes(turned, model.node_ids[:, 1])
         if not self.boxes.free(low, high):
@@ -115,7 +115,7 @@ class _Street:
         return PlacedObject(model.name, node, xy, radius, height, spot.yaw_deg, spot.z)
 
     def try_spots(self, name: str, spot: Callable[[ObjectModel], _Spot]) -> PlacedObject | None:
-        """Place a thing at the first of some random spots that is free."""
+        """Place an object at the first free one of `TRIES` random spots, or return None."""
         model = self.draw(name)
         for _ in range(TRIES):
             placed = self.put(model, spot(model))
@@ -124,7 +124,7 @@ class _Street:
         return None
 
     def vehicle_spot(self, model: ObjectModel) -> _Spot:
-        """Parked at either kerb, oncoming, or ahead in the driver's lane."""
+        """Draw a spot parked at either kerb, oncoming, or ahead in the driver's lane."""
         rng, width = self.rng, float(np.ptp(model.triangles[..., 1]))
         half = float(np.ptp(model.triangles[..., 0])) / 2
         x = float(rng.uniform(THINGS_X[0] + half, THINGS_X[1] - half))
@@ -140,14 +140,14 @@ class _Street:
         return _Spot(float(rng.uniform(DRIVE_X[1] + half + 5, 27 + half)), LANE_Y, 0.0, tilt)
 
     def cyclist_spot(self, model: ObjectModel) -> _Spot:
-        """Beside the lanes."""
+        """Draw a spot beside the lanes."""
         rng = self.rng
         if rng.random() < 0.5:
             return _Spot(float(rng.uniform(-2, 18)), LANE + 0.05, 0.0, 180 + float(rng.uniform(-8, 8)))
         return _Spot(float(rng.uniform(2, 20)), -LANE - 0.3, 0.0, float(rng.uniform(-8, 8)))
 
     def pedestrian_spot(self, model: ObjectModel) -> _Spot:
-        """On a sidewalk, mostly along it."""
+        """Draw a spot on a sidewalk, facing roughly along it."""
         rng = self.rng
         side = -1 if rng.random() < 0.6 else 1
         yaw = float(rng.choice([0.0, 180.0]) + rng.uniform(-35, 35))
@@ -155,7 +155,7 @@ class _Street:
         return _Spot(float(rng.uniform(-6, 20)), y, 0.14, yaw)
 
     def furniture_spot(self, name: str, side: int) -> Callable[[ObjectModel], _Spot]:
-        """In the strip of the sidewalk beside the kerb."""
+        """Return a function that draws a spot beside the kerb, on the sidewalk."""
         rng = self.rng
 
         def spot(model: ObjectModel) -> _Spot:
@@ -174,15 +174,15 @@ class _Street:
 
 
 def build_street(seed: int, objects: int) -> WorldScene:
-    """A stretch of street. `objects` counts vehicles and people; houses and furniture come with it.
+    """Build a stretch of street with houses, street furniture, and `objects` vehicles and people.
 
-    Vehicles stand in the lanes or park at the kerbs, people walk on the sidewalks, trees, lamps, signs and
-    fences stand beside the kerb. The box around each part of a thing intersects no box of another thing;
-    things without a place are left out. `placed` lists the vehicles and people.
+    Vehicles are in the lanes or parked at the kerbs, people on the sidewalks, and trees, lamps, signs and
+    fences beside the kerb. The boxes around the parts of one object intersect no box of another; objects that
+    do not fit are omitted. `placed` lists only vehicles and people.
 
     Args:
         seed: not negative; the same seed and number of objects give the same scene.
-        objects: how many vehicles and people to place; there is room for about 16.
+        objects: number of vehicles and people to place; about 16 fit.
     """
     street = _Street(seed)
     rng = street.rng
@@ -217,7 +217,7 @@ def build_street(seed: int, objects: int) -> WorldScene:
 
 
 def _add_buildings(street: _Street) -> int:
-    """Rows of houses on both sides and across both ends; returns how many."""
+    """Add rows of houses on both sides and across both ends; return their number."""
     rng, count = street.rng, 0
     for side in (-1, 1):
         x = STREET_X[0] + float(rng.uniform(0, 2))
@@ -237,14 +237,14 @@ def _add_buildings(street: _Street) -> int:
 
 
 def _daylight(rng: np.random.Generator) -> Style:
-    """Sun and sky; the sun is far away, so its light hardly falls off along the street."""
+    """Draw sun and sky; the sun is far away, so its light is nearly constant along the street."""
     azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(38, 62))
     warm = rng.uniform(0, 1)
     toward = np.array(
         [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
     )
     sun = np.array([1.0, 0.97 - 0.05 * warm, 0.90 - 0.14 * warm]) * rng.uniform(1.1, 1.35)
-    # The shader's light falls off as 13 / distance^2, which is 1 over a table.
+    # The shader's light falls off as 13 / distance^2, which is about 1 above a table.
     sun *= SUN_DISTANCE**2 / 13.0
     sky = np.array([0.40, 0.45, 0.54]) * rng.uniform(0.9, 1.1)
     position = tuple((SUN_DISTANCE * toward).tolist())
@@ -262,10 +262,10 @@ def _daylight(rng: np.random.Generator) -> Style:
 
 
 def drive_poses(scene: WorldScene, views: int) -> list[tuple[Float[np.ndarray, " 3"], float]]:
-    """Where the camera is and where it heads: centre and yaw in degrees, one per view.
+    """Return centre and yaw in degrees of the camera in each view.
 
-    The camera moves along its lane and sways, while its heading sweeps between the two sides of the
-    street; neighbours differ by 9 degrees. Few views make a shorter drive rather than a coarser one.
+    The camera moves along its lane and sways, while its yaw sweeps between the two sides of the street in
+    steps of 9 degrees. Fewer views shorten the drive rather than increase the steps.
     """
     rng = np.random.default_rng([scene.seed, 25])
     length = DRIVE_X[1] - DRIVE_X[0]
@@ -281,13 +281,13 @@ def drive_poses(scene: WorldScene, views: int) -> list[tuple[Float[np.ndarray, "
 
 
 def drive_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int = 360.0) -> Cameras:
-    """Cameras of a drive along the street; take the global mapper for them (`docs/world.md`).
+    """Return the cameras of a drive along the street, for the global mapper (see `docs/world.md`).
 
     Args:
-        scene: its seed also determines the jitter.
+        scene: scene to view; its seed also determines the jitter.
         views: number of cameras, named 000.png, 001.png, ...
         image_px: height and width.
-        arc_deg: not used: a drive is not a ring.
+        arc_deg: unused, because a drive is not a ring.
     """
     rng = np.random.default_rng([scene.seed, 26])
     transforms = []
@@ -297,13 +297,13 @@ def drive_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float |
 
 
 def _heading(yaw_deg: float, pitch_deg: float) -> Float[np.ndarray, " 3"]:
-    """Unit vector; positive pitch looks up."""
+    """Return the unit vector of a viewing direction; positive pitch looks up."""
     yaw, pitch = np.radians(yaw_deg), np.radians(pitch_deg)
     return np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
 
 
 def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int = 256) -> Camera:
-    """A random camera for training: views from the road, and close ones of one visible thing."""
+    """Return a random camera for training: a view from the road, or a close-up of a visible object."""
     intrinsics = pinhole(image_px, float(rng.uniform(56, 66)))
     pose = _close_up(scene, rng) if rng.random() < 0.5 else None
     if pose is None:
@@ -314,12 +314,12 @@ def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int =
 
 
 def _close_up(scene: WorldScene, rng: np.random.Generator) -> Float[np.ndarray, "4 4"] | None:
-    """A camera on the road's side of a random thing that nothing hides, None if none is found."""
+    """Return a camera on the road side of a random unoccluded object, or None if none is found."""
     wholes = sorted(set(np.unique(scene.node_ids[:, 0]).tolist()) - scene.background)
     for _ in range(30):
         node = wholes[int(rng.integers(len(wholes)))]
         if scene.nodes[node].text == "building" and rng.random() < 0.6:
-            continue  # there are many houses
+            continue  # houses outnumber all other objects
         corners = scene.triangles[scene.node_ids[:, 0] == node].reshape(-1, 3).astype(np.float64)
         low, high = corners.min(axis=0), corners.max(axis=0)
         if low[0] > 30 or high[0] < -16:
@@ -341,7 +341,7 @@ def _close_up(scene: WorldScene, rng: np.random.Generator) -> Float[np.ndarray, 
 def _sees(
     scene: WorldScene, centre: np.ndarray, corners: np.ndarray, node: int, rng: np.random.Generator
 ) -> bool:
-    """Whether most of a thing's corners are visible from a point, or hidden only by the thing itself."""
+    """Return whether most of an object's corners are visible from a point or hidden only by the object."""
     chosen = corners[rng.integers(len(corners), size=40)]
     directions = chosen - centre
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""What is under and around a street: road, markings, kerbs, sidewalks, ground and sky. Metres."""
+"""Surroundings of a street: road, markings, kerbs, sidewalks, ground and sky. Lengths are metres."""
 
 import numpy as np
 
@@ -8,12 +8,12 @@ from hilsplat.world.shapes import Mesh, box, joined, lathe
 
 LANE = 3.2
 KERB = 5.7
-"""Half the width of the road: a lane and a strip for parked cars."""
+"""Half the width of the road, m: a lane and a parking strip."""
 FRONT = 8.7
-"""Where the houses begin."""
+"""Distance of the house fronts from the middle of the road, m."""
 WALK_Z = 0.14
 SCALE = 4.0
-"""`Style.scale`: textures and hidden sky are four times as large as on a table."""
+"""`Style.scale`: textures and occlusion distance are four times as large as on a table."""
 ROAD_X = (-34.0, 50.0)
 DOME_RADIUS = 115.0
 DOME_HEIGHT = 62.0
@@ -21,7 +21,7 @@ CROSSING_X = (14.2, 16.8)
 
 
 def add_ground(assembly: Assembly, rng: np.random.Generator) -> list[int]:
-    """Add the surroundings, as wholes without parts; returns their ids.
+    """Add the surroundings as wholes without parts and return their ids.
 
     Their texts are those of the Waymo classes (road, lane marker, curb, sidewalk, other ground).
     """
@@ -77,13 +77,13 @@ def _paint(
     scale: float,
     rng: np.random.Generator,
 ) -> Paint:
-    """A dull paint with strong grain: structure from motion needs detail on large plain surfaces."""
+    """Return a dull paint with strong grain, because structure from motion needs detail on large surfaces."""
     offset = tuple(rng.uniform(3.0, 17.0, 3).tolist())
     return Paint(colour, kind, first, second, scale, 0.03, 8.0, 0.34, offset)
 
 
 def _patches(rng: np.random.Generator) -> Mesh:
-    """Repaired patches and manhole covers of the road."""
+    """Return repaired patches and manhole covers of the road."""
     pieces = []
     for _ in range(14):
         size = (float(rng.uniform(0.6, 2.2)), float(rng.uniform(0.5, 1.6)), 0.02)
@@ -93,7 +93,7 @@ def _patches(rng: np.random.Generator) -> Mesh:
 
 
 def _markings() -> Mesh:
-    """Dashes between the lanes, lines and ticks of the parking strips, a zebra crossing, a stop line."""
+    """Return lane dashes, lines and ticks of the parking strips, a zebra crossing and a stop line."""
     pieces = []
 
     def mark(x0: float, x1: float, y0: float, y1: float) -> None:
@@ -117,7 +117,7 @@ def _markings() -> Mesh:
 
 
 def _dome(middle: float) -> Mesh:
-    """The sky: half an ellipsoid over everything, near enough for its clouds to show parallax."""
+    """Return the sky: half an ellipsoid over the scene, near enough for its clouds to show parallax."""
     angle = np.linspace(-0.02, np.pi / 2, 15)
     profile = [(max(0.0, float(np.cos(a))), float(np.sin(a))) for a in angle]
     profile[-1] = (0.0, 1.0)

@@ -20,31 +20,31 @@ ROOM_HALF = 3.0
 FLOOR_Z = -0.75
 WALL_HEIGHT = 3.4
 COVERED_SHARE = 0.58
-"""Share of the table top that the objects' footprints would cover if all were placed."""
+"""Share of the table top covered by the objects' footprints if all are placed."""
 MAX_FOOTPRINT = 0.36
 MAX_HEIGHT_TO_FOOTPRINT = 2.7
 GAP = 0.015
 WALL_GROUPS = ("brick", "collage", "stone", "plain", "cloth")
 ROOM_PALE = 0.5
-"""Walls and floor are mixed with this share of grey, so that the things stand out."""
+"""Share of grey mixed into walls and floor, so that the objects stand out."""
 FOV_DEG = 50.0
 ELEVATIONS_DEG = (24.0, 46.0)
 DISTANCE = 2.15 * TABLE_RADIUS
 LOOK_AT_Z = 0.16
 TRIES = 150
 LAYOUTS = 25
-"""Layouts tried before an object is left out; the first that holds all is taken, otherwise the fullest."""
+"""Maximum number of layouts tried; the first that fits all objects is used, otherwise the fullest."""
 
 
 def build_tabletop(seed: int, objects: int) -> WorldScene:
-    """Objects on a table whose top is z = 0. The more are requested, the smaller each is.
+    """Build a scene of objects on a table whose top is z = 0.
 
-    Objects are of different classes while there are enough classes. Each is put at a random place
-    where its footprint overlaps no other; objects without a place are left out.
+    The more objects are requested, the smaller each is. No class repeats before all have been used. Each
+    object is placed at random without overlap of footprints; objects that do not fit are omitted.
 
     Args:
         seed: not negative; the same seed and number of objects give the same scene.
-        objects: how many to place.
+        objects: number of objects to place.
     """
     rng = np.random.default_rng([seed, 1])
     assembly = Assembly()
@@ -77,9 +77,9 @@ def build_tabletop(seed: int, objects: int) -> WorldScene:
 
 
 def _layout(rng: np.random.Generator, radii: list[float]) -> list[Float[np.ndarray, " 2"] | None]:
-    """Random places on the table for footprints, given largest first; None for those left out.
+    """Return random places on the table for footprints, given largest first; None for omitted ones.
 
-    Each is redrawn until it overlaps no earlier one, at most `TRIES` times; at most `LAYOUTS` layouts.
+    Each place is redrawn until its footprint overlaps no earlier one, at most `TRIES` times.
     """
     best: list[np.ndarray | None] = []
     most = -1
@@ -104,8 +104,7 @@ def _layout(rng: np.random.Generator, radii: list[float]) -> list[Float[np.ndarr
 
 
 def _add_room(assembly: Assembly, rng: np.random.Generator) -> list[int]:
-    """Table, floor and walls, sometimes a cloth, a rug or pictures; rich textures, for structure from
-    motion."""
+    """Add richly textured table, floor and walls, sometimes a cloth, a rug or pictures; return their ids."""
     paints = PaintBox(rng)
     nodes = _add_table(assembly, rng, paints)
     half = ROOM_HALF
@@ -146,7 +145,7 @@ def _add_room(assembly: Assembly, rng: np.random.Generator) -> list[int]:
 
 
 def _add_table(assembly: Assembly, rng: np.random.Generator, paints: PaintBox) -> list[int]:
-    """A round, square or eight-sided table around `TABLE_RADIUS`, sometimes with a cloth."""
+    """Add a round, square or octagonal table of about `TABLE_RADIUS`, sometimes with a cloth."""
     top = paints.draw(
         str(rng.choice(["wood", "wood", "stone", "collage", "plain", "tiles"])), scale=0.6
     ).paled(0.45)
@@ -179,7 +178,7 @@ def _add_table(assembly: Assembly, rng: np.random.Generator, paints: PaintBox) -
     if cloth:
         fabric = _fabric(paints, 0.5).paled(0.35)
         draped = [(slab(1.012, -0.30, 0.0), fabric)]
-        if rng.random() < 0.5:  # only laid on, so smaller than the table
+        if rng.random() < 0.5:  # a flat cloth, smaller than the table
             draped = [(slab(0.86, -0.015, 0.0), fabric)]
         nodes.append(
             assembly.add_surroundings("tablecloth", (f"{fabric.colour} tablecloth", "cloth"), draped)
@@ -188,18 +187,18 @@ def _add_table(assembly: Assembly, rng: np.random.Generator, paints: PaintBox) -
 
 
 def _fabric(paints: PaintBox, scale: float) -> Paint:
-    """Cloth with printed patterns of the given scale; a weave stays fine, or it would look like waves."""
+    """Draw cloth with a pattern of the given scale; a weave stays fine, because a coarse one looks wavy."""
     paint = paints.draw("cloth", scale=scale)
     return replace(paint, scale=paint.scale * 2.2 / scale * 0.5) if paint.kind == "weave" else paint
 
 
 def ring_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int = 360.0) -> Cameras:
-    """Cameras around the table at two alternating elevations, slightly jittered.
+    """Return slightly jittered cameras around the table at two alternating elevations.
 
-    Neighbours should be at most 9 degrees apart, or structure from motion fails (measured).
+    Neighbours should be at most 9 degrees apart: structure from motion failed with larger steps.
 
     Args:
-        scene: its seed also determines the jitter.
+        scene: scene to view; its seed also determines the jitter.
         views: number of cameras, named 000.png, 001.png, ...
         image_px: height and width.
         arc_deg: azimuth covered, centred on +x, where the objects' fronts tend to face; a full ring
@@ -218,12 +217,13 @@ def ring_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | 
 
 
 def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int = 256) -> Camera:
-    """A random camera for training: like those of `ring_cameras`, and closer ones on one object.
+    """Return a random camera for training.
 
-    Half of them see the whole table, half look at an object from closer; lenses range from wide to long.
+    Half of the cameras see the whole table, as in `ring_cameras`; the others look at one object from nearer.
+    Their fields of view vary.
     """
     azimuth, elevation, fov_deg = rng.uniform(0, 360), rng.uniform(16, 60), rng.uniform(42, 64)
-    nearer = np.tan(np.radians(FOV_DEG / 2)) / np.tan(np.radians(fov_deg / 2))  # things keep their size
+    nearer = np.tan(np.radians(FOV_DEG / 2)) / np.tan(np.radians(fov_deg / 2))  # keeps sizes
     if scene.placed and rng.random() < 0.5:
         thing = scene.placed[int(rng.integers(len(scene.placed)))]
         target = np.array([*thing.centre_xy, thing.height * 0.45]) + rng.uniform(-0.08, 0.08, 3)
